@@ -216,10 +216,10 @@ def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
 def room_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool) -> int:
     """How many steps a program has room for.
 
-    If it keeps nothing of each, the next power of 4 from `max_steps`, so that one program serves several numbers, or
-    the number of steps that derivatives keep: those of more need a program that finds steps again. Otherwise
-    `max_steps` in a program that is traced, and else as many as take little memory, or less: a motion that takes more
-    steps is computed again with more room.
+    If it keeps nothing of each, the next power of 4 from `max_steps`, so that one program serves several numbers, but
+    no more than the steps that derivatives keep where `max_steps` is not above these: a derivative of more steps has a
+    program that finds them again. Otherwise `max_steps` in a program that is traced, and else as many as take little
+    memory, or less: a motion that takes more steps is computed again with more room.
     """
     # Of dense output as many numbers for each of the state as a multistep method has in its history.
     kept = 16 if saveat.dense else int(saveat.subs[0].steps)

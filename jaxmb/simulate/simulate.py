@@ -145,7 +145,7 @@ def simulate(
         tolerances; both together take two to two and a half times as long as one, and nothing more to compile.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
         and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
-        then exert, without restitution where contacts are closed, but for those whose own terrain or ends jump. A
+        then exert, without restitution where contacts are closed, except at those whose own terrain or ends jump. A
         function that is evaluated at a jump should return its value after it, as a state saved there does. Needs
         `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints. A warning
         tells of jumps and kinks of drivers at other times, except under `jit`, `vmap` or a derivative.
@@ -157,8 +157,8 @@ def simulate(
         and states are kept: a motion that has more of them fails.
     - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
         error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
-        some more steps are simulated; not under `jit`, `vmap` or a derivative. A derivative of at most 2048 steps has
-        nothing that finds steps again, a fifth of its program: with `max_steps=2000` it compiles so much faster.
+        some more steps are simulated; not under `jit`, `vmap` or a derivative. A derivative keeps at most 2048 steps;
+        with a larger `max_steps` its program also finds steps again, and takes a fifth longer to compile.
 
     **Returns:** a `Trajectory`.
 

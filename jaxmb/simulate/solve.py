@@ -252,7 +252,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         no_state = result == RESULTS.promote(NO_STATE)
         result, unknown = RESULTS.where(no_state, RESULTS.contacts_undetermined, result), unknown & ~no_state
         result = RESULTS.where(found.number > problem.max_events, RESULTS.too_many_events, result)
-        result = RESULTS.where(times["t1"] < times["t0"], RESULTS.impacts_backward, result)
+        backward = (times["t1"] < times["t0"]) & finite & valid
+        result, unknown = RESULTS.where(backward, RESULTS.impacts_backward, result), unknown & ~backward
     stuck, coupling = has_failed(result) & unknown, None
     evidence = policy.evidence(solution.solver_state)
     if problem.traced:

@@ -1,9 +1,10 @@
 """The loop over the steps of a solve, in the place of diffrax's own.
 
 It does the same with the same state, for `diffrax.diffeqsolve` and the adjoints of this package. The time from which on
-a step ends with the run, a hundred rounding errors before its end, is found in one operation: diffrax takes a hundred
-times fifteen for it, a tenth of what it takes to trace and to compile a small mechanism. An event whose function is not
-a number does not happen, so that a member of a batch that fails does not stop the others.
+a step ends with the run, a hundred rounding errors before its end, is found in one operation: diffrax takes fifteen
+hundred for it, a tenth of what it takes to trace and to compile a small mechanism. Where a run fails no event happens,
+and the search for the time of an event is that of the members of a batch that have one, so that a member that fails
+does not stop the others.
 """
 
 import dataclasses
@@ -45,11 +46,10 @@ class _Solve(NamedTuple):
         """A function of each series of saved states, and of what is saved of it."""
         return jax.tree.map(function, self.saveat.subs, saved, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
 
-    def guards(self, t: Any, y: PyTree) -> PyTree:
-        """The values of the functions of the event."""
+    def guard(self, function: Callable[..., Any], t: Any, y: PyTree) -> Any:
+        """The value of a function of the event."""
         names = ("terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller", "max_steps")
-        given = {name: getattr(self, name) for name in names}
-        return jax.tree.map(lambda guard: guard(t, y, self.args, **given), self.event.cond_fn, is_leaf=callable)  # pyright: ignore[reportOptionalMemberAccess]
+        return function(t, y, self.args, **{name: getattr(self, name) for name in names})
 
 
 def loop(*, init_state: Any, outer_while_loop: Callable[..., Any], **given: Any) -> tuple[Any, dict[str, Any]]:
@@ -68,15 +68,15 @@ def known_in_steps(state: Any, **given: Any) -> dict[str, Any]:
 
     **Arguments:** as of `loop`.
     """
-    solve, known = _Solve(**given), {"made_jump": state.made_jump, "result": state.result}
+    solve, known = _Solve(**given), _known(state)
     while True:
         # What is found of one may change the other.
-        at = lambda state, known=known: _are_traced(_advanced(solve, dataclasses.replace(state, **known)))
-        traced = eqx.filter_eval_shape(at, state)
-        found = {name: value for name, value in known.items() if not traced[name]}
-        if len(found) == len(known):
+        at = lambda state, known=known: _known(_advanced(solve, dataclasses.replace(state, **known)))
+        after = eqx.filter_eval_shape(at, state)
+        same = {name: value for name, value in known.items() if name in after and after[name] == value}
+        if len(same) == len(known):
             return known
-        known = found
+        known = same
 
 
 def stepped(state: Any, outer_while_loop: Callable[..., Any], known: dict[str, Any], **given: Any) -> Any:
@@ -117,9 +117,10 @@ def _proceeds(solve: _Solve, state: Any) -> Any:
     return more & diffrax.is_successful(state.result)
 
 
-def _are_traced(state):
-    """What of a state is not known before the program runs."""
-    return {"made_jump": type(state.made_jump) is not bool, "result": state.result.is_traced()}
+def _known(state):
+    """What of a state is known before the program runs."""
+    found = {"made_jump": state.made_jump} if isinstance(state.made_jump, bool) else {}
+    return found if state.result.is_traced() else found | {"result": state.result}
 
 
 def _buffers(state):
@@ -179,8 +180,8 @@ def _advanced(solve: _Solve, state: Any) -> Any:
             dense_save_index=place + jnp.where(keep, 1, 0),
         )
     if solve.event is not None:
-        values = solve.guards(tprev, y)
-        mask, happened = _first_of(_changes(solve.event, state.event_values, values))
+        values = jax.tree.map(lambda guard: solve.guard(guard, tprev, y), solve.event.cond_fn, is_leaf=callable)
+        mask, happened = _first_of(_changes(solve.event, state.event_values, values, _is_finite(y)))
         result = _RESULTS.where(happened, _RESULTS.event_occurred, result)
         new = dataclasses.replace(
             new,
@@ -298,8 +299,14 @@ def _until(saved, t):
     )
 
 
-def _changes(event: diffrax.Event, before: PyTree, values: PyTree) -> PyTree:
-    """Which functions of an event say that it happened in a step: a truth value, or a change of sign."""
+def _is_finite(y: PyTree) -> Any:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
+
+
+def _changes(event: diffrax.Event, before: PyTree, values: PyTree, finite: Any) -> PyTree:
+    """Which functions of an event say that it happened in a step to a state that is `finite`: a truth value, or a
+    number that changes its sign or is none any more.
+    """
 
     def changes(_, old, new, upwards):
         if jnp.issubdtype(jnp.result_type(new), jnp.bool_):
@@ -309,7 +316,7 @@ def _changes(event: diffrax.Event, before: PyTree, values: PyTree) -> PyTree:
             change = old != new
         else:
             change = (old <= 0) & (new > 0) if upwards else (old > 0) & (new <= 0)
-        return change & ~jnp.isnan(new)
+        return change & ~jnp.isnan(old) & (finite | ~jnp.isnan(new))
 
     return jax.tree.map(changes, event.cond_fn, before, values, event.direction, is_leaf=callable)
 
@@ -325,7 +332,9 @@ def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
 
 
 def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree, Any]:
-    """The time of the event in the last step, the state there and the result; the end of the step without one."""
+    """The time of the event in the last step, the state there and the result; those of the end of the run if none
+    happened.
+    """
     event: Any = solve.event
     finite = jnp.isfinite(last.event_tnext)
     end = jnp.where(finite, last.event_tnext, solve.t1)
@@ -334,18 +343,24 @@ def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree
     def left(t, _):
         """Zero at the event."""
 
-        def of(value, mask):
-            is_sign = jnp.issubdtype(jnp.result_type(value), jnp.floating)
-            value = jnp.where(mask, value if is_sign else end - t, 0.0)
-            return jnp.where(happened & finite, value, end - t)
+        def of(guard, mask):
+            def found():
+                value = solve.guard(guard, t, within.evaluate(t))
+                return value if jnp.issubdtype(jnp.result_type(value), jnp.floating) else end - t
 
-        return jax.tree.map(of, solve.guards(t, within.evaluate(t)), last.event_mask)
+            # What did not happen is not evaluated, since its derivatives need not exist.
+            own = eqx.filter_eval_shape(found)
+            value = lax.cond(mask, found, lambda: jnp.zeros(own.shape, own.dtype))
+            return jnp.where(happened & finite, value, (end - t).astype(value.dtype))
+
+        return jax.tree.map(of, event.cond_fn, last.event_mask, is_leaf=callable)
 
     limits = {"lower": jnp.where(finite, last.event_tprev, solve.t0), "upper": end}
     found = optx.root_find(left, event.root_finder, y0=end, options=limits, throw=False)
     # A derivative that is not a number, as in a failed member of a batch, does not come to the search.
-    t = jnp.where(happened, found.value, end)
-    y = lax.cond(last.num_steps == 0, lambda: last.y, lambda: within.evaluate(t))
-    of_search = _RESULTS.promote(found.result)
-    result = _RESULTS.where(found.result == optx.RESULTS.successful, last.result, of_search)
-    return t, y, result
+    t = jnp.where(happened, found.value, last.tprev)
+    moved = happened & (last.num_steps > 0)
+    y = lax.cond(any_of_batch(moved), lambda: within.evaluate(t), lambda: last.y)
+    y = jax.tree.map(lambda inside, y: jnp.where(moved, inside, y), y, last.y)
+    lost = happened & (found.result != optx.RESULTS.successful)
+    return t, y, _RESULTS.where(lost, _RESULTS.promote(found.result), last.result)

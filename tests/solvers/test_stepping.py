@@ -34,6 +34,13 @@ CASES = {
         "saveat": diffrax.SaveAt(ts=jnp.linspace(0.0, 3.0, 7), t1=True),
     },
     "event among steps": {"event": diffrax.Event(falling, **EVENT), "saveat": diffrax.SaveAt(steps=2, t1=True)},
+    "event without a search": {"event": diffrax.Event(falling)},
+    "event that ends its function": {"event": diffrax.Event(lambda t, y, args, **_: jnp.sqrt(y[0] + 0.4) + 1.0)},
+    "a jump at the start": {
+        "stepsize_controller": diffrax.ConstantStepSize(),
+        "dt0": 0.1,
+        "made_jump": jnp.array(True),
+    },
     "truth": {"event": diffrax.Event(lambda t, y, args, **_: t > 1.0)},
     "two events": {"event": diffrax.Event([lambda t, *_, **__: t > 1.5, falling], **EVENT)},
     "too few steps": {"max_steps": 4, "throw": False},
@@ -52,8 +59,8 @@ CASES = {
 def solve(adjoint=None, **given):
     options = {"t0": 0.0, "t1": 3.0, "dt0": None, "stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-8)}
     options |= {} if adjoint is None else {"adjoint": adjoint}
-    term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -4.0 * y[0] + jnp.where(t > 1.0, 1.0, 0.0)]))
-    return diffrax.diffeqsolve(term, diffrax.Tsit5(), y0=jnp.array([1.0, 0.0]), **options | given)
+    options["terms"] = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -4.0 * y[0] + jnp.where(t > 1.0, 1.0, 0.0)]))
+    return diffrax.diffeqsolve(**{"solver": diffrax.Tsit5(), "y0": jnp.array([1.0, 0.0]), **options, **given})
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -81,3 +88,35 @@ def test_a_member_that_fails_at_an_event_does_not_stop_the_others():
     slope = lambda start: -0.2 / start**2 / np.sqrt(1 - (0.4 / start) ** 2)
     np.testing.assert_allclose(times[::2], [exact(1.0), exact(0.5)], rtol=1e-5)
     np.testing.assert_allclose(rates[::2], [slope(1.0), slope(0.5)], rtol=1e-4)
+
+
+def test_the_time_of_an_event_beside_one_without_a_derivative():
+    def at_event(rate):
+        norm = lambda t, y, args, **_: jnp.sqrt(y[2] ** 2 + y[3] ** 2) - 1.0
+        term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -rate * y[0], 0.0 * y[0], 0.0 * y[0]]))
+        return solve(
+            MeshAdjoint(64),
+            terms=term,
+            y0=jnp.array([1.0, 0.0, 0.0, 0.0]),
+            event=diffrax.Event([norm, falling], **EVENT),
+        ).ts[0]
+
+    exact = -np.arccos(-0.4) / 16
+    np.testing.assert_allclose([jax.grad(at_event)(4.0), jax.jacfwd(at_event)(4.0)], exact, rtol=1e-4)
+
+
+def test_a_member_without_an_event_ends_where_it_ends_alone():
+    def at_end(start):
+        found = solve(
+            MeshAdjoint(64),
+            y0=jnp.stack([start, 0.0 * start]),
+            event=diffrax.Event(falling, **EVENT),
+            max_steps=11,
+            throw=False,
+        )
+        return found.ts[0], found.ys[0]
+
+    both = jax.vmap(at_end)(jnp.array([1.0, 0.3]))
+    for k, start in enumerate((1.0, 0.3)):
+        for one, alone in zip(both, at_end(jnp.asarray(start)), strict=True):
+            np.testing.assert_allclose(one[k], alone, rtol=1e-9)

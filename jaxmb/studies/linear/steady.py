@@ -70,13 +70,13 @@ def steady_motion(
     - `t`: the time, for drivers that depend on it [s].
     - `throw`: whether a failed search is an error. With `False` the state is NaN instead.
 
-    **Returns:** a `State` on the constraints, differentiable with respect to parameters and prescribed values.
-
     Contacts stay as they are in the guess, open or closed, as in `equilibrium`.
 
-    **Raises:** `ValueError` for unknown names, and if there is no such motion, with the accelerations that remain, or
-    only one in which an open contact is overlapped or a closed one would have to pull. Under `jit` the result is NaN
-    instead. Also for a system with dry friction that may stick.
+    **Returns:** a `State` on the constraints, differentiable with respect to parameters and prescribed values.
+
+    **Raises:** `ValueError` for unknown names, for a system with dry friction that may stick, and if there is no such
+    motion, with the accelerations that remain, or only one in which an open contact is overlapped or a closed one would
+    have to pull. Under `jit` the result is NaN instead where the motion is not found.
     """
     check_system("steady_motion", system)
     check_no_states("steady_motion", system)
@@ -98,7 +98,7 @@ def steady_motion(
         raise ValueError(_not_found(system, found, [*chosen[0], *chosen[1]]))
     if found.against is not None and not holds:
         against, change = about_contacts("The motion is steady", system, *found.against)
-        raise ValueError(f"{against}For example jaxmb.steady_motion(system, jaxmb.assemble(system, {change})).")
+        raise ValueError(f"{against}For example jaxmb.steady_motion(system, jaxmb.assemble(system, guess, {change})).")
     return found.state
 
 
