@@ -427,8 +427,12 @@ def _with_derivatives(found, equations, jumps, init_state, fixed):
     **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
     step size controller knows as well, and the solver stand here for their tangents.
     """
-    del equations, jumps, init_state, fixed
-    return found
+    del jumps, fixed
+    # In a batch what comes out is batched where its tangents are, and tangents are where anything is: JAX gives the
+    # outputs of a rule that is applied inside of `jit` the axes of those of its function.
+    numbers = [x for x in jax.tree.leaves((found, equations, init_state)) if eqx.is_array(x) and x.size]
+    same = jnp.any(jnp.stack([jnp.ravel(x)[0] != jnp.ravel(x)[0] for x in numbers]))
+    return jax.tree.map(lambda x: jnp.where(same, x, x) if eqx.is_array(x) else x, found)
 
 
 @_with_derivatives.def_jvp

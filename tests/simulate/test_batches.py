@@ -141,6 +141,7 @@ def test_derivatives_of_a_state_that_was_not_found():
         np.testing.assert_array_equal(np.isnan(jax.jit(jax.vmap(derivative(angle)))(lengths)), [False, True])
 
 
+@pytest.mark.always
 def test_the_gradient_of_a_sum_over_a_batch():
     """Of what the members share: the sum of theirs."""
     mechanism = mb.mechanisms.get("pendulum")
