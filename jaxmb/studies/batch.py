@@ -8,12 +8,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jax import lax
 from jaxtyping import PyTree
 
 from .._compat import ClosedJaxpr, Jaxpr
 from .._traced_functions import NEED_NUMBERS
 from ..linalg.arrays import ARRAYS
+from ..linalg.members import in_blocks
 from ..parts.names import names_arguments
 
 # What the loops of the members of a block may carry [bytes], and the most members of a block.
@@ -60,22 +60,15 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
         raise ValueError(f"size must be an integer of at least 1, or None, got {size!r}.")
 
     @eqx.filter_jit
-    def in_blocks(members, count):
+    def of_all(members, count):
         arrays, shared = eqx.partition(members, lambda x: isinstance(x, ARRAYS))
         member = Member(lambda own: function(*eqx.combine(own, shared)), jax.tree.map(lambda x: x[0], arrays))
-        number = -(-count // min(size or member.block_size(count), count))
-        together = -(-count // number)
-        if number == 1:
-            return member.block(together)(arrays)
-        # What fills the last block up fails only where the last member does.
-        places = np.minimum(np.arange(number * together), count - 1)
-        blocks = jax.tree.map(lambda x: x[places].reshape(number, together, *x.shape[1:]), arrays)
-        found = lax.map(member.block(together), blocks)
-        return jax.tree.map(lambda x: x.reshape(number * together, *x.shape[2:])[:count], found)
+        together = lambda own: member.block(_count(own))(own)
+        return in_blocks(together, arrays, min(size or member.block_size(count), count))
 
     @functools.wraps(function)
     def batched(*members: Any) -> Any:
-        return in_blocks(members, _count(members))
+        return of_all(members, _count(members))
 
     return batched
 
@@ -126,7 +119,9 @@ def _carried(program: Any) -> Iterator[int]:
     for equation in getattr(program, "jaxpr", program).eqns:
         inner = [x for x in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program) if _is_program(x)]
         if equation.primitive.name in ("while", "scan"):
-            yield sum(_touched(x.aval.shape) * x.aval.dtype.itemsize for x in equation.outvars)
+            # What a scan makes of each step is not carried.
+            carried = equation.outvars[: equation.params.get("num_carry")]
+            yield sum(_touched(x.aval.shape) * x.aval.dtype.itemsize for x in carried)
         for own in inner:
             yield from _carried(own)
 

@@ -1,12 +1,18 @@
-"""What is kept of each step has room for as many steps as a motion takes."""
+"""What is kept of each step has room for as many steps as a motion takes, and derivatives for a few at first."""
+
+import importlib
 
 import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb.simulate import arguments
+from jaxmb.simulate import arguments, solve
+
+# The name of the function hides the module that it is in.
+module = importlib.import_module("jaxmb.simulate.simulate")
 
 
 @pytest.fixture(scope="module")
@@ -37,3 +43,65 @@ def test_a_long_motion_finds_more_room(pendulum, monkeypatch, kept):
         count = found.ts.size
         np.testing.assert_array_equal(found.ys.q, whole.ys.q[:count])
         assert not np.isfinite(whole.ts[count])
+
+
+@pytest.fixture
+def rooms(monkeypatch):
+    """For how many steps the programs have room that are used. Derivatives keep 16 of them."""
+    used, solved = [], module.solved
+
+    def spied(problem):
+        used.append(problem.room)
+        return solved(problem)
+
+    for where in (arguments, solve):
+        monkeypatch.setattr(where, "MOST_ROWS", 16)
+    monkeypatch.setattr(arguments, "_FEWEST_ROWS", 16)
+    monkeypatch.setattr(module, "_long", set())
+    monkeypatch.setattr(module, "solved", spied)
+    return used
+
+
+def end(system, state, t1, **options):
+    """The angle of the rod at the end, as a function of the gravity."""
+
+    def angle(gravity):
+        changed = mb.with_parameters(system, {"gravity.acceleration": jnp.array([0.0, -gravity])})
+        return mb.simulate(changed, state, t1=t1, **options)["rod"].angle[-1]
+
+    return angle
+
+
+def test_a_derivative_that_takes_more_steps_than_it_keeps_is_computed_again(pendulum, rooms):
+    long = end(*pendulum, 1.0)
+    whole = jax.jit(jax.grad(long))(9.81)
+    assert rooms == [65536]
+    rooms.clear()
+    np.testing.assert_allclose(jax.grad(long)(9.81), whole, rtol=1e-12)
+    assert rooms == [16, 65536]
+    # From now on it is known.
+    rooms.clear()
+    np.testing.assert_allclose(jax.jacfwd(long)(9.81), whole, rtol=1e-9)
+    assert rooms == [65536]
+    # A number of steps that does not suffice is said as before.
+    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=20))(9.81))
+
+
+def test_a_motion_of_many_steps_tells_its_derivative(pendulum, rooms):
+    long = end(*pendulum, 1.0)
+    value = long(9.81)
+    rooms.clear()
+    assert np.isfinite(jax.value_and_grad(long)(9.81)[0] - value)
+    assert rooms == [65536]
+
+
+def test_a_short_motion_has_a_short_program(pendulum, rooms):
+    short = end(*pendulum, 1e-2, rtol=1e-4)
+    both = short(9.81), jax.value_and_grad(short)(9.81)
+    np.testing.assert_allclose(both[0], both[1][0], rtol=1e-6)
+    assert rooms == [65536, 16]
+    more = jax.hessian(short)(9.81)
+    assert rooms == [65536, 16, 16] and np.isfinite(more)
+    # Of a batch it is not known beforehand how many steps its members take.
+    np.testing.assert_allclose(jax.vmap(jax.grad(short))(jnp.array([9.81]))[0], both[1][1], rtol=1e-9)
+    assert rooms[-1] == 65536
