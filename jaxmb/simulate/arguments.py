@@ -226,7 +226,9 @@ def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool
     kept = 16 if saveat.dense else int(saveat.subs[0].steps)
     if not kept:
         room, fewer = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9), kept_steps(state)
-        if max_steps <= fewer < room:
+        if room <= fewer:
+            return [room]
+        if max_steps <= fewer:
             return [fewer]
         return [fewer, room] if traced and short and fewer == MOST_ROWS else [room]
     if traced:

@@ -84,7 +84,13 @@ def test_a_derivative_that_takes_more_steps_than_it_keeps_is_computed_again(pend
     np.testing.assert_allclose(jax.jacfwd(long)(9.81), whole, rtol=1e-9)
     assert rooms == [65536]
     # A number of steps that does not suffice is said as before.
-    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=20))(9.81))
+    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=20))(9.81)) and rooms[1:] == [64]
+
+
+def test_few_steps_have_a_small_program(pendulum, rooms):
+    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=3))(9.81))
+    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=16))(9.81))
+    assert rooms == [4, 16]
 
 
 def test_a_motion_of_many_steps_tells_its_derivative(pendulum, rooms):
