@@ -86,8 +86,8 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None, *, max_bytes: in
     JAX in this process. Importing jaxmb never switches that on; the command line does, but for reports. Call it first:
     what was compiled before is not kept. What JAX does not recognise is compiled again: another version of it or
     another processor, another scene or number of its bodies, another method; other numbers are the same program.
-    Programs with `throw=True` call Python, and JAX does not keep them; those of second derivatives do where there may
-    be more than 2048 steps, as under `jit` with a `max_steps` above that.
+    Programs that call Python are not kept: those with `throw=True`, and those of second derivatives where there may be
+    more than 2048 steps, as under `jit` with a `max_steps` above that.
 
     Other users of the machine who can write to the folder can make this process run what they like.
 

@@ -46,9 +46,10 @@ def after_jumps(
     """
     fixed = lax.stop_gradient(t)
     at_jump = jnp.isin(fixed, jumps, method="binary_search")
-    # A run without a step has one time only.
-    at_end = (fixed == jnp.maximum(t0, t1)) & (t0 != t1)
-    moved = jnp.where(at_end, next_number(fixed, -1), jnp.where(at_jump, next_number(fixed, 1), fixed))
+    # A run backward that began before a jump at its start had that time for its last. One without a step has one only.
+    last, earlier = jnp.maximum(t0, t1), next_number(fixed, -1)
+    at_end = ((fixed == last) | (earlier == last)) & (t0 != t1)
+    moved = jnp.where(at_end, earlier, jnp.where(at_jump, next_number(fixed, 1), fixed))
     return t + (moved - fixed)
 
 

@@ -153,7 +153,8 @@ def checked_saveat(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
         if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
             raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
         if saveat.subs is not None and saveat.subs.ts is not None:
-            _check_saved_times(saveat.subs.ts, start, end)
+            times = _check_saved_times(saveat.subs.ts, start, end)
+            return changed(saveat, subs=changed(saveat.subs, ts=times))
         return saveat
     times = _check_saved_times(saveat, start, end)
     return changed(_END, subs=changed(_AT_END, t1=False, ts=times))
@@ -213,12 +214,12 @@ def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
     return changed(saveat, subs=(changed(first, ts=times), last))
 
 
-def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool, short: bool) -> list[int]:
+def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool, tries: bool) -> list[int]:
     """How many steps programs have room for, of which the next is used where a motion takes more steps than the last.
 
     If nothing is kept of each step, the next power of 4 from `max_steps`, so that one program serves several numbers.
     Derivatives keep numbers of each step; a derivative of more steps than `kept_steps` has a program that finds them
-    again, so the first has room for no more where the motion is `short`, or `max_steps` is.
+    again, so where one `tries`, as it can where values are known, the first has room for no more.
 
     If states are kept, `max_steps` in a program that is traced, and else first as many as take little memory.
     """
@@ -230,7 +231,7 @@ def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool
             return [room]
         if max_steps <= fewer:
             return [fewer]
-        return [fewer, room] if traced and short and fewer == MOST_ROWS else [room]
+        return [fewer, room] if traced and tries and fewer == MOST_ROWS else [room]
     if traced:
         return [max_steps]
     rooms = [max(2 ** int(math.log2(_ROOM / (kept * (state.q.nbytes + state.u.nbytes)))), _FEWEST_STEPS)]
@@ -242,7 +243,7 @@ def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool
 def kept_steps(state: State) -> int:
     """Of how many steps derivatives keep numbers at once."""
     size = 2 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
-    return max(min(MOST_ROWS, _ROW_BYTES // size), _FEWEST_ROWS)
+    return max(min(MOST_ROWS, _ROW_BYTES // max(size, 1)), _FEWEST_ROWS)
 
 
 def checked_state(system: AbstractSystem, state: Any) -> State:

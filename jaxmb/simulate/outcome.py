@@ -21,14 +21,28 @@ _TOUCH = 1e-6
 _ENOUGH, _LOOKED = 200, 512
 
 
+class Flags(NamedTuple):
+    """What is looked at after a simulation.
+
+    **Fields:** whether it `failed`; whether its start violates the constraints (`inconsistent`); whether it got `stuck`
+    on its way; whether nothing of what was to be saved is missing (`whole`); whether there were too few steps
+    (`ran_out`); whether it took at least as many as derivatives keep at most (`long`).
+    """
+
+    failed: Any
+    inconsistent: Any
+    stuck: Any
+    whole: Any
+    ran_out: Any
+    long: Any
+
+
 class Outcome(NamedTuple):
     """How a simulation ended, beside its `Trajectory`.
 
-    **Fields:** `flags`: whether it failed, whether it started from a state that violates the constraints, whether it
-    got stuck on its way, whether nothing of what was to be saved is missing, and whether it took more steps than
-    derivatives keep; the last time `t` and state `y`; `step`: the length of the next step, None where the controller
-    does not tell; `coupling` of friction with its own reactions where that is the reason of a failure, None without
-    friction; `evidence` by which the manifold diagnoses a failure.
+    **Fields:** `flags`, one array of those that `Flags` names; the last time `t` and state `y`; `step`: the length of
+    the next step, None where the controller does not tell; `coupling` of friction with its own reactions where that is
+    the reason of a failure, None without friction; `evidence` by which the manifold diagnoses a failure.
     """
 
     flags: Any

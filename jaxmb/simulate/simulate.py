@@ -13,7 +13,6 @@ from jax import lax
 from jaxtyping import ArrayLike
 
 from .._arguments import check_kind
-from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import derivatives_of, is_traced
@@ -46,12 +45,13 @@ from .arguments import (
 )
 from .compiling import told_of_compiling
 from .moving_times import may_move
-from .outcome import message_of_failure, warn_of_jumps, warn_of_stiffness
+from .outcome import Flags, message_of_failure, warn_of_jumps, warn_of_stiffness
 from .solve import Problem, made_precise, solved
 
 # Defaults, made once: their construction would take as long as the rest of a call.
 _ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
-# The structures of systems a motion of which took more steps than derivatives keep at once.
+# The structures of systems of which a motion in this process, with or without derivatives, took as many steps as
+# derivatives keep at once: the next derivative outside of `jit` does not try with room for no more.
 _long: set[Any] = set()
 _HIDDEN = (
     "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
@@ -159,8 +159,9 @@ def simulate(
     - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
         error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
         some more steps are simulated; not under `jit`, `vmap` or a derivative. A derivative keeps at most 2048 steps.
-        One of more steps has a program that also finds steps again, and takes a fifth longer to compile; under `jit`
-        and `vmap` so has every derivative with a larger `max_steps`, as the number of steps is not known there.
+        One of more steps needs a program that also finds steps again, which takes a fifth longer to compile. Under
+        `jit` and `vmap` every derivative with a larger `max_steps` has it; otherwise one whose motion turns out to be
+        long is computed again with it, and for the system from then on.
 
     **Returns:** a `Trajectory`.
 
@@ -182,9 +183,10 @@ def simulate(
 
     Contacts (`Stop`, `RigidContact`, `Slack`, …) close and open, and `DryFriction` sticks and slips, at events, at
     which a step ends: `Trajectory.events` lists them. An event is found to a thousandth of `rtol`, relative to the size
-    of the system; bounces that are lower than `rtol` are left out, and the contact stays closed. Derivatives are those
-    of a motion whose events move with the parameters, while their sequence stays: the time of an impact has a
-    derivative, its number has none.
+    of the system; bounces that are lower than `rtol` are left out, and the contact stays closed. Dry friction in joints
+    that it loads then rubs earlier than it would, by a time of the size of √`rtol` s, and velocities err by what it
+    changes in that time: several hundred `rtol`, seen. Derivatives are those of a motion whose events move with the
+    parameters, while their sequence stays: the time of an impact has a derivative, its number has none.
     After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
     Gaps and forces of contacts are looked at in the middle of each step as well as at its ends. What comes and goes
     between these is not seen, as a lone bump below a body in free flight: bound the steps there, with
@@ -240,10 +242,10 @@ def simulate(
     orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
     if max(orders, default=0) > 1 and system.contacts is not None:
         raise ValueError(NO_SECOND_DERIVATIVES)
-    # How many steps a motion takes is known after it, if values are.
+    # Where values are known, so is after it how many steps a motion took.
     known = not traced or (taken is not None and taken.known)
-    short = known and not (traced and jax.tree.structure(system) in _long)
-    rooms = (max_steps,) if adjoint is not None else rooms_for(max_steps, saved, state, traced, short)
+    tries = traced and known and jax.tree.structure(system) not in _long
+    rooms = [max_steps] if adjoint is not None else rooms_for(max_steps, saved, state, traced, tries)
     problem = Problem(
         system=system,
         state=state,
@@ -268,20 +270,22 @@ def simulate(
             return *solved(problem), None
         with contextlib.nullcontext() if traced else told_of_compiling(system):
             trajectory, outcome = solved(problem)
-            hidden = is_traced(outcome.flags)
-            if hidden and not traced:
+            if is_traced(outcome.flags) and not traced:
                 raise ValueError(_HIDDEN)
             for room in rooms[1:]:
-                if not hidden and trajectory.result != RESULTS.max_steps_reached:
+                # A value that is traced and hidden in a function leaves it open whether the steps sufficed.
+                if not is_traced(outcome.flags) and not Flags(*np.asarray(outcome.flags)).ran_out:
                     break
                 problem = problem._replace(room=room, limit=np.asarray(min(max_steps, room)))
                 trajectory, outcome = solved(problem)
             if problem.room < max_steps:
                 trajectory = eqx.tree_at(lambda own: own.stats["max_steps"], trajectory, np.asarray(max_steps))
-            flags = None if traced else np.asarray(outcome.flags)
-            if problem.room > rooms[0] if flags is None else flags[4]:
+            if is_traced(outcome.flags):
+                return trajectory, outcome, None
+            flags = Flags(*np.asarray(outcome.flags))
+            if flags.long:
                 _long.add(jax.tree.structure(system))
-            return trajectory, outcome, flags
+            return trajectory, outcome, None if traced else flags
 
     trajectory, outcome, flags = run(problem)
     if solver == "switch" and trajectory.stats["stiff"]:
@@ -294,16 +298,15 @@ def simulate(
     given = {"formulation": formulation, "manifold": manifold, "jumps": jumps, "max_events": max_events}
     again = functools.partial(simulate, t1=t1, **given, throw=False)
     if flags is not None:
-        failed, inconsistent, stuck, whole, _ = flags
-        if inconsistent:
+        if flags.inconsistent:
             consistent(system, times["t0"], state)
-        if stuck:
+        if flags.stuck:
             result, coupling = made_precise(problem, trajectory.result, outcome)
             trajectory = eqx.tree_at(lambda trajectory: trajectory.result, trajectory, result)
             outcome = outcome._replace(coupling=coupling)
         if not system.drift_free and system.acceleration_rows > 0:
             warn_of_jumps(system, outcome, times, restarts, jumps)
-        if failed and throw is not False:
+        if flags.failed and throw is not False:
             # Other runs of the same motion.
             on = functools.partial(again, system, outcome.y, t0=outcome.t, rtol=relative)
             probe = lambda solver, steps: on(solver=solver, max_steps=steps, atol=absolute)
@@ -311,7 +314,7 @@ def simulate(
                 system, trajectory.result, times["t1"], outcome, trajectory.stats, problem.solver, probe
             )
             raise RuntimeError(text)
-        if not whole:
+        if not flags.whole:
             trajectory = trajectory.trimmed()
     else:
         trajectory = trajectory.trimmed()

@@ -25,6 +25,7 @@ from ..manifold import (
     contact_guards,
     default_manifold,
     natural_units,
+    next_number,
     project,
     state_blocks,
     with_internal_states,
@@ -49,7 +50,7 @@ from .arguments import MOST_ROWS, default_controller, kept_steps, with_restarts
 from .compiling import tracing_begins
 from .loop import Loop
 from .moving_times import at_frozen_start, at_moving_times, saved_times
-from .outcome import Outcome, has_failed
+from .outcome import Flags, Outcome, has_failed
 
 # What saves states as they are.
 _STATES = diffrax.SubSaveAt(t1=True).fn
@@ -206,6 +207,10 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
             # States that are saved at a jump are those after it, also in a run that comes to it from there.
             after = after_jumps(saved_at, jumps, options["t0"], options["t1"])
         options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].ts, options["saveat"], at_once(after))
+    if jumps is not None:
+        # A run backward starts before a jump at its start.
+        before = jnp.isin(options["t0"], jumps) & (options["t1"] < options["t0"])
+        options["t0"] = jnp.where(before, next_number(options["t0"], -1), options["t0"])
     are_states = first.fn is _STATES
     if any(problem.moving):
         # A user's function is one of states at times that move.
@@ -218,6 +223,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     solve = _solve_with_tangents if problem.differentiated else _solve_on_mesh
     solution: Any = solve((term, solver, options), control, problem.adjoint, problem.limit, problem.projects_steps)
     ts, saved = solution.ts[0], solution.ys[0]
+    if jumps is not None and first.t0:
+        ts = ts.at[0].set(lax.stop_gradient(times["t0"]))
     if saved_at is not None:
         ts = jnp.where(finite, ts, jnp.inf)
     correction, lost = policy.correction(problem.interpolated), None
@@ -253,7 +260,11 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         result = RESULTS.where(found.number > problem.max_events, RESULTS.too_many_events, result)
         backward = (times["t1"] < times["t0"]) & finite & valid
         result, unknown = RESULTS.where(backward, RESULTS.impacts_backward, result), unknown & ~backward
-    stuck, coupling = has_failed(result) & unknown, None
+    # A run without enough steps is stuck where the rest would take a thousand times as many as it had.
+    ran_out, step = result == RESULTS.max_steps_reached, intended_step(solution.controller_state)
+    left = jnp.abs(options["t1"] - end[0])
+    creeps = True if step is None else left > 1e3 * solution.stats["num_steps"] * jnp.abs(step)
+    stuck, coupling = has_failed(result) & unknown & (creeps | ~ran_out), None
     evidence = policy.evidence(solution.solver_state)
     if problem.traced:
         result, coupling = diagnosed(problem, *end, evidence, result, stuck)
@@ -284,9 +295,9 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         # derivative that is taken alone.
         inputs = system, problem.state, times, problem.formulation, problem.manifold, problem.event, first.fn
         motion = nan_where(failed, motion, inputs)
-    long = stats["num_steps"] > MOST_ROWS
-    flags = jnp.stack([failed, ~jnp.asarray(consistent), stuck, jnp.all(jnp.isfinite(ts)), long])
-    outcome = Outcome(flags, *end, intended_step(solution.controller_state), coupling, evidence)
+    whole, long = jnp.all(jnp.isfinite(ts)), stats["num_steps"] >= MOST_ROWS
+    flags = Flags(failed, ~jnp.asarray(consistent), stuck, whole, ran_out, long)
+    outcome = Outcome(jnp.stack(flags), *end, step, coupling, evidence)
     fields = {
         "formulation": problem.method,
         "ts": ts,

@@ -63,7 +63,7 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     def of_all(members, count):
         arrays, shared = eqx.partition(members, lambda x: isinstance(x, ARRAYS))
         member = Member(lambda own: function(*eqx.combine(own, shared)), jax.tree.map(lambda x: x[0], arrays))
-        together = lambda own: member.block(_count(own))(own)
+        together = lambda own: member.block(jax.tree.leaves(own)[0].shape[0])(own)
         return in_blocks(together, arrays, min(size or member.block_size(count), count))
 
     @functools.wraps(function)

@@ -49,6 +49,13 @@ def test_steps_are_trimmed(dense):
     assert names == "Names: rod, pin" and repr(dense.reactions) == "<of each joint: pin>"
 
 
+def test_saved_times_may_be_integers(rod):
+    saveat = diffrax.SaveAt(ts=jnp.array([0, 1, 2]))
+    found = mb.simulate(rod, rod.guess, t1=2.0, saveat=saveat)
+    other = mb.simulate(rod, rod.guess, t1=2.0, saveat=[0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(found.ys.q, other.ys.q)
+
+
 def test_energy_momenta_and_save(dense, tmp_path):
     np.testing.assert_allclose(dense.energy, dense.energy[0], rtol=0, atol=1e-7)
     motion = dense["rod"]

@@ -647,3 +647,29 @@ def test_derivatives_of_the_rate_of_a_joint_that_moves():
     for at, value, derivative in zip(many, values, derivatives, strict=True):
         np.testing.assert_allclose(value, exact(at), rtol=0, atol=1e-11)
         np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("t0", [0.7, 1.0])
+def test_a_run_backward_starts_before_a_jump_at_its_start(pendulum, t0):
+    """At the last time the value does not jump, but its derivative by the values does."""
+    times, values = np.array([0.0, 0.3, 0.7, 1.0]), np.array([1.0, -2.0, 3.0, 3.0])
+    rates = lambda t, y, torque: [y[1], (torque - MASS * G * LENGTH / 2 * np.cos(y[0])) / INERTIA]
+    y, pieces = np.zeros(2), [(0.7, 0.3, -2.0), (0.3, 0.0, 1.0)]
+    for since, until, torque in [(1.0, 0.7, 3.0), *pieces] if t0 == 1.0 else pieces:
+        y = solve_ivp(rates, (since, until), y, "DOP853", args=(torque,), rtol=1e-12, atol=1e-13).y[:, -1]
+
+    def motion(values, rtol=1e-11, **options):
+        inputs = {"motor.torque": mb.Series(times, values, "held")}
+        return mb.simulate(pendulum, pendulum.guess, t0=t0, t1=0.0, rtol=rtol, inputs=inputs, **options)
+
+    saveat = diffrax.SaveAt(t0=True, ts=[t0, 0.5, 0.0], dense=True)
+    found = motion(values, saveat=saveat)
+    np.testing.assert_allclose(found["rod"].angle[-1], y[0], atol=1e-9)
+    np.testing.assert_array_equal(found.ts, [t0, t0, 0.5, 0.0])
+    np.testing.assert_allclose(found.at(np.array([t0, 0.5])).q, found.ys.q[1:3], atol=1e-9)
+    last = lambda values: motion(values)["rod"].angle[-1]
+    forward, reverse = jax.jacfwd(last)(values), jax.jacrev(last)(values)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        forward, central_differences(lambda v: motion(v, 1e-12)["rod"].angle[-1], values), atol=1e-7
+    )

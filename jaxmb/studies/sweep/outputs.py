@@ -157,7 +157,9 @@ def statuses(found: Returned) -> np.ndarray:
     finite = np.ones(members, bool)
     for value in found.values.values():
         if value.dtype.kind in "fc":
-            finite &= np.isfinite(value).reshape(members, -1).all(axis=1)
+            # Times of contacts' events hold infinity after the last one; a result tells of failures.
+            sound = np.isfinite(value) if found.result is None else ~np.isnan(value)
+            finite &= sound.reshape(members, -1).all(axis=1)
     ended = np.where(finite, OK, NOT_FINITE)
     if found.result is not None:
         names, code = list(messages_of(found.result)), codes_of(found.result)

@@ -291,6 +291,17 @@ class _Solution:
         self.result, self.stats = result, stats
 
 
+def test_times_after_the_last_event_are_no_failure():
+    def function(a):
+        result = diffrax.RESULTS.where(a < 3, diffrax.RESULTS.successful, diffrax.RESULTS.singular)
+        times = jnp.where(a > 1, jnp.array([0.1, jnp.inf]), jnp.inf).at[0].multiply(jnp.where(a == 2, jnp.nan, 1.0))
+        return {"times": times, "result": _Solution(result, {"num_steps": 1})}
+
+    found = mb.sweep(function, mb.cases.table(a=[0.0, 1.5, 2.0, 3.0]), progress=False)
+    words = np.array(found["status"].attrs["flag_meanings"].split())[found["status"]]
+    assert list(words) == ["ok", "ok", "not_finite", "singular"]
+
+
 def test_members_beyond_the_budget_are_computed_anew():
     n = np.full(200, 10)
     n[[5, 50, 120]], n[[7, 9]], n[77] = 90, 300, 3
