@@ -21,6 +21,11 @@ _TOUCH = 1e-6
 _ENOUGH, _LOOKED = 200, 512
 
 
+# What contacts resolve in single precision and, at the default tolerance, in double precision, relative to the size of
+# the system.
+_MOVED_SINGLE, _MOVED = 1e-6, 1e-11
+
+
 class Flags(NamedTuple):
     """What is looked at after a simulation.
 
@@ -176,4 +181,20 @@ def reason_of_failure(system, result, t1, outcome: Outcome) -> str:
         wrong = system.not_finite(t + ahead, y.q + ahead * rates, y.u)
         if wrong:
             return f"{text} Here at t = {float(t + ahead):.6g} {' and '.join(wrong)} is not finite."
-    return text
+    return text + about_coarse_times(system, t, y) if result == RESULTS.newton_failed else text
+
+
+def about_coarse_times(system, t, y) -> str:
+    """What to do where contacts move by more than they resolve from one number for the time to the next; empty where
+    they do not.
+    """
+    coarse = float(np.spacing(np.abs(np.asarray(t))))
+    moved = coarse * float(np.max(np.abs(y.u) / system.velocity_scale(), initial=0.0))
+    single = np.finfo(y.q.dtype).bits < 64
+    if system.contacts is None or moved < (_MOVED_SINGLE if single else _MOVED):
+        return ""
+    cure = "Switch double precision on, or let the time begin at zero." if single else "Let the time begin at zero."
+    return (
+        f" Or it is the time: the numbers next to t = {float(t):.6g} are {coarse:.1e} s away, in which bodies move by "
+        f"{moved:.1e} of the size of the system, more than contacts resolve. {cure}"
+    )

@@ -35,6 +35,12 @@ BALL = ball(0.5)
 FALL = np.sqrt(2 / G)
 
 
+def test_a_time_that_is_too_coarse_for_contacts_is_named():
+    """Seconds since 1970: the next number is a quarter of a microsecond away."""
+    with pytest.raises(RuntimeError, match=r"numbers next to t = 1.7e\+09 are 2.4e-07 s away.*begin at zero"):
+        mb.simulate(BALL, mb.assemble(BALL), t0=1.7e9, t1=1.7e9 + 1)
+
+
 @pytest.mark.always
 def test_bouncing_ball_comes_to_rest():
     """Twenty impacts, and the sum of all that follow."""
