@@ -10,7 +10,11 @@ from . import (
     system as system,
     trajectory as trajectory,
 )
-from ._programs import compile_quickly as compile_quickly, keep_compiled as keep_compiled
+from ._programs import (
+    compile_quickly as compile_quickly,
+    keep_compiled as keep_compiled,
+    run_quickly as run_quickly,
+)
 from ._results import RESULTS as RESULTS
 from ._types import State as State
 from ._version import __version__ as __version__

@@ -146,9 +146,21 @@ def full_pivot(
         jnp.array(0),
     )
     _, row_order, column_order, smallest, largest, rank = start if m == 0 else lax.fori_loop(0, min(m, n), step, start)
-    rows, columns = jnp.argsort(row_order, stable=True), jnp.argsort(column_order, stable=True)
-    packed = jnp.concatenate([rows, columns, jnp.argsort(rows), jnp.argsort(columns)]).astype(np.int32)
+    row_place, column_place = _places(row_order), _places(column_order)
+    packed = jnp.concatenate([_inverse(row_place), _inverse(column_place), row_place, column_place])
     return PivotSearch(rank, PivotOrder(packed, m, n), smallest, largest)
+
+
+def _places(keys: Int[Array, "n"]) -> Int[Array, "n"]:
+    """The places of numbers in their order, equal ones in the order that they have."""
+    index = np.arange(keys.size, dtype=np.int32)
+    before = (keys[None, :] < keys[:, None]) | ((keys[None, :] == keys[:, None]) & (index[None, :] < index[:, None]))
+    return jnp.sum(before, axis=1, dtype=np.int32)
+
+
+def _inverse(permutation: Int[Array, "n"]) -> Int[Array, "n"]:
+    index = np.arange(permutation.size, dtype=np.int32)
+    return jnp.sum(jnp.where(permutation[None, :] == index[:, None], index[None, :], 0), axis=1, dtype=np.int32)
 
 
 def eliminate(A: Float[Array, "m n"], order: PivotOrder, rank: int) -> Factor:

@@ -430,20 +430,23 @@ class RedundantRows(eqx.Module):
 class Chart(eqx.Module):
     """The index sets with their quality and counters.
 
-    **Fields:** `split`; `nearness` to a loss of rank at the last evaluation: the largest entry on the diagonal of the
-    inverse that elimination ends with; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H|
-    and, with redundant rows, largest entry of the solution of the kept ones; `counters`: see the properties;
-    `redundant`: None where all rows are independent; `multipliers` of the rows that friction depends on, at the
-    prediction of the last step and at its end, None without any.
+    **Fields:** `split`; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H|, with redundant
+    rows the largest entry of the solution of the kept ones, and the `nearness` to a loss of rank; `counters`: see the
+    properties; `redundant`: None where all rows are independent; `multipliers` of the rows that friction depends on,
+    at the prediction of the last step and at its end, None without any.
     """
 
     split: ChartIndices
-    nearness: Float[Array, ""]
     quality: Float[Array, "k"]
     fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
     redundant: RedundantRows | None = None
     multipliers: Float[Array, "2 k"] | None = None
+
+    @property
+    def nearness(self) -> Float[Array, ""]:
+        """To a loss of rank: the largest entry on the diagonal of the inverse that elimination ends with."""
+        return self.quality[-1]
 
     @property
     def age(self) -> Int[Array, ""]:
@@ -490,8 +493,7 @@ class PartitionTerm(AbstractManifoldTerm):
         redundant = RedundantRows(row_sizes(system, t, y), jnp.zeros((), y.q.dtype)) if drops_rows(system) else None
         frictions = system.friction_rows.size
         multipliers = jnp.zeros((2, frictions), y.q.dtype) if frictions else None
-        counters, unknown = jnp.zeros(5, int), jnp.full((), jnp.inf, y.q.dtype)
-        return Chart(split, unknown, jnp.full_like(quality, jnp.inf), quality, counters, redundant, multipliers)
+        return Chart(split, jnp.full_like(quality, jnp.inf), quality, jnp.zeros(5, int), redundant, multipliers)
 
     def evaluate(self, t, y, chart, args):
         q = correct_positions(self.system, t, y.q, lax.stop_gradient(chart.split))
@@ -499,7 +501,6 @@ class PartitionTerm(AbstractManifoldTerm):
 
     def _evaluate(self, t, q, u, chart):
         system, split, quality, failed = self.system, chart.split, chart.quality, None
-        nearness = chart.nearness
         multipliers = chart.multipliers
         if system.acceleration_rows == 0:
             udot, factors = system.inertia(t, q, u).solve(system.force(t, q, u)), None
@@ -513,10 +514,9 @@ class PartitionTerm(AbstractManifoldTerm):
                     multipliers = jnp.stack([out.multipliers] * 2)
             u, udot, factors = out.u, out.udot, (out.factor, out.every)
             quality = _velocity_quality(system, out.factor, split.velocity)
-            nearness = _nearness(system, out.factor, split.velocity)
             if split.coordinate is None:
                 split = ChartIndices(split.velocity, split.acceleration, None, out.factor.right_inverse)
-        chart = dataclasses.replace(chart, split=split, nearness=nearness, quality=quality, multipliers=multipliers)
+        chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=multipliers)
         f = State(system.rates(t, q, u), udot)
         failed = chart.singular if failed is None else chart.singular | failed
         return ManifoldEvaluation(State(q, u), f, chart, failed, factors)
@@ -570,8 +570,8 @@ class PartitionTerm(AbstractManifoldTerm):
         if system.coordinate_rank:
             own = coordinate_factor(*lax.stop_gradient((system, t, y.q)), split)
             split = ChartIndices(split.velocity, split.acceleration, split.coordinate, own.right_inverse)
-        none = jnp.zeros(1 + drops_rows(system), y.q.dtype)
-        out = self._project(t, y, Chart(split, none[0], none, none, jnp.zeros(5, int)), split)
+        none = jnp.zeros(2 + drops_rows(system), y.q.dtype)
+        out = self._project(t, y, Chart(split, none, none, jnp.zeros(5, int)), split)
         return out.y, out.f
 
     @property
@@ -585,8 +585,7 @@ class PartitionTerm(AbstractManifoldTerm):
         if self.system.contacts is None:
             return chart
         # Contacts that close or open make the chart one of other rows.
-        none = jax.tree.map(lambda x: jnp.full_like(x, jnp.inf), (chart.nearness, chart.quality))
-        return dataclasses.replace(chart, nearness=none[0], quality=none[1])
+        return dataclasses.replace(chart, quality=jnp.full_like(chart.quality, jnp.inf))
 
     def controlled(self, chart):
         # All components: where dependent ones change fast, the error of the independent ones alone shows it too late.
@@ -627,9 +626,9 @@ def _counted(chart, iterations):
 @eqx.filter_jit
 def _updated(system, t, y, chart, max_influence):
     """The chart, refreshed or chosen anew where it has become worse."""
-    bounds = np.array([max_influence, _ROW_GROWTH])[: chart.fresh.size]
+    bounds = np.array([max_influence, _ROW_GROWTH])[: chart.fresh.size - 1]
     # Of no quality, not a number, are charts that are none.
-    worse = lambda chart: ~jnp.all(chart.quality <= bounds * chart.fresh)
+    worse = lambda chart: ~jnp.all(chart.quality[:-1] <= bounds * chart.fresh[:-1])
 
     def renewed(chart, jacobian):
         def renew(chart):
@@ -646,7 +645,7 @@ def _updated(system, t, y, chart, max_influence):
     def refresh(chart):
         jacobian = _of_coordinates(system, t, y)
         split, own = _refreshed(system, jacobian, chart.split)
-        quality = jnp.maximum(chart.quality, own)
+        quality = chart.quality.at[:-1].max(own)
         # Only a chart that has been refreshed can be worse.
         counters = chart.counters.at[0].set(0)
         refreshed = dataclasses.replace(chart, split=split, quality=quality, counters=counters)
@@ -691,7 +690,7 @@ def _choose(system, t, y, of_coordinates):
     split, own = _refreshed(
         system, of_coordinates, ChartIndices(velocity.order, acceleration, pivots.order, jnp.zeros(()))
     )
-    return split, jnp.maximum(quality, own), singular | (pivots.rank < system.coordinate_rank)
+    return split, quality.at[:-1].max(own), singular | (pivots.rank < system.coordinate_rank)
 
 
 def _refreshed(system, jacobian, split):
@@ -702,18 +701,15 @@ def _refreshed(system, jacobian, split):
 
 
 def _velocity_quality(system, solved, order):
-    solved = lax.stop_gradient(solved)
-    return _quality(system, solved, system.velocity_scale(), order, system.velocity_rank)
-
-
-def _nearness(system, solved, order):
-    rows, columns = order.rows[: system.velocity_rank], order.columns[: system.velocity_rank]
-    diagonal = lax.stop_gradient(solved.right_inverse).at[columns, rows]
-    return jnp.max(jnp.abs(diagonal.get(mode="promise_in_bounds", wrap_negative_indices=False)), initial=0.0)
+    """The quality of a chart, as `Chart` has it."""
+    solved, rank = lax.stop_gradient(solved), system.velocity_rank
+    diagonal = solved.right_inverse.at[order.columns[:rank], order.rows[:rank]]
+    nearness = jnp.max(jnp.abs(diagonal.get(mode="promise_in_bounds", wrap_negative_indices=False)), initial=0.0)
+    return jnp.append(_quality(system, solved, system.velocity_scale(), order, rank), nearness)
 
 
 def _quality(system, solved, scale, order, rank):
-    """The quality of a chart, in units of the coordinates' scales."""
+    """That of the coordinates or velocities that it makes depend on others, in units of their scales."""
     influence = jnp.abs(solved.null_space) * scale[order.columns[rank:]][None, :] / scale[:, None]
     largest = [jnp.max(influence, initial=1.0)]
     if system.velocity_rank < system.velocity_rows:

@@ -52,7 +52,7 @@ def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
 def spans(mesh: Float[Array, " length"]) -> Float[Array, " length-1"]:
     """The divisors of the factors of the basis. If the latest point is double, its own span is the next one."""
     out = mesh[0] - mesh[1:]
-    return jnp.where(out > 0, out, jnp.append(out[1:], out[-1:]))
+    return jnp.where(out > 0, out, out[1])
 
 
 def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Array, "length points"]:

@@ -5,6 +5,7 @@ from typing import Any, ClassVar, Literal
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -323,4 +324,4 @@ class Adams(AbstractMultistep):
             errors = jnp.where(controlled[None], errors, jnp.zeros((), errors.dtype)) / jnp.sqrt(share).astype(
                 errors.dtype
             )
-        return jnp.stack([norm_of(self.tolerances.norm, error, y0) for error in errors])
+        return jax.vmap(lambda error: norm_of(self.tolerances.norm, error, y0))(errors)

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .._compat import any_of_batch
-from ._history import INDEX, LENGTH, basis_means, before_each, known_differences, start, step_end
+from ._history import INDEX, LENGTH, basis_means, known_differences, start, step_end
 from ._interpolation import RateInterpolation
 from .evaluation import (
     after_jump,
@@ -66,14 +66,16 @@ def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, 
     end = step_end(mesh, t1)
     means, values = basis_means(mesh, mesh[0], end)
     means, values = means.astype(dtype), values.astype(dtype)
-    lengths = order + np.array([-1, 0, 1, 0], np.int32)
-    near = jnp.stack([values, values, values, means])
-    near = jnp.where(lengths[:, None] > INDEX[None], near, jnp.zeros((), dtype))
-    every = jnp.asarray(before_each(LENGTH), dtype) * values[None]
+    # Row by row, how many differences count: all polynomials, those of three orders, and the mean.
+    lengths = jnp.concatenate([jnp.asarray(INDEX), order + np.array([-1, 0, 1, 0], np.int32)])
+    is_mean = np.arange(LENGTH + 4) == LENGTH + 3
+    products = jnp.where(is_mean[:, None], means[None], values[None])
+    products = jnp.where(lengths[:, None] > INDEX[None], products, jnp.zeros((), dtype))
     integrals = means / values
     padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
-    differences = jnp.diff(lax.dynamic_slice_in_dim(padded, order - 1, 4))
-    return Coefficients(h, end, jnp.concatenate([every, near]), integrals[order], differences)
+    # Those of the terms k - 2 to k + 1, of which the term k is the new derivative's.
+    integrals = lax.dynamic_slice_in_dim(padded, order - 1, 4)
+    return Coefficients(h, end, products, integrals[2], jnp.diff(integrals))
 
 
 class Jump(eqx.Module):

@@ -231,13 +231,13 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         trial = opening == 2
 
         scalar = lambda x: jnp.asarray(x, y_error.error.dtype)
-        # The first step has no others before it.
-        response = jnp.where(opening > 0, scalar(1.0), y_error.response)
-        allowed = (scalar(self.safety) * y_error.growth) ** response
-        retry = (scalar(self.safety) * y_error.retry) ** response
-        keep = (y_error.error < 1) & ~(trial & (retry > scalar(self.factormax)))
+        safety = scalar(self.safety)
+        keep = (y_error.error < 1) & ~(trial & (safety * y_error.retry > scalar(self.factormax)))
         if self.force_dtmin:
             keep = keep | (intended <= jnp.asarray(self.dtmin, dtype))
+        # The first step has no others before it.
+        response = jnp.where(opening > 0, scalar(1.0), y_error.response)
+        allowed = (safety * jnp.where(keep, y_error.growth, y_error.retry)) ** response
         growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))
         growth = jnp.where(caution > 0, jnp.minimum(growth, scalar(_CAUTIOUS)), growth)
         # The last step before a stop may be short only because of the stop.
@@ -245,7 +245,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         repeated = jnp.where(rejections == 0, _REPEATED[0], jnp.where(rejections == 1, _REPEATED[1], _REPEATED[2]))
         repeated = jnp.where(trial, _LONGER, repeated)
         smallest = jnp.where(opening > 0, scalar(_SHORTER), scalar(self.factormin))
-        shrink = jnp.clip(retry, smallest, repeated.astype(allowed.dtype))
+        shrink = jnp.clip(allowed, smallest, repeated.astype(allowed.dtype))
         shrink = jnp.where(y_error.retry > 0, shrink, scalar(_WITHOUT_ESTIMATE))
         shrink = jnp.where(y_error.retry < 0, scalar(0.0), shrink)
         factor = jnp.where(keep, jnp.maximum(growth, recovered), shrink)

@@ -45,9 +45,10 @@ class StepEstimate(eqx.Module):
 
 def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
     """The estimate of a step that must not be accepted, where `off`."""
-    values = ((estimate.error, jnp.inf), (estimate.growth, 0.0), (estimate.retry, _REFUSED ** (1 / estimate.response)))
+    parts = lambda e: (e.error, e.growth, e.retry, e.response)
+    values = zip(parts(estimate), (jnp.inf, 0.0, _REFUSED, 1.0), strict=True)
     changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]
-    return eqx.tree_at(lambda e: (e.error, e.growth, e.retry), estimate, changed)
+    return eqx.tree_at(parts, estimate, changed)
 
 
 def growth_factors(errors: Float[Array, " formulas"], powers: Any, target: float) -> Float[Array, " formulas"]:

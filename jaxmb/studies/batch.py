@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._compat import ClosedJaxpr, Jaxpr
+from .._programs import bytes_of_kernel_loops
 from .._traced_functions import NEED_NUMBERS
 from ..linalg.arrays import ARRAYS
 from ..linalg.members import in_blocks
@@ -18,6 +19,8 @@ from ..parts.names import names_arguments
 
 # What the loops of the members of a block may carry [bytes], and the most members of a block.
 _CARRIED, _MOST = 2**20, 64
+# What the equations of a loop give in a turn is so many times what the kernels that XLA makes of them read and write.
+_FUSED = 3
 # Rows from which an array of several axes is a table that a step writes one row of.
 _LONG = 1024
 
@@ -43,7 +46,8 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     - `function`: of any arguments by position, pytrees of arrays, to a pytree of arrays; it is traced by JAX.
     - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
         which the numbers that the largest loop of the function carries from step to step stay in the cache of a core;
-        all members, where it has no loop, and on other devices than a CPU.
+        1 where that loop becomes one kernel, by `run_quickly`, which is as fast and waits for no other member; all
+        members, where it has no loop, and on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array, compiled at its first call,
     whose results have them there as well. Values that are no arrays, such as names, are the same for all members, and
@@ -92,9 +96,12 @@ class Member:
 
     def block_size(self, members: int) -> int:
         """The number of members, a power of two or all, that are computed at once on the default device."""
-        carried = max(_carried(self._program), default=0)
+        loops = list(_loops(self._program))
+        carried = max((own for own, _ in loops), default=0)
         if carried == 0 or jax.default_backend() != "cpu":
             return members
+        if max(given for _, given in loops) < _FUSED * bytes_of_kernel_loops():
+            return 1
         return min(2 ** int(math.log2(max(_CARRIED / carried, 1))), _MOST)
 
     def block(self, size: int) -> Callable[..., Any]:
@@ -114,16 +121,30 @@ class Member:
         return together
 
 
-def _carried(program: Any) -> Iterator[int]:
-    """The bytes that each loop of a program carries from step to step."""
+def _loops(program: Any) -> Iterator[tuple[int, int]]:
+    """The bytes that each loop of a program carries from step to step, and those that its equations give in a step."""
     for equation in getattr(program, "jaxpr", program).eqns:
-        inner = [x for x in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program) if _is_program(x)]
+        inner = _inner(equation)
         if equation.primitive.name in ("while", "scan"):
             # What a scan makes of each step is not carried.
-            carried = equation.outvars[: equation.params.get("num_carry")]
-            yield sum(_touched(x.aval.shape) * x.aval.dtype.itemsize for x in carried)
+            yield _bytes(equation.outvars[: equation.params.get("num_carry")]), sum(map(_given, inner))
         for own in inner:
-            yield from _carried(own)
+            yield from _loops(own)
+
+
+def _given(program: Any) -> int:
+    """The bytes that the equations of a program give, those in a loop once."""
+    found = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
+    return sum(sum(map(_given, inner)) if inner else _bytes(equation.outvars) for equation, inner in found)
+
+
+def _inner(equation: Any) -> list[Any]:
+    """The programs within an equation."""
+    return [x for x in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program) if _is_program(x)]
+
+
+def _bytes(variables: list[Any]) -> int:
+    return sum(_touched(x.aval.shape) * x.aval.dtype.itemsize for x in variables)
 
 
 def _touched(shape: tuple[int, ...]) -> int:

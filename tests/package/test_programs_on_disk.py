@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import jax
+import numpy as np
 import pytest
 from compiling import QUICKLY
 
@@ -57,16 +58,56 @@ def kept(*arguments, **options):
     return folder
 
 
-def test_options_of_the_compiler_are_set_before_jax_starts():
-    code = 'mb.compile_quickly()\nmb.compile_quickly()\njnp.ones(3)\nprint(repr(os.environ["XLA_FLAGS"]))'
-    own, said = process("import os\n" + code, XLA_FLAGS="")
-    assert said == "" and set(own.split()) == {f"--{name}={value}" for name, value in _programs._XLA_FLAGS.items()}
+def options_of(code, flags=""):
+    own, said = process(f'import os\n{code}\nprint(repr(os.environ["XLA_FLAGS"]))', XLA_FLAGS=flags)
+    return own, said
+
+
+@pytest.mark.parametrize("name", ["compile_quickly", "run_quickly"])
+def test_options_of_the_compiler_are_set_before_jax_starts(name):
+    flags = getattr(_programs, f"_{name.upper()}")
+    code = f"mb.{name}()\nmb.{name}()\njnp.ones(3)\nmb.{name}()"
+    own, said = options_of(code)
+    assert said == "" and set(own.split()) == {f"--{option}={value}" for option, value in flags.items()}
     # Those of the user stay.
     given = "--xla_disable_hlo_passes=reshape-mover --xla_cpu_enable_fast_math=false"
-    both, _ = process("import os\n" + code, XLA_FLAGS=given)
-    assert both == given + " --xla_cpu_use_fusion_emitters=false"
-    late, said = process("import os\njnp.ones(3)\n" + code, XLA_FLAGS="")
-    assert late == "" and "JAX has computed something already" in said and said.count("UserWarning") == 2
+    both, _ = options_of(code, given)
+    assert both.startswith(given + " ") and both.count("xla_disable_hlo_passes") == 1
+    late, said = options_of("jnp.ones(3)\n" + code)
+    assert late == "" and "JAX has computed something already" in said and said.count("UserWarning") == 3
+
+
+def test_the_last_way_to_compile_counts():
+    for code, last in (
+        ("mb.compile_quickly()\nmb.run_quickly()", "_RUN_QUICKLY"),
+        ("mb.run_quickly()\nmb.compile_quickly()", "_COMPILE_QUICKLY"),
+    ):
+        own, said = options_of(code)
+        assert said == "" and own.split() == [f"--{name}={value}" for name, value in getattr(_programs, last).items()]
+    _, said = options_of("mb.compile_quickly()\njnp.ones(3)\nmb.run_quickly()")
+    assert "JAX has computed something already" in said
+
+
+def test_the_loop_over_steps_is_one_kernel():
+    code = """
+import dataclasses
+machine = mb.mechanisms.get("four_bar")
+
+def angle(u):
+    state = dataclasses.replace(machine.state, u=u)
+    return mb.simulate(machine.system, state, t1=1.0, rtol=1e-8)["rocker"].angle[-1]
+
+found = []
+for function in (angle, jax.grad(angle)):
+    program = jax.jit(function).lower(machine.state.u).compile()
+    rest, start = program.as_text().split("ENTRY")
+    found.append([rest.count(" while("), start.count(" while("), program(machine.state.u).tolist()])
+print(found)
+"""
+    plain, quick = (process(call + code, XLA_FLAGS="")[0] for call in ("", "mb.run_quickly()\n"))
+    for one, other in zip(plain, quick, strict=True):
+        assert one[1] > 0 == other[1] and other[0] > 0
+        np.testing.assert_allclose(other[2], one[2], rtol=1e-8, atol=1e-8)
 
 
 def test_python_looks_for_garbage_less_often():

@@ -117,6 +117,15 @@ def test_the_size_of_a_block_is_that_of_what_loops_carry():
     assert Member(lambda x: jnp.sin(x) * jnp.ones(10), np.asarray(1.0)).block_size(1000) == 1000
 
 
+def test_loops_that_become_kernels_are_computed_one_after_the_other(monkeypatch):
+    """Those of large arrays stay in blocks."""
+    function = lambda size: lambda x: jax.lax.fori_loop(0, 10, lambda k, y: y * jnp.sin(y), x * jnp.ones(size))
+    sizes = lambda: [Member(function(size), np.asarray(1.0)).block_size(1000) for size in (100, 20_000)]
+    before = sizes()
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=9000")
+    assert sizes() == [1, before[1]] and before[0] > before[1] > 1
+
+
 @pytest.mark.parametrize("size", [0, -1, 1.5, True, "4"])
 def test_a_size_that_is_none_is_refused(size):
     with pytest.raises(ValueError, match=re.escape(f"size must be an integer of at least 1, or None, got {size!r}.")):
