@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .elimination import solve
 from .rotations import norm
 
 # Entries of a column below this multiple of its largest one are rounding errors, and no pivots.
@@ -245,7 +246,7 @@ def _in_directions(W, b, dry, among):
             e = jnp.where(k == 0, own[0], last)
             newton = corrected(answers, e, own[1])
             matrix, right = (jnp.where(k == 0, first, other) for first, other in zip(straight, newton, strict=True))
-            return e, jnp.linalg.solve(matrix, right)
+            return e, solve(matrix, right)
 
         _, x = lax.fori_loop(0, 1 + _CORRECTIONS, correct, (e, jnp.zeros_like(b)))
         new = direction(e, x)
@@ -280,7 +281,7 @@ def _with_implied(W, answers):
     closed = jnp.concatenate([answers.closed, jnp.zeros_like(sticks)])
     columns = jnp.where(closed[:, None], W, 0.0)
     matrix = jnp.where(closed[:, None] & closed[None, :], W, jnp.eye(W.shape[0], dtype=W.dtype))
-    left = (W - columns.T @ jnp.linalg.solve(matrix, columns))[n:, n:]
+    left = (W - columns.T @ solve(matrix, columns))[n:, n:]
     own = independent_components(left, sticks)
     return answers._replace(sticks=own, implied=sticks & ~own)
 
@@ -376,4 +377,4 @@ def solved_components(W: Float[Array, "k k"], b: Float[Array, "k"], positive: Bo
     """x with `W x + b = 0` in these components and zero in the others; differentiable."""
     both = positive[:, None] & positive[None, :]
     matrix = jnp.where(both, W, jnp.eye(b.size, dtype=b.dtype))
-    return jnp.linalg.solve(matrix, jnp.where(positive, -b, 0.0))
+    return solve(matrix, jnp.where(positive, -b, 0.0))

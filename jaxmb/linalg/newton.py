@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .elimination import solve
+
 
 def newton(
     correct: Callable[[PyTree], tuple[PyTree, Float[Array, ""]]],
@@ -94,4 +96,4 @@ def root(residual: Callable[[Array], Array], start: Array, solve: Callable[[Call
 
 def solve_linear(linear: Callable[[Array], Array], b: Float[Array, "n"]) -> Float[Array, "n"]:
     """Solve `linear(x) = b` with the matrix of a linear function."""
-    return jnp.linalg.solve(jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype)), b)
+    return solve(jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype)), b)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..formulations import accelerations
+from ..linalg.elimination import solve
 from ..linalg.rotations import norm
 from ..system.gaps import (
     STICK,
@@ -41,7 +42,7 @@ def stick_reserve(system, t, q, u, multipliers):
         gradients = jnp.where(stick[:, None], direction_gradients(system, t, q, u)[n:], 0.0)
         gram = gradients @ gradients.T
         size = _YIELD * jnp.max(jnp.diag(gram)) + jnp.finfo(gram.dtype).tiny
-        shared = jnp.linalg.solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ forces)
+        shared = solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ forces)
         forces = jnp.where(stick, shared, forces)
     return frictions.limit * normal - sizes_of(frictions.pairs, forces)
 

@@ -19,6 +19,7 @@ from ..linalg.complementarity import (
     slip_direction,
     solved_components,
 )
+from ..linalg.elimination import solve
 from ..linalg.rotations import norm
 from ..system.gaps import BEGUN, CLOSED, FORWARD, FREE, IMPLIED_STICK, STICK
 
@@ -145,7 +146,7 @@ class Laws(NamedTuple):
         # Others are zero to all digits.
         act = jnp.concatenate([answers.closed, answers.sticks | (answers.slips != 0)])
         if reactions is None:
-            return jnp.where(act, jnp.linalg.solve(matrix, right), 0.0)
+            return jnp.where(act, solve(matrix, right), 0.0)
         factor = jnp.where(self.of_joints & ~answers.sticks, self.coefficient * answers.slips, 0.0)
 
         def correct(_, forces):
@@ -155,9 +156,9 @@ class Laws(NamedTuple):
             along = reaction / jnp.where(normal > 0, normal, 1.0)[:, None]
             slope = jnp.einsum("kmd,md->mk", reactions[1:], along)
             own = matrix.at[self.n :].add(factor[:, None] * slope)
-            return jnp.linalg.solve(own, right.at[self.n :].add(factor * (slope @ forces - normal)))
+            return solve(own, right.at[self.n :].add(factor * (slope @ forces - normal)))
 
-        linear = jnp.linalg.solve(matrix, right)
+        linear = solve(matrix, right)
         return jnp.where(act, lax.fori_loop(0, _CORRECTIONS, correct, linear), 0.0)
 
     def _may(self, staying):
@@ -175,7 +176,7 @@ def is_implied(influence, closed):
     influence, closed = lax.stop_gradient((influence, closed))
     columns = jnp.where(closed[:, None], influence, 0.0)
     matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))
-    left = influence - columns.T @ jnp.linalg.solve(matrix, columns)
+    left = influence - columns.T @ solve(matrix, columns)
     return jnp.diag(left) <= REST * jnp.diag(influence)
 
 

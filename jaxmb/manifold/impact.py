@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
 from ..linalg.complementarity import of_pairs
+from ..linalg.elimination import solve
 from ..linalg.rotations import norm
 from ..system import AbstractEquation
 from ..system.gaps import (
@@ -174,7 +175,7 @@ def _struck(event: Event, at, along):
     of = _phases(event, at, tangents, du)
 
     def solved(plain, matrix, right):
-        impulses = jnp.linalg.solve(matrix, right)
+        impulses = solve(matrix, right)
         return impulses, plain + impulses @ of.moves
 
     # By the share of the rebounds velocities and impulses change as well.
@@ -186,11 +187,11 @@ def _struck(event: Event, at, along):
         last = Phase(event.u, event.held, event.slips, event.impulses)
         plain, matrix, right = _equations(of, event.at, du, last, none)
         impulses, change = solved(plain, matrix, right)
-        by_share = jnp.linalg.solve(matrix, jnp.where(event.held, bounce, 0.0))
+        by_share = solve(matrix, jnp.where(event.held, bounce, 0.0))
     else:
         plain, matrix, right = _equations(of, event.at, du, compression, none)
         first, between = solved(plain, matrix, right)
-        first_by_share = jnp.linalg.solve(matrix, jnp.where(compression.held, bounce, 0.0))
+        first_by_share = solve(matrix, jnp.where(compression.held, bounce, 0.0))
         pushes = ~event.low & np.array(contacts.by_poisson, bool)
         again = lambda system, impulses: jnp.where(
             pushes, event.share * contacts_of(system).restitution * impulses[:n], 0.0
@@ -203,7 +204,7 @@ def _struck(event: Event, at, along):
         normal = jnp.where(pushes, normal, 0.0)
         closing = bounce - of.rows @ (first_by_share @ of.moves)
         right = jnp.where(event.held, closing, jnp.pad(normal, (0, m)))
-        impulses, by_share = first + second, first_by_share + jnp.linalg.solve(matrix, right)
+        impulses, by_share = first + second, first_by_share + solve(matrix, right)
 
     # The share is that at which no energy is gained.
     both = at_rates + direction_rates(system, t, q, event.u)

@@ -8,8 +8,8 @@ import pytest
 from jaxmb.linalg import elimination
 
 # As programs: every operation of its own would be compiled for every shape.
-full_pivot, solve_positive, cholesky = map(
-    jax.jit, (elimination.full_pivot, elimination.solve_positive, elimination.cholesky)
+full_pivot, solve, solve_positive, cholesky = map(
+    jax.jit, (elimination.full_pivot, elimination.solve, elimination.solve_positive, elimination.cholesky)
 )
 eliminate = jax.jit(elimination.eliminate, static_argnums=2)
 gauss_jordan = jax.jit(elimination.gauss_jordan, static_argnums=1)
@@ -151,3 +151,35 @@ def test_cholesky_and_its_derivatives(n):
         found, expected = jax.jit(lambda s, both=(distance, plain): [of(s) for of in both])(0.0)
         np.testing.assert_allclose(found, expected, rtol=1e-10, err_msg=f"derivative {order}")
         distance, plain = jax.grad(distance), jax.jacfwd(plain)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 5, 12, 41])
+def test_solve_of_any_regular_matrix(n):
+    """With zeros on the diagonal, so that rows have to be chosen."""
+    A = RNG.normal(size=(n, n)) * (1 - np.eye(n)) if n > 1 else RNG.normal(size=(n, n))
+    for b in (RNG.normal(size=n), RNG.normal(size=(n, 3))):
+        np.testing.assert_allclose(solve(A, b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-11)
+    As, bs = RNG.normal(size=(4, n, n)), RNG.normal(size=(4, n))
+    together = jax.vmap(elimination.solve)(As, bs)
+    np.testing.assert_allclose(together, [np.linalg.solve(*pair) for pair in zip(As, bs, strict=True)], rtol=1e-8)
+
+
+def test_solve_leaves_the_residual_of_an_elimination():
+    """Of Hilbert's matrices, up to a condition of 1e10."""
+    for n in (4, 6, 8):
+        A = 1 / (1 + np.arange(n)[:, None] + np.arange(n)[None])
+        x = np.asarray(solve(A, A @ np.ones(n)))
+        assert np.max(np.abs(A @ x - A @ np.ones(n))) < 1e-14 * n * np.max(np.abs(x))
+
+
+def test_solve_has_derivatives_of_every_order():
+    A, b = jnp.asarray(RNG.normal(size=(4, 4))), jnp.asarray(RNG.normal(size=4))
+    by = jax.jit(lambda A, b: jnp.sum(jnp.sin(elimination.solve(A, b))))
+    other = jax.jit(lambda A, b: jnp.sum(jnp.sin(jnp.linalg.solve(A, b))))
+    for derivative in (jax.grad, jax.jacfwd, jax.hessian):
+        for k in (0, 1):
+            np.testing.assert_allclose(derivative(by, k)(A, b), derivative(other, k)(A, b), rtol=1e-9, atol=1e-9)
+
+
+def test_solve_with_a_singular_matrix_is_not_finite():
+    assert not np.any(np.isfinite(solve(np.array([[1.0, 2.0], [2.0, 4.0]]), np.ones(2))))

@@ -11,12 +11,15 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from ..._machine import threads
+from ...linalg.members import in_blocks
 from ..batch import Member, batch
 from .outputs import Outputs, Returned, check_same, outputs_of, returned, statuses
 
 # By how much a budget exceeds the steps of those that it is to suit, and how often it has to save the time in which
 # its program is compiled.
 _MARGIN, _PAYS = 1.1, 2.0
+# Members that are computed one after the other are so many in a call of the program.
+_ALONE = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Chunks:
                 for old, new in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
                     old[own] = new
         elif self._batch.budget == "auto" and self._budget is None and left > 0:
-            budget, share = cheapest_budget(np.asarray(found.steps), last.size)
+            budget, share = cheapest_budget(np.asarray(found.steps), last.together)
             self._lost.append(share * (time.perf_counter() - begin))
             if left * float(np.mean(self._lost)) > _PAYS * last.seconds:
                 self._budget = min(budget, full or budget)
@@ -116,7 +119,9 @@ def whole_chunk(chunk: int, devices: tuple[Any, ...]) -> int:
 
 
 class _Program:
-    """The compiled program of a block of `size` members with a limit of steps; of a whole chunk on several devices."""
+    """The compiled program of `size` members with a limit of steps, on several devices of a whole chunk; `together`: of
+    how many each waits for the slowest.
+    """
 
     def __init__(self, own: Batch, steps: int | None, columns: Mapping[str, np.ndarray]):
         fixed = {} if steps is None else {"max_steps": steps}
@@ -128,16 +133,18 @@ class _Program:
 
         begin = time.perf_counter()
         if own.devices:
-            self.size = own.chunk
+            self.size = self.together = own.chunk
             mesh, along = Mesh(np.array(own.devices), ("member",)), PartitionSpec("member")
             # Each device leaves its loops when its own members have ended; the check would ask diffrax's loops for
             # values that are the same on all devices.
             members = jax.shard_map(batch(of_parameters), mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
         else:
             member = Member(of_parameters, {name: jax.numpy.asarray(column[0]) for name, column in columns.items()})
-            number = -(-own.chunk // min(member.block_size(own.chunk), own.chunk))
+            together = member.block_size(own.chunk)
+            number = -(-own.chunk // min(_ALONE if together == 1 else together, own.chunk))
             self.size = -(-own.chunk // number)
-            members = member.block(self.size)
+            self.together = min(together, self.size)
+            members = lambda parameters: in_blocks(member.block(self.together), parameters, self.together)
         self._alone = own.alone
         self._run = jax.jit(members).lower(self._block(columns, 0)).compile()
         self.seconds = time.perf_counter() - begin
