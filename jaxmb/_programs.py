@@ -75,7 +75,7 @@ def compile_quickly() -> None:
 
 
 def run_quickly() -> None:
-    """Let programs of small machines run in a third to a half of the time.
+    """Let programs of small machines run in a third to three quarters of the time.
 
     ```python
     jaxmb.run_quickly()  # At the head of a script that computes for minutes, before anything is computed.
@@ -83,10 +83,11 @@ def run_quickly() -> None:
 
     As `compile_quickly`, in whose place it is called, with one difference: the loop over steps becomes one kernel of
     XLA. Otherwise a step calls a hundred, which for a machine of a few bodies takes most of its time. A step takes 2.0
-    instead of 6.6 µs for a four-bar, 5.3 instead of 14 for Andrews' mechanism, 9.8 instead of 18 for ten rods, and a
-    gradient two fifths of its time; its program compiles for a tenth to twice longer than with `compile_quickly`. A
-    loop stays as it is where it reads and writes more than 1 MiB in a step, as that of a hundred bodies or of a large
-    block of a batch does, or calls a library, as for matrices of more than 40 rows that are dense.
+    instead of 6.6 µs for a four-bar, 5.3 instead of 14 for Andrews' mechanism, 9.8 instead of 18 for ten rods, and 49
+    instead of 66 for Bricard's, with gradients likewise; these compile for a tenth to twice longer than with
+    `compile_quickly`. A loop stays as it is where it reads and writes more than 1 MiB in a step, as that of a hundred
+    bodies or of a large block of a batch does, or calls a library, as for matrices of more than 40 rows that are dense;
+    a step of a hundred rods takes a fifth longer than without options.
     """
     _tell(_RUN_QUICKLY)
 
