@@ -297,7 +297,8 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def contacts(self):
-        rows, names, modes, by_poisson, restitution, first = [], [], [], [], [], 0
+        rows, names, modes, by_poisson, first = [], [], [], [], 0
+        restitution, peaks = ([jnp.zeros(0, self.length.dtype)] for _ in range(2))
         for g in self.constraints:
             count = len(g.group.names) * g.rows
             if isinstance(g.group.part, AbstractUnilateralConstraint):
@@ -306,12 +307,13 @@ class RigidBodySystem(AbstractSystem):
                 modes += self.layout.pose_index[g.group.body_index[:, -1], 0].tolist()
                 by_poisson += [g.group.part.impact_law == "poisson"] * len(g.group.names)
                 restitution.append(g.group.part.restitution)
+                peaks.append(g.group.part.peak)
             first += count
         frictions = self._dry_frictions(names)
         if not names and frictions is None:
             return None
-        coefficients = jnp.concatenate([*restitution, jnp.zeros(0, self.length.dtype)])
-        return Contacts(tuple(names), tuple(rows), tuple(modes), tuple(by_poisson), coefficients, frictions)
+        numbers = jnp.concatenate(restitution), jnp.concatenate(peaks)
+        return Contacts(tuple(names), tuple(rows), tuple(modes), tuple(by_poisson), *numbers, frictions)
 
     def _dry_frictions(self, contacts):
         names, rows, modes, of_contacts, releases, pairs, first = [], [], [], [], [], [], self.position_rows

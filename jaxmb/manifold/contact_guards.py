@@ -43,6 +43,8 @@ _HALFWAY = 0.75
 class ContactGuards(AbstractGuards):
     """The gaps of open contacts, in units of the system's size, and the forces of closed ones, relative to the largest
     forces; slips in units of the size per second, and what the forces of stick are below their limits.
+
+    A gap g with a kink at its peak p counts as g (1 - g / 2p), which is smooth and the same near zero.
     """
 
     system: AbstractEquation
@@ -58,7 +60,8 @@ class ContactGuards(AbstractGuards):
         q = system.normalize(y.q)
         t, (n, _) = jnp.asarray(t, q.dtype), counts(system)
         modes = modes_of(system, q)
-        free = jnp.where(modes[:n] == OPEN, gaps(system, t, q), system.length)
+        gap = gaps(system, t, q)
+        free = jnp.where(modes[:n] == OPEN, gap * (1 - 0.5 * gap / contacts_of(system).peaks), system.length)
         frictions = contacts_of(system).frictions
         acts = self.forces(y)
         if frictions is not None:
@@ -105,10 +108,11 @@ class ContactGuards(AbstractGuards):
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
-        q, (n, _) = system.normalize(y.q), counts(system)
-        rates = direction_rates(system, jnp.asarray(t, q.dtype), q, y.u) / system.length
-        watched = (modes_of(system, q) == OPEN) & (np.arange(rates.size) < n)
-        return jnp.where(watched, rates, jnp.inf)
+        q, (n, m) = system.normalize(y.q), counts(system)
+        t = jnp.asarray(t, q.dtype)
+        slopes = 1 - gaps(system, t, q) / contacts_of(system).peaks
+        rates = direction_rates(system, t, q, y.u)[:n] * slopes / system.length
+        return jnp.pad(jnp.where(modes_of(system, q)[:n] == OPEN, rates, jnp.inf), (0, m), constant_values=jnp.inf)
 
 
 def contact_guards(

@@ -67,7 +67,16 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
 
     @abc.abstractmethod
     def gap(self, space: AbstractSpace, poses: Poses) -> Float[Array, ""]:
-        """The gap [m, rad] at the poses of the bodies, as a smooth function, also where it is negative."""
+        """The gap [m, rad] at the poses of the bodies, as a smooth function, also where it is negative; a kink is
+        allowed at its `peak`.
+        """
+
+    @property
+    def peak(self) -> Float[Array, "..."]:
+        """The largest value of a gap that rises to a kink and falls again, as between two stops; infinite, the default,
+        for one without.
+        """
+        return jnp.full_like(self.restitution, jnp.inf)
 
     def residual(self, space, poses, t):
         del t
@@ -117,13 +126,19 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
                 )
         return super().with_numbers(given)
 
+    @property
+    def peak(self):
+        if self.lower is None or self.upper is None:
+            return super().peak
+        return 0.5 * (self.upper - self.lower)
+
     def gap(self, space, poses):
         (value,) = self.measured(space, poses)
         if self.lower is None or self.upper is None:
             return value - self.lower if self.upper is None else self.upper - value
         middle = 0.5 * (self.lower + self.upper)
         # Of the two stops that which is nearer.
-        return 0.5 * (self.upper - self.lower) - jnp.abs(self.near(value[None], middle)[0] - middle)
+        return self.peak - jnp.abs(self.near(value[None], middle)[0] - middle)
 
 
 class AbstractGeometricContact(AbstractUnilateralConstraint):

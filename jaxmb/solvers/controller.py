@@ -31,7 +31,8 @@ _WITHOUT_ESTIMATE = 0.25
 _REPEATED = (0.95, 0.5, 0.1)
 # The length of the trial before the first step, in units of the interval, and the factors from it to the first step.
 _TRIAL, _SHORTER, _LONGER = 1e-4, 1e-8, 100.0
-# The recovery from a step shortened by a wrapper is at most this factor; beyond it differences are rounding errors.
+# The recovery from a step shortened by a wrapper is at most this factor, unless the step's own error allows a longer
+# one; beyond it differences are rounding errors.
 _RECOVERY = 100.0
 # After a step without an estimate, this number of steps grow by at most this factor, so that steps that are too long to
 # be solved are not tried again and again.
@@ -241,7 +242,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))
         growth = jnp.where(caution > 0, jnp.minimum(growth, scalar(_CAUTIOUS)), growth)
         # The last step before a stop may be short only because of the stop.
-        recovered = jnp.minimum(jnp.minimum(allowed, scalar(_RECOVERY)), (intended / dt).astype(allowed.dtype))
+        most = jnp.maximum(scalar(_RECOVERY), y_error.retry)
+        recovered = jnp.minimum(jnp.minimum(allowed, most), (intended / dt).astype(allowed.dtype))
         repeated = jnp.where(rejections == 0, _REPEATED[0], jnp.where(rejections == 1, _REPEATED[1], _REPEATED[2]))
         repeated = jnp.where(trial, _LONGER, repeated)
         smallest = jnp.where(opening > 0, scalar(_SHORTER), scalar(self.factormin))

@@ -34,6 +34,8 @@ _SHORTER = 1e-2
 # fractions of them; otherwise it is halved, so many times at most, as they may jump. Where they are not up to a
 # hundredth of that, or a force varies, the next step is at most twice as long, or they could repeat themselves in it.
 _COARSE, _BENT, _HALVED, _NOT_SMOOTH, _VARIES, _GROWTH = 0.25, 0.05, 4, 0.01, 0.4, 2.0
+# The share of the length that the error of a start allows which the next start has.
+_START_SAFETY = 0.92
 # Forces that are smaller than this, relative to the largest ones, are compared with it.
 _FAINT = 1e-3
 # The result of a solve that ends since there is no state after an event.
@@ -58,7 +60,8 @@ class Crossing(AbstractErrorWithMore):
     guard is negative `within` the step, and otherwise zero, since diffrax expects no truth values in an error; the
     `lowest` guard at its end; one where a guard is `falling` through zero there; one where the term has `lost` the
     motion at the start of the step: there was no state after an event, and it gave an infinite one; how `coarse` the
-    step is for guards that vary in it, more than one where it is too long; `touch` and `near` of the guards.
+    step is for guards that vary in it, more than one where it is too long; `touch` and `near` of the guards; the factor
+    by which a multistep method could `retry` the step, infinite for other methods, which do not start anew.
     """
 
     error: PyTree
@@ -70,6 +73,7 @@ class Crossing(AbstractErrorWithMore):
     coarse: Float[Array, ""]
     touch: Float[Array, ""]
     near: Float[Array, ""]
+    retry: Float[Array, ""]
 
 
 def error_of(y_error: Any) -> PyTree:
@@ -123,12 +127,18 @@ class _Search(NamedTuple):
 
 
 def crossing(
-    guards: AbstractGuards, direction: Any, error: PyTree, step: tuple[Any, Any], ends: tuple[Any, Any], at: Callable
+    guards: AbstractGuards,
+    direction: Any,
+    error: PyTree,
+    step: tuple[Any, Any],
+    ends: tuple[Any, Any],
+    at: Callable,
+    retry: Any = jnp.inf,
 ) -> Crossing:
     """Look for zeros of guards in a step.
 
     **Arguments:** `direction` of time; `step`: its first and last time, in the solver's; `ends`: the states there;
-    `at(t)`: a state in between.
+    `at(t)`: a state in between; `retry`: see `Crossing`.
     """
     (t0, t1), (y0, y1) = step, ends
     sign = jnp.asarray(direction, t0.dtype)
@@ -158,9 +168,9 @@ def crossing(
     falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
     lost = jnp.any(jnp.isinf(ravel(y0)))
     falling, lost, within = (x.astype(start.dtype) for x in (falling, lost, found.dips))
-    touch, near = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near))
+    touch, near, retry = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near, retry))
     target = t0 + found.bracket.b * (t1 - t0)
-    return Crossing(error, target, within, jnp.min(found.end), falling, lost, found.coarse, touch, near)
+    return Crossing(error, target, within, jnp.min(found.end), falling, lost, found.coarse, touch, near, retry)
 
 
 class _Known(NamedTuple):
@@ -345,7 +355,8 @@ class EventState(AbstractControllerState):
 
     **Fields:** that of the controller `inner`; the `target` of the step that is tried, infinite without one; the
     `length` that it had before it was made to end there; the `count` of events, their `times` and the raveled `states`
-    before them, in buffers; `touch` of the guards; how many times in a row a step was `halved`.
+    before them, in buffers; `touch` of the guards; how many times in a row a step was `halved`; whether the method
+    `starts` anew with this step, and the length that the error of the last `start` allows.
     """
 
     inner: Any
@@ -356,6 +367,8 @@ class EventState(AbstractControllerState):
     states: Float[Array, "events n"]
     touch: Float[Array, ""]
     halved: Any
+    starts: Any
+    start: Any
 
     @property
     def intended(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -399,7 +412,8 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         states = jnp.zeros((self.most + 1, flat.size), flat.dtype)
         touch = jnp.zeros((), flat.dtype)
         none = jnp.asarray(jnp.inf, t0.dtype), jnp.zeros((), t0.dtype), jnp.array(0)
-        return first, EventState(inner, *none, times, states, touch, jnp.array(0))
+        start = jnp.array(True), jnp.asarray(jnp.inf, t0.dtype)
+        return first, EventState(inner, *none, times, states, touch, jnp.array(0), *start)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
         before, found = controller_state, y_error
@@ -424,6 +438,10 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         next_t1 = jnp.minimum(next_t1, growing)
         length = jnp.where(jnp.isinf(before.target), t1 - t0, before.length)
         next_t1 = jnp.where(empty & ~again, t1 + _SHORTER * length, next_t1)
+        # A method that starts anew, at order one, takes the longest step that it could take when it last did.
+        accepted, allowed = keep & ~again, (t1 - t0) * _START_SAFETY * found.retry.astype(before.start.dtype)
+        start = jnp.where(before.starts & accepted & ~empty, allowed, before.start)
+        next_t1 = jnp.where(ends, jnp.minimum(next_t1, t1 + start), next_t1)
         target = jnp.where(keep & crossed, found.target, jnp.inf)
         place = jnp.where(ends, jnp.minimum(before.count, self.most), self.most)
         state = EventState(
@@ -435,6 +453,8 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
             before.states.at[place].set(ravel(y1_candidate)),
             found.touch,
             jnp.where(keep & coarse, before.halved + 1, 0),
+            jnp.where(accepted, made_jump | ends, before.starts),
+            start,
         )
         full = ends & (before.count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)

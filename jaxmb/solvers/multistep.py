@@ -148,7 +148,8 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         guards = guards_of(terms)
         if guards is not None:
             at = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
-            estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), (y0, y1), at)
+            retry = jnp.inf if estimate is None else estimate.retry
+            estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), (y0, y1), at, retry)
         result: Any = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)

@@ -70,8 +70,8 @@ class Contacts(eqx.Module):
     force acts on, is a number of the state like any other.
 
     **Fields:** their `names`; for each the number of its `rows` of A, among those of positions, and the index of its
-    mode in q, `modes`; whether its impacts are `by_poisson`, or by Newton's law; coefficients of `restitution`; the
-    `frictions`, None without any.
+    mode in q, `modes`; whether its impacts are `by_poisson`, or by Newton's law; coefficients of `restitution`;
+    the `peaks` of gaps that rise to a kink and fall again, infinite for others; the `frictions`, None without any.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -79,6 +79,7 @@ class Contacts(eqx.Module):
     modes: tuple[int, ...] = eqx.field(static=True)
     by_poisson: tuple[bool, ...] = eqx.field(static=True)
     restitution: Float[Array, "contacts"]
+    peaks: Float[Array, "contacts"]
     frictions: Frictions | None = None
 
 

@@ -501,6 +501,25 @@ def test_a_mass_between_two_stops():
     np.testing.assert_allclose(np.asarray(motion.events.impulses)[:, 0], 6 * 1.9 * 0.9 ** np.arange(len(times)))
 
 
+@pytest.mark.always
+def test_steps_between_impacts():
+    """A rattling mass takes three steps from one stop to the other, and a fourth that was too long: the step after an
+    impact is as long as it could be after the last one, and one that passes the middle is not too coarse.
+    """
+    system = mb.Scene(
+        [planar.Body("mass", mass=1.0, inertia=1.0, velocity=(10.0, 0.0))],
+        joints=[
+            planar.Prismatic("rail", "ground", "mass", axis=(1.0, 0.0), point=(0.0, 0.0)),
+            mb.Stop("stop", "rail.displacement", lower=-0.005, upper=0.005, restitution=0.9999),
+        ],
+        forces=[mb.JointSpring("spring", "rail.displacement", stiffness=3.0)],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=0.03, rtol=1e-6, error=False)
+    assert len(motion.events) == 30
+    assert motion.stats["num_rejected_steps"] <= 32
+    assert motion.stats["num_steps"] <= 4.2 * 30
+
+
 def test_cradle():
     """Five balls almost touch: the last one takes all of the velocity of the first."""
     at = [-0.2, *(0.1 * k + 1e-6 * k for k in range(1, 5))]
