@@ -93,6 +93,37 @@ def test_a_slider_crank_with_clearance():
     converges_to(end(rigid), lambda k: end(run(slider_crank(bearing(k)))))
 
 
+def four_bar(stop):
+    """A four-bar linkage whose rocker swings against a stop."""
+    links = {"crank": ((0.0, 0.5), 1.57, 1.0), "coupler": ((1.0, 1.4), 0.4, 2.0), "rocker": ((2.2, 0.9), 1.8, 1.8)}
+    bodies = [
+        planar.Body(name, mass=1.0, inertia=planar.rod(1.0, length), position=at, angle=angle)
+        for name, (at, angle, length) in links.items()
+    ]
+    joints = [
+        planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+        planar.Revolute("B", "crank", "coupler", point_a=(0.5, 0.0), point_b=(-1.0, 0.0)),
+        planar.Revolute("C", "coupler", "rocker", point_a=(1.0, 0.0), point_b=(0.9, 0.0)),
+        planar.Revolute("D", "ground", "rocker", point_a=(2.5, 0.0), point_b=(-0.9, 0.0)),
+    ]
+    rigid = isinstance(stop, mb.Stop)
+    forces = [mb.Gravity((0.0, -9.81)), *[stop] * (not rigid)]
+    return mb.Scene(bodies, joints=joints + [stop] * rigid, forces=forces).compile()
+
+
+def test_a_four_bar_whose_rocker_hits_a_stop():
+    def run(system):
+        start = mb.assemble(system, rates={"crank.angle": -4.0})
+        return mb.simulate(system, start, t1=0.5, saveat=[0.5], rtol=1e-11, max_steps=100_000)
+
+    end = lambda motion: np.array([motion[name].angle[0] for name in ("crank", "coupler", "rocker")])
+    rigid = run(four_bar(mb.Stop("stop", "D.angle", upper=2.3, restitution=1.0)))
+    assert len(rigid.events) == 1
+    ends = {"lower": -9.0, "upper": 2.3}
+    compliant = lambda k: mb.JointStop("stop", "D.angle", **ends, stiffness=k, smoothing=1e-2 / np.sqrt(k))
+    converges_to(end(rigid), lambda k: end(run(four_bar(compliant(k)))))
+
+
 def test_ten_thousand_impacts():
     """A mass on a spring rattles between two stops: no energy comes in, and what is lost is what impacts take."""
     system = mb.Scene(
