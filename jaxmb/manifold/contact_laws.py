@@ -25,6 +25,9 @@ from ..system.gaps import BEGUN, CLOSED, FORWARD, FREE, IMPLIED_STICK, STICK
 
 # Rates below this fraction of what adds up in them, and squares of gradients, are zero.
 REST = 1e-9
+# Friction that sticks slips from this fraction below its limit on; an event where it still held would be followed by the
+# same one at once.
+_REACHED = 1e-7
 # The normal forces of joints, which depend on the friction in them, are found by this many corrections.
 _CORRECTIONS = 6
 
@@ -113,8 +116,8 @@ class Laws(NamedTuple):
         this is zero; `opening`: the accelerations without them; `forces`: nearly those, on which the normal forces of
         joints depend.
         """
-        # Friction that has just reached its limit is beyond it up to rounding errors.
-        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - REST, 1.0)
+        # Friction that has just reached its limit is beyond it, up to what the search for the laws that hold resolves.
+        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REACHED, 1.0)
         coefficient = jnp.where(self.sizes(slips) == 0, limit, self.coefficient)
         bounds = jnp.zeros(self.m, opening.dtype)
         if reactions is not None:

@@ -317,11 +317,18 @@ def find_event(system, formulation, touch, t, y) -> Event:
     else:
         left, cancelled = jnp.where(staying, rate, 0.0), held & settled.low
     held = held & independent_components(influence, held)
+    cancelled = held & cancelled
+    if m:
+        # Bodies that move side by side would come nearer, by a rate that is too small beside slips to close their
+        # contact, and by no end of events.
+        drifts = jnp.pad(staying & ~held[:n] & ~implied & (rate[:n] < 0), (0, m))
+        cancelled = cancelled | drifts
+        cancelled = cancelled & independent_components(influence, cancelled)
     compression = settled.compression
     if compression is not None:
         first = compression.held
         compression = compression._replace(held=first & independent_components(influence, first))
-    lost = jnp.where(held & cancelled, solved_components(influence, left, held & cancelled), 0.0)
+    lost = jnp.where(cancelled, solved_components(influence, left, cancelled), 0.0)
     after = settled.after + lost @ moves
     # Impulses of rounding errors are none.
     sizes = jnp.abs(rows) @ (jnp.abs(after) + jnp.abs(when.u))
