@@ -25,8 +25,8 @@ from ..system.gaps import BEGUN, CLOSED, FORWARD, FREE, IMPLIED_STICK, STICK
 
 # Rates below this fraction of what adds up in them, and squares of gradients, are zero.
 REST = 1e-9
-# Friction that sticks slips from this fraction below its limit on; an event where it still held would be followed by the
-# same one at once.
+# Friction that sticks slips from this fraction below its limit on: an event at which it still held would be followed by
+# the same one at once.
 _REACHED = 1e-7
 # The normal forces of joints, which depend on the friction in them, are found by this many corrections.
 _CORRECTIONS = 6

@@ -151,6 +151,24 @@ def belt():
     return mb.Scene(bodies, joints=joints, forces=[DOWN, spring, rub]).compile()
 
 
+def test_discs_that_roll_side_by_side():
+    """They come nearer by rounding errors, which neither close their contact nor end the run."""
+    discs = [
+        planar.Body(
+            f"disc{k}", mass=1.0, inertia=0.02, position=(0.4 * k, 0.2), velocity=(v, 0), angular_velocity=-5 * v
+        )
+        for k, v in enumerate((0.5, 0.5 - 5e-12))
+    ]
+    contacts = [mb.RigidContact(f"floor{k}", f"disc{k}", terrain=terrain.Flat(), radius=0.2) for k in range(2)]
+    contacts.append(mb.RigidBallContact("pair", "disc0", "disc1", radius_a=0.2, radius_b=0.2))
+    rubs = [mb.DryFriction(f"rub {part.name}", part.name, coefficient=0.3) for part in contacts]
+    system = mb.Scene(discs, joints=contacts, forces=[DOWN, *rubs]).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=1.0, rtol=1e-8, max_events=10)
+    assert len(motion.events) == 0
+    for k in range(2):
+        np.testing.assert_allclose(motion[f"disc{k}"].position[-1], [0.5 + 0.4 * k, 0.2], atol=1e-10)
+
+
 def test_stick_slip_on_a_belt():
     system = belt()
     motion = mb.simulate(system, mb.assemble(system), t1=6.0, rtol=1e-10)
