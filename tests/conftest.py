@@ -15,10 +15,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # A test that took longer runs with `--all` only [s].
-LONG = 1.2
+LONG = 2.5
 # How long tests took [s], by their ids, but for quick ones; null where one is long and has not been timed yet.
 DURATIONS = Path(__file__).parent / "durations.json"
-KEPT = 1.0
+KEPT = 0.5
 
 
 def pytest_addoption(parser):

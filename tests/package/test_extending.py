@@ -248,6 +248,7 @@ def test_lines(cls, most):
     assert len(code) <= most
 
 
+@pytest.mark.always
 def test_a_joint():
     """A wheel rolls down a slope, and rubs and presses on it as the closed form says."""
     mass, inertia, slope, t1 = 2.0, 0.05, 0.3, 0.8
@@ -286,6 +287,7 @@ def test_a_force_with_an_internal_state():
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-8)
 
 
+@pytest.mark.always
 def test_a_one_step_solver():
     """Of its order in steps of one length, and as accurate as asked for where it chooses them."""
     pendulum = mechanisms.get("pendulum")
@@ -298,6 +300,7 @@ def test_a_one_step_solver():
     np.testing.assert_allclose(run(solver=Kutta(), rtol=1e-8), exact, rtol=0, atol=1e-6)
 
 
+@pytest.mark.always
 def test_a_multistep_solver():
     """Errors in proportion to the tolerance, on a pendulum that is constrained and on a plain field; a derivative."""
     pendulum = mechanisms.get("pendulum")
@@ -351,6 +354,7 @@ def test_a_formulation(name):
     np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-9)
 
 
+@pytest.mark.always
 def test_a_system_that_is_not_made_of_bodies():
     """A particle that goes around on a cone, with the period and the tension of the closed form."""
     mass, length, tilt, t1 = 0.7, 1.3, 0.6, 2.0

@@ -107,6 +107,7 @@ def test_the_figure_of_the_readme_shows_what_is_computed():
         assert before["error"] / 3 < run.error < 3 * before["error"]
 
 
+@pytest.mark.always
 def test_readme_example(capsys):
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert code is not None

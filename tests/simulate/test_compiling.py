@@ -25,6 +25,7 @@ def programs(monkeypatch):
     return traced
 
 
+@pytest.mark.always
 def test_twenty_calls_of_a_user(programs):
     """Times, tolerances, numbers of steps and of saved times, errors, other parameters."""
     machine = mb.mechanisms.pendulum()

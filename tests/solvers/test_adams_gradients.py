@@ -49,6 +49,7 @@ def differences():
     return np.array([(loss(PARAMETERS + step * e) - loss(PARAMETERS - step * e)) / (2 * step) for e in np.eye(4)])
 
 
+@pytest.mark.always
 def test_forward_equals_reverse():
     """On one and the same mesh: at a tolerance so coarse that rounding errors have no say in the size of steps."""
     loss = lambda adjoint: lambda p: _loss(p, adjoint, 1e-4)

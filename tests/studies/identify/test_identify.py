@@ -77,6 +77,7 @@ def test_recovers_parameters_with_honest_deviations(system, motion):
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.4
 
 
+@pytest.mark.always
 def test_result(system, motion):
     """The result carries the fitted system, its state, and a table; NaN samples are left out."""
     measured = noisy(motion, 0)
