@@ -96,6 +96,31 @@ def test_derivatives_through_impacts():
         np.testing.assert_allclose(got, known, rtol=1e-7)
 
 
+def test_the_saltation_matrix_of_an_impact():
+    """How height and speed after an impact change with those at the start, by the formula for a hybrid system.
+
+    Source: R. I. Leine and H. Nijmeijer, "Dynamics and Bifurcations of Non-Smooth Mechanical Systems", Springer, 2004.
+    """
+    start, e, t1 = mb.assemble(BALL), 0.5, 0.7
+
+    def end(at):
+        state = dataclasses.replace(start, q=start.q.at[1].set(at[0]), u=start.u.at[1].set(at[1]))
+        last = mb.simulate(BALL, state, t1=t1, rtol=1e-12, max_steps=300, max_events=4).ys
+        return jnp.stack([last.q[-1, 1], last.u[-1, 1]])
+
+    at = jnp.array([1.0, -0.4])
+    before = -np.sqrt(0.4**2 + 2 * G)
+    impact = (-0.4 - before) / G
+    flow = lambda t: np.array([[1.0, t], [0.0, 1.0]])
+    # The jump, and the times by which fields before and after it act longer or shorter.
+    field = lambda v: np.array([v, -G])
+    reset = np.diag([1.0, -e])
+    saltation = reset + np.outer(field(-e * before) - reset @ field(before), [1.0, 0.0]) / before
+    exact = flow(t1 - impact) @ saltation @ flow(impact)
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jit_quickly(mode(end))(at), exact, rtol=1e-9)
+
+
 def test_forward_mode_is_reverse_mode_through_impacts():
     at = jnp.array([0.7, 0.05])
     forward, reverse = (jit_quickly(mode(lambda at: end(at, 2.0)))(at) for mode in (jax.jacfwd, jax.grad))
