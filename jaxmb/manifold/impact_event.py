@@ -319,8 +319,8 @@ def find_event(system, formulation, touch, t, y) -> Event:
     held = held & independent_components(influence, held)
     cancelled = held & cancelled
     if m:
-        # Bodies that move side by side would come nearer at a rate that is too small, beside slips, to close their contact,
-        # and each step would end with an event.
+        # Bodies that move side by side would come nearer, at a rate that is too small beside slips to close their
+        # contact, and each step would end with an event.
         drifts = jnp.pad(staying & ~held[:n] & ~implied & (rate[:n] < 0), (0, m))
         cancelled = cancelled | drifts
         cancelled = cancelled & independent_components(influence, cancelled)
