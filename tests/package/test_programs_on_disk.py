@@ -89,6 +89,7 @@ def test_the_last_way_to_compile_counts():
     assert "JAX has computed something already" in said
 
 
+@pytest.mark.always
 def test_the_loop_over_steps_is_one_kernel():
     code = """
 import dataclasses

@@ -93,6 +93,7 @@ def test_forward_reverse_and_the_discrete_solution(name):
     np.testing.assert_allclose(forward / scale, exact / scale, rtol=0, atol=1e-8)
 
 
+@pytest.mark.always
 def test_hessian_and_batches_without_an_option():
     energy = lambda p: jnp.sum(jnp.cos(jnp.arange(6.0)) * states(run(p)))
     gradient = jax.jit(jax.grad(energy))
