@@ -185,6 +185,35 @@ def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any
     return eqx.combine(chosen(pred, taken, other), rest)
 
 
+def loop_of_lanes(together: Callable, going: Callable, advance: Callable, start: Any) -> Any:
+    """`lax.while_loop` of what is `going` on, without derivatives, in which under `vmap` few lanes hold up the others.
+
+    Lanes advance side by side while `together` holds for them; those that then still go on do so as in `cond_of_lanes`.
+    (jax.custom_batching.custom_vmap, 0.7 to 0.10; equinox.filter_closure_convert, 0.13.)
+    """
+    start = lax.stop_gradient(start)
+    closed, static = eqx.partition(eqx.filter_closure_convert(advance, start), eqx.is_array)
+
+    def advanced(condition, closed, state):
+        return lax.while_loop(condition, lambda state: eqx.combine(closed, static)(state), state)
+
+    @custom_vmap
+    def of_lane(closed, start):
+        return advanced(going, closed, start)
+
+    @of_lane.def_vmap
+    def of_lanes(_, batched, closed, start):
+        def alone(closed, start):
+            first = advanced(together, closed, start)
+            more = lambda state: advanced(going, closed, state)
+            return cond_of_lanes(going(first), more, lambda state: state, first)
+
+        axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
+        return jax.vmap(alone, axes)(closed, start), jax.tree.map(lambda own: True, batched[1])
+
+    return of_lane(lax.stop_gradient(closed), start)
+
+
 # A loop whose buffers are written in place, also in batches. (equinox.internal.while_loop and buffer_at_set, 0.13.)
 while_loop = eqxi.while_loop
 

@@ -8,6 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._compat import cond_of_any_lane
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
 from ..linalg.complementarity import placed_pairs
@@ -72,7 +73,7 @@ class ContactGuards(AbstractGuards):
             free = jnp.concatenate([free, jnp.where(slips, slip, system.length)])
             free = self._of_pairs(free, modes, rates, y.u)
 
-        def forces():
+        def forces(_):
             own = system.at(y)
             _, multipliers = contact_forces(own, self.formulation, t, q, y.u)
             largest = largest_force(own, t, dataclasses.replace(y, q=q), multipliers)
@@ -81,7 +82,7 @@ class ContactGuards(AbstractGuards):
                 taken = jnp.concatenate([taken[:n], stick_reserve(own, t, q, y.u, multipliers)])
             return taken / largest
 
-        held = lax.cond(jnp.any(acts), forces, lambda: jnp.ones_like(free))
+        held = cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free)
         return jnp.where(acts, held, free / system.length)
 
     def _of_pairs(self, free, modes, rates, u):

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._compat import WrappedSolver, cond_of_any_lane, direction_of, inner_term
+from .._compat import WrappedSolver, direction_of, inner_term
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass, solve_constrained
 from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
-from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation, crossing
+from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation, cond_of_jumps, crossing
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .constraints import RestoredState, SolvedState, restore, solved
@@ -258,7 +258,8 @@ class ProjectedSolver(WrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system, direction = inner_term(terms).vector_field.system, direction_of(terms)
         if made_jump is not False:
-            y0 = cond_of_any_lane(made_jump, lambda y: self._after_jump(system, t0 * direction, y), lambda y: y, y0)
+            after = lambda y: self._after_jump(system, t0 * direction, y)
+            y0 = cond_of_jumps(self.guards)(made_jump, after, lambda y: y, y0)
         first, last = t0, t1
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
         t1 = t1 * direction

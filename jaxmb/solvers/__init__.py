@@ -16,7 +16,12 @@ from .evaluation import (
     ravel as ravel,
     unravel_like as unravel_like,
 )
-from .events import NO_STATE as NO_STATE, crossing as crossing, events_found as events_found
+from .events import (
+    NO_STATE as NO_STATE,
+    cond_of_jumps as cond_of_jumps,
+    crossing as crossing,
+    events_found as events_found,
+)
 from .hermite import Hermite as Hermite, HermiteState as HermiteState
 from .manifold_term import (
     AbstractFieldJacobian as AbstractFieldJacobian,

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
+from .._compat import cond_of_any_lane, cond_of_lanes, loop_of_lanes
 from .controller import AbstractControllerState, intended_step, states_inside
 from .evaluation import ravel
 from .manifold_term import AbstractGuards
@@ -86,6 +87,11 @@ def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
     if not isinstance(y_error, AbstractErrorWithMore):
         return function(y_error)
     return eqx.tree_at(lambda y_error: y_error.error, y_error, function(y_error.error), is_leaf=lambda x: x is None)
+
+
+def cond_of_jumps(guards: AbstractGuards | None) -> Callable:
+    """The `lax.cond` for what follows a jump: members of a batch jump together, and have events at their own times."""
+    return cond_of_any_lane if guards is None else cond_of_lanes
 
 
 # What the search in a step looks for: a zero at its end or in its middle, forces at its start, where one of them is
@@ -164,7 +170,9 @@ def crossing(
     zero, no = jnp.zeros((), start.dtype), jnp.array(False)
     bracket = Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0))
     first = _Search(jnp.array(_LOOK), one, bracket, none > 0, none > 0, none, none, none, no, zero, jnp.array(0))
-    found = lax.while_loop(lambda search: search.phase != _DONE, advance, first)
+    # Each lane evaluates its guards at a few points; few of them have a zero to find.
+    looks, goes = lambda search: search.phase <= _LEAST, lambda search: search.phase != _DONE
+    found = loop_of_lanes(looks, goes, advance, first)
     falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
     lost = jnp.any(jnp.isinf(ravel(y0)))
     falling, lost, within = (x.astype(start.dtype) for x in (falling, lost, found.dips))

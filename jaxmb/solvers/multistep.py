@@ -6,13 +6,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import any_of_batch, direction_of, from_controller
+from .._compat import direction_of, from_controller
 from .evaluation import (
     after_jump,
     chart_after_jump,
@@ -24,7 +22,7 @@ from .evaluation import (
     guards_of,
     refused,
 )
-from .events import Crossing, crossing
+from .events import Crossing, cond_of_jumps, crossing
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
 from .steps import AbstractSteps
@@ -160,14 +158,14 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         if made_jump is False:
             return y0, solver_state
 
-        def restarted():
+        def restarted(before):
+            y0, solver_state = before
             after = after_jump(terms, t0, y0, args)
             chart = chart_after_jump(terms, solver_state.chart)
-            restart = after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
-            return jax.tree.map(lambda new, old: jnp.where(made_jump, new, old), restart, (y0, solver_state))
+            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
 
-        # In a batch the restart is evaluated if any member has made a jump.
-        return lax.cond(any_of_batch(made_jump), restarted, lambda: (y0, solver_state))
+        cond = cond_of_jumps(guards_of(terms))
+        return cond(made_jump, restarted, lambda before: before, (y0, solver_state))
 
     def linear_steps(self, jumps: bool) -> AbstractSteps | None:
         """The steps of the method as linear maps of tangents, if it knows a cheaper form than their derivatives.

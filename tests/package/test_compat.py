@@ -212,6 +212,26 @@ def test_conditions_of_lanes(compat, monkeypatch, lanes, at_once):
     assert kind in text, "a branch is computed for lanes that do not take it"
 
 
+@pytest.mark.parametrize("lanes", [1, 5])
+def test_loops_of_lanes(compat, lanes):
+    """Each lane ends where it ends alone, and derivatives are zero."""
+
+    def halved(limit, x, a):
+        advance = lambda state: (state[0] + 1, jnp.where(state[1] > limit, a * state[1], 0.0))
+        going = lambda state: (state[1] > 0) & (state[0] < 100)
+        return compat.loop_of_lanes(lambda state: going(state) & (state[0] < 2), going, advance, (jnp.array(0.0), x))[0]
+
+    own = lambda x, a: halved(1.0, x, a) * x
+    x, a = jnp.asarray(4.0 ** np.arange(lanes)), jnp.asarray(0.5)
+    counts = 2.0 * np.arange(lanes) + 1
+    np.testing.assert_array_equal([own(x, a) for x in x], counts * x)
+    for axes, of in (((0, None), (x, a)), ((0, 0), (x, jnp.full(lanes, a)))):
+        np.testing.assert_array_equal(jax.jit(jax.vmap(own, axes))(*of), counts * x)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_array_equal(jax.vmap(derivative(own), (0, None))(x, a), counts)
+        np.testing.assert_array_equal(derivative(own, 1)(x[-1], a), 0.0)
+
+
 def test_enumerations(compat):
     about = "items of equinox.Enumeration no longer hold their class, their code or all names"
 

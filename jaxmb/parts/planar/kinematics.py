@@ -3,7 +3,6 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 
 from ...linalg.arrays import namespace
 from ..space import AbstractSpace
@@ -92,7 +91,7 @@ def _turned_back(pose, v):
 
 def _quarter_turn(v):
     """Counter-clockwise."""
-    return v[::-1] * np.array([-1.0, 1.0], v.dtype)
+    return namespace(v).concatenate([-v[1:], v[:1]])
 
 
 PLANE = PlanarSpace()
