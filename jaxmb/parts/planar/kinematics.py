@@ -91,6 +91,7 @@ def _turned_back(pose, v):
 
 def _quarter_turn(v):
     """Counter-clockwise."""
+    # Not by v[::-1]: XLA simplifies reversals of one constant one by one, each in a pass over the whole program.
     return namespace(v).concatenate([-v[1:], v[:1]])
 
 
