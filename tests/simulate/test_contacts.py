@@ -514,6 +514,15 @@ def test_members_of_a_batch_have_their_own_events():
     np.testing.assert_allclose(together[0][2], height(1.9, 0.8, 0.1, 3), atol=1e-9)
 
 
+def test_derivatives_of_a_batch_whose_members_have_their_own_events():
+    """Those of the closed form, in both modes, of members with two to six impacts."""
+    at, impacts, t1 = jnp.array([[0.95, -0.5], [0.8, 0.1], [0.9, 0.3], [0.7, 0.3]]), (2, 3, 3, 6), 1.9
+    exact = [jax.grad(lambda values, n=n: height(t1, *values, n))(own) for own, n in zip(at, impacts, strict=True)]
+    reverse, forward = (jit_quickly(jax.vmap(mode(lambda x: end(x, t1))))(at) for mode in (jax.grad, jax.jacfwd))
+    np.testing.assert_allclose(reverse, exact, rtol=1e-7)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+
+
 def test_a_mass_between_two_stops():
     """Without forces the speed is `restitution` to the number of impacts."""
     system = mb.Scene(
