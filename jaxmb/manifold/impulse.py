@@ -26,6 +26,8 @@ _VISIBLE, _ROUNDED = 1e-6, 1e-11
 # At a jump the second difference of the changes is at least this fraction of the largest change, and this fraction of
 # that is left in the end; of a smooth function next to nothing is.
 _UNEVEN, _LEFT = 0.02, 0.01
+# Rows are looked at with this number of coordinates beside those of the state.
+_OTHERS = 2
 
 
 def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*batch"]:
@@ -56,12 +58,13 @@ def after_jumps(
 def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state just after a time at which prescribed rates jump: `M (u⁺ − u⁻) = Aᵀ Λ`, `ψ(t, q, u⁺) = 0`.
 
-    Where no rate jumps the impulses Λ are zero. Constraints are taken as ideal.
+    Where no rate jumps the impulses Λ are zero. Constraints are taken as ideal. Where Newton's method fails, as it can
+    for constraints that are not linear in the velocities, these are NaN.
 
     Source: L. A. Pars, "A Treatise on Analytical Dynamics", Heinemann, 1965 (impulsive motion).
     """
-    u, _ = project_velocities(system, t, y.q, y.u, system.inertia(t, y.q, y.u))
-    return dataclasses.replace(y, u=u)
+    u, failed = project_velocities(system, t, y.q, y.u, system.inertia(t, y.q, y.u))
+    return dataclasses.replace(y, u=jnp.where(failed, jnp.nan, u))
 
 
 class Jump(NamedTuple):
@@ -81,6 +84,11 @@ def find_jumps(
     Each row is looked at between each two neighbouring `restarts`. Where its changes in equal intervals are least even
     is followed into the parts where they remain so, again and again: a smooth function becomes even, one that jumps
     does not. At most one jump of a row is found between two restarts.
+
+    Coordinates are the same at all times. An angle's row wraps where the prescribed angle is half a turn away from
+    theirs, and its rates jump there. With other coordinates it does so at other times, and what is prescribed jumps at
+    the same ones: so only what is uneven with all of several coordinates counts. Kinks of an angle in space that makes
+    a turn in fewer than about 20 intervals may so be missed.
     """
     dtype = q.dtype
     first, last = sorted((np.asarray(t0, dtype), np.asarray(t1, dtype)))
@@ -107,9 +115,20 @@ def find_jumps(
 
 
 def _prescribed(system, q, t):
-    """What ψ and A have where nothing moves."""
+    """What ψ and A have where nothing moves, with the coordinates and with others."""
     rest = jnp.zeros(system.nu, q.dtype)
-    return jnp.concatenate([system.velocity_residual(t, q, rest), system.acceleration_residual(t, q, rest, rest)])
+    shifts = np.random.default_rng(0).standard_normal((_OTHERS, q.size)).astype(q.dtype)
+
+    def rows(shift):
+        at = system.normalize(q + system.coordinate_scale() * shift)
+        return jnp.concatenate([system.velocity_residual(t, at, rest), system.acceleration_residual(t, at, rest, rest)])
+
+    return jax.vmap(rows)(np.concatenate([np.zeros_like(shifts[:1]), shifts]))
+
+
+def _least(share):
+    """The least share with all coordinates, along the first axis; with some of them a row may not be defined."""
+    return jnp.nan_to_num(jnp.nanmin(share, axis=0))
 
 
 @eqx.filter_jit
@@ -117,14 +136,16 @@ def _least_smooth(system, q, starts, ends, count):
     """For all rows between all restarts how much they look like a jump, and the interval where they do so most."""
     share = jnp.arange(count + 1, dtype=q.dtype) / count
     grid = starts[:, None] + (ends - starts)[:, None] * share[None]
-    values = lax.map(jax.vmap(lambda t: _prescribed(system, q, t)), grid)
-    changes = jnp.diff(values, axis=1)
-    uneven = jnp.abs(jnp.diff(changes, n=2, axis=1))
-    largest = jnp.max(jnp.abs(changes), axis=1)
-    sizes = jnp.max(jnp.abs(values), axis=(0, 1))
-    visible = (largest > _VISIBLE * sizes[None]) & (largest > _ROUNDED * jnp.max(sizes))
-    likeness = jnp.where(visible, jnp.max(uneven, axis=1) / largest, 0.0)
-    return likeness, jnp.argmax(uneven, axis=1) + 1
+    values = lax.map(jax.vmap(lambda t: _prescribed(system, q, t), out_axes=1), grid)
+    # Coordinates, restarts, times, rows.
+    values = jnp.moveaxis(values, 1, 0)
+    changes = jnp.diff(values, axis=2)
+    largest = jnp.max(jnp.abs(changes), axis=2)
+    sizes = jnp.max(jnp.abs(values), axis=(1, 2))
+    visible = (largest > _VISIBLE * sizes[:, None]) & (largest > _ROUNDED * jnp.max(sizes, axis=1)[:, None, None])
+    uneven = jnp.abs(jnp.diff(changes, n=2, axis=2)) / jnp.where(visible, largest, jnp.inf)[:, :, None]
+    likeness = _least(uneven)
+    return jnp.max(likeness, axis=1), jnp.argmax(likeness, axis=1) + 1
 
 
 @eqx.filter_jit
@@ -135,17 +156,19 @@ def _followed(system, q, starts, ends, rows):
     def follow(a, b, row):
         def values(a, b):
             grid = a + (b - a) * share
-            return grid, jax.vmap(lambda t: _prescribed(system, q, t)[row])(grid)
+            return grid, jax.vmap(lambda t: _prescribed(system, q, t)[:, row], out_axes=1)(grid)
+
+        largest = jnp.max(jnp.abs(jnp.diff(values(a, b)[1])), axis=1, keepdims=True)
+        share_of = lambda changes: _least(jnp.abs(changes) / jnp.where(largest > 0, largest, jnp.inf))
 
         def narrow(_, ends):
             grid, own = values(*ends)
-            k = jnp.argmax(jnp.abs(jnp.diff(own, n=3)))
+            k = jnp.argmax(share_of(jnp.diff(own, n=3)))
             return grid[k], grid[k + 3]
 
-        largest = jnp.max(jnp.abs(jnp.diff(values(a, b)[1])))
         grid, own = values(*lax.fori_loop(0, _ROUNDS, narrow, (a, b)))
-        left = jnp.abs(jnp.diff(own))
+        left = share_of(jnp.diff(own))
         k = jnp.argmax(left)
-        return grid[k + 1], left[k] > _LEFT * largest
+        return grid[k + 1], left[k] > _LEFT
 
     return jax.vmap(follow)(starts, ends, rows)

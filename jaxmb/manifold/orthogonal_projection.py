@@ -37,6 +37,8 @@ _MEASURED = 0.6
 # The last measured correction of velocities that constraints are not linear in, relative to the speed, as a power of
 # eps: the error that is left is of the size of its square.
 _MEASURED_SPEED = 0.4
+# Corrections of velocities near constraints that are not linear in them, and those that follow from farther away.
+_FEW, _MORE = 3, 5
 
 
 def projector_constraints(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> "ProjectorConstraints":
@@ -170,23 +172,41 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
     u = y.u
     if system.velocity_rank > 0:
         scale = system.velocity_scale()
-        u, change = project_velocities(system, t, q, u, DiagonalInertia(1 / scale**2))
-        if not system.linear:
-            failed = failed | ~(_largest(change, scale) <= eps**_MEASURED_SPEED * _largest(u, scale))
+        u, failed_u = project_velocities(system, t, q, u, DiagonalInertia(1 / scale**2))
+        failed = failed | failed_u
     found = dataclasses.replace(y, q=q, u=u)
     return found, failed | ~_is_finite(found)
 
 
 def project_velocities(
     system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities, metric: AbstractInertia
-) -> tuple[Float[Array, "nu"], Float[Array, "nu"]]:
-    """The velocities that satisfy ψ after the smallest change in a metric, and the last correction."""
-    change = u
-    for _ in range(1 if system.linear else 3):
+) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
+    """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed, as it can
+    where ψ is not linear in them.
+    """
+
+    def corrected(u, _=None):
         jacobian = binding_velocities(system, t, q, u).selected(system.velocity_rank, system.velocity_scale())
         change = jacobian.projector(metric).displacement(-velocity_rows(system, t, q, u))
-        u = u + change
-    return u, change
+        return u + change, change
+
+    u, change = corrected(u)
+    if system.linear:
+        return u, jnp.array(False)
+    scale, small = system.velocity_scale(), jnp.finfo(u.dtype).eps ** _MEASURED_SPEED
+    for _ in range(_FEW - 1):
+        u, change = corrected(u)
+
+    def is_far(u, change):
+        return ~(_largest(change, scale) <= small * _largest(u, scale))
+
+    def go_on(u):
+        # Derivatives need all corrections, and a loop whose length is not known keeps none.
+        u, changes = lax.scan(corrected, u, length=_MORE)
+        return u, is_far(u, changes[-1])
+
+    far = is_far(u, change)
+    return lax.cond(far, go_on, lambda u: (u, far), u)
 
 
 def _is_finite(y: State) -> Bool[Array, ""]:

@@ -180,7 +180,10 @@ def reason_of_failure(system, result, t1, outcome: Outcome) -> str:
     for ahead in np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(t1, t - 1.0, t + 1.0) - t):
         wrong = system.not_finite(t + ahead, y.q + ahead * rates, y.u)
         if wrong:
-            return f"{text} Here at t = {float(t + ahead):.6g} {' and '.join(wrong)} is not finite."
+            return (
+                f"The motion came to t = {float(t):.6g} of {float(t1):.6g}: at t = {float(t + ahead):.6g} "
+                f"{' and '.join(wrong)} is not finite. With `throw=False` the motion up to there is kept."
+            )
     return text + about_coarse_times(system, t, y) if result == RESULTS.newton_failed else text
 
 

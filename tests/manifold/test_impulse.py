@@ -11,7 +11,7 @@ from driven_arm import AFTER, BEFORE, END, INERTIA, MASS, WHEN, A, B, G, driven_
 from scipy.integrate import solve_ivp
 
 import jaxmb as mb
-from jaxmb import planar
+from jaxmb import planar, spatial
 from jaxmb.manifold.impulse import find_jumps
 
 
@@ -239,6 +239,20 @@ def test_every_row_is_searched_between_all_restarts(two_driven, case):
         found = sorted({(float(jump.t), names[jump.row][0][-1]) for jump in jumps})
         # To the last digit, since a restart elsewhere would miss it.
         assert found == [(when, name) for name, when in expected]
+
+
+@pytest.mark.parametrize("turns, kinks", [(1.2, []), (8.0, []), (60.0, []), (300.0, []), (1.2, [0.7]), (8.0, [0.7])])
+def test_only_the_kink_of_turns_in_space_is_found(turns, kinks):
+    """Rows of angles in space wrap half a turn away, in rapid turns within each interval that is looked at."""
+    speed, later = 2 * np.pi * turns, 0.5 * len(kinks)
+    motion = lambda t, p: speed * (t + jnp.where(t < 0.7, 0.0, later * (t - 0.7)))
+    axis = {"axis": (0.0, 0.6, 0.8)}
+    joints = [
+        spatial.Revolute("hinge", "ground", "arm", point=(0.0, 0.0, 0.0), **axis),
+        spatial.Driver("drive", "ground", "arm", quantity="angle", motion=motion, **axis),
+    ]
+    system = mb.Scene([spatial.Body("arm", mass=1.0, inertia=(0.1, 0.2, 0.2))], joints=joints).compile()
+    assert sorted({float(jump.t) for jump in find_jumps(system, system.guess.q, 0.0, 1.0, [])}) == kinks
 
 
 def test_a_jump_between_announced_ones_is_warned_of(arm):

@@ -44,3 +44,26 @@ def test_the_field_changes_as_its_differences_say_in_every_direction(inertial):
     for k, unit in enumerate(np.eye(y.size)):
         change = (at(y + step * unit) - at(y - step * unit)) / (2 * step)
         np.testing.assert_allclose(exact[:, :, k], change, rtol=0, atol=1e-6 * np.max(np.abs(exact)))
+
+
+def test_velocities_far_from_constraints_that_are_not_linear_in_them():
+    """Three corrections bring them near, the others farther to rounding; derivatives are those of all corrections."""
+    system = mb.mechanisms.benenti().system
+    q = jnp.array([0.01, -0.01, 1.05, 0.04])
+    near, far = jnp.array([1.0, 2.0, 0.52, 1.01]), jnp.array([1.1, 1.9, -0.07, 0.97])
+    project = lambda u: mb.manifold.project(system, jnp.zeros(()), mb.State(q, u)).u
+
+    @jax.jit
+    @jax.vmap
+    def found(u):
+        return project(u), system.velocity_residual(0.0, q, project(u)), jax.jacfwd(project)(u), jax.jacrev(project)(u)
+
+    starts = jnp.stack([near, far])
+    u, residual, forward, reverse = found(starts)
+    np.testing.assert_allclose(residual, 0.0, atol=1e-14)
+    assert np.max(np.abs(u - starts)[1]) > 0.3
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-13)
+    step = 1e-5
+    for k, unit in enumerate(np.eye(4)):
+        change = (found(starts + step * unit[None])[0] - found(starts - step * unit[None])[0]) / (2 * step)
+        np.testing.assert_allclose(forward[:, :, k], change, rtol=0, atol=1e-9)
