@@ -98,7 +98,12 @@ def find_jumps(
     starts = np.append(first, np.nextafter(inside, np.array(np.inf, dtype)))
     ends = np.append(np.nextafter(inside, np.array(-np.inf, dtype)), last)
     count = max(_INTERVALS // starts.size, _FEWEST)
-    likeness, k = (np.asarray(x) for x in _least_smooth(system, q, starts, ends, count))
+    shifts = np.random.default_rng(0).standard_normal((_OTHERS, q.size)).astype(dtype)
+    shifts = np.concatenate([np.zeros_like(shifts[:1]), shifts])
+    each = [np.asarray(_unevenness(system, q, shift, starts, ends, count)) for shift in shifts]
+    # With some coordinates a row may not be defined.
+    uneven = np.nan_to_num(np.fmin.reduce(each))
+    likeness, k = np.max(uneven, axis=1), np.argmax(uneven, axis=1) + 1
     between, rows = np.nonzero(likeness > _UNEVEN)
     order = np.argsort(-likeness[between, rows], kind="stable")[:_PLACES]
     between, rows = between[order], rows[order]
@@ -109,65 +114,52 @@ def find_jumps(
     for n in range(0, rows.size, _AT_ONCE):
         several = slice(n, n + _AT_ONCE)
         own = [np.resize(x[several], _AT_ONCE) for x in (a.astype(dtype), b.astype(dtype), rows)]
-        times, jumps = (np.asarray(x)[: rows[several].size] for x in _followed(system, q, *own))
+        times, jumps = (np.asarray(x)[: rows[several].size] for x in _followed(system, q, shifts, *own))
         found += [Jump(t, int(row)) for t, jump, row in zip(times, jumps, rows[several], strict=True) if jump]
     return sorted(found)
 
 
-def _prescribed(system, q, t):
-    """What ψ and A have where nothing moves, with the coordinates and with others."""
-    rest = jnp.zeros(system.nu, q.dtype)
-    shifts = np.random.default_rng(0).standard_normal((_OTHERS, q.size)).astype(q.dtype)
-
-    def rows(shift):
-        at = system.normalize(q + system.coordinate_scale() * shift)
-        return jnp.concatenate([system.velocity_residual(t, at, rest), system.acceleration_residual(t, at, rest, rest)])
-
-    return jax.vmap(rows)(np.concatenate([np.zeros_like(shifts[:1]), shifts]))
-
-
-def _least(share):
-    """The least share with all coordinates, along the first axis; with some of them a row may not be defined."""
-    return jnp.nan_to_num(jnp.nanmin(share, axis=0))
+def _prescribed(system, q, shift, t):
+    """What ψ and A have where nothing moves, with coordinates that are shifted."""
+    q, rest = system.normalize(q + system.coordinate_scale() * shift), jnp.zeros(system.nu, q.dtype)
+    return jnp.concatenate([system.velocity_residual(t, q, rest), system.acceleration_residual(t, q, rest, rest)])
 
 
 @eqx.filter_jit
-def _least_smooth(system, q, starts, ends, count):
-    """For all rows between all restarts how much they look like a jump, and the interval where they do so most."""
+def _unevenness(system, q, shift, starts, ends, count):
+    """How much each row, between each two restarts, looks like a jump in each interval."""
     share = jnp.arange(count + 1, dtype=q.dtype) / count
     grid = starts[:, None] + (ends - starts)[:, None] * share[None]
-    values = lax.map(jax.vmap(lambda t: _prescribed(system, q, t), out_axes=1), grid)
-    # Coordinates, restarts, times, rows.
-    values = jnp.moveaxis(values, 1, 0)
-    changes = jnp.diff(values, axis=2)
-    largest = jnp.max(jnp.abs(changes), axis=2)
-    sizes = jnp.max(jnp.abs(values), axis=(1, 2))
-    visible = (largest > _VISIBLE * sizes[:, None]) & (largest > _ROUNDED * jnp.max(sizes, axis=1)[:, None, None])
-    uneven = jnp.abs(jnp.diff(changes, n=2, axis=2)) / jnp.where(visible, largest, jnp.inf)[:, :, None]
-    likeness = _least(uneven)
-    return jnp.max(likeness, axis=1), jnp.argmax(likeness, axis=1) + 1
+    values = lax.map(jax.vmap(lambda t: _prescribed(system, q, shift, t)), grid)
+    changes = jnp.diff(values, axis=1)
+    largest = jnp.max(jnp.abs(changes), axis=1)
+    sizes = jnp.max(jnp.abs(values), axis=(0, 1))
+    visible = (largest > _VISIBLE * sizes[None]) & (largest > _ROUNDED * jnp.max(sizes))
+    return jnp.abs(jnp.diff(changes, n=2, axis=1)) / jnp.where(visible, largest, jnp.inf)[:, None]
 
 
 @eqx.filter_jit
-def _followed(system, q, starts, ends, rows):
+def _followed(system, q, shifts, starts, ends, rows):
     """The times at which rows jump between others, and whether they do."""
     share = jnp.arange(_PARTS + 1, dtype=q.dtype) / _PARTS
 
     def follow(a, b, row):
         def values(a, b):
             grid = a + (b - a) * share
-            return grid, jax.vmap(lambda t: _prescribed(system, q, t)[:, row], out_axes=1)(grid)
+            at = lambda shift, t: _prescribed(system, q, shift, t)[row]
+            return grid, jax.vmap(lambda shift: jax.vmap(lambda t: at(shift, t))(grid))(shifts)
 
         largest = jnp.max(jnp.abs(jnp.diff(values(a, b)[1])), axis=1, keepdims=True)
-        share_of = lambda changes: _least(jnp.abs(changes) / jnp.where(largest > 0, largest, jnp.inf))
+        largest = jnp.where(largest > 0, largest, jnp.inf)
+        least = lambda changes: jnp.nan_to_num(jnp.nanmin(jnp.abs(changes) / largest, axis=0))
 
         def narrow(_, ends):
             grid, own = values(*ends)
-            k = jnp.argmax(share_of(jnp.diff(own, n=3)))
+            k = jnp.argmax(least(jnp.diff(own, n=3)))
             return grid[k], grid[k + 3]
 
         grid, own = values(*lax.fori_loop(0, _ROUNDS, narrow, (a, b)))
-        left = share_of(jnp.diff(own))
+        left = least(jnp.diff(own))
         k = jnp.argmax(left)
         return grid[k + 1], left[k] > _LEFT
 

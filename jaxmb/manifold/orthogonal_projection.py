@@ -181,8 +181,8 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
 def project_velocities(
     system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities, metric: AbstractInertia
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
-    """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed, as it can
-    where ψ is not linear in them.
+    """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed, as it
+    can where ψ is not linear in them.
     """
 
     def corrected(u, _=None):

@@ -44,12 +44,6 @@ def compile_for_tests():
         os.environ.update(options)
 
 
-def flags_to_run_long() -> dict[str, str]:
-    """The environment of a process of its own that runs longer than it compiles, as `jit_to_run_long`."""
-    quickly = os.environ.get("XLA_FLAGS") == QUICKLY
-    return {"XLA_FLAGS": QUICKLY.replace("level=0", "level=1")} if quickly else {}
-
-
 def jit_as_users_do(function: Callable) -> Callable:
     """`jax.jit` with XLA's own options.
 
