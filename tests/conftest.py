@@ -19,6 +19,8 @@ LONG = 2.5
 # How long tests took [s], by their ids, but for quick ones; null where one is long and has not been timed yet.
 DURATIONS = Path(__file__).parent / "durations.json"
 KEPT = 0.5
+# Where Linux lists the memory maps of this process, and with how many of them compiled programs are given back.
+MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
 
 
 def pytest_addoption(parser):
@@ -95,5 +97,17 @@ def pytest_configure(config):
 def _forget_programs():
     """Give back the memory maps of a module's compiled programs: a process may have 65530 of them and no more."""
     yield
+    _clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _forget_many_programs():
+    """The same within a module whose programs have many of them."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        _clear_caches()
+
+
+def _clear_caches():
     eqx.clear_caches()
     jax.clear_caches()
