@@ -103,6 +103,8 @@ def test_a_batch_whose_members_stop_at_other_times():
     np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12)
     # At rest the displacement grows with the square of the speed.
     np.testing.assert_allclose(slopes, [0.0, 1.0 / slow, 2.0 / slow, 1.0], rtol=1e-8, atol=1e-12)
+    reverse = jit_quickly(jax.vmap(jax.grad(end)))(speeds)
+    np.testing.assert_allclose(reverse, slopes, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("tan, time", [(0.29, None), (0.31, 0.7)])
