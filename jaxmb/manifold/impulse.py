@@ -127,7 +127,7 @@ def _prescribed(system, q, shift, t):
 
 @eqx.filter_jit
 def _unevenness(system, q, shift, starts, ends, count):
-    """How much each row, between each two restarts, looks like a jump in each interval."""
+    """How much each row looks like a jump in each interval, between all restarts."""
     share = jnp.arange(count + 1, dtype=q.dtype) / count
     grid = starts[:, None] + (ends - starts)[:, None] * share[None]
     values = lax.map(jax.vmap(lambda t: _prescribed(system, q, shift, t)), grid)

@@ -429,7 +429,7 @@ def test_what_only_bodies_have():
     for name in ("linear_momentum", "angular_momentum"):
         with pytest.raises(ValueError, match="Momentum is that of bodies"):
             getattr(motion, name)
-    with pytest.raises(ValueError, match=r"Unknown quantity 'q0.rat'; did you mean 'q0_rate'"):
+    with pytest.raises(ValueError, match=r"Unknown quantity 'q0\.rat'; did you mean 'q0_rate'"):
         motion.quantity("q0.rat")
 
 
