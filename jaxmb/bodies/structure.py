@@ -218,6 +218,9 @@ def _check_locked(system, joints, found):
     for bodies, own in _connected(system, parts):
         columns = system.layout.velocity_index[bodies].ravel()
         columns = np.sort(columns[columns < system.nu])
+        # Joints that close no loop say nothing of one another, and long chains of them have small singular values too.
+        if len(own) == len(bodies) and all(len(parts[p].bodies) == 2 for p in own):
+            continue
         # Where rows are fewer than columns, or some implied by others, the bodies move.
         if sum(np.sum(independent[parts[p].numbers]) for p in own) < len(columns):
             continue

@@ -72,9 +72,12 @@ class ProjectorConstraints(AbstractConstraints):
             step = fixed.cancel(system.velocity_residual(t, q, u))
             return u + step, _largest(step, scale) / speed
 
-        # Velocities and accelerations are known to rounding errors of all that adds up to them.
-        rounding = jnp.finfo(start.dtype).eps ** 0.5
-        u, _, failed_u = chord(turn, y.u, first=one, tol=tol, most=_ITERATIONS, rate=rate, rounding=rounding)
+        # Velocities and accelerations are known to rounding errors of all that adds up to them. Both equations are
+        # linear, so that corrections may be large: those of a body at rest are all that there is.
+        rounding, any_size = jnp.finfo(start.dtype).eps ** 0.5, jnp.inf
+        u, _, failed_u = chord(
+            turn, y.u, first=one, tol=tol, most=_ITERATIONS, rate=rate, rounding=rounding, largest=any_size
+        )
         inertia, force = system.inertia(t, q, u), system.force(t, q, u)
         given = inertia.solve(force)
         strength = _nonzero(_largest(given, scale) + _largest(near.udot, scale))
@@ -96,7 +99,7 @@ class ProjectorConstraints(AbstractConstraints):
             most=_ITERATIONS,
             rate=rate,
             rounding=100 * rounding,
-            largest=jnp.inf,
+            largest=any_size,
         )
         return RestoredState(q, u, udot, multipliers, iterations, failed | failed_u | failed_udot)
 

@@ -254,12 +254,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         control = self.tangent_control
         if control is None or tangents is None:
             return None, []
-        out, scales = [], []
-        for tangent, end in zip(tangents, along, strict=True):
-            peak = jnp.maximum(tangent.peak, control.largest(end.after))
-            out.append(Tangent(end.after, end.memory, peak))
-            scales.append(control.scale(self.tolerances.rtol, tangent, end.after))
-        return tuple(out), scales
+        scales = control.scales(self.tolerances.rtol, tangents, [end.after for end in along])
+        peaks = [jnp.maximum(x.peak, control.largest(end.after)) for x, end in zip(tangents, along, strict=True)]
+        return tuple(Tangent(end.after, end.memory, peak) for end, peak in zip(along, peaks, strict=True)), scales
 
     def first_sizes(
         self, flat: Float[Array, " n"], f: Float[Array, " n"], before: Any

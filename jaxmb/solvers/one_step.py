@@ -56,10 +56,10 @@ class WithTangents(WrappedSolver):
         out, along = pushed(step(with_loops(self._whole, "lax")), (terms, y0, state), along, step(self.inner))
         y1, error, dense_info, state, result = out
         tangents, errors = [], []
-        for tangent, (dy1, derror, _, memory, _) in zip(before, along, strict=True):
+        scales = self.control.scales(self.rtol, before, [ravel(dy1) for dy1, *_ in along])
+        for tangent, scale, (dy1, derror, _, memory, _) in zip(before, scales, along, strict=True):
             w = ravel(dy1)
             tangents.append(Tangent(w, memory, jnp.maximum(tangent.peak, self.control.largest(w))))
-            scale = self.control.scale(self.rtol, tangent, w)
             errors.append(ravel(error_of(derror)) / scale)
         error = map_error(lambda of_state: ErrorWithTangents(of_state, errors), error)
         return y1, error, dense_info, (state, tangents), result

@@ -18,8 +18,8 @@ class Block(eqx.Module):
     """A block of components of a state that are measured by the largest one among them.
 
     **Fields:** its `name`; `size`: the number of its components; `initial`: what the block counts as at the start of a
-    motion, in natural units of its components, where it is zero, and None for a block that counts as 1e-4 at least;
-    `rate_of`: the name of the block before it whose rate of change it is, or None.
+    motion, in natural units of its components, where it is zero but for rounding errors, and None for a block that
+    counts as 1e-4 at least; `rate_of`: the name of the block before it whose rate of change it is, or None.
     """
 
     name: str = eqx.field(static=True)
@@ -53,15 +53,18 @@ class RunningScales(eqx.Module):
     def start(self, y: Float[Array, " n"], f: Float[Array, " n"]) -> Float[Array, " groups"]:
         """The sizes at the start of a motion, from the state and its derivative."""
         sizes: dict[str, Array] = {}
+        eps = jnp.finfo(y.dtype).eps
         for block, size, rate in zip(self.blocks, self._largest(y), self._largest(f), strict=True):
             if block.rate_of is not None:
                 # From rest, a rate causes a motion of the size of the other block with this one.
                 ahead = jnp.sqrt(sizes[block.rate_of] * rate)
                 size = jnp.maximum(size, jnp.where(jnp.isfinite(ahead), ahead, 0.0))
             if block.initial is None:
-                sizes[block.name] = jnp.maximum(size, jnp.finfo(y.dtype).eps ** _LEAST)
+                sizes[block.name] = jnp.maximum(size, eps**_LEAST)
             else:
-                sizes[block.name] = jnp.where(size > 0, size, jnp.asarray(block.initial, y.dtype))
+                # Rounding errors of what constraints hold at rest are no size.
+                initial = jnp.asarray(block.initial, y.dtype)
+                sizes[block.name] = jnp.where(size > eps * initial, size, initial)
         return lax.stop_gradient(jnp.stack(list(sizes.values())))
 
     def grown(self, sizes: Float[Array, " groups"], y: Float[Array, " n"]) -> Float[Array, " groups"]:

@@ -12,6 +12,7 @@ solver's memory. The derivative of the error estimate is then the error estimate
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -31,6 +32,9 @@ _LOOSER, _FLOOR = 5.0, 0.01
 # relative to it where that is fainter still. (From 1e-12 the first steps are so short that modes of derivatives differ
 # by 1e-10 of rounding errors.)
 _FAINT = 1e-4
+# The rounding errors of a tangent, at most, in units of its largest entry so far and of eps. Of the tangents of a body
+# that constraints hold or drive nothing else is left.
+_ROUNDING = 100.0
 
 
 class TangentControl(eqx.Module):
@@ -59,9 +63,14 @@ class TangentControl(eqx.Module):
         random = np.random.default_rng(0)
         entries = random.choice([-1.0, 1.0], self.units.size) * random.uniform(0.5, 1.0, self.units.size)
         excited = self.units * jnp.asarray(entries, self.units.dtype)
+        return tuple(size * excited for size in self.start_sizes)
+
+    @property
+    def start_sizes(self) -> tuple[float, ...]:
+        """The size of each start, in units, before it is put on constraints."""
         if self.direction is None:
-            return (excited,)
-        return (excited, _FAINT * excited) if self.excites else (_FAINT * excited,)
+            return (1.0,)
+        return (1.0, _FAINT) if self.excites else (_FAINT,)
 
     @property
     def directions(self) -> tuple[PyTree, ...]:
@@ -93,12 +102,18 @@ class TangentControl(eqx.Module):
         groups = [jnp.full(b - a, jnp.max(relative[a:b], initial=0.0), w.dtype) for a, b in ends_of(self.blocks)]
         return self.units * jnp.concatenate(groups)
 
-    def scale(self, rtol: Any, tangent: "Tangent", after: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The error tolerated in each component of a tangent in a step that ends with `after`."""
+    def scales(
+        self, rtol: Any, tangents: Sequence["Tangent"], afters: Sequence[Float[Array, " n"]]
+    ) -> list[Float[Array, " n"]]:
+        """The errors tolerated in the components of tangents in a step that ends with `afters`."""
+        return [self._scale(rtol, *own) for own in zip(tangents, afters, self.start_sizes, strict=True)]
+
+    def _scale(self, rtol, tangent, after, start_size):
         after = jnp.where(jnp.isnan(after), 0.0, jnp.abs(after))
-        size = jnp.maximum(jnp.abs(tangent.w), after) + _FLOOR * jnp.maximum(tangent.peak, self.largest(after))
-        # A direction that has had no effect yet has no size.
-        return _LOOSER * rtol * (size + self.units * jnp.finfo(after.dtype).eps ** 2)
+        peak = jnp.maximum(tangent.peak, self.largest(after))
+        size = jnp.maximum(jnp.abs(tangent.w), after) + _FLOOR * peak
+        largest = jnp.maximum(start_size, jnp.max(peak / self.units, initial=0.0))
+        return jnp.maximum(_LOOSER * rtol * size, _ROUNDING * jnp.finfo(after.dtype).eps * largest * self.units)
 
 
 class Tangent(eqx.Module):

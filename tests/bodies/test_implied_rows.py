@@ -104,6 +104,15 @@ def test_a_four_bar_near_its_flat_pose_is_accepted():
     assert system.velocity_rank == 8
 
 
+def test_a_long_beam_of_welded_bodies_is_accepted():
+    """Joints that close no loop are not redundant, though the rows of many of them are nearly dependent."""
+    bodies = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, position=(k + 0.5, 0.0)) for k in range(40)]
+    ends = ["ground", *(body.name for body in bodies)]
+    welds = [planar.Fixed(f"weld{k}", ends[k], ends[k + 1], point=(float(k), 0.0)) for k in range(40)]
+    system = mb.Scene(bodies, joints=welds, forces=[mb.Gravity((0.0, -9.81))]).compile()
+    assert system.velocity_rank == 120
+
+
 # Components of many rows, without dense matrices
 
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_quickly
 
 import jaxmb as mb
 from jaxmb import planar
@@ -174,6 +175,29 @@ def test_parameters_of_constraints_with_steps_that_are_projected():
         assert steps < 12
     whole = jax.jit(end, static_argnums=(1, 2, 3))
     np.testing.assert_allclose(jax.grad(lambda x: whole(x, "Dopri8", 1e-8, False)[0])(0.0), exact, rtol=1e-6)
+
+
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
+def test_a_body_that_is_held(solver):
+    """Of its tangents constraints leave nothing but rounding, which steps do not resolve."""
+    weld = planar.Fixed("weld", "ground", "plate", point_a=(0.2, 0.1), point_b=(-0.3, 0.1))
+    plate = planar.Body("plate", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    system = mb.Scene([plate], joints=[weld], forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+    def end(angle):
+        changed = mb.with_parameters(system, {"weld.angle": angle})
+        start = mb.assemble(changed, throw=False)
+        options = {"manifold": mb.manifold.Projection(), "solver": SOLVERS[solver]}
+        sol = mb.simulate(changed, start, t1=0.2, rtol=1e-6, throw=False, **options)
+        return sol.ys.q[-1], sol.stats["num_steps"]
+
+    angles = jnp.linspace(-1.0, 1.0, 40)
+    derivative = lambda angle: jax.jvp(end, (angle,), (jnp.ones(()),))
+    (q, steps), (slope, _) = jit_quickly(jax.vmap(derivative))(angles)
+    c, s = jnp.cos(angles), jnp.sin(angles)
+    np.testing.assert_allclose(q, jnp.stack([0.2 + 0.3 * c + 0.1 * s, 0.1 + 0.3 * s - 0.1 * c, angles], -1), atol=1e-12)
+    np.testing.assert_allclose(slope, jnp.stack([-0.3 * s + 0.1 * c, 0.3 * c + 0.1 * s, jnp.ones(40)], -1), atol=1e-9)
+    assert jnp.max(steps) < 30
 
 
 def test_controls_that_are_zero():
