@@ -5,7 +5,6 @@ Each stands in a small scene of its own, where gravity and a spring move it.
 """
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -40,13 +39,17 @@ SOON = [pytest.param(name, marks=[pytest.mark.long] * name.startswith("spatial")
 # What is tested
 
 
-@functools.cache
-def programs(name):
-    """A motion and its forward derivative with respect to a parameter of the part, and its reverse derivative.
+@pytest.fixture(scope="module")
+def programs(request):
+    """A motion and its forward derivative with respect to a parameter of the part, its reverse derivative, and the
+    finest tolerance of both.
 
-    Both are functions of a number that is added to the parameter, in its own size, and of the tolerance.
+    They are functions of a number that is added to the parameter, in its own size, and of the tolerance. Tests of one
+    part follow one another, so that its programs need not be kept beside those of all others.
     """
-    example = EXAMPLES[name]
+    example = EXAMPLES[request.param]
+    # At finer ones `Dopri8` follows the rounding errors of a driver's accelerations with ever shorter steps.
+    finest = 1e-11 if request.param == "spatial: Driver" else 1e-12
     system, parameter = compiled(example), f"{example.part.name}.{example.parameter}"
     value = mb.parameters(system)[parameter]
     size = max(float(np.max(np.abs(value))), 0.1)
@@ -64,13 +67,13 @@ def programs(name):
     def forward(share, rtol):
         return jax.jvp(lambda x: end(x, rtol), (share,), (jnp.ones(()),), has_aux=True)
 
-    return forward, jax.jit(jax.grad(lambda share, rtol: end(share, rtol)[0]))
+    return forward, jax.jit(jax.grad(lambda share, rtol: end(share, rtol)[0])), finest
 
 
-@pytest.mark.parametrize("name", SOON)
-def test_motion_and_its_derivative(name):
+@pytest.mark.parametrize("programs", SOON, indirect=True)
+def test_motion_and_its_derivative(programs):
     """The state stays on the constraints, and the derivative is that of central differences."""
-    forward, _ = programs(name)
+    forward, _, finest = programs
     still = jnp.zeros(())
     _, _, (broken, energy) = forward(still, 1e-6)
     for residual in broken:
@@ -81,16 +84,15 @@ def test_motion_and_its_derivative(name):
     # A parameter without effect would pass the rest.
     assert abs(derivative) > 1e-6
     h = 1e-3
-    # At this tolerance `Dopri8` follows the rounding errors of a driver's accelerations with ever shorter steps.
-    value = lambda s: forward(still + s, 1e-11 if name == "spatial: Driver" else 1e-12)[0]
+    value = lambda s: forward(still + s, finest)[0]
     difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
     np.testing.assert_allclose(derivative, difference, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_reverse_derivative(name):
-    forward, reverse = programs(name)
+@pytest.mark.parametrize("programs", EXAMPLES, indirect=True)
+def test_reverse_derivative(programs):
+    forward, reverse, _ = programs
     still = jnp.zeros(())
     np.testing.assert_allclose(reverse(still, 1e-9), forward(still, 1e-9)[1], rtol=1e-9, atol=1e-10)
 
