@@ -178,4 +178,4 @@ def test_as_a_module():
     """It is no error if the program that reads the output ends before it has read all."""
     command = f"{sys.executable} -m jaxmb help | head -1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("jaxmb help NAME") and done.stderr == ""
+    assert done.stdout.startswith("`jaxmb help NAME`") and done.stderr == ""
