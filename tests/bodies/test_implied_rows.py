@@ -104,6 +104,17 @@ def test_a_four_bar_near_its_flat_pose_is_accepted():
     assert system.velocity_rank == 8
 
 
+def test_three_rockers_that_lock_are_refused():
+    """They are parallel but for one pin, which is a millimetre beside its place."""
+    bodies = [planar.Body(f"rocker{k}", mass=1.0, inertia=0.1, position=(k, 0.5)) for k in range(3)]
+    bodies.append(planar.Body("platform", mass=1.0, inertia=0.1, position=(1.0, 1.0)))
+    feet, heads = [(0.0, 0.0), (1.001, 0.0), (2.0, 0.0)], [(float(k), 1.0) for k in range(3)]
+    joints = [planar.Revolute(f"foot{k}", "ground", f"rocker{k}", point=feet[k]) for k in range(3)]
+    joints += [planar.Revolute(f"head{k}", f"rocker{k}", "platform", point=heads[k]) for k in range(3)]
+    with pytest.raises(ValueError, match=r"rocker0, .*platform cannot move: .*foot1.* leave no degree of freedom"):
+        mb.Scene(bodies, joints=joints).compile()
+
+
 def test_a_long_beam_of_welded_bodies_is_accepted():
     """Joints that close no loop are not redundant, though the rows of many of them are nearly dependent."""
     bodies = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, position=(k + 0.5, 0.0)) for k in range(40)]

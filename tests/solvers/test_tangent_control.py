@@ -198,6 +198,8 @@ def test_a_body_that_is_held(solver):
     np.testing.assert_allclose(q, jnp.stack([0.2 + 0.3 * c + 0.1 * s, 0.1 + 0.3 * s - 0.1 * c, angles], -1), atol=1e-12)
     np.testing.assert_allclose(slope, jnp.stack([-0.3 * s + 0.1 * c, 0.3 * c + 0.1 * s, jnp.ones(40)], -1), atol=1e-9)
     assert jnp.max(steps) < 30
+    reverse = jit_quickly(jax.vmap(jax.jacrev(lambda angle: end(angle)[0])))(angles)
+    np.testing.assert_allclose(reverse, slope, atol=1e-12)
 
 
 def test_controls_that_are_zero():
