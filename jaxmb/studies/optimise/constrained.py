@@ -98,7 +98,7 @@ def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: 
     """
     here, left, ended, message = start, limit, False, ""
     for number in range(1, _RUNS + 1):
-        size = _size(here)
+        size = objective_size(here)
         spent, well, how = run(here, size, left, number)
         left -= max(spent, 1)
         new = trials.best
@@ -155,7 +155,7 @@ def _one_sided(trials: Trials, unit: float, sizes: np.ndarray):
     return values, slopes, np.concatenate([equal[lower], np.zeros(upper.size, bool)])
 
 
-def _size(trial: Trial) -> float:
+def objective_size(trial: Trial) -> float:
     """The size of the objective, or of its change where parameters change by their scales, if that is larger."""
     size = max(abs(float(trial.rows[0])), float(np.max(np.abs(trial.jacobian[0]), initial=0.0)))
     return size if size > 0 else 1.0

@@ -14,7 +14,7 @@ from ...parts.names import names_arguments
 from ...system import AbstractSystem
 from ...system.design import Bounds
 from ...system.quantities import component_names
-from .constrained import multipliers, slsqp, trust_constr
+from .constrained import multipliers, objective_size, slsqp, trust_constr
 from .evaluation import (
     Limits,
     Program,
@@ -33,6 +33,9 @@ _LOCAL = 4
 
 # Gradients below this, relative to that at the start, are those of an optimum.
 _BALANCED = 1e-3
+
+# How far beside the result a leap of the objective is looked for, in units of the scales of parameters.
+_BESIDE = 1e-5
 
 # Lines of the log that are printed.
 _FIRST, _LAST = 3, 9
@@ -87,8 +90,8 @@ class Optimum:
     - `iterations`: the log of the local optimisation that gave the result; `trials`: how often the function was
         differentiated for it, of which `failed` trials were rejected.
     - `attempts`: all local optimisations, the best first, if there were several.
-    - `success`: whether the method converged, at no edge beyond which trials fail, and all constraints hold, to 1e-6 of
-        the bound, or where it is zero of their size; `message`: how it ended.
+    - `success`: whether the method converged, at no edge beyond which trials fail or the objective leaps up, and all
+        constraints hold, to 1e-6 of the bound, or where it is zero of their size; `message`: how it ended.
     - `derivatives`: the mode, `"forward"` or `"reverse"`.
     """
 
@@ -249,6 +252,12 @@ def optimise(
     stuck = trials.failed > 0 and np.max(np.abs(unbalanced), initial=0.0) > _BALANCED * slope
     if stuck:
         message = f"{message}; trials fail where the objective decreases: constrain a margin from there"
+    elif ok and (beside := _leap(program, trials, unbalanced)) is not None:
+        stuck = True
+        message = (
+            f"{message}; beside the result the objective leaps to {beside:.6g}, where its gradient promises less: "
+            "constrain a margin from there, or, where a mechanism is assembled, give a guess closer to the branch"
+        )
     if spent:
         message = f"{message}; {spent} trials led from the start, which failed, to one that does not"
     if trials.violation(best) > HOLDS:
@@ -274,6 +283,22 @@ def optimise(
         message=message,
         derivatives="forward" if program.forward else "reverse",
     )
+
+
+def _leap(program: Program, trials: Trials, unbalanced: np.ndarray) -> float | None:
+    """The objective beside the best trial, against its gradient, if it rises there by far more than any slope explains,
+    as where a mechanism is assembled on another branch; without an evaluation where the gradient is balanced.
+    """
+    best = trials.best
+    length = float(np.linalg.norm(unbalanced))
+    if length <= _BALANCED * objective_size(best):
+        return None
+    beside = evaluate(program, np.clip(best.z - _BESIDE * unbalanced / length, *trials.box))
+    if not beside.good:
+        return None
+    slope = max(np.linalg.norm(trial.jacobian[0]) for trial in (best, beside))
+    leaps = beside.rows[0] - best.rows[0] > 10 * slope * _BESIDE
+    return float(beside.rows[0]) if leaps else None
 
 
 def _check(method: Any, limited: Limits, starts: Any, local: Any, max_iterations: Any, tol: Any) -> None:

@@ -1,5 +1,7 @@
 """Designs as users write them: four-bar paths from the literature, a ride, a camber curve; all start infeasible."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +65,13 @@ def four_bar(lengths, scale, angle):
     return mb.design(mechanism.system, variables, points), mechanism.state
 
 
+def moved(state, place, tilt):
+    """A state of bodies in the plane, moved as if they were one."""
+    x, y, angle = jnp.reshape(state.q, (-1, 3)).T
+    poses = jnp.stack([*(turned(tilt, (x, y)) + place[:, None]), angle + tilt], axis=-1)
+    return dataclasses.replace(state, q=jnp.ravel(poses))
+
+
 def path_error(system, state, target, v, angles):
     """Squared distances of the coupler's point from a target at crank angles, one after the other, their sum and the
     root of their mean; the gap; and the sine of the angle between coupler and rocker, which is zero where the linkage
@@ -78,7 +87,9 @@ def path_error(system, state, target, v, angles):
         transmission = jnp.abs(jnp.sin(new.q[8] - new.q[5]))
         return ahead, (new.q[3:6], mb.assembly_gap(system, guess, fix=fix), transmission)
 
-    _, (coupler, gap, transmission) = jax.lax.scan(turn, state, angles + v.get("tilt", jnp.zeros(())))
+    tilt = v.get("tilt", jnp.zeros(()))
+    first = moved(state, v.get("place", jnp.zeros(2)), tilt)
+    _, (coupler, gap, transmission) = jax.lax.scan(turn, first, angles + tilt)
     point = jnp.stack([v["point"][0] - 0.5 * v["coupler"], v["point"][1]])
     path = coupler[:, :2] + jax.vmap(turned, (0, None))(coupler[:, 2], point)
     error = jnp.sum((path - target) ** 2)

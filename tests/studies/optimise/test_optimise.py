@@ -198,6 +198,18 @@ def test_trials_that_fail_shorten_the_step(method):
     assert not best.success
 
 
+def test_an_objective_that_leaps_up_is_no_optimum():
+    """As where a mechanism is assembled on another branch: SciPy's method calls it a success."""
+    leaping = lambda v: jnp.where(v["x"] < 0.5, (v["x"] - 1.0) ** 2, 40.0 + v["x"])
+    best = mb.optimise(leaping, {"x": -3.0})
+    assert 0.499 < best.parameters["x"] < 0.5
+    assert not best.success and "leaps to 40.5" in best.message
+    # A kink is an optimum.
+    best = mb.optimise(lambda v: jnp.abs(v["x"] - 0.5) + 1e-3 * v["x"], {"x": -3.0})
+    np.testing.assert_allclose(best.parameters["x"], 0.5, atol=1e-6)
+    assert best.success
+
+
 def test_a_simulation_that_throws_is_a_trial_that_failed():
     import equinox as eqx
 
