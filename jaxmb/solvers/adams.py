@@ -249,10 +249,11 @@ class Adams(AbstractMultistep):
         step, along = self.attempted(terms, t1, before, y0, args, state)
         after = step.after
 
+        h = (t1 - history.mesh[0]).astype(dtype)
         failed = step.first.failed | step.second.failed
         started = self._started(state.sizes, before, step.first.f)
         state = eqx.tree_at(lambda state: state.sizes, state, started, is_leaf=lambda x: x is None)
-        scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
+        scale = self.tolerances.of_step(before, after, h, state.sizes, _FINEST)
         sizes = self._sizes(terms, y0, scale, step.errors, state.chart)
         # In the first step the state changes at most by its own size, or by the tolerance.
         reached = sizes[2] / jnp.maximum(sizes[0], 1)
@@ -277,7 +278,6 @@ class Adams(AbstractMultistep):
         retry = jnp.where(lost, jnp.asarray(-1.0, dtype), estimate.retry)
         estimate = eqx.tree_at(lambda e: (e.growth, e.retry), estimate, (growth, retry))
         y1 = unravel_like(y0, after)
-        h = (t1 - history.mesh[0]).astype(dtype)
         new_state = AdamsState(
             history=step.history,
             order=order + change,
@@ -308,7 +308,7 @@ class Adams(AbstractMultistep):
     def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
         if state.stiffness is None:
             return None
-        scale = self.tolerances.of_step(before, after, state.sizes, _FINEST)
+        scale = self.tolerances.of_step(before, after, h, state.sizes, _FINEST)
         size = lambda change: self.weighted_norm(lax.stop_gradient(change), scale, like)
         correction = size(after - predicted), size(second - first)
         change = size(after - before), size(second - state.history.differences[0])

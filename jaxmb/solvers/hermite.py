@@ -260,7 +260,7 @@ class Hermite(AbstractMultistep):
 
     def attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
         begun = self._begun(terms, t1, before, like, args, state)
-        scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
+        scale = self._tolerated(t1, before, state)
         latest = before, state.slope[-before.size :]
         equation, scale, predicted, latest, matrix = freeze(
             (begun.equation, scale, begun.predicted, latest, state.matrix)
@@ -350,7 +350,7 @@ class Hermite(AbstractMultistep):
         dtype = before.dtype
         h = (step_end(history.mesh, t1) - history.mesh[0]).astype(dtype)
         free = free_components(terms, before, state.chart)
-        scale = self.tolerances.of_step(before, before, state.sizes, _FINEST)
+        scale = self._tolerated(t1, before, state)
         step, along = self.attempted(terms, t1, before, y0, args, state)
         newton = freeze(step.newton)
         failed = ~newton.converged | step.broke | ~is_resolved(h, newton.matrix.spectrum)
@@ -405,6 +405,11 @@ class Hermite(AbstractMultistep):
             tangents=tangents,
         )
         return y1, estimate, self.dense_info(step, y0, k), new_state, failed
+
+    def _tolerated(self, t1, before, state: HermiteState) -> Float[Array, " n"]:
+        """The errors tolerated in the step, by the state that it starts from: those of its iterations as well."""
+        h = step_end(state.history.mesh, t1) - state.history.mesh[0]
+        return self.tolerances.of_step(before, before, h, state.sizes, _FINEST)
 
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
         """Weighted norms of the errors of the formulas with these numbers of points.

@@ -162,7 +162,7 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         state, sizes, least = controller_state.inner, controller_state.sizes, controller_state.least
         of_state, of_tangents = (y_error.error, y_error.of_tangents) if self.tangents else (y_error, [])
         scale = Tolerances(self.rtol, self.atol, MultistepNorm(self.norm, self.scales)).scale(
-            ravel(y0), ravel(y1_candidate), sizes
+            ravel(y0), ravel(y1_candidate), t1 - t0, sizes
         )
         errors = [self.norm(unravel_like(y0, error)) for error in (ravel(of_state) / scale, *of_tangents)]
         # What is left to the controller is one number in units of the tolerance.

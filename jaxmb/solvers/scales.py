@@ -6,12 +6,16 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 # What a block counts as at least, in its natural units, as a power of eps: 1e-4 in double precision. Much more hides a
 # small motion that starts at zero; much less asks for the digits of rounding errors.
 _LEAST = 0.25
+# What a step at rest moves by at most, in natural units, as a power of eps: 2e-14 in double precision. Rounding errors
+# of a chain of many bodies add up to nearly that; much more hides slow motions.
+_REST = 0.875
 
 
 class Block(eqx.Module):
@@ -74,6 +78,19 @@ class RunningScales(eqx.Module):
     def of_components(self, sizes: Float[Array, " groups"]) -> Float[Array, " n"]:
         """The size of each component."""
         return self.units * jnp.concatenate([jnp.full(block.size, sizes[k]) for k, block in enumerate(self.blocks)])
+
+    def at_rest(self, y: Float[Array, " n"], h: Any) -> Float[Array, " n"]:
+        """The errors of rates that move nothing in a step of length h to y; zero for all else.
+
+        Where forces balance, accelerations are the rounding errors of these forces, and no step is so short that its
+        error estimate is not made of them. What rates are there does not matter as long as nothing moves. The errors
+        fall with the square of what the step does move, to far below those of any tolerance.
+        """
+        least = float(jnp.finfo(y.dtype).eps) ** _REST
+        moved = jnp.abs(h) * jnp.stack(self._largest(y))
+        errors = least / jnp.abs(h) * jnp.minimum((least / moved) ** 2, 1.0)
+        is_rate = np.array([block.rate_of is not None for block in self.blocks])
+        return lax.stop_gradient(self.of_components(jnp.where(is_rate, errors, 0.0)))
 
     def rate(self, sizes: Float[Array, " groups"]) -> Float[Array, ""]:
         """The size of the first block of rates over that of the block whose rates they are [1/s]."""

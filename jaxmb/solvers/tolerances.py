@@ -67,22 +67,24 @@ class Tolerances(eqx.Module):
         """What the absolute tolerance is relative to."""
         return self.norm.scales
 
-    def scale(self, y0: Array, y1: Array, sizes: Array | None) -> Array:
-        """The tolerance of each component over a step from `y0` to `y1`; `sizes` are those of the running scales so
-        far.
+    def scale(self, y0: Array, y1: Array, h: Any, sizes: Array | None) -> Array:
+        """The tolerance of each component over a step of length h from `y0` to `y1`; `sizes` are those of the running
+        scales so far. With these, a machine at rest is not resolved into its rounding errors.
         """
         # A step that ends where the vector field is undefined is measured at its start.
         y1 = jnp.where(jnp.isnan(y1), y0, y1)
         with jax.numpy_dtype_promotion("standard"):
             absolute = absolute_tolerance(self.atol, self.scales, sizes)
             scale = absolute + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+            if self.scales is not None:
+                scale = jnp.maximum(scale, self.scales.at_rest(y1, h))
         return jax.lax.stop_gradient(scale.astype(y0.dtype))
 
-    def of_step(self, y0: Array, y1: Array, sizes: Array | None, finest: float = 0.0) -> Array:
-        """The error tolerated in each component in one step of a multistep method.
+    def of_step(self, y0: Array, y1: Array, h: Any, sizes: Array | None, finest: float = 0.0) -> Array:
+        """The error tolerated in each component in one step of a multistep method, from `y0` to `y1` in a time h.
 
         `finest`: the smallest relative one, in units of the machine precision, where rounding dominates the estimates.
         """
         with jax.numpy_dtype_promotion("standard"):
             share = jnp.clip(finest * float(jnp.finfo(y0.dtype).eps) / self.rtol, _SHARE, 1.0)
-        return jax.lax.stop_gradient(share.astype(y0.dtype)) * self.scale(y0, y1, sizes)
+        return jax.lax.stop_gradient(share.astype(y0.dtype)) * self.scale(y0, y1, h, sizes)

@@ -156,7 +156,8 @@ class TwoStep(solvers.AbstractMultistep):
         before = solvers.ravel(y0)
         step, along = self.attempted(terms, t1, before, y0, args, state)
         tangents, scales = self.tangents_after(state.tangents, along)
-        errors = [((step.after - step.predicted) / 6, self.tolerances.of_step(before, step.after, state.sizes))]
+        tolerated = self.tolerances.of_step(before, step.after, t1 - state.ts[0], state.sizes)
+        errors = [((step.after - step.predicted) / 6, tolerated)]
         errors += [((end.after - end.predicted) / 6, own) for end, own in zip(along, scales, strict=True)]
         size = jnp.max(jnp.stack([self.weighted_norm(error, scale, y0) for error, scale in errors]))
         size = jnp.where(step.failed, jnp.inf, size)
