@@ -144,6 +144,16 @@ class AbstractGroup(eqx.Module):
         """The part of a group of one without the leading axis; of others a part with that axis on every number."""
         return self.group.part.named(name)
 
+    def given_in_time(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts *shape"]:
+        """What functions of time give in parts that have them, while nothing moves."""
+        space = self.group.layout.space
+
+        def single(at, x, v):
+            part = at(t)
+            return part.given_in_time(space, *part.seen(space, x, v), t)
+
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
 
 class BodyGroup(AbstractGroup):
     """Stacked bodies."""

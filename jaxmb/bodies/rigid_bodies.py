@@ -461,6 +461,19 @@ class RigidBodySystem(AbstractSystem):
     def with_signals(self, signals):
         return dataclasses.replace(self, **with_signals(self._groups, signals))
 
+    @property
+    def of_time(self):
+        return any(group.group.part.of_time for group in self._acting)
+
+    def given_in_time(self, t, q, u):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        own = [g.given_in_time(t, poses, velocities) for g in self._acting if g.group.part.of_time]
+        return jnp.concatenate([given.ravel() for given in own])
+
+    @property
+    def _acting(self):
+        return (*self.constraints, *self.velocity_constraints, *self.forces)
+
     def describe(self):
         return describe_scene(self)
 

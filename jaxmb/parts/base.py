@@ -281,6 +281,8 @@ class AbstractLink(AbstractActor):
     bodies = _Bodies()
     path_kind: ClassVar[PathKind] = "rod"
 
+    # Whether it has a function of time, in which steps look for pulses, by `given_in_time`.
+    of_time: ClassVar[bool] = False
     # Names of the coordinates that are angles.
     angles: ClassVar[frozenset[str]] = frozenset()
     # Names of the coordinates that measure how the bodies slide over each other, where they do in two directions.
@@ -295,6 +297,10 @@ class AbstractLink(AbstractActor):
         """Hook: the part's own coordinates by name, numbers or vectors, such as the `angle` of a joint."""
         del space, poses
         return {}
+
+    def given_in_time(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Array:
+        """Hook: what the function of time gives while nothing moves, of a part that is `of_time`."""
+        raise NotImplementedError
 
     def coordinates_at(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
         """The coordinates at these poses of the bodies."""

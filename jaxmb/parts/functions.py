@@ -5,7 +5,7 @@ unless the body was given `centre=`, or the part names a `Frame` in its place.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -54,6 +54,14 @@ class Constraint(AbstractConstraint):
     parameters: fields.Numbers = fields.numbers()
     rheonomic: bool = eqx.field(static=True, default=True, kw_only=True)
 
+    @property
+    def of_time(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.rheonomic
+
+    def given_in_time(self, space, poses, velocities, t):
+        del velocities
+        return self.residual(space, poses, t)
+
     def residual(self, space, poses, t):
         value = self.function(poses[:, : space.pose_size], t, self.parameters)
         return _shaped(self, value, (self.rows,))
@@ -83,6 +91,10 @@ class VelocityConstraint(AbstractVelocityConstraint):
     parameters: fields.Numbers = fields.numbers()
     linear: bool = eqx.field(static=True, default=False, kw_only=True)
     homogeneous: bool = eqx.field(static=True, default=False, kw_only=True)
+    of_time: ClassVar[bool] = True
+
+    def given_in_time(self, space, poses, velocities, t):
+        return self.residual(space, poses, velocities, t)
 
     def residual(self, space, poses, velocities, t):
         value = self.function(poses[:, : space.pose_size], velocities, t, self.parameters)
@@ -118,10 +130,14 @@ class Force(AbstractPotentialForce):
     function: Callable[..., Array] = fields.function()
     parameters: fields.Numbers = fields.numbers()
     potential: Callable[..., Array] | None = fields.function(default=None, kw_only=True)
+    of_time: ClassVar[bool] = True
 
     @property
     def conservative(self):
         return self.potential is not None
+
+    def given_in_time(self, space, poses, velocities, t):
+        return self.wrenches(space, poses, velocities, t)
 
     def wrenches(self, space, poses, velocities, t):
         value = self.function(poses[:, : space.pose_size], velocities, t, self.parameters)

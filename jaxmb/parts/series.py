@@ -16,6 +16,13 @@ from ..solvers.closures import opened
 from .fields import as_jax, as_parameter
 
 Interpolation = Literal["linear", "cubic", "held"]
+# At how many times a function is looked at.
+_SAMPLES = 513
+
+
+def sample_times(t0: Scalar, t1: Scalar) -> Float[Array, "n"]:
+    """The times [s] between two others at which functions of time are looked at, ascending."""
+    return jnp.linspace(jnp.minimum(t0, t1), jnp.maximum(t0, t1), _SAMPLES)
 
 
 class AbstractSignal(eqx.Module):
@@ -28,6 +35,10 @@ class AbstractSignal(eqx.Module):
     @abc.abstractmethod
     def break_times(self, *, of_rates: bool) -> np.ndarray:
         """Times [s] at which the value jumps; with `of_rates` also those at which its rate does."""
+
+    @abc.abstractmethod
+    def samples(self, t0: Scalar, t1: Scalar) -> Array:
+        """Times [s], ascending, between which the value is taken to rise or to fall."""
 
     @abc.abstractmethod
     def check_interval(self, label: str, t0: Scalar, t1: Scalar) -> None:
@@ -128,6 +139,9 @@ class Series(AbstractSignal):
         values = np.asarray(self.values).reshape(len(self.ts), -1)
         return np.asarray(self.ts)[1:][np.any(np.diff(values, axis=0) != 0, axis=1)]
 
+    def samples(self, t0, t1):
+        return jnp.asarray(self.ts)
+
     def check_interval(self, label, t0: Any, t1: Any):
         if is_traced((self.ts, t0, t1)):
             return
@@ -165,6 +179,9 @@ class Signal(AbstractSignal):
     def break_times(self, *, of_rates):
         # What a function does is not known; `simulate(..., jumps=)` says it.
         return np.zeros(0)
+
+    def samples(self, t0, t1):
+        return sample_times(t0, t1)
 
     def check_interval(self, label, t0, t1):
         pass

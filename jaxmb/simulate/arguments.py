@@ -77,10 +77,20 @@ def default_controller(solver: Any, rtol: Any, atol: Any, scales: RunningScales 
     return OneStepController.around(diffrax.PIDController(rtol, atol), scales)
 
 
-def with_restarts(controller: Any, restarts: Any, events: int | None) -> Any:
-    """A controller that restarts at some times, and at as many events of contacts; None where there are none."""
+def may_stop(controller: Any) -> bool:
+    """Whether steps of a controller, None for the default, may be cut at times that it does not know of."""
+    adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    return controller is None or (adapts and not isinstance(controller, diffrax.ClipStepSizeController))
+
+
+def with_restarts(controller: Any, restarts: Any, stops: Any, events: int | None) -> Any:
+    """A controller that restarts at some times, steps to others, and restarts at as many events of contacts; None where
+    there are none.
+    """
     controller = controller if events is None else EventController(controller, events)
-    return controller if restarts is None else diffrax.ClipStepSizeController(controller, jump_ts=restarts)
+    if restarts is None and stops is None:
+        return controller
+    return diffrax.ClipStepSizeController(controller, step_ts=stops, jump_ts=restarts)
 
 
 def check_error_estimate(saveat, stepsize_controller, event) -> None:

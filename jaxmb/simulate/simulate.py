@@ -24,7 +24,7 @@ from ..solvers.closures import opened
 from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..system import AbstractSystem
-from ..system.inputs import Signals, input_break_times, with_inputs
+from ..system.inputs import Signals, input_break_times, turning_times, with_inputs
 from ..trajectory import Trajectory
 from .arguments import (
     DEFAULT_RTOL,
@@ -37,6 +37,7 @@ from .arguments import (
     checked_state,
     checked_times,
     checked_tolerances,
+    may_stop,
     named_solver,
     padded,
     parameter_changes,
@@ -117,7 +118,10 @@ def simulate(
     - `inputs`: parameters as functions of time, by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a function
         of t; see `with_inputs`, which also `assemble` needs where a driver has such an input. The solver restarts where
         a held series jumps and, if it moves a point, an axis, a joint, a stop or the ground, or constraints depend on
-        it, at every time of a linear one.
+        it, at every time of a linear one. No step passes a pulse of an input, however long steps are where nothing
+        moves: a series is followed from value to value, a function at 513 times, and so are functions of time of
+        drivers, of `Force` and of constraints, with `of_time` those of one's own parts. Shorter ones need `jumps`, or a
+        `MultistepController` with `dtmax`, and so do those in a `LagrangianSystem`.
 
     **Other arguments, rarely needed:**
 
@@ -233,6 +237,7 @@ def simulate(
         "times": times,
         "saveat": saved,
         "restarts": restarts,
+        "stops": turning_times(system, state, times["t0"], times["t1"]) if may_stop(stepsize_controller) else None,
         "event": jax.tree.map(opened, event),
         "changes": {} if direction is None else parameter_changes(system, direction),
     }

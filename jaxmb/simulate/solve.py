@@ -65,10 +65,10 @@ class Problem(NamedTuple):
     `solver`; `controller`, None for that of `rtol` and `atol`, and atol None for running scales; `times`: t0, t1,
     dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`; `limit`: the largest number of steps, and
     `room`: that which the program has room for; `max_events`: the largest number of events of contacts;
-    `progress_meter`; times of `restarts`, or None; `changes`: values of parameters with changes whose tangent is
-    watched, by name; whether states are `interpolated`; whether anything is `traced`; by which leaves of the system
-    and the state derivatives are taken (`differentiated`), empty where that is not known; whether the start, and the
-    end or a saved time, are `moving`.
+    `progress_meter`; times of `restarts`, and of `stops`, which no step passes, or None; `changes`: values of
+    parameters with changes whose tangent is watched, by name; whether states are `interpolated`; whether anything is
+    `traced`; by which leaves of the system and the state derivatives are taken (`differentiated`), empty where that is
+    not known; whether the start, and the end or a saved time, are `moving`.
     """
 
     system: AbstractSystem
@@ -88,6 +88,7 @@ class Problem(NamedTuple):
     room: int
     progress_meter: Any
     restarts: Any
+    stops: Any
     changes: dict[str, tuple[Any, Any]]
     interpolated: bool
     traced: bool
@@ -137,7 +138,7 @@ class Problem(NamedTuple):
             "y0": start,
             "saveat": self.saveat,
             "stepsize_controller": with_restarts(
-                controller, self.restarts, None if self.system.contacts is None else self.max_events
+                controller, self.restarts, self.stops, None if self.system.contacts is None else self.max_events
             ),
             "event": self.event,
             "max_steps": self.room,

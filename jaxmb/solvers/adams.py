@@ -64,7 +64,7 @@ class AdamsState(AbstractMultistepState):
     step_counts: Int[Array, " length"]
     chart: Chart | None
     stiffness: Stiffness | None
-    sizes: Float[Array, " groups"] | None
+    sizes: Float[Array, " sizes"] | None
     tangents: tuple[Tangent, ...] | None
 
     @property
@@ -298,7 +298,7 @@ class Adams(AbstractMultistep):
             failed = failed | state.stiffness.found
         return y1, estimate, dense_info, new_state, failed
 
-    def _started(self, sizes, before, f) -> Float[Array, " groups"] | None:
+    def _started(self, sizes, before, f) -> Float[Array, " sizes"] | None:
         """The sizes that the absolute tolerance is relative to, where there are none yet those of a first state."""
         scales = self.tolerances.scales
         if scales is None:

@@ -63,7 +63,7 @@ class HermiteState(AbstractMultistepState):
     step_counts: Int[Array, " length"]
     work: Int[Array, "2"]
     chart: Chart | None
-    sizes: Float[Array, " groups"] | None
+    sizes: Float[Array, " sizes"] | None
     tangents: tuple[Tangent, ...] | None
 
     @property

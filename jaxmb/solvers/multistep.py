@@ -50,7 +50,7 @@ class AbstractMultistepState(eqx.Module):
     """
 
     chart: AbstractVar[Chart | None]
-    sizes: AbstractVar[Float[Array, " groups"] | None]
+    sizes: AbstractVar[Float[Array, " sizes"] | None]
     tangents: AbstractVar[tuple[Tangent, ...] | None]
 
     @property
@@ -260,7 +260,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
     def first_sizes(
         self, flat: Float[Array, " n"], f: Float[Array, " n"], before: Any
-    ) -> Float[Array, " groups"] | None:
+    ) -> Float[Array, " sizes"] | None:
         """The sizes that the absolute tolerance is relative to, at a start."""
         scales = self.tolerances.scales
         if scales is None:
@@ -268,8 +268,8 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         return scales.start(flat, f) if before is None else before.sizes
 
     def grown_sizes(
-        self, sizes: Float[Array, " groups"] | None, after: Float[Array, " n"]
-    ) -> Float[Array, " groups"] | None:
+        self, sizes: Float[Array, " sizes"] | None, after: Float[Array, " n"]
+    ) -> Float[Array, " sizes"] | None:
         """The same after a step."""
         scales = self.tolerances.scales
         return None if scales is None or sizes is None else scales.grown(sizes, after)

@@ -111,7 +111,7 @@ class OneStepState(AbstractControllerState):
     """
 
     inner: Any
-    sizes: Float[Array, " groups"] | None
+    sizes: Float[Array, " sizes"] | None
     least: Float[Array, ""]
     intended: Float[Array, ""]
 

@@ -1,12 +1,12 @@
 """Sizes of coordinates and velocities that follow the motion, for tolerances that do not depend on units."""
 
+import functools
 import itertools
 from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -39,7 +39,7 @@ def ends_of(sizes: Iterable[int]) -> tuple[tuple[int, int], ...]:
 
 class RunningScales(eqx.Module):
     """Sizes of the components of a state: the largest in each block that a motion has shown so far, in natural units of
-    each component.
+    each component; and the largest rate that it really had, which at a start from rest is zero.
 
     With them an absolute tolerance is a pure number, and a component that never moves may be zero.
 
@@ -50,11 +50,11 @@ class RunningScales(eqx.Module):
     units: Float[Array, " n"]
     blocks: tuple[Block, ...]
 
-    def none(self, dtype: Any) -> Float[Array, " groups"]:
+    def none(self, dtype: Any) -> Float[Array, " sizes"]:
         """Zeros, for sizes that are not known yet."""
-        return jnp.zeros(len(self.blocks), dtype)
+        return jnp.zeros(len(self.blocks) + 1, dtype)
 
-    def start(self, y: Float[Array, " n"], f: Float[Array, " n"]) -> Float[Array, " groups"]:
+    def start(self, y: Float[Array, " n"], f: Float[Array, " n"]) -> Float[Array, " sizes"]:
         """The sizes at the start of a motion, from the state and its derivative."""
         sizes: dict[str, Array] = {}
         eps = jnp.finfo(y.dtype).eps
@@ -69,34 +69,41 @@ class RunningScales(eqx.Module):
                 # Rounding errors of what constraints hold at rest are no size.
                 initial = jnp.asarray(block.initial, y.dtype)
                 sizes[block.name] = jnp.where(size > eps * initial, size, initial)
-        return lax.stop_gradient(jnp.stack(list(sizes.values())))
+        return lax.stop_gradient(jnp.stack([*sizes.values(), self._largest_rate(self._largest(y))]))
 
-    def grown(self, sizes: Float[Array, " groups"], y: Float[Array, " n"]) -> Float[Array, " groups"]:
+    def grown(self, sizes: Float[Array, " sizes"], y: Float[Array, " n"]) -> Float[Array, " sizes"]:
         """The sizes after a step to y."""
-        return lax.stop_gradient(jnp.maximum(sizes, jnp.stack(self._largest(y))))
+        largest = self._largest(y)
+        return lax.stop_gradient(jnp.maximum(sizes, jnp.stack([*largest, self._largest_rate(largest)])))
 
-    def of_components(self, sizes: Float[Array, " groups"]) -> Float[Array, " n"]:
+    def of_components(self, sizes: Float[Array, " sizes"]) -> Float[Array, " n"]:
         """The size of each component."""
         return self.units * jnp.concatenate([jnp.full(block.size, sizes[k]) for k, block in enumerate(self.blocks)])
 
-    def at_rest(self, y: Float[Array, " n"], h: Any) -> Float[Array, " n"]:
-        """The errors of rates that move nothing in a step of length h to y; zero for all else.
+    def at_rest(self, sizes: Float[Array, " sizes"], y: Float[Array, " n"], h: Any) -> Float[Array, " n"]:
+        """The errors of rates that move nothing in a step of length h to y, where nothing has moved faster so far; zero
+        for all else.
 
         Where forces balance, accelerations are the rounding errors of these forces, and no step is so short that its
         error estimate is not made of them. What rates are there does not matter as long as nothing moves. The errors
-        fall with the square of what the step does move, to far below those of any tolerance.
+        fall with the square of what the step would move, to far below those of any tolerance.
         """
         least = float(jnp.finfo(y.dtype).eps) ** _REST
-        moved = jnp.abs(h) * jnp.stack(self._largest(y))
-        errors = least / jnp.abs(h) * jnp.minimum((least / moved) ** 2, 1.0)
-        is_rate = np.array([block.rate_of is not None for block in self.blocks])
-        return lax.stop_gradient(self.of_components(jnp.where(is_rate, errors, 0.0)))
+        moved = jnp.abs(h) * jnp.maximum(sizes[-1], self._largest_rate(self._largest(y)))
+        error = least / jnp.abs(h) * jnp.minimum((least / moved) ** 2, 1.0)
+        none = jnp.zeros_like(error)
+        errors = jnp.stack([none if block.rate_of is None else error for block in self.blocks])
+        return lax.stop_gradient(self.of_components(errors))
 
-    def rate(self, sizes: Float[Array, " groups"]) -> Float[Array, ""]:
+    def rate(self, sizes: Float[Array, " sizes"]) -> Float[Array, ""]:
         """The size of the first block of rates over that of the block whose rates they are [1/s]."""
         names = [block.name for block in self.blocks]
         k, of = next((k, names.index(block.rate_of)) for k, block in enumerate(self.blocks) if block.rate_of)
         return sizes[k] / sizes[of]
+
+    def _largest_rate(self, largest):
+        rates = [size for block, size in zip(self.blocks, largest, strict=True) if block.rate_of is not None]
+        return functools.reduce(jnp.maximum, rates, jnp.zeros_like(largest[0]))
 
     def _largest(self, y):
         relative = jnp.abs(y) / self.units

@@ -76,8 +76,8 @@ class Tolerances(eqx.Module):
         with jax.numpy_dtype_promotion("standard"):
             absolute = absolute_tolerance(self.atol, self.scales, sizes)
             scale = absolute + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
-            if self.scales is not None:
-                scale = jnp.maximum(scale, self.scales.at_rest(y1, h))
+            if self.scales is not None and sizes is not None:
+                scale = jnp.maximum(scale, self.scales.at_rest(sizes, y1, h))
         return jax.lax.stop_gradient(scale.astype(y0.dtype))
 
     def of_step(self, y0: Array, y1: Array, h: Any, sizes: Array | None, finest: float = 0.0) -> Array:

@@ -85,6 +85,8 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
     """The steps of a solver, and the solver itself, without the tangents that it carries along."""
     still = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
     # Concrete classes, since nothing else tells that a controller knows no jumps.
+    if isinstance(controller, diffrax.ClipStepSizeController) and controller.jump_ts is None:
+        controller = controller.controller
     jumps = not isinstance(controller, still)
     if isinstance(solver, AbstractMultistep):
         # A multistep method has no numbers but its tolerances.

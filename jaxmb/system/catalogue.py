@@ -146,6 +146,17 @@ class AbstractSystem(AbstractEquation):
         """
         raise ValueError(f"{type(self).__name__} takes no inputs; got {', '.join(signals)}.")
 
+    # Functions of time
+
+    @property
+    def of_time(self) -> bool:
+        """Whether parts have functions of time from the user, for `given_in_time`."""
+        return False
+
+    def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "k"]:
+        """What these functions give while nothing moves, such as a prescribed motion or a force."""
+        raise NotImplementedError
+
     # Energy
 
     @abc.abstractmethod

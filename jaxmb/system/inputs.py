@@ -4,17 +4,23 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax import lax
+from jaxtyping import Array, Float
 
 from .._traced_functions import traced_by_jax
-from .._types import Scalar
+from .._types import Scalar, State
 from ..parts.names import unknown
-from ..parts.series import AbstractSignal, as_signal
+from ..parts.series import AbstractSignal, as_signal, sample_times
 from .catalogue import AbstractSystem
 from .parameters import parameters
 
 System = TypeVar("System", bound=AbstractSystem)
+# How far an input may come and go between two steps, relative to its range.
+_HIDDEN = 0.1
+
 Signals = Mapping[str, AbstractSignal | Callable[[Scalar], Array]]
 
 
@@ -68,3 +74,46 @@ def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndar
         signal.check_interval(name, t0, t1)
     own = [signal.break_times(of_rates=binding) for signal, binding in signals.values()]
     return np.unique(np.concatenate([np.zeros(0), *own])) if own else np.zeros(0)
+
+
+def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) -> Float[Array, "n"] | None:
+    """Times [s] that no step may pass, for no input or function of time to come and go unseen, and infinite ones; None
+    where nothing depends on time.
+
+    A machine at rest, or in free flight, allows steps of any length: one that passes a pulse would miss it. From one of
+    these times to the next, what depends on time moves hardly further than from its first value to its last: by a tenth
+    of its range between t0 and t1 at most. A series is followed from value to value, a function at 513 times.
+    """
+    # Where a motion restarts, steps end as well.
+    signals = [signal for signal, binding in system.signals.values() if not signal.break_times(of_rates=binding).size]
+    if not signals and not system.of_time:
+        return None
+    return _turning_times(signals, system if system.of_time else None, state, t0, t1)
+
+
+@eqx.filter_jit
+def _turning_times(signals, system, state, t0, t1):
+    first, last, found = jnp.minimum(t0, t1), jnp.maximum(t0, t1), []
+    functions = [(signal.samples(t0, t1), signal) for signal in signals]
+    if system is not None:
+        functions.append((sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u)))
+    for ts, function in functions:
+        values = jax.vmap(lambda t, function=function: jnp.ravel(function(t)))(jnp.clip(ts, first, last))
+        turned = _has_turned(values)
+        found.append(jnp.where(turned & (ts[:-1] > first) & (ts[:-1] < last), ts[:-1], jnp.inf))
+    return lax.stop_gradient(jnp.sort(jnp.concatenate(found)))
+
+
+def _has_turned(values):
+    """Whether a value has turned before the next, since the last that has; of any column of values."""
+    range_ = jnp.max(values, axis=0) - jnp.min(values, axis=0)
+    rounding = 16 * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), axis=0)
+    most = jnp.where(range_ > rounding, _HIDDEN * range_, jnp.inf)
+
+    def passed(carry, value):
+        start, before, way = carry
+        step = jnp.abs(value - before)
+        turned = jnp.any(way + step - jnp.abs(value - start) > most)
+        return (jnp.where(turned, before, start), value, jnp.where(turned, step, way + step)), turned
+
+    return lax.scan(passed, (values[0], values[0], jnp.zeros_like(most)), values[1:])[1]

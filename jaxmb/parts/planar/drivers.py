@@ -44,6 +44,7 @@ class Driver(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     point_b: fields.Number = fields.point(body=1, optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = True
+    of_time: ClassVar[bool] = True
 
     def validate(self):
         if self.quantity == "angle" and not (self.point_a is None and self.point_b is None):
@@ -61,6 +62,10 @@ class Driver(AbstractPlanarPart, AbstractPair, AbstractConstraint):
             return norm(point_b - space.point(poses[0], self.point_a))
         relative = space.body_point(poses[0], point_b) - self.point_a
         return relative[0 if self.quantity == "x" else 1]
+
+    def given_in_time(self, space, poses, velocities, t):
+        del space, poses, velocities
+        return jnp.asarray(self.motion(t, self.parameters))
 
     def residual(self, space, poses, t):
         return jnp.reshape(self.value(space, poses) - self.motion(t, self.parameters), (1,))

@@ -54,6 +54,7 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = True
+    of_time: ClassVar[bool] = True
 
     def __check_init__(self):
         turn, length = ("axis_a", "axis", "x_a", "x_b"), ("point_a", "point_b")
@@ -78,6 +79,10 @@ class Driver(AbstractSpatialPart, AbstractPair, AbstractConstraint):
         if self.quantity == "distance":
             return norm(shift)
         return shift["xyz".index(self.quantity)]
+
+    def given_in_time(self, space, poses, velocities, t):
+        del space, poses, velocities
+        return jnp.asarray(self.motion(t, self.parameters))
 
     def residual(self, space, poses, t):
         motion = self.motion(t, self.parameters)

@@ -1,0 +1,170 @@
+"""What comes and goes while a machine is at rest is not passed over by a long step."""
+
+import itertools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import jit_quickly
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb.system.inputs import turning_times
+
+SOLVERS = {"Adams": mb.solvers.Adams(), "Dopri8": diffrax.Dopri8(), "Hermite": mb.solvers.Hermite()}
+AT, END = 5.3, 10.0
+TS = np.linspace(0.0, END, 201)
+GRAVITY = mb.Gravity((0.0, -9.81))
+
+
+def pulse(t, width):
+    """A bell of height one, whose width is that of a tenth of the interval at most."""
+    return jnp.exp(-(((t - AT) / width) ** 2))
+
+
+def pendulum(*more):
+    bob = planar.Body("bob", mass=1.0, inertia=0.02, position=(0.0, -1.0))
+    return mb.Scene([bob], joints=[planar.Revolute("pin", "ground", "bob", point=(0.0, 0.0))], forces=[GRAVITY, *more])
+
+
+TORQUE = pendulum(planar.Torque("motor", "bob", torque=0.0)).compile()
+KICK = pendulum(
+    mb.Force(
+        "kick",
+        "bob",
+        lambda x, v, t, p: jnp.zeros((1, 3)).at[0, 2].set(pulse(t, p["width"])),
+        parameters={"width": 1.0},
+    )
+).compile()
+
+
+def shaken_pendulum():
+    cart = planar.Body("cart", mass=1.0, inertia=1.0)
+    bob = planar.Body("bob", mass=1.0, inertia=0.02, position=(0.0, -1.0))
+    rail = planar.Prismatic("rail", "ground", "cart", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis=(1.0, 0.0))
+    pin = planar.Revolute("pin", "cart", "bob", point=(0.0, 0.0))
+    motion = {"motion": lambda t, p: 0.1 * pulse(t, p["width"]), "parameters": {"width": 1.0}}
+    shake = planar.Driver("shake", "ground", "cart", quantity="x", **motion)
+    return mb.Scene([cart, bob], joints=[rail, pin, shake], forces=[GRAVITY])
+
+
+SHAKEN = shaken_pendulum().compile()
+
+
+def of_input(signal, width):
+    given = lambda t: pulse(t, width)
+    return TORQUE, {"motor.torque": given if signal == "function" else mb.Series(TS, given(TS), signal)}
+
+
+def of_force(width):
+    return mb.with_parameters(KICK, {"kick.width": width}), None
+
+
+def of_driver(width):
+    return mb.with_parameters(SHAKEN, {"shake.width": width}), None
+
+
+WAYS = {
+    "linear series": lambda width: of_input("linear", width),
+    "cubic series": lambda width: of_input("cubic", width),
+    "function": lambda width: of_input("function", width),
+    "force": of_force,
+    "driver": of_driver,
+}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("way", WAYS)
+def test_a_pulse_moves_a_machine_at_rest(way, solver):
+    """As much as with steps that are shorter than the pulse."""
+    for width in (0.3, 0.06):
+        system, inputs = WAYS[way](width)
+        run = lambda system=system, inputs=inputs, **options: mb.simulate(
+            system, mb.assemble(system), t1=END, inputs=inputs, max_steps=20000, **options
+        )
+        bounded = mb.solvers.MultistepController(1e-9, 1e-11, dtmax=0.02)
+        exact = run(stepsize_controller=bounded).ys
+        found = run(rtol=1e-7, solver=SOLVERS[solver]).ys
+        assert jnp.max(jnp.abs(exact.u)) > 1e-3
+        np.testing.assert_allclose(found.q, exact.q, atol=1e-6)
+        np.testing.assert_allclose(found.u, exact.u, atol=1e-6)
+
+
+@pytest.mark.parametrize("end", [END, -END])
+def test_a_pulse_under_jit_and_in_a_batch(end):
+    """Also with heights that are traced, and backward in time."""
+
+    def rate(height):
+        inputs = {"motor.torque": lambda t: height * pulse(jnp.abs(t), 0.2)}
+        return mb.simulate(TORQUE, mb.assemble(TORQUE), t1=end, rtol=1e-9, inputs=inputs).ys.u[-1, 2]
+
+    one = jit_quickly(rate)
+    rates = jit_quickly(jax.vmap(rate))(jnp.array([0.0, 0.5, 1.0]))
+    assert rates[0] == 0 and abs(rates[2]) > 1e-2
+    np.testing.assert_allclose(rates, [one(x) for x in (0.0, 0.5, 1.0)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("signal", ["cubic", "function"])
+def test_gradient_by_the_height_of_a_pulse(signal):
+    def rate(height, rtol):
+        given = lambda t: height * pulse(t, 0.2)
+        inputs = {"motor.torque": given if signal == "function" else mb.Series(TS, given(TS), signal)}
+        return mb.simulate(TORQUE, mb.assemble(TORQUE), t1=END, rtol=rtol, inputs=inputs).ys.u[-1, 2]
+
+    value = jit_quickly(rate)
+    differences = (value(1 + 1e-4, 1e-12) - value(1 - 1e-4, 1e-12)) / 2e-4
+    forward, reverse = jit_quickly(jax.jacfwd(rate))(1.0, 1e-9), jit_quickly(jax.grad(rate))(1.0, 1e-9)
+    np.testing.assert_allclose(forward, differences, rtol=1e-6)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    batch = jit_quickly(jax.vmap(jax.grad(rate), (0, None)))(jnp.array([1.0, 0.5]), 1e-9)
+    np.testing.assert_allclose(batch[0], forward, rtol=1e-6)
+
+
+def test_steps_of_the_users_own_controller():
+    """Tolerances of the user miss no pulse either; times of the user's own are left to them."""
+    system, inputs = WAYS["cubic series"](0.1)
+    control = mb.solvers.MultistepController(1e-8, 1e-10)
+    run = lambda control: mb.simulate(system, mb.assemble(system), t1=END, inputs=inputs, stepsize_controller=control)
+    assert jnp.max(jnp.abs(run(control).ys.u)) > 1e-2
+    at_end = diffrax.ClipStepSizeController(control, step_ts=[9.0])
+    assert int(run(at_end).stats["num_steps"]) < 20
+
+
+def hidden(values):
+    """How far values move on their way, beyond what their ends show."""
+    return np.sum(np.abs(np.diff(values))) - abs(values[-1] - values[0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_more_than_a_tenth_is_hidden_between_stops(seed):
+    rng = np.random.default_rng(seed)
+    ts, values = np.sort(rng.uniform(-1.0, 11.0, 60)), np.cumsum(rng.normal(size=60)) * 10.0 ** rng.integers(-6, 6)
+    ts[0], ts[-1] = -1.0, 11.0
+    series = mb.Series(ts, values)
+    system = mb.with_inputs(TORQUE, {"motor.torque": series})
+    stops = np.asarray(turning_times(system, mb.assemble(TORQUE), 0.0, END))
+    stops = stops[np.isfinite(stops)]
+    assert np.all(np.isin(stops, ts)) and np.all((stops > 0) & (stops < END))
+    grid = np.unique(np.concatenate([[0.0, END], ts[(ts > 0) & (ts < END)]]))
+    along = np.interp(grid, ts, values)
+    most, ends = 0.1 * np.ptp(along), np.concatenate([[0.0], stops, [END]])
+    for first, last in itertools.pairwise(ends):
+        inside = (grid >= first) & (grid <= last)
+        assert hidden(along[inside]) <= most * (1 + 1e-12)
+        if last < END:  # No stop is too early: with the next value more is hidden.
+            longer = (grid >= first) & (grid <= grid[np.searchsorted(grid, last) + 1])
+            assert hidden(along[longer]) > most
+
+
+def test_what_does_not_come_and_go_needs_no_stops():
+    at = mb.assemble(TORQUE)
+    stops = lambda signal: turning_times(mb.with_inputs(TORQUE, {"motor.torque": signal}), at, 0.0, END)
+    assert not np.any(np.isfinite(stops(lambda t: 3.0 + 0.0 * t)))
+    assert not np.any(np.isfinite(stops(lambda t: jnp.tanh(t - 4.0))))
+    assert not np.any(np.isfinite(stops(mb.Series(TS, np.full(201, 0.1) + TS))))
+    assert turning_times(pendulum().compile(), at, 0.0, END) is None
+    assert (
+        turning_times(mb.with_inputs(TORQUE, {"motor.torque": mb.Series(TS, np.sin(TS), "held")}), at, 0.0, END) is None
+    )
