@@ -81,6 +81,10 @@ class Implied(NamedTuple):
     by: tuple[str, ...]
 
 
+# Of more parts than this with functions of time only a combination is looked at.
+_MOST_OF_TIME = 32
+
+
 class RigidBodySystem(AbstractSystem):
     """A scene, compiled. Made by `Scene.compile`; a pytree whose leaves are the parameters.
 
@@ -468,7 +472,7 @@ class RigidBodySystem(AbstractSystem):
     def given_in_time(self, t, q, u):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         own = [g.given_in_time(t, poses, velocities) for g in self._acting if g.group.part.of_time]
-        return jnp.concatenate([given.ravel() for given in own])
+        return jnp.concatenate([_combined(given).ravel() for given in own])
 
     @property
     def _acting(self):
@@ -883,3 +887,10 @@ def _with_scalars(system, guess):
 def _of_rows(values: Array, count: int) -> Array:
     """The numbers of parts, once for each of their rows."""
     return values if count == 1 else jnp.repeat(values, count, axis=0)
+
+
+def _combined(of_parts):
+    """What some parts give, or one combination of many, with weights that let no two of them cancel."""
+    parts = of_parts.shape[0]
+    weights = np.random.default_rng(0).uniform(1.0, 2.0, parts).astype(of_parts.dtype)
+    return of_parts if parts <= _MOST_OF_TIME else weights @ of_parts.reshape(parts, -1)

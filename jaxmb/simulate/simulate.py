@@ -109,11 +109,12 @@ def simulate(
         `diffrax.Dopri8()`; `error=True` estimates it. Near rounding the part grows, up to all of it: steps are not
         asked for less than 4e-14 (`Adams`) or 1e-11 (`Hermite`). `atol` defaults to one hundredth of `rtol`, times the
         largest coordinate (in units of the machine's size, or radians) and the largest velocity so far, so that the
-        units do not matter and slow or small motions are as accurate as others; velocities that move nothing, by more
-        than 2e-14 of that size in a step, are none. Internal states count by kinds, each with its largest value, at
-        least 1e-4 of its typical size. A number is in SI units; it may be a vector of one for each coordinate, velocity
-        and internal state, (nq + nu + nz,): where stiff springs vibrate too little to matter in positions, a coarser
-        one for velocities saves most of the steps of `Hermite`.
+        units do not matter and slow or small motions are as accurate as others; while all that moved since the
+        start was less than 2e-14 of that size in each step, velocities are taken for rounding errors of forces that
+        balance. Internal states count by kinds, each with its largest value, at least 1e-4 of its typical size. A
+        number is in SI units; it may be a vector of one for each coordinate, velocity and internal state,
+        (nq + nu + nz,): where stiff springs vibrate too little to matter in positions, a coarser one for velocities
+        saves most of the steps of `Hermite`.
 
     - `inputs`: parameters as functions of time, by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a function
         of t; see `with_inputs`, which also `assemble` needs where a driver has such an input. The solver restarts where

@@ -154,7 +154,9 @@ class AbstractSystem(AbstractEquation):
         return False
 
     def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "k"]:
-        """What these functions give while nothing moves, such as a prescribed motion or a force."""
+        """What these functions give while nothing moves, such as a prescribed motion or a force; of many parts of one
+        kind a combination.
+        """
         raise NotImplementedError
 
     # Energy

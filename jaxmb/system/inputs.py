@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -14,12 +13,15 @@ from .._traced_functions import traced_by_jax
 from .._types import Scalar, State
 from ..parts.names import unknown
 from ..parts.series import AbstractSignal, as_signal, sample_times
+from ..solvers.evaluation import freeze
 from .catalogue import AbstractSystem
 from .parameters import parameters
 
 System = TypeVar("System", bound=AbstractSystem)
 # How far an input may come and go between two steps, relative to its range.
 _HIDDEN = 0.1
+# For how many coordinates, of all times together, functions of time are computed at once.
+_AT_ONCE = 2**17
 
 Signals = Mapping[str, AbstractSignal | Callable[[Scalar], Array]]
 
@@ -93,15 +95,18 @@ def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) 
 
 @eqx.filter_jit
 def _turning_times(signals, system, state, t0, t1):
+    signals, system, state, t0, t1 = freeze((signals, system, state, t0, t1))
     first, last, found = jnp.minimum(t0, t1), jnp.maximum(t0, t1), []
+    at_once = max(_AT_ONCE // state.q.size, 1)
     functions = [(signal.samples(t0, t1), signal) for signal in signals]
     if system is not None:
         functions.append((sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u)))
     for ts, function in functions:
-        values = jax.vmap(lambda t, function=function: jnp.ravel(function(t)))(jnp.clip(ts, first, last))
+        at = lambda t, function=function: jnp.ravel(function(t))
+        values = lax.map(at, jnp.clip(ts, first, last), batch_size=min(at_once, ts.size))
         turned = _has_turned(values)
         found.append(jnp.where(turned & (ts[:-1] > first) & (ts[:-1] < last), ts[:-1], jnp.inf))
-    return lax.stop_gradient(jnp.sort(jnp.concatenate(found)))
+    return jnp.sort(jnp.concatenate(found))
 
 
 def _has_turned(values):
