@@ -300,7 +300,7 @@ class AbstractLink(AbstractActor):
 
     def given_in_time(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Array:
         """Hook: what the function of time gives while nothing moves, of a part that is `of_time`."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{self.kind} says of_time = True, and needs a method given_in_time.")
 
     def coordinates_at(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
         """The coordinates at these poses of the bodies."""

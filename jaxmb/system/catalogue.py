@@ -155,9 +155,9 @@ class AbstractSystem(AbstractEquation):
 
     def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "k"]:
         """What these functions give while nothing moves, such as a prescribed motion or a force; of many parts of one
-        kind a combination.
+        kind a combination. Empty where `of_time` is False.
         """
-        raise NotImplementedError
+        return jnp.zeros(0, q.dtype)
 
     # Energy
 

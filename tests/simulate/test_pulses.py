@@ -122,6 +122,32 @@ def test_gradient_by_the_height_of_a_pulse(signal):
     np.testing.assert_allclose(batch[0], forward, rtol=1e-6)
 
 
+class Thruster(mb.parts.AbstractForce):
+    """A force of the user's own that fires once."""
+
+    name: str = mb.parts.name()
+    body: str = mb.parts.body_name()
+    of_time = True
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.zeros((1, 3)).at[0, 0].set(pulse(t, 0.1))
+
+    def given_in_time(self, space, poses, velocities, t):
+        return pulse(t, 0.1)
+
+
+class Silent(Thruster):
+    given_in_time = mb.parts.AbstractForce.given_in_time
+
+
+def test_a_part_of_ones_own():
+    system = pendulum(Thruster("jet", "bob")).compile()
+    assert jnp.max(jnp.abs(mb.simulate(system, mb.assemble(system), t1=END).ys.u)) > 1e-2
+    silent = pendulum(Silent("jet", "bob")).compile()
+    with pytest.raises(NotImplementedError, match="Silent says of_time = True, and needs a method given_in_time"):
+        mb.simulate(silent, mb.assemble(silent), t1=END)
+
+
 def test_steps_of_the_users_own_controller():
     """Tolerances of the user miss no pulse either; times of the user's own are left to them."""
     system, inputs = WAYS["cubic series"](0.1)
