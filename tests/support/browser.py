@@ -21,6 +21,12 @@ _OPTIONS = (
     "remote-debugging-port=0 window-size=900,620"
 )
 
+# True once the page has drawn this many times: a picture taken while it is busy, as with its first, is an old one.
+_DRAWN = (
+    "new Promise(done => { let left = 10; "
+    "const next = () => left-- ? requestAnimationFrame(next) : done(true); next(); })"
+)
+
 
 class Browser:
     """One page; `requests`: what it asked for, `complaints`: errors that it reported."""
@@ -74,6 +80,7 @@ class Browser:
         raise AssertionError("The picture does not come to rest.")
 
     def _seen(self):
+        self.call("Runtime.evaluate", expression=_DRAWN, awaitPromise=True)
         data = self.call("Page.captureScreenshot", format="png")["data"]
         return matplotlib.image.imread(io.BytesIO(base64.b64decode(data)))[..., :3]
 
