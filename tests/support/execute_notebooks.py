@@ -3,9 +3,7 @@
 Without names all notebooks are executed, and the figures `work_precision` and `four_bar` of the README are made. A
 notebook keeps the version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares
 them with the package and with the cells, and in its long tests what is printed with what a new execution prints. Cells
-with the tag `varies` print what differs between machines and runs, such as times, and are not compared. Those with the
-tag `counts` print numbers of steps or iterations, which rounding errors decide where a step is nearly rejected or an
-iteration nearly ends, so that only the size of whole numbers is compared.
+with the tag `varies` print what differs between machines and runs, such as times, and are not compared.
 """
 
 import hashlib
@@ -27,7 +25,6 @@ import jaxmb
 FOLDER = Path(__file__).parents[2] / "notebooks"
 # The rounding errors of two machines have nothing in common, and errors of solutions their size.
 ROUNDING, OF_ERRORS, OF_VALUES = 1e-9, 20.0, 0.05
-OF_COUNTS, FEW = 0.5, 8
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w])", re.IGNORECASE)
 
 
@@ -75,28 +72,26 @@ def printed(cell: nbformat.NotebookNode) -> str:
     return "\n".join(texts)
 
 
-def difference(stored: str, new: str, counts: bool = False) -> str | None:
+def difference(stored: str, new: str) -> str | None:
     """The first pair of lines that do not say the same; None if all do.
 
-    Words are to be equal, whole and other numbers to 5 %, numbers with an exponent, which are mostly errors, within a
-    factor of 20. With `counts` whole numbers agree within a factor of 2, and where they differ by 8 or less.
+    Words are to be equal, integers and other numbers to 5 %, numbers with an exponent, which are mostly errors, within
+    a factor of 20.
     """
     lines = [[" ".join(line.split()) for line in text.strip().splitlines()] for text in (stored, new)]
     for a, b in zip(*lines, strict=False):
         words = [_NUMBER.sub("#", line) for line in (a, b)]
         numbers = [_NUMBER.findall(line) for line in (a, b)]
-        if words[0] != words[1] or not all(_agree(x, y, counts) for x, y in zip(*numbers, strict=True)):
+        if words[0] != words[1] or not all(map(_agree, *numbers)):
             return f"stored: {a}\nnew:    {b}"
     return None if len(lines[0]) == len(lines[1]) else f"{len(lines[0])} lines stored, {len(lines[1])} new"
 
 
-def _agree(a: str, b: str, counts: bool) -> bool:
+def _agree(a: str, b: str) -> bool:
     x, y = float(a), float(b)
     size = max(abs(x), abs(y))
     if size <= ROUNDING:
         return True
-    if counts and a.isdigit() and b.isdigit():
-        return abs(x - y) <= max(OF_COUNTS * size, FEW)
     if "e" in a.lower() and "e" in b.lower() and x * y > 0:
         return size <= OF_ERRORS * min(abs(x), abs(y))
     return abs(x - y) <= OF_VALUES * size
