@@ -32,7 +32,7 @@ from .tangent import Tangent, TangentControl
 from .tolerances import Tolerances, norm_of
 
 # The finest relative tolerance of a step, in units of the machine precision.
-_FINEST = 200
+_FINEST = 250
 # The target error of a step, in units of the tolerance.
 _TARGET = 0.2
 # Numbers of evaluations and matrices in a step.

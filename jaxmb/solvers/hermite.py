@@ -230,7 +230,7 @@ class Hermite(AbstractMultistep):
         known = unknown_structure(jacobian_of(terms, t0, y0, args), flat)
         matrix = DenseLinearization.unknown(flat, free) if known is None else known
         if before is None:
-            size = None if scales is None else scales.of_components(scales.start(flat, jnp.zeros_like(flat)))
+            size = None if scales is None else scales.expected(flat)
             first = matrix.probed(field, t0, flat, size)
         else:
             first = derivatives(field, t0, flat)

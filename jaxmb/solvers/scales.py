@@ -16,13 +16,16 @@ _LEAST = 0.25
 # What a step at rest moves by at most, in natural units, as a power of eps: 2e-14 in double precision. Rounding errors
 # of a chain of many bodies add up to nearly that; much more hides slow motions.
 _REST = 0.875
+# What rates count as at least at the start of a motion, in units of what is expected of them, as a power of eps: 1e-6 in
+# double precision. Steps of an explicit method beyond its stability enlarge rounding errors to nearly the tolerance.
+_LEAST_RATE = 0.375
 
 
 class Block(eqx.Module):
     """A block of components of a state that are measured by the largest one among them.
 
-    **Fields:** its `name`; `size`: the number of its components; `initial`: what the block counts as at the start of a
-    motion, in natural units of its components, where it is zero but for rounding errors, and None for a block that
+    **Fields:** its `name`; `size`: the number of its components; `initial`: what is expected of the block at the start
+    of a motion, in natural units of its components, where it is zero but for rounding errors, and None for a block that
     counts as 1e-4 at least; `rate_of`: the name of the block before it whose rate of change it is, or None.
     """
 
@@ -57,19 +60,21 @@ class RunningScales(eqx.Module):
     def start(self, y: Float[Array, " n"], f: Float[Array, " n"]) -> Float[Array, " sizes"]:
         """The sizes at the start of a motion, from the state and its derivative."""
         sizes: dict[str, Array] = {}
-        eps = jnp.finfo(y.dtype).eps
         for block, size, rate in zip(self.blocks, self._largest(y), self._largest(f), strict=True):
-            if block.rate_of is not None:
+            if block.rate_of is None:
+                sizes[block.name] = _expected(block, size)
+            else:
                 # From rest, a rate causes a motion of the size of the other block with this one.
                 ahead = jnp.sqrt(sizes[block.rate_of] * rate)
                 size = jnp.maximum(size, jnp.where(jnp.isfinite(ahead), ahead, 0.0))
-            if block.initial is None:
-                sizes[block.name] = jnp.maximum(size, eps**_LEAST)
-            else:
-                # Rounding errors of what constraints hold at rest are no size.
-                initial = jnp.asarray(block.initial, y.dtype)
-                sizes[block.name] = jnp.where(size > eps * initial, size, initial)
+                least = float(jnp.finfo(y.dtype).eps) ** _LEAST_RATE
+                sizes[block.name] = jnp.maximum(size, least * jnp.asarray(block.initial, y.dtype))
         return lax.stop_gradient(jnp.stack([*sizes.values(), self._largest_rate(self._largest(y))]))
+
+    def expected(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The size of each component of a motion that starts at y, with what is expected of those that are zero."""
+        sizes = [_expected(block, size) for block, size in zip(self.blocks, self._largest(y), strict=True)]
+        return lax.stop_gradient(self.of_components(jnp.stack(sizes)))
 
     def grown(self, sizes: Float[Array, " sizes"], y: Float[Array, " n"]) -> Float[Array, " sizes"]:
         """The sizes after a step to y."""
@@ -108,3 +113,12 @@ class RunningScales(eqx.Module):
     def _largest(self, y):
         relative = jnp.abs(y) / self.units
         return tuple(jnp.max(relative[a:b], initial=0.0) for a, b in ends_of(block.size for block in self.blocks))
+
+
+def _expected(block, size):
+    eps = jnp.finfo(size.dtype).eps
+    if block.initial is None:
+        return jnp.maximum(size, eps**_LEAST)
+    # Rounding errors of what constraints hold at rest are no size.
+    initial = jnp.asarray(block.initial, size.dtype)
+    return jnp.where(size > eps * initial, size, initial)

@@ -71,20 +71,26 @@ class Tolerances(eqx.Module):
         """The tolerance of each component over a step of length h from `y0` to `y1`; `sizes` are those of the running
         scales so far. With these, a machine at rest is not resolved into its rounding errors.
         """
-        # A step that ends where the vector field is undefined is measured at its start.
-        y1 = jnp.where(jnp.isnan(y1), y0, y1)
-        with jax.numpy_dtype_promotion("standard"):
-            absolute = absolute_tolerance(self.atol, self.scales, sizes)
-            scale = absolute + self.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
-            if self.scales is not None and sizes is not None:
-                scale = jnp.maximum(scale, self.scales.at_rest(sizes, y1, h))
-        return jax.lax.stop_gradient(scale.astype(y0.dtype))
+        return self._scale(1.0, self.rtol, self.atol, y0, y1, h, sizes)
 
     def of_step(self, y0: Array, y1: Array, h: Any, sizes: Array | None, finest: float = 0.0) -> Array:
         """The error tolerated in each component in one step of a multistep method, from `y0` to `y1` in a time h.
 
         `finest`: the smallest relative one, in units of the machine precision, where rounding dominates the estimates.
+        All tolerances `rtol` of one to twenty times it have the same steps, to the last bit, for the same `atol / rtol`.
         """
         with jax.numpy_dtype_promotion("standard"):
-            share = jnp.clip(finest * float(jnp.finfo(y0.dtype).eps) / self.rtol, _SHARE, 1.0)
-        return jax.lax.stop_gradient(share.astype(y0.dtype)) * self.scale(y0, y1, h, sizes)
+            eps = float(jnp.finfo(y0.dtype).eps)
+            whole = jnp.maximum(self.rtol, eps)
+            rtol = jnp.clip(finest * eps, _SHARE * whole, whole)
+            share, atol = rtol / whole, rtol * (self.atol / whole)
+        return self._scale(share, rtol, atol, y0, y1, h, sizes)
+
+    def _scale(self, share, rtol, atol, y0, y1, h, sizes):
+        # A step that ends where the vector field is undefined is measured at its start.
+        y1 = jnp.where(jnp.isnan(y1), y0, y1)
+        with jax.numpy_dtype_promotion("standard"):
+            scale = absolute_tolerance(atol, self.scales, sizes) + rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+            if self.scales is not None and sizes is not None:
+                scale = jnp.maximum(scale, share * self.scales.at_rest(sizes, y1, h))
+        return jax.lax.stop_gradient(scale.astype(y0.dtype))

@@ -62,6 +62,18 @@ def test_a_machine_at_rest_takes_fewer_steps_than_a_swing(name, solver):
         assert jnp.max(jnp.abs(rest.ys.u)) <= 1e-11
 
 
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_steps_at_rest_do_not_enlarge_rounding_errors(solver):
+    """A pendulum that balances exactly at the start, and later is pushed by as much as rounding errors would."""
+    bob = planar.Body("bob", mass=1.0, inertia=0.02, position=(0.0, -1.0))
+    pin = planar.Revolute("pin", "ground", "bob", point=(0.0, 0.0))
+    push = mb.Force("push", "bob", lambda x, v, t, p: jnp.zeros((1, 3)).at[0, 2].set(1e-14 * jnp.sin(t)))
+    system = mb.Scene([bob], joints=[pin], forces=[mb.Gravity((0.0, -9.81)), push]).compile()
+    times = np.linspace(0.0, 20.0, 201)
+    rest = mb.simulate(system, mb.assemble(system), t1=20.0, saveat=times, rtol=1e-6, solver=SOLVERS[solver])
+    assert jnp.max(jnp.abs(rest.ys.u)) <= 1e-11
+
+
 def test_a_long_chain_at_rest():
     """Rounding errors of twenty bodies add up."""
     system = hanging_chain(20).compile()

@@ -139,6 +139,15 @@ def test_bounds_of_the_step():
     assert np.min(steps(solution)[:-1]) > 0.01 * (1 - 1e-12)
 
 
+def test_tolerances_beyond_rounding_have_the_same_steps():
+    """All that ask for more than rounding errors allow."""
+    swing = diffrax.ODETerm(lambda t, y, args: jnp.array([y[1], -jnp.sin(y[0])]))
+    run = lambda tol: _solve(swing, None, MultistepController(tol, tol), y0=np.array([1.0, 0.0]), t1=10.0)
+    first, second = run(1e-12), run(1e-13)
+    assert first.stats["num_steps"] == second.stats["num_steps"]
+    np.testing.assert_array_equal(first.ys, second.ys)
+
+
 def test_states_at_rest():
     solution = _solve(diffrax.ODETerm(lambda t, y, args: 0.0 * y), y0=np.zeros(3))
     np.testing.assert_array_equal(solution.ys[-1], 0.0)
