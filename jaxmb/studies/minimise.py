@@ -53,7 +53,10 @@ def levenberg_marquardt(
     """Minimise an objective from its linearised residuals; trials that fail are rejected.
 
     A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt). The damping μ follows
-    the gain, the ratio of the decrease of the objective to that of the linear model.
+    the gain, the ratio of the decrease of the objective to that of the linear model. Where the model promises a
+    decrease of less than `tol` times the objective, errors of the motions, which differ from step to step, are more
+    than that: the objective does not tell good steps from bad ones any more. These steps are taken without it, as long
+    as each is less than a tenth of the one before.
 
     Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
 
@@ -99,7 +102,7 @@ def _trials(
     z, residuals, jacobian, objective = at(z, (yield z))
     if not np.isfinite(objective):
         return Minimum(z, 1, False, np.inf)
-    damping, growth = _FIRST_DAMPING, 2.0
+    damping, growth, last = _FIRST_DAMPING, 2.0, np.inf
     for iteration in range(1, limit):
         norms = np.linalg.norm(jacobian, axis=0)
         weights = np.sqrt(damping) * np.where(norms > 0, norms, 1.0)
@@ -112,8 +115,14 @@ def _trials(
         decrease = objective - trial[-1]
         predicted = 0.5 * step @ (weights**2 * step - jacobian.T @ residuals)
         gain = decrease / predicted if predicted > 0 else 0.0
-        small = np.all(np.abs(whole) <= tol * (1 + np.abs(z)))
-        converged = small and abs(decrease) <= tol * (1 + abs(objective))
+        settled = predicted <= tol * (1 + abs(objective)) and abs(decrease) <= np.sqrt(tol) * (1 + abs(objective))
+        # With more damping a step may promise little far from the minimum.
+        hidden = settled and damping <= _FIRST_DAMPING and predicted <= tol * abs(objective)
+        size = np.max(np.abs(whole) / (1 + np.abs(z)))
+        if hidden and size > 0.1 * last:
+            return Minimum(z, iteration + 1, True, objective)
+        converged = size <= tol and settled
+        gain, last = (1.0, size) if hidden else (gain, np.inf)
         if gain > 0:
             damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
             z, residuals, jacobian, objective = trial

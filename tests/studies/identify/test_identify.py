@@ -325,6 +325,25 @@ def decays(z):
     return z[0] * shape, np.stack([shape, -DECAY * z[0] * shape], axis=1)
 
 
+@pytest.mark.parametrize("errors, more", [(1e-8, 1), (1e-6, 10)])
+def test_errors_of_the_motions_cost_few_iterations(errors, more):
+    """Residuals with errors that differ from trial to trial, as steps do, and that hide the last decrease."""
+    measured = decays([3.0, 2.0])[0] + 0.05 * np.random.default_rng(0).standard_normal(DECAY.size)
+    exact = lambda z: ((decays(z)[0] - measured) / 0.05, decays(z)[1] / 0.05)
+    known = levenberg_marquardt(exact, jnp.array([1.0, 0.5]), tol=1e-8, limit=100)
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+
+        def linearised(z, random=random):
+            residuals, jacobian = exact(z)
+            return residuals + errors * random.standard_normal(DECAY.size), jacobian
+
+        found = levenberg_marquardt(linearised, jnp.array([1.0, 0.5]), tol=1e-8, limit=100)
+        assert found.success and found.iterations <= known.iterations + more
+        deviations = np.sqrt(np.diag(np.linalg.inv(exact(found.z)[1].T @ exact(found.z)[1])))
+        assert np.all(np.abs(found.z - known.z) <= 0.01 * deviations)
+
+
 @pytest.mark.parametrize("name", ["soft_l1", "huber"])
 def test_robust_losses_agree_with_scipy(name):
     """On estimates and objective; errors divided by their standard deviations have unit size, with outliers as well."""
