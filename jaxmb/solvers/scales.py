@@ -16,8 +16,8 @@ _LEAST = 0.25
 # What a step at rest moves by at most, in natural units, as a power of eps: 2e-14 in double precision. Rounding errors
 # of a chain of many bodies add up to nearly that; much more hides slow motions.
 _REST = 0.875
-# What rates count as at least at the start of a motion, in units of what is expected of them, as a power of eps: 1e-6 in
-# double precision. Steps of an explicit method beyond its stability enlarge rounding errors to nearly the tolerance.
+# What rates count as at least at the start of a motion, in units of what is expected of them, as a power of eps: 1e-6
+# in double precision. Steps of an explicit method beyond its stability enlarge rounding errors to nearly the tolerance.
 _LEAST_RATE = 0.375
 
 

@@ -77,7 +77,7 @@ class Tolerances(eqx.Module):
         """The error tolerated in each component in one step of a multistep method, from `y0` to `y1` in a time h.
 
         `finest`: the smallest relative one, in units of the machine precision, where rounding dominates the estimates.
-        All tolerances `rtol` of one to twenty times it have the same steps, to the last bit, for the same `atol / rtol`.
+        All `rtol` of one to twenty times it have the same steps, to the last bit, for the same `atol / rtol`.
         """
         with jax.numpy_dtype_promotion("standard"):
             eps = float(jnp.finfo(y0.dtype).eps)
