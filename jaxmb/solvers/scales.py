@@ -67,7 +67,8 @@ class RunningScales(eqx.Module):
                 # From rest, a rate causes a motion of the size of the other block with this one.
                 ahead = jnp.sqrt(sizes[block.rate_of] * rate)
                 size = jnp.maximum(size, jnp.where(jnp.isfinite(ahead), ahead, 0.0))
-                least = float(jnp.finfo(y.dtype).eps) ** _LEAST_RATE
+                # Less where the motion itself is small.
+                least = jnp.finfo(y.dtype).eps ** _LEAST_RATE * jnp.minimum(sizes[block.rate_of], 1.0)
                 sizes[block.name] = jnp.maximum(size, least * jnp.asarray(block.initial, y.dtype))
         return lax.stop_gradient(jnp.stack([*sizes.values(), self._largest_rate(self._largest(y))]))
 
