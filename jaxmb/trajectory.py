@@ -109,7 +109,7 @@ class Trajectory(eqx.Module):
     `events` are the impacts of unilateral constraints, as a table.
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
-    that are given here. `closer` is the same motion at a tenth of the tolerances if `error` asked for it.
+    that are given here. `closer` is the same motion at tighter tolerances if `error` asked for it.
     """
 
     system: Any
@@ -220,7 +220,7 @@ class Trajectory(eqx.Module):
         result = self.closer.result
         if not isinstance(self.ts, Tracer) and self.closer.ts.shape != self.ts.shape:
             raise ValueError(
-                f"There is no error estimate, since the run at a tenth of the tolerances failed: {RESULTS[result]}"
+                f"There is no error estimate, since the run at tighter tolerances failed: {RESULTS[result]}"
             )
         return GlobalError(self, self.closer)
 
@@ -479,10 +479,11 @@ class PartMotion:
 
 
 class GlobalError(NamedTuple):
-    """The estimated global error of a motion: how far it is from the same one at a tenth of the tolerances.
+    """The estimated global error of a motion: how far it is from the same one at tighter tolerances.
 
-    The error of the closer motion is smaller by about the same factor, so the distance is nearly the error itself.
-    Errors of the model, and rounding errors that both motions share, are not seen. In derivatives it is a constant.
+    Steps of the closer motion may err a hundredth as much (near rounding, or with a method of a fixed order, a tenth),
+    so the distance is nearly the error itself. Errors of the model, and rounding errors that both motions share, are
+    not seen. In derivatives it is a constant.
     """
 
     motion: Trajectory

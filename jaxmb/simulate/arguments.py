@@ -21,6 +21,7 @@ from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScal
 from ..solvers.closures import opened
 from ..solvers.events import EventController
 from ..solvers.one_step import OneStepController
+from ..solvers.tolerances import closer_tolerance
 from ..system import AbstractSystem
 from ..system.parameters import parameters
 
@@ -33,6 +34,8 @@ _MORE_ROOM = 8
 MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
 # A program saves at this number of times, or at a power of 2 of them.
 _FEWEST_TIMES = 4
+# The least `rtol` with an error estimate, in units of the machine precision: a second run has a tenth.
+_CLOSEST = 100
 
 _KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
@@ -105,6 +108,21 @@ def check_error_estimate(saveat, stepsize_controller, event) -> None:
         raise ValueError(
             f"error=True compares two runs at the same times, which {what} does not have; give saveat=times."
         )
+
+
+def closer_tolerances(solver: Any, rtol: Any, atol: Any) -> tuple[Any, Any]:
+    """The tolerances of the second run of an error estimate: of the same parts of the error of a step.
+
+    Methods of a fixed order, to which a hundredth may be many times the steps, have a tenth.
+    """
+    if not is_traced(rtol) and rtol < _CLOSEST * jnp.finfo(rtol.dtype).eps:
+        raise ValueError(
+            f"error=True repeats the run at tighter tolerances, which rtol={float(rtol):.1e} leaves no room for in a "
+            f"precision of {rtol.dtype}; give at least {_CLOSEST * float(jnp.finfo(rtol.dtype).eps):.1e}."
+        )
+    is_multistep = isinstance(solver, AbstractMultistep)
+    closer = closer_tolerance(rtol, solver.finest, rtol.dtype) if is_multistep else rtol / 10
+    return closer, None if atol is None else atol * (closer / rtol)
 
 
 def parameter_changes(system: AbstractSystem, direction: Mapping[str, VectorLike]) -> dict[str, tuple[Any, Any]]:

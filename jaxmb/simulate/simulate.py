@@ -37,6 +37,7 @@ from .arguments import (
     checked_state,
     checked_times,
     checked_tolerances,
+    closer_tolerances,
     may_stop,
     named_solver,
     padded,
@@ -148,8 +149,9 @@ def simulate(
         of parameters; forward mode costs as much for one parameter and somewhat less than half a run for each further
         one, whatever the number of outputs.
     - `direction`: parameters by name with a change of each, for runs that are differentiated; see below.
-    - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run at a tenth of the
-        tolerances; both together take two to two and a half times as long as one, and nothing more to compile.
+    - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run whose
+        steps may err a hundredth as much; near rounding, and with a method of a fixed order, a tenth. Both together
+        take two to two and a half times as long as one, more with a low order, and nothing more to compile.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
         and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
         then exert, without restitution where contacts are closed, except at those whose own terrain or ends jump. A
@@ -225,6 +227,7 @@ def simulate(
     check_fixed_steps(method, stepsize_controller)
     if error:
         check_error_estimate(saveat, stepsize_controller, event)
+        closer_relative, closer_absolute = closer_tolerances(method, relative, absolute)
     restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
     saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]))
     first = saved.subs[0]
@@ -334,8 +337,8 @@ def simulate(
             dt0=dt0,
             saveat=saveat,
             solver=problem.solver,
-            rtol=relative / 10,
-            atol=None if absolute is None else absolute / 10,
+            rtol=closer_relative,
+            atol=closer_absolute,
             adjoint=adjoint,
             max_steps=max_steps,
         )

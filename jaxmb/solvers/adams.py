@@ -31,8 +31,6 @@ from .order import GAIN, choose_order
 from .tangent import Tangent, TangentControl
 from .tolerances import Tolerances, norm_of
 
-# The finest relative tolerance of a step, in units of the machine precision.
-_FINEST = 250
 # The target error of a step, in units of the tolerance.
 _TARGET = 0.2
 # Numbers of evaluations and matrices in a step.
@@ -145,6 +143,7 @@ class Adams(AbstractMultistep):
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., RateInterpolation]] = RateInterpolation
     solves_implicitly: ClassVar[bool] = False
+    finest: ClassVar[float] = 250.0
 
     def __init__(
         self,
@@ -253,7 +252,7 @@ class Adams(AbstractMultistep):
         failed = step.first.failed | step.second.failed
         started = self._started(state.sizes, before, step.first.f)
         state = eqx.tree_at(lambda state: state.sizes, state, started, is_leaf=lambda x: x is None)
-        scale = self.tolerances.of_step(before, after, h, state.sizes, _FINEST)
+        scale = self.tolerances.of_step(before, after, h, state.sizes, self.finest)
         sizes = self._sizes(terms, y0, scale, step.errors, state.chart)
         # In the first step the state changes at most by its own size, or by the tolerance.
         reached = sizes[2] / jnp.maximum(sizes[0], 1)
@@ -308,7 +307,7 @@ class Adams(AbstractMultistep):
     def _observed(self, state, h, before, predicted, after, first, second, like) -> Stiffness | None:
         if state.stiffness is None:
             return None
-        scale = self.tolerances.of_step(before, after, h, state.sizes, _FINEST)
+        scale = self.tolerances.of_step(before, after, h, state.sizes, self.finest)
         size = lambda change: self.weighted_norm(lax.stop_gradient(change), scale, like)
         correction = size(after - predicted), size(second - first)
         change = size(after - before), size(second - state.history.differences[0])

@@ -32,8 +32,6 @@ from .tolerances import Tolerances
 
 # Newton's method ends when the next correction is below this, in units of the tolerance.
 _NEWTON = 0.01
-# The finest relative tolerance of a step, in units of the machine precision.
-_FINEST = 50000
 # The target error of a step, in units of the tolerance.
 _TARGET = 0.05
 
@@ -167,6 +165,7 @@ class Hermite(AbstractMultistep):
 
     term_structure: ClassVar = diffrax.AbstractTerm
     solves_implicitly: ClassVar[bool] = True
+    finest: ClassVar[float] = 50000.0
 
     def __init__(
         self,
@@ -409,7 +408,7 @@ class Hermite(AbstractMultistep):
     def _tolerated(self, t1, before, state: HermiteState) -> Float[Array, " n"]:
         """The errors tolerated in the step, by the state that it starts from: those of its iterations as well."""
         h = step_end(state.history.mesh, t1) - state.history.mesh[0]
-        return self.tolerances.of_step(before, before, h, state.sizes, _FINEST)
+        return self.tolerances.of_step(before, before, h, state.sizes, self.finest)
 
     def _sizes(self, ends, points, family, newton, free, scale, like) -> Float[Array, " formulas"]:
         """Weighted norms of the errors of the formulas with these numbers of points.

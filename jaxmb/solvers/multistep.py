@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import diffrax
 import equinox as eqx
@@ -98,11 +98,14 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     - `tangent_control`: None; set where a tangent's error is controlled.
     - `solves_implicitly`: whether a step solves an equation for the independent components of the state, which an
         `AbstractManifoldTerm` then has to name (`free`).
+    - `finest`: the smallest relative tolerance of a step that the method resolves, in units of the machine precision;
+        default zero.
     """
 
     tolerances: AbstractVar[Tolerances]
     tangent_control: AbstractVar[TangentControl | None]
     solves_implicitly: AbstractVar[bool]
+    finest: ClassVar[float] = 0.0
 
     # diffrax fills in the tolerances of a step size controller here; there is no root finder.
     @property

@@ -18,6 +18,21 @@ from .scales import RunningScales
 _SHARE = 1 / 20
 
 
+def closer_tolerance(rtol: Any, finest: float, dtype: Any) -> Any:
+    """The relative tolerance whose steps may err a hundredth as much; near rounding, a tenth. `finest` as in
+    `Tolerances.of_step`.
+    """
+    with jax.numpy_dtype_promotion("standard"):
+        whole = _part_of_step(rtol, finest, dtype)
+        finest = finest * float(jnp.finfo(dtype).eps)
+        part = jnp.minimum(jnp.maximum(whole / 100, finest / 10), whole / 10)
+        return jnp.where(part < finest, part, part / _SHARE)
+
+
+def _part_of_step(rtol, finest, dtype):
+    return jnp.clip(finest * float(jnp.finfo(dtype).eps), _SHARE * rtol, rtol)
+
+
 def norm_of(norm: Callable[[PyTree], Any], flat: Array, like: PyTree[Array]) -> Any:
     """The norm of a raveled quantity, evaluated in the structure of `like` but in one precision."""
     return norm(unravel_like(jax.tree.map(lambda leaf: leaf.astype(flat.dtype), like), flat))
@@ -80,9 +95,8 @@ class Tolerances(eqx.Module):
         All `rtol` of one to twenty times it have the same steps, to the last bit, for the same `atol / rtol`.
         """
         with jax.numpy_dtype_promotion("standard"):
-            eps = float(jnp.finfo(y0.dtype).eps)
-            whole = jnp.maximum(self.rtol, eps)
-            rtol = jnp.clip(finest * eps, _SHARE * whole, whole)
+            whole = jnp.maximum(self.rtol, float(jnp.finfo(y0.dtype).eps))
+            rtol = _part_of_step(whole, finest, y0.dtype)
             share, atol = rtol / whole, rtol * (self.atol / whole)
         return self._scale(share, rtol, atol, y0, y1, h, sizes)
 
