@@ -227,7 +227,7 @@ def simulate(
     check_fixed_steps(method, stepsize_controller)
     if error:
         check_error_estimate(saveat, stepsize_controller, event)
-        closer_relative, closer_absolute = closer_tolerances(method, relative, absolute)
+    closer = closer_tolerances(method, relative, absolute) if error else None
     restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
     saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]))
     first = saved.subs[0]
@@ -330,17 +330,17 @@ def simulate(
         trajectory = trajectory.trimmed()
         if throw:
             trajectory = trajectory.result.error_if(trajectory, outcome.flags[0])
-    if error:
-        closer = again(
+    if closer is not None:
+        second = again(
             *(lax.stop_gradient((system, state)) if traced else (system, state)),
             t0=t0,
             dt0=dt0,
             saveat=saveat,
             solver=problem.solver,
-            rtol=closer_relative,
-            atol=closer_absolute,
+            rtol=closer[0],
+            atol=closer[1],
             adjoint=adjoint,
             max_steps=max_steps,
         )
-        trajectory = eqx.tree_at(lambda t: t.closer, trajectory, closer, is_leaf=lambda leaf: leaf is None)
+        trajectory = eqx.tree_at(lambda t: t.closer, trajectory, second, is_leaf=lambda leaf: leaf is None)
     return trajectory

@@ -37,13 +37,11 @@ def test_estimates_are_of_the_size_of_errors(name):
     assert np.mean((ratios > 0.1) & (ratios < 10)) >= 0.95 and np.max(ratios) < 100, np.sort(ratios)[[0, 1, -2, -1]]
 
 
-@pytest.mark.parametrize(
-    "name, solver, rtol", [("four_bar", mb.solvers.Hermite(), 2e-10), ("pendulum", mb.solvers.Adams(), 1e-12)]
-)
-def test_estimates_where_a_tighter_tolerance_has_the_same_steps(name, solver, rtol):
+@pytest.mark.parametrize("solver, rtol", [(mb.solvers.Adams(), 1e-12), (mb.solvers.Hermite(), 2e-10)])
+def test_estimates_where_a_tighter_tolerance_has_the_same_steps(solver, rtol):
     """Near rounding tolerances of a range mean the same error of a step."""
-    system, state = mb.mechanisms.get(name).system, mb.mechanisms.get(name).state
-    run = lambda rtol, **options: mb.simulate(system, state, t1=1.0, rtol=rtol, **options)
+    mechanism = mb.mechanisms.get("pendulum")
+    run = lambda rtol, **options: mb.simulate(mechanism.system, mechanism.state, t1=3.0, rtol=rtol, **options)
     found, exact = run(rtol, solver=solver, error=True), run(2e-14, solver=diffrax.Dopri8())
     true = np.max(np.abs(found.ys.u - exact.ys.u))
     assert true / 5 < np.max(found.error.ys.u) < 5 * true
@@ -51,7 +49,7 @@ def test_estimates_where_a_tighter_tolerance_has_the_same_steps(name, solver, rt
 
 def test_tolerances_without_room_for_a_second_run_are_refused():
     mechanism = mb.mechanisms.get("pendulum")
-    with pytest.raises(ValueError, match="leaves no room for .* give at least 2.2e-14"):
+    with pytest.raises(ValueError, match=r"leaves no room for .* give at least 2\.2e-14"):
         mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-14, error=True)
 
 
