@@ -111,9 +111,8 @@ def check_error_estimate(saveat, stepsize_controller, event) -> None:
 
 
 def closer_tolerances(solver: Any, rtol: Any, atol: Any) -> tuple[Any, Any]:
-    """The tolerances of the second run of an error estimate: of the same parts of the error of a step.
-
-    Methods of a fixed order, to which a hundredth may be many times the steps, have a tenth.
+    """The tolerances of the second run of an error estimate, whose steps may err a hundredth as much; a tenth where the
+    order is fixed, and a hundredth may take many times the steps.
     """
     if not is_traced(rtol) and rtol < _CLOSEST * jnp.finfo(rtol.dtype).eps:
         raise ValueError(

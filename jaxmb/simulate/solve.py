@@ -423,8 +423,8 @@ def _pushed(function, at, used):
 
 
 def running_scales(system, state, options) -> RunningScales:
-    """Natural units of coordinates, velocities and internal states; where nothing moves yet, one unit in the whole
-    time.
+    """Natural units of coordinates, velocities and internal states; what is expected of velocities where nothing moves
+    yet is one unit in the whole time.
     """
     span = jnp.abs(options["t1"] - options["t0"])
     units = natural_units(system, system.velocity_scale(), state.q.dtype)

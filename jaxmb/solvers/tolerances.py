@@ -23,10 +23,10 @@ def closer_tolerance(rtol: Any, finest: float, dtype: Any) -> Any:
     `Tolerances.of_step`.
     """
     with jax.numpy_dtype_promotion("standard"):
-        whole = _part_of_step(rtol, finest, dtype)
-        finest = finest * float(jnp.finfo(dtype).eps)
-        part = jnp.minimum(jnp.maximum(whole / 100, finest / 10), whole / 10)
-        return jnp.where(part < finest, part, part / _SHARE)
+        whole, least = _part_of_step(rtol, finest, dtype), finest * float(jnp.finfo(dtype).eps)
+        part = jnp.minimum(jnp.maximum(whole / 100, least / 10), whole / 10)
+        # The tolerance of which a step has this part: below the finest, a step has all of it.
+        return jnp.where(part < least, part, part / _SHARE)
 
 
 def _part_of_step(rtol, finest, dtype):
