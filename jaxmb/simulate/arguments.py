@@ -114,10 +114,11 @@ def closer_tolerances(solver: Any, rtol: Any, atol: Any) -> tuple[Any, Any]:
     """The tolerances of the second run of an error estimate, whose steps may err a hundredth as much; a tenth where the
     order is fixed, and a hundredth may take many times the steps.
     """
-    if not is_traced(rtol) and rtol < _CLOSEST * jnp.finfo(rtol.dtype).eps:
+    least = _CLOSEST * float(jnp.finfo(rtol.dtype).eps)
+    if not is_traced(rtol) and rtol < least:
         raise ValueError(
-            f"error=True repeats the run at tighter tolerances, which rtol={float(rtol):.1e} leaves no room for in a "
-            f"precision of {rtol.dtype}; give at least {_CLOSEST * float(jnp.finfo(rtol.dtype).eps):.1e}."
+            f"error=True repeats the run at tighter tolerances, which rtol={float(rtol):g} leaves no room for in a "
+            f"precision of {rtol.dtype}; give at least {_rounded_up(least)}."
         )
     is_multistep = isinstance(solver, AbstractMultistep)
     closer = closer_tolerance(rtol, solver.finest, rtol.dtype) if is_multistep else rtol / 10
@@ -162,7 +163,7 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
             raise ValueError(f"{name} must be between 0 and 1, got {value}.")
     if not is_traced(relative) and relative < least:
         if dtype != jnp.float32:
-            raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {least:.1e}.")
+            raise ValueError(f"rtol={rtol:g} is below what double precision can do; use at least {_rounded_up(least)}.")
         whose = "The default rtol" if rtol == DEFAULT_RTOL else "rtol"
         warnings.warn(
             f"{whose}={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
@@ -171,6 +172,11 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
         )
         relative = as_array(least, dtype)
     return relative, absolute
+
+
+def _rounded_up(bound: float) -> str:
+    """Two digits of a lower bound that are not below it, so that the value that a message names is accepted."""
+    return f"{1.05 * bound:.1e}"
 
 
 def checked_saveat(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
