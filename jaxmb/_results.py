@@ -15,8 +15,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
     singular_configuration = (
         "The mechanism came to a singular configuration (toggle, lock-up or bifurcation): the rank of its constraints "
-        "falls, or friction has no solution or more than one, and the motion beyond is not determined by them. With "
-        "`throw=False` the motion up to there is kept."
+        "falls, and the motion beyond is not determined by them. With `throw=False` the motion up to there is kept."
     )
     newton_failed = (
         "Newton's method found no state on the constraints, however small the step: constraints whose derivatives are "
@@ -49,3 +48,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     saved_outside = "A saved time is not between `t0` and `t1`, or not a number, or before the one that it follows."
     input_ended = "An input is a `Series` that is not known for the whole motion, from `t0` to `t1`."
     impacts_backward = "Impacts cannot be undone: with contacts `t1` must be after `t0`."
+    friction_undetermined = (
+        "The friction of joints has no solution, or more than one: its force changes the reaction that it depends on "
+        "too much (Painlevé's paradox). A smaller coefficient, or a compliant contact, has one. With `throw=False` the "
+        "motion up to there is kept."
+    )

@@ -18,7 +18,6 @@ from jaxtyping import Array
 from ..linalg.graphs import connected
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.rotations import cross, unrotate
-from ..states.assembly import violated_joints
 from ..states.closest import largest_residual, meet_in_blocks, tolerance
 from ..states.redundancy import (
     ZERO,
@@ -30,6 +29,7 @@ from ..states.redundancy import (
     dense_remains,
     smallest_step,
 )
+from ..states.refusals import violated_joints
 from ..system.equation import Ranks
 from ..system.residuals import binding_velocities, displaced, position_rows
 from .independence import JointBlocks, JointRows

@@ -83,7 +83,7 @@ class CoulombFriction(AbstractNonIdealForce):
     ```
 
     Its work is `−μ N s·δs/|s| tanh(|s| / transition_speed)`, which is smooth at rest. If no such N exists, or more than
-    one (Painlevé's paradox), a simulation ends with `singular_configuration`.
+    one (Painlevé's paradox), a simulation ends with `friction_undetermined`.
 
     **Arguments:**
 

@@ -73,4 +73,4 @@ def diagnose_friction(
     none = jnp.zeros((system.friction_rows.size,) * 2, y.q.dtype)
     coupling = lax.cond(failed, lambda: friction_coupling(system.at(y), formulation, t, y.q, y.u), lambda: none)
     singular = failed & jnp.all(jnp.isfinite(coupling)) & ~contracts((1 + _SINGULAR_COUPLING) * coupling)
-    return RESULTS.where(singular, RESULTS.singular_configuration, result), jnp.where(singular, coupling, none)
+    return RESULTS.where(singular, RESULTS.friction_undetermined, result), jnp.where(singular, coupling, none)

@@ -23,7 +23,7 @@ class Friction(AbstractNonIdeal):
     force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest, so that it creeps where
     `DryFriction` sticks. N is the magnitude of
     the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If no
-    such N exists, or more than one (Painlevé's paradox), the simulation ends with `singular_configuration`.
+    such N exists, or more than one (Painlevé's paradox), the simulation ends with `friction_undetermined`.
 
     **Arguments:**
 

@@ -13,16 +13,20 @@ from ..linalg.arrays import is_traced
 from ..manifold import find_jumps
 from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
+from ..states.refusals import LostRank, lost_rank, violated_joints
 from ..system.gaps import counts, gaps, names_of
 
 # Gaps below this fraction of the system's size are named where contacts have no solution.
 _TOUCH = 1e-6
 # Stiffness is not looked for after fewer steps than this, and found in this number.
 _ENOUGH, _LOOKED = 200, 512
+# So many joints of a singular configuration are named.
+_NAMED = 8
+# Residuals count beyond the end of a motion from this part of the displacement on.
+_UNMET = 0.1
 
-
-# What contacts resolve in single precision and, at the default tolerance, in double precision, relative to the size of
-# the system.
+# What steps resolve in single precision and, at the default tolerance, in double precision, relative to the size of the
+# system.
 _MOVED_SINGLE, _MOVED = 1e-6, 1e-11
 
 
@@ -115,20 +119,31 @@ def warn_of_jumps(system, outcome: Outcome, times, restarts, announced) -> None:
     )
 
 
-def message_of_failure(system, result, t1, outcome: Outcome, stats, solver, probe) -> str:
-    """Why a simulation with a solver failed; `probe` as in `is_stiff_at_end`."""
+def message_of_failure(system, result, times, outcome: Outcome, stats, solver, probe) -> str:
+    """Why a simulation with a solver failed, and where; `probe` as in `is_stiff_at_end`."""
+    if is_traced((system, outcome, times)):
+        return RESULTS[result]
     if np.any(outcome.coupling):
-        return about_friction(system, outcome.coupling)
-    if result == RESULTS.contacts_undetermined and not is_traced((system, outcome)):
+        return f"{how_far(outcome, times)} {about_friction(system, outcome.coupling)}"
+    if result == RESULTS.contacts_undetermined:
         return about_contacts(system, outcome)
-    if result == RESULTS.too_many_events and not is_traced(outcome.t):
-        return f"The motion came to t = {float(outcome.t):.6g} of {float(t1):.6g}. {RESULTS[result]}"
-    if result == RESULTS.max_steps_reached and not is_traced((system, outcome, t1)):
-        return about_steps(outcome, t1, stats, is_stiff_at_end(probe, stats, solver))
-    return reason_of_failure(system, result, t1, outcome)
+    if result == RESULTS.max_steps_reached:
+        return about_steps(outcome, times, stats, is_stiff_at_end(probe, stats, solver))
+    if not np.all(np.isfinite(np.concatenate(jax.tree.leaves(outcome.y)))):
+        return RESULTS[result]
+    if result == RESULTS.inconsistent_constraints:
+        return contradiction(system, outcome.t, outcome.y)
+    return f"{how_far(outcome, times)} {reason_of_failure(system, result, times, outcome)}"
 
 
-def about_steps(outcome: Outcome, t1, stats, stiff) -> str:
+def how_far(outcome: Outcome, times) -> str:
+    """The time at the end and that to be reached, with six digits of the time that they differ from the start."""
+    t0, t, t1 = float(times["t0"]), float(outcome.t), float(times["t1"])
+    digits = 6 + max(0, int(np.log10(max(abs(t0), 1e-300) / max(abs(t1 - t0), 1e-300))))
+    return f"The motion came to t = {t:.{digits}g} of {t1:.{digits}g}."
+
+
+def about_steps(outcome: Outcome, times, stats, stiff) -> str:
     """How far a motion came in the largest number of steps, and what takes it further.
 
     **Arguments:** `stiff`: whether it is stiff at its end, None where that is not known, and False with a solver for
@@ -136,7 +151,7 @@ def about_steps(outcome: Outcome, t1, stats, stiff) -> str:
     """
     steps = int(stats["num_steps"])
     length = "" if outcome.step is None else f", with steps of about {abs(float(outcome.step)):.2g} in the end"
-    text = f"The motion came to t = {float(outcome.t):.6g} of {float(t1):.6g} in max_steps = {steps} steps{length}. "
+    text = f"{how_far(outcome, times).rstrip('.')} in max_steps = {steps} steps{length}. "
     if stiff:
         return text + (
             "It is stiff there: stability is the limit of its steps. simulate(..., solver=jaxmb.solvers.Hermite()) "
@@ -168,36 +183,71 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
         return bool(probe(Adams(stiffness="count"), _LOOKED).stats["stiff"])
 
 
-def reason_of_failure(system, result, t1, outcome: Outcome) -> str:
-    """Why a simulation ended at a state, in one line, with what is not finite there or just beyond."""
-    text, t, y = RESULTS[result], outcome.t, outcome.y
-    if is_traced((system, t, y)) or not np.all(np.isfinite(np.concatenate(jax.tree.leaves(y)))):
-        return text
-    if result == RESULTS.inconsistent_constraints:
-        return contradiction(system, t, y)
+def reason_of_failure(system, result, times, outcome: Outcome) -> str:
+    """Why a simulation ended at a finite state: numbers that are not finite there or just beyond, the joints whose
+    constraints lose rank, those that cannot be met, or times that are too coarse.
+    """
+    t, y = outcome.t, outcome.y
     system = system.at(y)
     rates = system.rates(t, y.q, y.u)
-    for ahead in np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(t1, t - 1.0, t + 1.0) - t):
-        wrong = system.not_finite(t + ahead, y.q + ahead * rates, y.u)
+    ahead = np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(times["t1"], t - 1.0, t + 1.0) - t)
+    for step in ahead:
+        wrong = system.not_finite(t + step, y.q + step * rates, y.u)
         if wrong:
-            return (
-                f"The motion came to t = {float(t):.6g} of {float(t1):.6g}: at t = {float(t + ahead):.6g} "
-                f"{' and '.join(wrong)} is not finite. With `throw=False` the motion up to there is kept."
-            )
-    return text + about_coarse_times(system, t, y) if result == RESULTS.newton_failed else text
+            names = f"{' and '.join(wrong)} {'is' if len(wrong) == 1 else 'are'} not finite"
+            return f"At t = {float(t + step):.6g} {names}. With `throw=False` the motion up to there is kept."
+    if result not in (RESULTS.newton_failed, RESULTS.singular_configuration):
+        return RESULTS[result]
+    lost = lost_rank(system, t, y)
+    if lost is not None:
+        return about_lost_rank(lost)
+    coarse = about_coarse_times(system, times, t, y)
+    return f"{coarse} Or: {RESULTS[result]}" if coarse else RESULTS[result] + about_unmet(system, outcome, ahead, rates)
 
 
-def about_coarse_times(system, t, y) -> str:
-    """What to do where contacts move by more than they resolve from one number for the time to the next; empty where
-    they do not.
+def about_lost_rank(lost: LostRank) -> str:
+    """Which joints make a configuration singular, and which drives lead beyond it."""
+    text = (
+        "The mechanism came to a singular configuration there (toggle, lock-up or bifurcation): the constraints of "
+        f"{', '.join(lost.joints[:_NAMED])} are no longer independent"
+    )
+    if lost.drives:
+        names = " and ".join(repr(name) for name in lost.drives)
+        leaves = "leaves its reach" if len(lost.drives) == 1 else "leave their reach"
+        text += f", and the motion that {names} prescribes {leaves}: the mechanism cannot follow it beyond"
+    else:
+        text += ", and the motion beyond is not determined by them"
+    return f"{text}. With `throw=False` the motion up to there is kept."
+
+
+def about_unmet(system, outcome: Outcome, ahead, rates) -> str:
+    """The joints with the largest residuals where a motion goes on without constraints, by the next step or a shorter
+    one; empty where residuals are small beside the displacement, as smooth constraints leave them.
+    """
+    t, y = outcome.t, outcome.y
+    speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=0.0)
+    next_step = [] if outcome.step is None else [float(outcome.step)]
+    for step in [*next_step, *ahead]:
+        q = system.normalize(y.q + step * rates)
+        unmet = violated_joints(system, t + step, q, least=max(1e-9, _UNMET * abs(step) * speed))
+        if unmet:
+            units = " [m, rad]" if system.body_names else ""
+            return f" At t = {float(t + step):.6g}, just beyond, the largest residuals{units} are of {unmet}."
+    return ""
+
+
+def about_coarse_times(system, times, t, y) -> str:
+    """What to do where a motion changes by more than it resolves from one number for the time to the next; empty where
+    it does not.
     """
     coarse = float(np.spacing(np.abs(np.asarray(t))))
-    moved = coarse * float(np.max(np.abs(y.u) / system.velocity_scale(), initial=0.0))
+    speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=1 / abs(times["t1"] - times["t0"]))
+    moved = coarse * float(speed)
     single = np.finfo(y.q.dtype).bits < 64
-    if system.contacts is None or moved < (_MOVED_SINGLE if single else _MOVED):
+    if moved < (_MOVED_SINGLE if single else _MOVED):
         return ""
     cure = "Switch double precision on, or let the time begin at zero." if single else "Let the time begin at zero."
     return (
-        f" Or it is the time: the numbers next to t = {float(t):.6g} are {coarse:.1e} s away, in which bodies move by "
-        f"{moved:.1e} of the size of the system, more than contacts resolve. {cure}"
+        f"The time is too coarse for steps of this accuracy: the numbers next to t = {float(t):.6g} are {coarse:.1e} s "
+        f"away, in which bodies move by {moved:.1e} of the size of the system. {cure}"
     )

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import ArrayLike
 
 from .._arguments import check_kind
+from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import derivatives_of, is_traced
@@ -23,6 +24,7 @@ from ..solvers import Adams, Hermite
 from ..solvers.closures import opened
 from ..states.arguments import check_precision
 from ..states.consistency import consistent
+from ..states.refusals import lost_rank
 from ..system import AbstractSystem
 from ..system.inputs import Signals, input_break_times, turning_times, with_inputs
 from ..trajectory import Trajectory
@@ -312,6 +314,9 @@ def simulate(
             consistent(system, times["t0"], state)
         if flags.stuck:
             result, coupling = made_precise(problem, trajectory.result, outcome)
+            if result == RESULTS.newton_failed and lost_rank(system.at(outcome.y), outcome.t, outcome.y) is not None:
+                # Elimination in blocks does not tell.
+                result = RESULTS.singular_configuration
             trajectory = eqx.tree_at(lambda trajectory: trajectory.result, trajectory, result)
             outcome = outcome._replace(coupling=coupling)
         if not system.drift_free and system.acceleration_rows > 0:
@@ -321,7 +326,7 @@ def simulate(
             on = functools.partial(again, system, outcome.y, t0=outcome.t, rtol=relative)
             probe = lambda solver, steps: on(solver=solver, max_steps=steps, atol=absolute)
             text = message_of_failure(
-                system, trajectory.result, times["t1"], outcome, trajectory.stats, problem.solver, probe
+                system, trajectory.result, times, outcome, trajectory.stats, problem.solver, probe
             )
             raise RuntimeError(text)
         if not flags.whole:

@@ -20,7 +20,7 @@ from ..linalg.jitted import jitted
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.gaps import CLOSED, OPEN
-from ..system.quantities import directions, rates_of
+from ..system.quantities import rates_of
 from .arguments import (
     check_system,
     checked_guess,
@@ -32,14 +32,12 @@ from .arguments import (
     split_rates,
 )
 from .closest import closest_configuration, closest_velocities
-from .consistency import listed
+from .refusals import cannot_assemble, cannot_move
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0
 # Velocities that were given count as changed by more than this fraction; this many of them are named.
 _CHANGED, _NAMED = 0.01, 3
-# Singular values, of rows of unit length, that count as zero.
-_DEPENDENT = 1e-8
 
 
 @names_arguments
@@ -109,7 +107,7 @@ def assemble(
     # Under a trace, results of concrete numbers are traced as well.
     if raises and not is_traced((ok, ok_rates)):
         if not ok_rates:
-            raise ValueError(_cannot_move(system, t, q, u, fixed_rates))
+            raise ValueError(cannot_move(system, t, q, u, fixed_rates))
         if of_bodies and not is_traced((system, u)):
             _warn_of_changed_velocities(system, guess.u, u)
         return State(q, u, z)
@@ -168,7 +166,7 @@ def configuration(
             return q, fixed, jnp.array(True)
     q, ok = closest_configuration(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
     if throw and not is_traced(ok) and not ok:
-        raise ValueError(_cannot_assemble(system, t, q, fixed))
+        raise ValueError(cannot_assemble(system, t, q, fixed))
     return q, fixed, ok
 
 
@@ -188,82 +186,3 @@ def _is_met(system, t, q):
 def _check_finite(vector, what):
     if not np.all(np.isfinite(vector)):
         raise ValueError(f"The guess or the fixed {what} are not finite: {np.asarray(vector)}.")
-
-
-def violated_joints(system: AbstractSystem, t: Scalar, q: Coordinates, least: float = 1e-9) -> str:
-    """The joints that a configuration violates with their largest residuals, the largest first, for messages.
-
-    `least`: residuals below it, relative to the system's size, do not count.
-    """
-    residual = np.nan_to_num(np.abs(np.asarray(system.position_residual(t, q))), nan=np.inf)
-    return listed(system, residual >= least * float(system.length), residual)
-
-
-def _cannot_assemble(system, t, q, fixed):
-    names = system.coordinate_names()
-    text = "The mechanism cannot be assembled"
-    of_bodies = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
-    # Coordinates of joints that are held are rows of their names.
-    rows = [k for k, (name, _) in enumerate(system.rows) if name in system.joint_coordinates()]
-    held = [*of_bodies, *(system.rows[k][0] for k in rows)]
-    if held:
-        text += f" with {', '.join(dict.fromkeys(held))} fixed"
-    dependent = _dependent(system, t, q, held, [names[name][0] for name in of_bodies], rows)
-    violated = violated_joints(system, t, q)
-    units = " [m, rad]" if system.body_names else ""
-    remain = f"residuals{units} remain in {violated}"
-    if dependent:
-        return f"{text}: {dependent}{f'; {remain}' if violated else ''}. Fix fewer of them."
-    if violated:
-        return f"{text}: {remain}. Check lengths, points and axes, or give a better guess."
-    if held:
-        return f"{text}: these coordinates are not independent of each other. Fix fewer of them, or others."
-    return (
-        f"{text}: the configuration that is closest to the guess is singular, or not the only one. Give another guess "
-        "of the positions."
-    )
-
-
-def _dependent(system, t, q, held, places, rows):
-    """Which fixed coordinates the constraints determine, alone or from each other, in a configuration; empty for none.
-
-    **Arguments:** `held`: their names; `places` in q of the first of them, and `rows` that hold the others, which are
-    coordinates of joints.
-
-    A motion that the constraints admit changes the fixed coordinates by the rows of a basis of such motions. Rows that
-    depend on each other, or vanish, belong to coordinates that cannot be chosen together.
-    """
-    scale = np.asarray(system.coordinate_scale())
-    jacobian = np.asarray(system.coordinate_jacobian(t, q)) * scale
-    jacobian /= np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), 1e-300)
-    _, sizes, right = np.linalg.svd(np.delete(jacobian, rows, axis=0))
-    motions = right[np.sum(sizes > _DEPENDENT) :].T
-    of_held = np.concatenate([motions[places], jacobian[rows] @ motions])
-    left, sizes, _ = np.linalg.svd(of_held)
-    combinations = left[:, np.sum(sizes > _DEPENDENT) :]
-    sizes = np.max(np.abs(combinations), axis=1, initial=0.0)
-    together = [name for name, size in zip(held, sizes, strict=True) if size > 1e-6]
-    if not together:
-        return ""
-    if len(together) == 1:
-        return f"the constraints determine {together[0]} already"
-    free = len(together) - combinations.shape[1]
-    chosen = f"of these {len(together)} coordinates only {free} can be chosen" if free else "none of them can be chosen"
-    return f"{', '.join(together[:-1])} and {together[-1]} depend on each other: {chosen}"
-
-
-def _cannot_move(system, t, q, u, fixed):
-    held = [name for k, name in directions(system.rate_names()).items() if fixed[k]]
-    residual = np.nan_to_num(np.abs(np.asarray(system.velocity_residual(t, q, u))), nan=np.inf)
-    own = system.rows[: system.velocity_rows]
-    least = 1e-6 * np.max(residual)
-    rows = sorted({name for (name, _), r in zip(own, residual, strict=True) if r >= least})
-    if not held:
-        return (
-            f"No velocities satisfy {', '.join(rows)}: the constraint rows are not independent in this configuration. "
-            "Assemble another configuration, with fix or a guess."
-        )
-    return (
-        f"No velocities satisfy {', '.join(rows)} with the rates {', '.join(held)} fixed: these contradict each other. "
-        "Fix fewer rates, or others."
-    )

@@ -159,7 +159,7 @@ def test_a_motion_ends_where_friction_is_no_longer_unique(solver):
     system, start = into_the_paradox()
     options = {"t1": 1.0, "saveat": diffrax.SaveAt(steps=True), "throw": False} | SOLVERS[solver]
     run = mb.simulate(system, start, **options)
-    assert run.result == mb.RESULTS.singular_configuration
+    assert run.result == mb.RESULTS.friction_undetermined
     assert run.ts.size > 10 and np.all(np.isfinite(run.ys.q))
     np.testing.assert_allclose(coupling(STEEP, run["rod"].angle[-1]), 1.0, rtol=1e-6)
     assert run.reactions["floor"].force[-1, 1] < 0

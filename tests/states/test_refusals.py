@@ -1,0 +1,143 @@
+"""Why a mechanism cannot be assembled, moved or simulated on, at dead centres and beyond them."""
+
+import re
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+
+CRANK, ROD = 0.3, 0.8
+REACH = CRANK + ROD
+
+
+def slider_crank(angle, *drivers):
+    """A crank at an angle, a rod and a piston on the x axis."""
+    pin = CRANK * np.array([np.cos(angle), np.sin(angle)])
+    end = np.array([pin[0] + np.sqrt(ROD**2 - pin[1] ** 2), 0.0])
+    bodies = [
+        planar.Body("crank", mass=1.0, inertia=0.02, position=pin / 2, angle=angle),
+        planar.Body("rod", mass=1.0, inertia=0.06, position=(pin + end) / 2, angle=float(np.arcsin(-pin[1] / ROD))),
+        planar.Body("piston", mass=0.5, inertia=0.01, position=end),
+    ]
+    joints = [
+        planar.Revolute("O", "ground", "crank", point=(0.0, 0.0)),
+        planar.Revolute("P", "crank", "rod", point=pin),
+        planar.Revolute("Q", "rod", "piston", point=end),
+        planar.Prismatic("slide", "ground", "piston", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis=(1.0, 0.0)),
+    ]
+    return mb.Scene(bodies, joints=[*joints, *drivers]).compile(), end[0]
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return slider_crank(0.6)[0]
+
+
+@pytest.fixture(scope="module")
+def straight():
+    return slider_crank(0.0)[0]
+
+
+@pytest.fixture(scope="module")
+def bar():
+    body = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    return mb.Scene([body], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+ASSEMBLED = {
+    "a joint at its reach": ({"slide.displacement": REACH}, "at the end of the reach of slide.displacement"),
+    "a body at its reach": ({"piston.x": REACH}, "at the end of the reach of piston.x"),
+    "a joint beyond": ({"slide.displacement": REACH + 0.1}, "the value of slide.displacement is out of reach.*P"),
+    "a body beyond": ({"piston.x": REACH + 0.1}, "the value of piston.x is out of reach.*P"),
+    "a coordinate without freedom": ({"piston.y": 0.1}, "the constraints determine piston.y already.*slide"),
+    "two of one freedom": ({"piston.x": 1.0, "crank.angle": 0.3}, "of these 2 coordinates only 1 can be chosen"),
+}
+
+
+@pytest.mark.parametrize("case", ASSEMBLED)
+def test_coordinates_that_cannot_be_fixed(machine, case):
+    """A coordinate that moves elsewhere is not called dependent, and a lone one is not said to depend on others."""
+    fix, why = ASSEMBLED[case]
+    with pytest.raises(ValueError, match=why) as error:
+        mb.assemble(machine, fix=fix)
+    assert len(fix) > 1 or not re.search("each other|these coordinates", str(error.value))
+
+
+def test_coordinates_beyond_the_reach_of_a_bar_that_is_drawn_at_it(bar):
+    """The bar is drawn at the end of the reach of x, which is free elsewhere."""
+    with pytest.raises(ValueError, match=r"value of bar.x is out of reach.* remain in pin \(2\.5\)"):
+        mb.assemble(bar, fix={"bar.x": 3.0})
+    with pytest.raises(ValueError, match=r"at the end of the reach of bar\.x"):
+        mb.assemble(bar, fix={"bar.x": 0.5})
+    np.testing.assert_allclose(mb.assemble(bar, fix={"bar.x": 0.4}).q[0], 0.4, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rate", ["slide.displacement", "piston.x", "piston.y"])
+def test_rates_that_a_position_forbids(straight, rate):
+    """At the dead centre the piston stands still, and across its guide it always does."""
+    with pytest.raises(ValueError, match=f"with the rates {rate} fixed: in this configuration .* determine {rate}"):
+        mb.assemble(straight, rates={rate: 0.1})
+
+
+def test_rates_that_contradict_each_other(machine):
+    with pytest.raises(ValueError, match=r"with the rates .*crank.angle.* fixed: these contradict each other"):
+        mb.assemble(machine, rates={"crank.angle": 1.0, "rod.angle": 1.0})
+
+
+METHODS = {
+    "Partition": {},
+    "Projection": {"manifold": mb.manifold.Projection()},
+    "Runge-Kutta": {"solver": diffrax.Dopri8(), "max_steps": 4000},
+}
+
+
+@pytest.fixture(scope="module")
+def pulled():
+    """The piston is pulled at 0.05 m/s to its dead centre and beyond."""
+    _, start = slider_crank(0.6)
+    return slider_crank(0.6, mb.JointDriver("pull", "slide.displacement", value=start, rate=0.05))[0], start
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_drive_that_leaves_its_reach_is_named(pulled, method):
+    """By one result, with every way to stay on the constraints, at the time at which it does."""
+    system, start = pulled
+    when = (REACH - start) / 0.05
+    run = lambda **given: mb.simulate(system, mb.assemble(system), t1=2 * when, **METHODS[method] | given)
+    assert run(throw=False).result == mb.RESULTS.singular_configuration
+    with pytest.raises(RuntimeError, match=r"'pull' prescribes leaves its reach") as error:
+        run()
+    found = re.match(r"The motion came to t = (\S+) of ", str(error.value))
+    np.testing.assert_allclose(float(found[1]), when, rtol=1e-5)
+    assert "friction" not in str(error.value)
+
+
+def test_a_large_mechanism_tells_the_same():
+    """Sparse elimination does not look at ranks: a drive of one of many arms leaves its reach."""
+    bodies, joints = [], []
+    for k in range(10):
+        names = f"upper{k}", f"lower{k}"
+        bodies += [planar.Body(names[0], mass=1.0, inertia=0.1, position=(0.5, k), angle=0.0)]
+        bodies += [planar.Body(names[1], mass=1.0, inertia=0.1, position=(1.0, k + 0.5), angle=np.pi / 2)]
+        joints += [planar.Revolute(f"hip{k}", "ground", names[0], point=(0.0, k))]
+        joints += [planar.Revolute(f"knee{k}", *names, point=(1.0, k))]
+    reach = {"quantity": "distance", "point_a": (0.0, 3.0), "point_b": (0.5, 0.0)}
+    foot = planar.Driver("foot", "ground", "lower3", motion=lambda t, p: jnp.sqrt(2.0) + t, **reach)
+    system = mb.Scene(bodies, joints=[*joints, foot]).compile()
+    assert system.elimination is not None
+    assert mb.simulate(system, mb.assemble(system), t1=1.0, throw=False).result == mb.RESULTS.singular_configuration
+    with pytest.raises(RuntimeError, match=r"came to t = 0\.58\d+ of 1\..* 'foot' prescribes leaves its reach"):
+        mb.simulate(system, mb.assemble(system), t1=1.0)
+
+
+def test_times_too_coarse_for_any_step_are_named(bar):
+    """Seconds since 1970: the first step would be shorter than the distance between two numbers."""
+    where = r"came to t = 1700000000\S* of 1700000002\. The time is too coarse.*2.4e-07 s away.*begin at zero"
+    for options in ({}, {"manifold": mb.manifold.Projection()}):
+        with pytest.raises(RuntimeError, match=where):
+            mb.simulate(bar, mb.assemble(bar), t0=1.7e9, t1=1.7e9 + 2, **options)
