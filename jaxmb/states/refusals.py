@@ -81,14 +81,17 @@ def _directions(system, t, q):
     return _unit_rows(np.asarray(_linearised(system, t, q)[1]))
 
 
-def _beside(system, t, q, rows):
-    """A configuration near one that may be singular, on the constraints without these rows."""
-    scale = np.asarray(system.coordinate_scale())
+def _beside(system, t, q, free, rows=()):
+    """A configuration near one that may be singular, on the constraints without these rows, and what remains of them.
+
+    **Arguments:** `free`: a mask of the coordinates that may change.
+    """
+    scale = np.asarray(system.coordinate_scale()) * free
     q = np.asarray(q) + _BESIDE * scale * np.random.default_rng(0).uniform(-1.0, 1.0, q.size)
     for _ in range(_ITERATIONS):
         residual, jacobian = (np.delete(np.asarray(x), rows, axis=0) for x in _linearised(system, t, q))
-        q = q - scale * np.linalg.lstsq(jacobian, residual, rcond=_DEPENDENT)[0]
-    return q
+        q = q - scale * np.linalg.lstsq(jacobian * free, residual, rcond=_DEPENDENT)[0]
+    return q, np.max(np.abs(np.delete(_linearised(system, t, q)[0], rows)), initial=0.0)
 
 
 def cannot_assemble(system: AbstractSystem, t: Scalar, q: Coordinates, fixed: Int[np.ndarray, "nq"]) -> str:
@@ -107,10 +110,16 @@ def cannot_assemble(system: AbstractSystem, t: Scalar, q: Coordinates, fixed: In
     remain = f"residuals{' [m, rad]' if system.body_names else ''} remain in {violated}"
     if held.names:
         here, _ = held.dependent(_directions(system, t, q), _LOST_IN_SEARCH)
-        together, free = held.dependent(_directions(system, t, _beside(system, t, q, rows)))
+        beside, _ = _beside(system, t, q, np.ones(q.size), rows)
+        together, free = held.dependent(_directions(system, t, beside))
         if together:
             return f"{text}: {_dependence(together, free)}{f'; {remain}' if violated else ''}. Fix fewer of them."
         if here and violated:
+            if _beside(system, t, q, ~fixed)[1] < _ZERO * float(system.length):
+                return (
+                    f"{text}: the guess is at a dead centre of {' and '.join(here)}, from which both sides are near; "
+                    f"there {remain}. Give a guess beside it."
+                )
             return (
                 f"{text}: {_values(listing)} out of reach; in the closest configuration {remain}. Give other values, "
                 "or check lengths, points and axes."

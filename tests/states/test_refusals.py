@@ -74,7 +74,10 @@ def test_coordinates_beyond_the_reach_of_a_bar_that_is_drawn_at_it(bar):
         mb.assemble(bar, fix={"bar.x": 3.0})
     with pytest.raises(ValueError, match=r"at the end of the reach of bar\.x"):
         mb.assemble(bar, fix={"bar.x": 0.5})
-    np.testing.assert_allclose(mb.assemble(bar, fix={"bar.x": 0.4}).q[0], 0.4, rtol=1e-12)
+    with pytest.raises(ValueError, match=r"the guess is at a dead centre of bar\.x"):
+        mb.assemble(bar, fix={"bar.x": 0.4})
+    raised = mb.assemble(bar, fix={"bar.angle": 0.1})
+    np.testing.assert_allclose(mb.assemble(bar, raised, fix={"bar.x": 0.4}).q[2], np.arccos(0.8), rtol=1e-12)
 
 
 @pytest.mark.parametrize("rate", ["slide.displacement", "piston.x", "piston.y"])
