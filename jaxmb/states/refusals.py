@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -169,13 +170,19 @@ def cannot_move(system: AbstractSystem, t: Scalar, q: Coordinates, u: Velocities
             "with fix or a guess."
         )
     text += f" with the rates {', '.join(dict.fromkeys(held.names))} fixed"
-    jacobian = _unit_rows(np.asarray(system.jacobian(t, q, u)) * np.asarray(system.velocity_scale()))
-    sizes = np.linalg.norm(held.directions(jacobian, _DEPENDENT), axis=1)
-    still = [name for name, size in zip(held.names, sizes, strict=True) if size < _ZERO]
-    if still:
+    scale = np.asarray(system.velocity_scale())
+    jacobian, own = np.asarray(system.jacobian(t, q, u)) * scale, np.asarray(system.velocity_residual(t, q, u))
+    still = np.linalg.norm(held.directions(_unit_rows(jacobian), _DEPENDENT), axis=1) < _ZERO
+    # How the rates that are held change on the way to velocities that satisfy the constraints alone.
+    others = np.setdiff1d(np.arange(own.size), rows)
+    change = np.linalg.lstsq(jacobian[others], -own[others], rcond=_DEPENDENT)[0]
+    changes = np.abs(np.append((scale * change)[places], jacobian[rows] @ change + own[rows]))
+    wrong = still & (changes > _ZERO * np.max(changes, initial=0.0))
+    if np.any(wrong):
+        names = dict.fromkeys(name for name, is_wrong in zip(held.names, wrong, strict=True) if is_wrong)
         return (
-            f"{text}: in this configuration the constraints determine {' and '.join(dict.fromkeys(still))}, as at a "
-            "dead centre. Assemble another configuration, with fix or a guess, or prescribe other rates."
+            f"{text}: in this configuration the constraints determine {' and '.join(names)}, as at a dead centre. "
+            "Assemble another configuration, with fix or a guess, or prescribe other rates."
         )
     return f"{text}: these contradict each other. Fix fewer rates, or others."
 
@@ -210,7 +217,7 @@ def lost_rank(system: AbstractSystem, t: Scalar, y: State) -> LostRank | None:
     share = left[:, system.acceleration_rank - 1]
     prescribed = np.zeros_like(share)
     if system.linear and not system.drift_free:
-        prescribed[: system.velocity_rows] = np.asarray(system.velocity_residual(t, q, np.zeros_like(y.u)))
+        prescribed[: system.velocity_rows] = np.asarray(system.velocity_residual(t, q, jnp.zeros_like(y.u)))
     asked = np.abs(share * prescribed / lengths)
     # What the rows ask for together, relative to its terms.
     leaves = np.abs(np.sum(share * prescribed / lengths)) > _SHARE * np.sum(asked)
