@@ -90,7 +90,7 @@ def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) 
     signals = [signal for signal, binding in system.signals.values() if not signal.break_times(of_rates=binding).size]
     if not signals and not system.of_time:
         return None
-    return _turning_times(signals, system if system.of_time else None, state, t0, t1)
+    return _turning_times(signals, system.at(state) if system.of_time else None, state, t0, t1)
 
 
 @eqx.filter_jit

@@ -148,6 +148,62 @@ def test_a_part_of_ones_own():
         mb.simulate(silent, mb.assemble(silent), t1=END)
 
 
+class Burst(mb.parts.AbstractDynamicForce):
+    """A pulse of a force whose size is an internal state, and of the rate of another one."""
+
+    name: str = mb.parts.name()
+    body: str = mb.parts.body_name()
+    size: mb.parts.Number = mb.parts.internal_state(unit="N", default=1.0)
+    spent: mb.parts.Number = mb.parts.internal_state(unit="N s", default=0.0)
+    of_time = True
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.zeros((1, 3)).at[0, 0].set(self.size * pulse(jnp.abs(t), 0.02))
+
+    def state_rates(self, space, poses, velocities, t):
+        return {"size": jnp.zeros_like(self.size), "spent": self.size * pulse(jnp.abs(t), 0.02)}
+
+    def given_in_time(self, space, poses, velocities, t):
+        return jnp.append(
+            self.wrenches(space, poses, velocities, t), self.state_rates(space, poses, velocities, t)["spent"]
+        )
+
+
+SLED = planar.Body("sled", mass=2.0, inertia=1.0)
+BURST = mb.Scene(
+    [SLED],
+    joints=[planar.Prismatic("rail", "ground", "sled", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis=(1.0, 0.0))],
+    forces=[Burst("burst", "sled")],
+).compile()
+
+
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.long)])
+@pytest.mark.parametrize("end", [END, -END])
+def test_a_pulse_of_a_force_with_internal_states(solver, end):
+    """Of the force, whose size is a state, and of the rate of a state, in both directions of time."""
+    for size in (1.0, -40.0):
+        start = mb.assemble(BURST, fix={"burst.size": size})
+        motion = mb.simulate(BURST, start, t1=end, rtol=1e-8, solver=SOLVERS[solver], max_steps=4000)
+        impulse = size * np.sign(end) * 0.02 * np.sqrt(np.pi)
+        np.testing.assert_allclose(motion.ys.u[-1, 0], impulse / 2.0, rtol=1e-6)
+        np.testing.assert_allclose(motion["burst"].spent[-1], impulse, rtol=1e-6)
+
+
+@pytest.mark.long
+def test_gradient_by_the_internal_state_of_a_pulse():
+    """The velocity is proportional to the state."""
+
+    def rate(size):
+        start = mb.assemble(BURST, fix={"burst.size": size})
+        return mb.simulate(BURST, start, t1=END, rtol=1e-8).ys.u[-1, 0]
+
+    slope = 0.01 * np.sqrt(np.pi)
+    sizes = jnp.array([1.0, -40.0])
+    np.testing.assert_allclose(jit_quickly(jax.vmap(rate))(sizes), slope * sizes, rtol=1e-6)
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(jit_quickly(jax.vmap(derivative(rate)))(sizes), slope, rtol=1e-6)
+
+
 def test_steps_of_the_users_own_controller():
     """Tolerances of the user miss no pulse either; times of the user's own are left to them."""
     system, inputs = WAYS["cubic series"](0.1)
