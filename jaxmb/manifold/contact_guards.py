@@ -122,10 +122,10 @@ class ContactGuards(AbstractGuards):
 
 
 def contact_guards(
-    system: AbstractEquation, formulation: AbstractFormulation, touch: Float[Array, ""]
+    system: AbstractEquation, formulation: AbstractFormulation, touch: Float[Array, ""] | None
 ) -> ContactGuards | None:
-    """The guards of a system's contacts; None without any."""
-    return None if system.contacts is None else ContactGuards(system, formulation, touch)
+    """The guards of a system's contacts, of which gaps up to `touch` count as closed; None without any."""
+    return None if system.contacts is None or touch is None else ContactGuards(system, formulation, touch)
 
 
 def after_jump(term: Any, t: Scalar, y: State) -> State:

@@ -60,6 +60,10 @@ class AbstractManifold(eqx.Module):
         **Arguments:** `interpolated`: whether states between steps are among those that are saved.
         """
 
+    def contact_tolerance(self, system: AbstractEquation, rtol: Scalar) -> Any:
+        """The gaps that count as closed, relative to the system's size; None without contacts."""
+        return contact_tolerance(system, None, rtol)
+
     def statistics(self, solver_state: Any) -> dict[str, Array]:
         """Counts of the policy's work, from the final state of the solver."""
         del solver_state
@@ -116,3 +120,13 @@ def newton_tolerance(given: float | None, rtol: Scalar) -> Any:
     if given is not None:
         return as_array(given, dtype)
     return namespace(rtol).clip(1e-3 * rtol, 64 * float(jnp.finfo(dtype).eps), 1e-6)
+
+
+def contact_tolerance(system: AbstractEquation, newton_tol: float | None, rtol: Scalar) -> Any:
+    """The gaps that count as closed, relative to the system's size: those up to a thousandth of the tolerance of
+    integration, and up to a given tolerance of positions; None without contacts.
+    """
+    if system.contacts is None:
+        return None
+    least = newton_tolerance(None, rtol)
+    return least if newton_tol is None else namespace(least).maximum(least, newton_tol)

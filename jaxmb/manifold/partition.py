@@ -49,7 +49,7 @@ from .constraints import (
 )
 from .contact_guards import after_jump, contact_guards
 from .diagnosis import diagnose
-from .manifold import AbstractManifold, VectorField, newton_tolerance
+from .manifold import AbstractManifold, VectorField, contact_tolerance, newton_tolerance
 from .orthogonal_projection import project_normalized
 
 # Largest number of Newton iterations for positions.
@@ -394,13 +394,17 @@ class Partition(AbstractManifold):
                 "manifold=Projection() with it."
             )
         check_mass(system, formulation)
-        return PartitionTerm(system, formulation, self.max_influence, newton_tolerance(self.newton_tol, rtol)), solver
+        tol, touch = newton_tolerance(self.newton_tol, rtol), self.contact_tolerance(system, rtol)
+        return PartitionTerm(system, formulation, self.max_influence, tol, touch), solver
 
     def default_formulation(self, system):
         return _PARTITIONED
 
     def correction(self, interpolated):
         return project_normalized if interpolated else None
+
+    def contact_tolerance(self, system, rtol):
+        return contact_tolerance(system, self.newton_tol, rtol)
 
     def statistics(self, solver_state):
         return {"newton_iterations": solver_state.chart.newton, "charts": solver_state.chart.charts}
@@ -475,12 +479,13 @@ class Chart(eqx.Module):
 
 
 class PartitionTerm(AbstractManifoldTerm):
-    """A constrained system as a term with charts."""
+    """A constrained system as a term with charts; `touch`: the gaps that count as closed, None without contacts."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
     max_influence: float = eqx.field(static=True)
     newton_tol: Float[Array, ""]
+    touch: Float[Array, ""] | None = None
 
     def vf(self, t, y, args):
         return VectorField(self.system, self.formulation)(t, y, args)
@@ -576,7 +581,7 @@ class PartitionTerm(AbstractManifoldTerm):
 
     @property
     def guards(self):
-        return contact_guards(self.system, self.formulation, self.newton_tol)
+        return contact_guards(self.system, self.formulation, self.touch)
 
     def after_jump(self, t, y, args):
         return after_jump(self, t, y)

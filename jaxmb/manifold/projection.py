@@ -23,7 +23,7 @@ from .constraints import RestoredState, SolvedState, restore, solved
 from .contact_guards import ContactGuards, after_jump, contact_guards
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
-from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
+from .manifold import AbstractManifold, VectorField, contact_tolerance, newton_tolerance, normalize_state
 from .orthogonal_projection import (
     ProjectorConstraints,
     project_in_metric,
@@ -79,7 +79,7 @@ class Projection(AbstractManifold):
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)
         if not isinstance(solver, AbstractMultistep):
-            guards = contact_guards(system, formulation, newton_tolerance(self.newton_tol, rtol))
+            guards = contact_guards(system, formulation, self.contact_tolerance(system, rtol))
             return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, guards)
         _check_multistep(system, formulation, type(solver).__name__)
         if solver.solves_implicitly and not system.has_field_jacobian:
@@ -95,10 +95,13 @@ class Projection(AbstractManifold):
         tol = newton_tolerance(self.newton_tol, rtol)
         if self.newton_tol is None:
             tol = namespace(tol).minimum(tol, float(jnp.finfo(jnp.result_type(float)).eps) ** _LEFT_OUT)
-        return ProjectionTerm(system, formulation, tol), solver
+        return ProjectionTerm(system, formulation, tol, self.contact_tolerance(system, rtol)), solver
 
     def correction(self, interpolated):
         return _returned if interpolated else None
+
+    def contact_tolerance(self, system, rtol):
+        return contact_tolerance(system, self.newton_tol, rtol)
 
     def violated(self, system, t, y):
         return _violated(*lax.stop_gradient((system, t, y))) if drops_rows(system) else False
@@ -148,12 +151,13 @@ def _check_multistep(system, formulation, solver):
 
 class ProjectionTerm(AbstractManifoldTerm):
     """A constrained system whose states are projected in the metric of the mass matrix. Its chart is the number of
-    Newton iterations so far.
+    Newton iterations so far. `touch`: the gaps that count as closed, None without contacts.
     """
 
     system: AbstractEquation
     formulation: AbstractFormulation
     newton_tol: Float[Array, ""]
+    touch: Float[Array, ""] | None = None
 
     def vf(self, t, y, args):
         return VectorField(self.system, self.formulation)(t, y, args)
@@ -226,7 +230,7 @@ class ProjectionTerm(AbstractManifoldTerm):
 
     @property
     def guards(self):
-        return contact_guards(self.system, self.formulation, self.newton_tol)
+        return contact_guards(self.system, self.formulation, self.touch)
 
     def after_jump(self, t, y, args):
         return after_jump(self, t, y)

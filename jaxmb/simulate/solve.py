@@ -31,7 +31,6 @@ from ..manifold import (
     with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
-from ..manifold.manifold import newton_tolerance
 from ..solvers import (
     NO_STATE,
     AbstractMultistep,
@@ -183,7 +182,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         options["made_jump"] = jnp.array(True)
     given = start
     if problem.moving[0]:
-        guards = contact_guards(system, problem.method, newton_tolerance(None, problem.rtol))
+        guards = contact_guards(system, problem.method, policy.contact_tolerance(system, problem.rtol))
         if guards is not None:
             # The field is that of the contacts that close or open, and of the friction that slips, at the start.
             start = guards.impact(times["t0"], start).after

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import itertools
 
 import diffrax
 import jax
@@ -14,7 +15,7 @@ from derivative_checks import central_differences, in_both_modes
 from scipy.optimize import brentq
 
 import jaxmb as mb
-from jaxmb import planar, spatial, terrain
+from jaxmb import manifold, planar, spatial, terrain
 from jaxmb.manifold import Projection
 
 G = 9.81
@@ -723,3 +724,42 @@ def test_refusals():
 def test_bad_stops(wrong, message):
     with pytest.raises(ValueError, match=message):
         ball(**({"restitution": 0.5} | wrong))
+
+
+def touch(policy, solver, system, rtol):
+    """The gaps that count as closed."""
+    term, prepared = policy.prepare(system, policy.default_formulation(system), solver, np.float64(rtol))
+    guards = term.guards if isinstance(solver, mb.solvers.Adams) else prepared.guards
+    return float(guards.touch)
+
+
+def test_gaps_that_count_as_closed():
+    """A thousandth of the tolerance with every manifold, and no less than positions are found to."""
+    ways = [
+        (manifold.Partition, mb.solvers.Adams()),
+        (manifold.Projection, mb.solvers.Adams()),
+        (manifold.Projection, diffrax.Dopri8()),
+    ]
+    for (policy, solver), rtol in itertools.product(ways, (1e-3, 1e-6, 1e-9)):
+        for newton_tol in (None, 1e-13):
+            np.testing.assert_allclose(touch(policy(newton_tol=newton_tol), solver, BALL, rtol), 1e-3 * rtol)
+        np.testing.assert_allclose(touch(policy(newton_tol=1e-5), solver, BALL, rtol), 1e-5)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6])
+def test_what_counts_as_closed_does_not_depend_on_the_size_of_a_scene(rtol):
+    """A ball beside bars whose rows are eliminated along the joints, with the steps of a dense matrix."""
+    lone = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(-3.0, 0.5))
+    floor = mb.RigidContact("floor", "ball", terrain=terrain.Flat(), radius=0.1, restitution=0.5)
+    bars = [planar.Body(f"bar{k}", mass=1.0, inertia=0.1, position=(3.0 * k, 2.0)) for k in range(15)]
+    pins = [planar.Revolute(f"pin{k}", "ground", f"bar{k}", point=(3.0 * k, 3.0)) for k in range(15)]
+    system = mb.Scene([lone, *bars], joints=[floor, *pins], forces=[mb.Gravity((0.0, -G))]).compile()
+    assert system.elimination is not None
+    start = mb.assemble(system)
+    runs = [mb.simulate(system, start, t1=1.2, rtol=rtol, manifold=own) for own in (None, manifold.Partition())]
+    several = [[(event.kind, event.part) for event in motion.events] for motion in runs]
+    assert several[0] == several[1]
+    assert len(several[0]) == {1e-3: 3, 1e-6: 8}[rtol]
+    for event, other in zip(runs[0].events, runs[1].events, strict=True):
+        np.testing.assert_allclose(event.time, other.time, atol=10 * rtol)
