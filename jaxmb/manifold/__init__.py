@@ -14,6 +14,7 @@ from .contact_guards import contact_guards as contact_guards
 from .default import Unconstrained as Unconstrained, default_manifold as default_manifold
 from .impulse import after_jumps as after_jumps, find_jumps as find_jumps, next_number as next_number
 from .internal_states import (
+    counted_components as counted_components,
     natural_units as natural_units,
     state_blocks as state_blocks,
     with_internal_states as with_internal_states,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..solvers import AbstractManifoldTerm, Block
 from ..system import AbstractSystem
+from ..system.gaps import mode_places
 
 
 def with_internal_states(term: Any) -> Any:
@@ -139,6 +140,19 @@ def state_blocks(system: AbstractSystem, rate: Any) -> tuple[Block, ...]:
         Block("velocities", system.nu, rate, rate_of="coordinates"),
         *(Block(f"states {k}", int(size)) for k, size in enumerate(kinds)),
     )
+
+
+def counted_components(system: AbstractSystem) -> tuple[int, ...] | None:
+    """The indices of the components of a raveled state whose sizes and errors count: all but the modes of contacts and
+    dry friction, which have none; None for all.
+    """
+    if system.contacts is None:
+        return None
+    modes = np.isin(np.arange(system.nq), mode_places(system))
+    along = system.held_velocities(modes)
+    assert along is not None, "a mode is no part of a rotation"
+    uncounted = np.concatenate([modes, along, np.zeros(system.nz, bool)])
+    return tuple(np.flatnonzero(~uncounted).tolist())
 
 
 def natural_units(system: AbstractSystem, velocities: Float[Array, " nu"], dtype: Any) -> Float[Array, " n"]:

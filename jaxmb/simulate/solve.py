@@ -23,6 +23,7 @@ from ..manifold import (
     AbstractManifold,
     after_jumps,
     contact_guards,
+    counted_components,
     default_manifold,
     natural_units,
     next_number,
@@ -39,6 +40,7 @@ from ..solvers import (
     TangentControl,
     events_found,
     intended_step,
+    with_counted,
     with_tangents,
 )
 from ..states.consistency import is_consistent
@@ -133,6 +135,7 @@ class Problem(NamedTuple):
         if controller is None:
             scales = running_scales(self.system, self.state, self.times) if self.atol is None else None
             controller = default_controller(self.solver, self.rtol, absolute, scales)
+        controller = with_counted(controller, counted_components(self.system))
         return self.times | {
             "y0": start,
             "saveat": self.saveat,
@@ -396,7 +399,7 @@ def _tangent_control(system, options, direction) -> TangentControl:
     rate = jnp.maximum(jnp.max(jnp.abs(state.u) / velocities, initial=0.0), 1 / jnp.where(span > 0, span, 1.0))
     units = natural_units(system, velocities * rate, state.q.dtype)
     sizes = tuple(block.size for block in state_blocks(system, rate))
-    return lax.stop_gradient(TangentControl(units, sizes, direction))
+    return lax.stop_gradient(TangentControl(units, sizes, direction, counted=counted_components(system)))
 
 
 def _pushed(function, at, used):
@@ -428,7 +431,7 @@ def running_scales(system, state, options) -> RunningScales:
     span = jnp.abs(options["t1"] - options["t0"])
     units = natural_units(system, system.velocity_scale(), state.q.dtype)
     units, rate = lax.stop_gradient((units, 1 / jnp.where(span > 0, span, 1.0)))
-    return RunningScales(units, state_blocks(system, rate))
+    return RunningScales(units, state_blocks(system, rate), counted_components(system))
 
 
 def _replaced(values, old, new):

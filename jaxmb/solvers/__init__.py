@@ -37,7 +37,7 @@ from .multistep import (
     AbstractMultistepState as AbstractMultistepState,
     tolerances_of as tolerances_of,
 )
-from .one_step import with_tangents as with_tangents
+from .one_step import with_counted as with_counted, with_tangents as with_tangents
 from .order import StepEstimate as StepEstimate, choose_order as choose_order
 from .scales import Block as Block, RunningScales as RunningScales
 from .tangent import Tangent as Tangent, TangentControl as TangentControl

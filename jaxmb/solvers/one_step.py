@@ -12,13 +12,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import WrappedSolver, with_loops
-from .controller import AbstractControllerState
+from .controller import AbstractControllerState, MultistepController
 from .evaluation import ravel, unravel_like
 from .events import error_of, map_error
 from .multistep import AbstractMultistep
 from .scales import RunningScales
 from .tangent import Tangent, TangentControl, pushed, pushed_only
-from .tolerances import MultistepNorm, Tolerances
+from .tolerances import MultistepNorm, NormOfCounted, Tolerances
 
 
 class WithTangents(WrappedSolver):
@@ -67,6 +67,28 @@ class WithTangents(WrappedSolver):
 
 def _step_from(solver, t0, t1, args, made_jump, terms, y0, state):
     return solver.step(terms, t0, t1, y0, args, state, made_jump)
+
+
+def with_counted(controller: Any, counted: tuple[int, ...] | None) -> Any:
+    """A controller that measures the errors of some components only, those with these indices in the raveled state, all
+    of them where this is None; one that measures no errors stays as it is.
+    """
+    if counted is None:
+        return controller
+    # Concrete classes, since a controller may be wrapped in others that diffrax has.
+    kinds = (diffrax.PIDController, OneStepController, MultistepController)
+    is_known = lambda x: isinstance(x, kinds)
+
+    def of_counted(x):
+        if not is_known(x):
+            return x
+        if isinstance(x, MultistepController):
+            where = lambda x: (x.norm.norm,)
+        else:
+            where = lambda x: (x.norm, x.controller.norm) if isinstance(x, OneStepController) else (x.norm,)
+        return eqx.tree_at(where, x, replace_fn=lambda norm: NormOfCounted(norm, counted))
+
+    return jax.tree.map(of_counted, controller, is_leaf=is_known)
 
 
 def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tuple[Any, Any, Callable[[Any], Any]]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -47,11 +48,12 @@ class RunningScales(eqx.Module):
     With them an absolute tolerance is a pure number, and a component that never moves may be zero.
 
     **Fields:** `units`: the natural sizes of the components of the raveled state, those of rates for one unit of time;
-    `blocks` of it, in order.
+    `blocks` of it, in order; the indices of the components that are `counted`, None for all.
     """
 
     units: Float[Array, " n"]
     blocks: tuple[Block, ...]
+    counted: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     def none(self, dtype: Any) -> Float[Array, " sizes"]:
         """Zeros, for sizes that are not known yet."""
@@ -113,6 +115,8 @@ class RunningScales(eqx.Module):
 
     def _largest(self, y):
         relative = jnp.abs(y) / self.units
+        if self.counted is not None:
+            relative = jnp.where(np.isin(np.arange(y.size), self.counted), relative, 0.0)
         return tuple(jnp.max(relative[a:b], initial=0.0) for a, b in ends_of(block.size for block in self.blocks))
 
 

@@ -47,6 +47,7 @@ class TangentControl(eqx.Module):
     - `direction`: a tangent of the term, None where derivatives by its numbers are not taken. The tangent of the state
         that it causes is carried along.
     - `excites`: whether the tangent from a start that excites every mode is, beside that.
+    - `counted`: the indices of the components that the starts excite, None for all.
     - `restored`: the starts on constraints (`on_constraints`); None where those of `starts` need not be on any.
     """
 
@@ -54,6 +55,7 @@ class TangentControl(eqx.Module):
     blocks: tuple[int, ...] = eqx.field(static=True)
     direction: PyTree = None
     excites: bool = eqx.field(static=True, default=True)
+    counted: tuple[int, ...] | None = eqx.field(static=True, default=None)
     restored: tuple[Float[Array, " n"], ...] | None = None
 
     def starts(self) -> tuple[Float[Array, " n"], ...]:
@@ -61,7 +63,9 @@ class TangentControl(eqx.Module):
         if self.restored is not None:
             return self.restored
         random = np.random.default_rng(0)
-        entries = random.choice([-1.0, 1.0], self.units.size) * random.uniform(0.5, 1.0, self.units.size)
+        own = np.arange(self.units.size) if self.counted is None else np.array(self.counted, int)
+        entries = np.zeros(self.units.size)
+        entries[own] = random.choice([-1.0, 1.0], own.size) * random.uniform(0.5, 1.0, own.size)
         excited = self.units * jnp.asarray(entries, self.units.dtype)
         return tuple(size * excited for size in self.start_sizes)
 

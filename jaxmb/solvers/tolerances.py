@@ -6,10 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from .evaluation import unravel_like
-from .scales import RunningScales
+from .scales import RunningScales, ends_of
 
 # The part of the tolerance that the error of one step may take. A method of variable order settles at the order where
 # the estimates of neighbouring orders are equal: the step taken with local extrapolation is hardly better than its
@@ -41,6 +42,23 @@ def norm_of(norm: Callable[[PyTree], Any], flat: Array, like: PyTree[Array]) -> 
 def absolute_tolerance(atol: Any, scales: RunningScales | None, sizes: Array | None) -> Any:
     """The absolute tolerance of the components of a state."""
     return atol if scales is None or sizes is None else atol * scales.of_components(sizes)
+
+
+class NormOfCounted(eqx.Module):
+    """The norm of some components of a state alone, those with the indices `counted` in the raveled state.
+
+    A norm that is a mean would be the less, the more components there are that have no error.
+    """
+
+    norm: Callable[[PyTree], Any]
+    counted: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, x: PyTree) -> Any:
+        leaves, structure = jax.tree.flatten(x)
+        ends = ends_of(leaf.size for leaf in leaves)
+        own = [[k - first for k in self.counted if first <= k < end] for first, end in ends]
+        taken = [leaf[np.array(k, int)] for leaf, k in zip(leaves, own, strict=True)]
+        return self.norm(structure.unflatten(taken))
 
 
 class MultistepNorm(eqx.Module):

@@ -3,10 +3,18 @@
 import functools
 
 import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
+from compiling import jit_quickly
 
 import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.manifold import counted_components
+from jaxmb.simulate.solve import running_scales
+from jaxmb.solvers.tolerances import NormOfCounted
 
 TOLERANCES = 10.0 ** -np.arange(4.0, 11.1, 1.0)
 SOLVERS = {"Adams": mb.solvers.Adams(), "Dopri8": diffrax.Dopri8(), "Hermite": mb.solvers.Hermite()}
@@ -80,3 +88,118 @@ def test_steps_do_not_creep_where_rounding_limits_them(solver, finest):
     run = lambda rtol: mb.simulate(system, state, t1=1.0, rtol=rtol, solver=SOLVERS[solver], max_steps=5000)
     steps = [int(run(rtol).stats["num_steps"]) for rtol in (100 * finest, 10 * finest, finest)]
     assert steps[0] < steps[1] <= steps[2] < 2 * steps[0]
+
+
+def pendulum(*more):
+    bar = planar.Body("bar", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    return mb.Scene([bar], joints=[pin, *more], forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+def lagging_pendulum(*more):
+    """With an internal state."""
+    bar = planar.Body("bar", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    drive = mb.Motor("drive", "pin.angle", mode="position", command=1.0, gain=3.0, lag=0.2)
+    return mb.Scene([bar], joints=[pin, *more], forces=[mb.Gravity((0.0, -9.81)), drive]).compile()
+
+
+def stops(count):
+    """With one end, and with two."""
+    one = [mb.Stop(f"end{k}", "pin.angle", lower=-50.0 - k, restitution=0.5) for k in range(count)]
+    return [*one, *(mb.Stop(f"ends{k}", "pin.angle", lower=-60.0, upper=50.0 + k) for k in range(count))]
+
+
+PENDULUM, AMONG_STOPS = pendulum(), pendulum(*stops(4))
+
+
+WAYS = {
+    "Adams": {},
+    "atol": {"atol": 1e-7},
+    "Projection": {"manifold": mb.manifold.Projection()},
+    "MultistepController": {"stepsize_controller": mb.solvers.MultistepController(1e-6, 1e-8)},
+    "Hermite": {"solver": mb.solvers.Hermite()},
+    "Tsit5": {"solver": diffrax.Tsit5()},
+    "PIDController": {"solver": diffrax.Tsit5(), "stepsize_controller": diffrax.PIDController(1e-6, 1e-8)},
+}
+
+
+def test_modes_are_left_out_of_norms():
+    """The norm of an error is that without stops."""
+    assert counted_components(PENDULUM) is None
+    own = counted_components(AMONG_STOPS)
+    assert own == (0, 1, 2, 11, 12, 13)
+    norm = NormOfCounted(optimistix.rms_norm, own)
+    error = jnp.array([1.0, -2.0, 3.0])
+    none = jnp.zeros(8)
+    among = mb.State(jnp.append(error, none), jnp.append(2 * error, none))
+    np.testing.assert_allclose(norm(among), optimistix.rms_norm(mb.State(error, 2 * error)), rtol=1e-15)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("way", WAYS)
+def test_stops_that_are_never_reached_change_no_step(way):
+    """The modes of contacts are no components whose errors count."""
+    runs = [
+        mb.simulate(system, mb.assemble(system, fix={"bar.angle": 0.5}), t1=4.0, rtol=1e-6, **WAYS[way])
+        for system in (PENDULUM, AMONG_STOPS)
+    ]
+    alone, among = (int(motion.stats["num_steps"]) for motion in runs)
+    assert alone == among
+    np.testing.assert_allclose(runs[0].ys.q[-1], runs[1].ys.q[-1, :3], rtol=1e-9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("solver", [mb.solvers.Adams(), diffrax.Tsit5()], ids=["Adams", "Tsit5"])
+@pytest.mark.parametrize("name", ["bar.mass", "bar.angle"])
+def test_stops_that_are_never_reached_change_no_step_of_a_derivative(solver, name):
+    """Neither where tangents by parameters are controlled, nor those by the state."""
+
+    def run(system, x):
+        system = mb.with_parameters(system, {name: x}) if name == "bar.mass" else system
+        start = mb.assemble(system, fix={"bar.angle": 0.5 if name == "bar.mass" else x})
+        motion = mb.simulate(system, start, t1=2.0, rtol=1e-6, solver=solver)
+        return motion.ys.q[-1, 2], motion.stats["num_steps"]
+
+    runs = [
+        jit_quickly(jax.jacfwd(functools.partial(run, system), has_aux=True))(1.3) for system in (PENDULUM, AMONG_STOPS)
+    ]
+    assert runs[0][1] == runs[1][1]
+    np.testing.assert_allclose(runs[0][0], runs[1][0], rtol=1e-6)
+
+
+@pytest.mark.long
+def test_stops_change_no_step_beside_internal_states():
+    runs = []
+    for system in (lagging_pendulum(), lagging_pendulum(*stops(2))):
+        start = mb.assemble(system, fix={"bar.angle": 0.5})
+        runs.append(mb.simulate(system, start, t1=4.0, rtol=1e-6))
+    assert int(runs[0].stats["num_steps"]) == int(runs[1].stats["num_steps"])
+
+
+@pytest.mark.long
+def test_balls_over_rough_ground_change_no_step():
+    """A body that spins far above the ground, which contacts with friction would touch."""
+
+    def steps(count):
+        top = spatial.Body("top", mass=1.0, inertia=np.diag([1.0, 2.0, 3.0]), angular_velocity=(1.0, 2.0, 3.0))
+        own = [
+            mb.RigidContact(f"foot{k}", "top", terrain=mb.terrain.Flat(-100.0), centre=(0.1 * k, 0.0, 0.0))
+            for k in range(count)
+        ]
+        rubs = [mb.DryFriction(f"rub{k}", f"foot{k}", coefficient=0.3) for k in range(count)]
+        system = mb.Scene([top], joints=own, forces=rubs).compile()
+        return int(mb.simulate(system, mb.assemble(system), t1=4.0, rtol=1e-6).stats["num_steps"])
+
+    assert steps(1) == steps(4)
+
+
+def test_a_contact_that_is_closed_is_no_size_of_a_motion():
+    """A small motion stays small where a mode is one."""
+    start = mb.assemble(AMONG_STOPS, fix={"bar.angle": 0.5})
+    scales = running_scales(AMONG_STOPS, start, {"t0": 0.0, "t1": 1.0})
+    modes = jnp.arange(AMONG_STOPS.nq) >= PENDULUM.nq
+    at = lambda mode: jnp.concatenate([jnp.where(modes, mode, 1e-3), jnp.zeros(AMONG_STOPS.nu)])
+    sizes = [scales.start(at(mode), jnp.zeros_like(at(mode))) for mode in (0.0, 1.0)]
+    np.testing.assert_array_equal(*sizes)
+    assert sizes[0][0] < 0.01
