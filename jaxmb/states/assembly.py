@@ -104,13 +104,16 @@ def assemble(
     known = not is_traced((system, guess, fix, u, t))
     at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     u, ok_rates = (u, True) if at_rest else closest_velocities(system, t, q, u, tuple(fixed_rates.tolist()))
+    # Under a derivative it is known whether a state was found, but its numbers are traced.
+    traced = is_traced((system, q, u, t))
     # Under a trace, results of concrete numbers are traced as well.
     if raises and not is_traced((ok, ok_rates)):
-        if not ok_rates:
+        if not ok_rates and not traced:
             raise ValueError(cannot_move(system, t, q, u, fixed_rates))
-        if of_bodies and not is_traced((system, u)):
-            _warn_of_changed_velocities(system, guess.u, u)
-        return State(q, u, z)
+        if ok and ok_rates:
+            if of_bodies and not is_traced((system, u)):
+                _warn_of_changed_velocities(system, guess.u, u)
+            return State(q, u, z)
     ok = ok & ok_rates
     if throw:
         q = eqx.error_if(
@@ -147,7 +150,7 @@ def configuration(
     system: AbstractSystem, guess: Coordinates, fix: Mapping[str, VectorLike] | None, t: Scalar, throw: bool
 ) -> tuple[Float[Array, "nq"], Bool[np.ndarray, "nq"], Bool[Array, ""]]:
     """The first half of `assemble`: the coordinates, a mask of those that were prescribed, and whether the constraints
-    hold; an error if not, with `throw` and outside `jit`.
+    hold; an error if not, with `throw` and where nothing is traced.
     """
     q, fixed = prescribe("coordinate", system.coordinate_names() if fix else {}, {} if fix is None else fix, guess)
     if system.contacts is not None:
@@ -165,7 +168,7 @@ def configuration(
         if not is_traced(met) and met:
             return q, fixed, jnp.array(True)
     q, ok = closest_configuration(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
-    if throw and not is_traced(ok) and not ok:
+    if throw and not is_traced((system, t, q, ok)) and not ok:
         raise ValueError(cannot_assemble(system, t, q, fixed))
     return q, fixed, ok
 

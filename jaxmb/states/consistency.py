@@ -12,6 +12,7 @@ from jax import lax
 from .._compat import used_inputs
 from .._types import State
 from ..linalg.arrays import is_traced
+from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..system import AbstractSystem, parameters, with_parameters
 from ..system.gaps import contacts_of, gaps
@@ -35,6 +36,11 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
     if is_traced(rows):
         off = jnp.any(rows[0]) | jnp.any(rows[1]) | jnp.any(rows[2])
         return jax.tree.map(lambda x: jnp.where(off, jnp.nan, x), state)
+    if not any(np.any(own) for own in rows):
+        return state
+    if is_traced((system, t, state)):
+        # A derivative is taken of known numbers.
+        return nan_where(jnp.array(True), state, (system, t, state))
     positions, velocities, overlaps = map(np.asarray, rows)
     if np.any(overlaps):
         names = [name for name, off in zip(contacts_of(system).names, overlaps, strict=True) if off]
@@ -52,10 +58,8 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
     if np.any(positions):
         names = listed(system, positions, system.position_residual(t, state.q))
         raise ValueError(f"The state violates the constraints {names} {cure}")
-    if np.any(velocities):
-        names = listed(system, velocities, system.velocity_residual(t, state.q, state.u))
-        raise ValueError(f"The velocities of the state violate the constraints {names} {cure}")
-    return state
+    names = listed(system, velocities, system.velocity_residual(t, state.q, state.u))
+    raise ValueError(f"The velocities of the state violate the constraints {names} {cure}")
 
 
 def constraints_depend_on(system: AbstractSystem, t: Any, state: State, names: Iterable[str]) -> bool:

@@ -113,23 +113,26 @@ def equilibrium(
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
     still = _still(system, time, start, u)
-    concrete = not is_traced(still)
-    if concrete and raises and not bool(still):
+    # Under a derivative the outcome is known, but the numbers that a message needs are traced.
+    errors = raises and not is_traced((system, time, start, z, still))
+    if errors and not bool(still):
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
     q, unbalanced, falling, ok, overlaps, pulls = _balanced(system, time, start, held, bool(stable))
-    if concrete and raises and not bool(ok):
+    if errors and not bool(ok):
         raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, start, unbalanced))
-    if concrete and raises and np.any(overlaps | pulls):
+    if errors and np.any(overlaps | pulls):
         against, change = about_contacts("The forces balance", system, overlaps, pulls)
         raise ValueError(f"{against}For example jaxmb.equilibrium(system, {change}).")
     steady = True if z is None else _steady(system, time, q, u)
-    if concrete and raises and not np.all(steady):
+    if errors and not np.all(steady):
         raise ValueError(_changing(system, time, q, u, np.asarray(steady)))
-    if raises and concrete:
+    if errors:
         return State(q, u, z)
     ok = ok & still & assembled & jnp.all(jnp.asarray(steady)) & ~jnp.any(overlaps | pulls)
+    if raises and not is_traced(ok) and ok:
+        return State(q, u, z)
     if throw:
         q = eqx.error_if(
             q,

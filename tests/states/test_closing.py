@@ -143,3 +143,81 @@ def test_velocities_of_bodies_that_contradict_a_joint_are_told():
     np.testing.assert_allclose(mb.assemble(system, state).u, state.u)
     with pytest.raises(ValueError, match=r"'bar\.angle' is prescribed twice"):
         mb.assemble(system, rates={"bar.angular_velocity": 2.0, "bar.angle": 1.0})
+
+
+@functools.cache
+def bar():
+    """A bar on a pin, whose centre moves on a circle of half a metre."""
+    angle = np.arctan2(0.3, 0.4)
+    own = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.4, 0.3), angle=angle)
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    return mb.Scene([own], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+def placed(x):
+    return mb.assemble(bar(), fix={"bar.x": x}).q[1]
+
+
+def moving(speed):
+    """At an angle of zero the centre has no speed along the bar."""
+    return mb.assemble(bar(), fix={"bar.angle": 0.0}, rates={"bar.x": speed}).u[1]
+
+
+def balanced(x):
+    return mb.equilibrium(bar(), fix={"bar.x": x}).q[1]
+
+
+def loaded(torque):
+    """No angle balances a torque above that of gravity."""
+    held = mb.Scene(
+        [planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.5, 0.0))],
+        joints=[planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))],
+        forces=[mb.Gravity((0.0, -9.81)), planar.Torque("motor", "bar", torque=0.0)],
+    ).compile()
+    return mb.equilibrium(mb.with_parameters(held, {"motor.torque": torque}), stable=False).q[2]
+
+
+def linearised(x):
+    state = mb.assemble(bar())
+    moved = mb.State(state.q.at[0].add(x), state.u)
+    return mb.linearise(bar(), moved).A[0, 0]
+
+
+FAILURES = {
+    "fixed": (placed, 3.0),
+    "rates": (moving, 1.0),
+    "equilibrium": (balanced, 3.0),
+    "torque": (loaded, 100.0),
+    "linearise": (linearised, 0.1),
+}
+LONG = ("equilibrium", "torque", "linearise")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in FAILURES]
+)
+def test_the_derivative_of_what_is_not_found_is_not_a_number(case):
+    """An error where a value is asked for, and NaN in every kind of derivative, also outside of `jit`."""
+    function, wrong = FAILURES[case]
+    with pytest.raises(ValueError):
+        function(wrong)
+    for derivative in (jax.grad, jax.jacfwd):
+        assert jnp.isnan(derivative(function)(wrong))
+    value, _ = jax.jvp(function, (wrong,), (1.0,))
+    assert jnp.isnan(value)
+    assert jnp.all(jnp.isnan(jax.vmap(jax.grad(function))(jnp.full(2, wrong))))
+
+
+def test_the_derivative_of_what_is_found():
+    """The slope of a circle; with `throw` a failure is an error in a derivative as well."""
+    np.testing.assert_allclose(jax.grad(placed)(0.3), -0.75, rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.grad(placed))(0.3), -0.75, rtol=1e-9)
+    with pytest.raises(RuntimeError, match="cannot be assembled"):
+        jax.grad(lambda x: mb.assemble(bar(), fix={"bar.x": x}, throw=True).q[1])(3.0)
+
+
+@pytest.mark.long
+def test_the_gradient_of_a_motion_from_a_state_that_is_not_found():
+    angle = lambda x: mb.simulate(bar(), mb.assemble(bar(), fix={"bar.x": x}), t1=0.1)["bar"].angle[-1]
+    assert jnp.isnan(jax.grad(angle)(3.0)) and jnp.isnan(jax.jit(jax.grad(angle))(3.0))
+    assert jnp.isfinite(jax.grad(angle)(0.3))

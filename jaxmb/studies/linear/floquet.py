@@ -126,7 +126,7 @@ def floquet(
     free = [_indices(system, name) for name in checked_names("coordinate", ignorable)]
     state = consistent(system, t, State(system.normalize(state.q), state.u))
     own = eqx.filter_jit(perturbations)(system, t, state, names)
-    if not is_traced(own.regular) and not np.all(np.asarray(own.regular)):
+    if not is_traced((system, state, own.regular)) and not np.all(np.asarray(own.regular)):
         raise ValueError("The state is singular, or the named coordinates or rates are not independent in it.")
     end, pushed = _flow(system, state, own.basis, t, period, rtol, solver)
     distance, pushed = _return(system, state, end, pushed, np.concatenate([np.zeros(0, int), *free]))
