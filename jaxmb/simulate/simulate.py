@@ -105,7 +105,8 @@ def simulate(
     - `system`, `state`: a compiled scene and a consistent state of it, from `assemble`.
     - `t0`, `t1`: the interval [s]; `t1 < t0` runs backwards.
     - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows
-        `Trajectory.at(t)`; under `jit` it takes memory for `max_steps` steps, otherwise for those of the motion.
+        `Trajectory.at(t)`; under `jit` it takes memory for `max_steps` steps, otherwise for those of the motion. A
+        function, `SaveAt(ts=times, fn=function)`, sees states on the constraints, as they are saved without it.
     - `rtol`, `atol`: tolerances. `Adams` and `Hermite` let a step err by a twentieth of them, as errors add up: the
         error of the result, relative to the largest coordinates and velocities, is then mostly below `rtol`; some ten
         times `rtol` over many periods, more where neighbouring motions part quickly, and about the same as that of
@@ -166,12 +167,13 @@ def simulate(
         `equinox.filter_jit` the message stands alone; `jax.jit` adds a page of JAX's own.
     - `max_events`: the largest number of impacts and other events of contacts (`Stop`, `RigidContact`, …), whose times
         and states are kept: a motion that has more of them fails.
-    - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. Where `max_steps` is reached the
-        error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether it is stiff there, for which
-        some more steps are simulated; not under `jit`, `vmap` or a derivative. A derivative keeps at most 2048 steps.
-        One of more steps needs a program that also finds steps again, which takes a fifth longer to compile. Under
-        `jit` and `vmap` every derivative with a larger `max_steps` has it; otherwise one whose motion turns out to be
-        long is computed again with it, and for the system from then on.
+    - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event also
+        sees states between the ends of steps, as they are interpolated: off the constraints by about `rtol`. Where
+        `max_steps` is reached the error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether
+        it is stiff there, for which some more steps are simulated; not under `jit`, `vmap` or a derivative. A
+        derivative keeps at most 2048 steps. One of more steps needs a program that also finds steps again, which takes
+        a fifth longer to compile. Under `jit` and `vmap` every derivative with a larger `max_steps` has it; otherwise
+        one whose motion turns out to be long is computed again with it, and for the system from then on.
 
     **Returns:** a `Trajectory`.
 

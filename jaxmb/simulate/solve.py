@@ -214,9 +214,10 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         # A run backward starts before a jump at its start.
         before = jnp.isin(options["t0"], jumps) & (options["t1"] < options["t0"])
         options["t0"] = jnp.where(before, next_number(options["t0"], -1), options["t0"])
-    are_states = first.fn is _STATES
-    if any(problem.moving):
-        # A user's function is one of states at times that move.
+    correction, lost = policy.correction(problem.interpolated), None
+    # A user's function is one of states on the constraints, at times that move.
+    of_saved = first.fn is not _STATES and (correction is not None or any(problem.moving))
+    if of_saved:
         options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].fn, options["saveat"], _STATES)
     control = _tangent_control(system, options, direction)
     if problem.differentiated and not problem.changes:
@@ -230,8 +231,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         ts = ts.at[0].set(lax.stop_gradient(times["t0"]))
     if saved_at is not None:
         ts = jnp.where(finite, ts, jnp.inf)
-    correction, lost = policy.correction(problem.interpolated), None
-    if are_states and correction is not None:
+    if correction is not None:
         saved, lost = _corrected(system, options, ts, saved, correction)
     if after is not saved_at:
         ts = _replaced(ts, after, saved_at)
@@ -241,8 +241,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
             saved = at_moving_times(term, ts, moves, saved)
         if problem.moving[0] and first.t0:
             saved = jax.tree.map(lambda x, y: x.at[0].set(y), saved, given)
-        if not are_states:
-            saved = _of_states(first.fn, ts, saved, (times["t0"], start))
+    if of_saved:
+        saved = _of_states(first.fn, ts, saved, (times["t0"], start))
 
     found, events = None, events_found(solution.controller_state)
     if events is not None:
@@ -380,12 +380,14 @@ def _solve_states(term, solver, options, adjoint, limit, derivatives):
 
 def _of_states(function, ts, ys, start):
     """What a user's function makes of saved states. Entries after the end of a run, whose states are infinite, are
-    infinite, and have no derivatives.
+    infinite, whole numbers zero, and have no derivatives.
     """
+    never = lambda x: jnp.inf if jnp.issubdtype(x.dtype, jnp.inexact) else 0
 
     def saved(t, y, finite):
         t, y = jax.tree.map(lambda x, x0: jnp.where(finite, x, x0), (t, y), start)
-        return jax.tree.map(lambda x: jnp.where(finite, x, jnp.asarray(jnp.inf, x.dtype)), function(t, y, None))
+        values = jax.tree.map(jnp.asarray, function(t, y, None))
+        return jax.tree.map(lambda x: jnp.where(finite, x, jnp.asarray(never(x), x.dtype)), values)
 
     return jax.vmap(saved)(ts, ys, jnp.isfinite(ts))
 

@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from compiling import jit_quickly
+from derivative_checks import central_differences, in_both_modes
 
 import jaxmb as mb
-from jaxmb import planar
+from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers, Partitioned
 
 G = 9.81
@@ -387,3 +389,83 @@ def test_moment_of_a_blade_is_about_its_point():
 def test_no_time_at_all(rod, count):
     motion = mb.simulate(rod, mb.assemble(rod), t0=1.0, t1=1.0, saveat=np.ones(count))
     np.testing.assert_array_equal(motion.ts, np.ones(count))
+
+
+# What a function of `SaveAt` sees
+
+
+def top():
+    body = spatial.Body("top", mass=1.0, inertia=np.diag([1.0, 2.0, 3.0]), angular_velocity=(1.0, 2.0, 3.0))
+    return mb.Scene([body]).compile()
+
+
+TS = np.linspace(0.0, 1.0, 7)
+OTHER = {"solver": diffrax.Tsit5()}
+TURNED = diffrax.Event(lambda t, y, args, **kwargs: y.q[2] + 0.5, optx.Newton(1e-9, 1e-9))
+SAVED = {
+    "times": ({"ts": TS}, {}),
+    "subs": ({"subs": diffrax.SubSaveAt(ts=TS, t1=True)}, {}),
+    "dense": ({"ts": TS, "dense": True}, {}),
+    "steps": ({"steps": True}, {}),
+    "steps to an event": ({"steps": True, "t1": True}, {"event": TURNED}),
+    "Projection": ({"ts": TS}, {"manifold": mb.manifold.Projection()}),
+    "Tsit5": ({"ts": TS}, OTHER),
+    "steps of Tsit5": ({"steps": True}, OTHER),
+}
+
+
+def with_function(options, function):
+    if "subs" not in options:
+        return diffrax.SaveAt(fn=function, **options)
+    return diffrax.SaveAt(subs=diffrax.SubSaveAt(ts=TS, t1=True, fn=function))
+
+
+@pytest.mark.parametrize("case", ["times", *(pytest.param(name, marks=pytest.mark.long) for name in list(SAVED)[1:])])
+def test_a_function_sees_the_states_that_are_saved(rod, case):
+    """They are on the constraints, to the last bit as those without a function."""
+    options, others = SAVED[case]
+    run = lambda saveat: mb.simulate(rod, mb.assemble(rod), t1=1.0, rtol=1e-4, saveat=saveat, **others)
+    plain = run(diffrax.SaveAt(**options))
+    seen = run(with_function(options, lambda t, y, args: (t, y, jnp.round(y.q[2]).astype(int))))
+    times, states, turns = seen.ys
+    np.testing.assert_array_equal(times, plain.ts)
+    np.testing.assert_array_equal(states.q, plain.ys.q)
+    np.testing.assert_array_equal(states.u, plain.ys.u)
+    np.testing.assert_array_equal(turns, np.round(plain.ys.q[:, 2]))
+    violation = jax.vmap(lambda q: rod.position_residual(0.0, q))(states.q)
+    assert float(jnp.max(jnp.abs(violation))) < 1e-12
+
+
+@pytest.mark.parametrize("solver", [mb.solvers.Adams(), pytest.param(diffrax.Tsit5(), marks=pytest.mark.long)])
+def test_a_function_sees_euler_parameters_of_unit_length(solver):
+    system = top()
+    size = diffrax.SaveAt(ts=TS, fn=lambda t, y, args: jnp.linalg.norm(y.q[3:7]))
+    found = mb.simulate(system, mb.assemble(system), t1=1.0, rtol=1e-4, saveat=size, solver=solver)
+    np.testing.assert_allclose(found.ys, 1.0, rtol=0, atol=1e-14)
+
+
+@pytest.mark.long
+def test_derivatives_of_what_a_function_returns(rod):
+    """In both modes those of central differences, with times that move as well, under `jit` and in batches."""
+
+    def seen(x, rtol=1e-8):
+        gravity, end = x
+        system = mb.with_parameters(rod, {"gravity.acceleration": jnp.stack([0.0 * gravity, -gravity])})
+        length = lambda t, y, args: y.q[0] * jnp.sin(y.q[2]) + t * y.u[1]
+        saveat = diffrax.SaveAt(ts=end * jnp.array([0.3, 0.7, 1.0]), fn=length)
+        return mb.simulate(system, mb.assemble(rod), t1=end, rtol=rtol, saveat=saveat).ys
+
+    def after(x):
+        gravity, end = x
+        system = mb.with_parameters(rod, {"gravity.acceleration": jnp.stack([0.0 * gravity, -gravity])})
+        ts = end * jnp.array([0.3, 0.7, 1.0])
+        motion = mb.simulate(system, mb.assemble(rod), t1=end, rtol=1e-8, saveat=ts)
+        return motion.ys.q[:, 0] * jnp.sin(motion.ys.q[:, 2]) + motion.ts * motion.ys.u[:, 1]
+
+    at = jnp.array([9.0, 1.2])
+    value, derivative = in_both_modes(seen, at)
+    np.testing.assert_allclose(derivative, central_differences(jit_quickly(lambda x: seen(x, 1e-12)), at), rtol=1e-5)
+    np.testing.assert_allclose(value, jit_quickly(after)(at), rtol=1e-12)
+    np.testing.assert_allclose(derivative, jit_quickly(jax.jacfwd(after))(at), rtol=1e-9)
+    batch = jit_quickly(jax.vmap(jax.jacfwd(seen)))(jnp.stack([at, 1.1 * at]))
+    np.testing.assert_allclose(batch[0], derivative, rtol=1e-9)
