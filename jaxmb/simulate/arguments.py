@@ -15,6 +15,7 @@ from .._compat import changed, default_float
 from .._types import State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import ARRAYS, as_array, is_traced
+from ..linalg.recent import Recent
 from ..manifold import AbstractManifold
 from ..parts.names import unknown
 from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScales
@@ -23,6 +24,7 @@ from ..solvers.events import EventController
 from ..solvers.one_step import OneStepController
 from ..solvers.tolerances import closer_tolerance
 from ..system import AbstractSystem
+from ..system.inputs import turning_times
 from ..system.parameters import parameters
 
 DEFAULT_RTOL = 1e-8
@@ -36,6 +38,9 @@ MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
 _FEWEST_TIMES = 4
 # The least `rtol` with an error estimate, in units of the machine precision: a second run has a tenth.
 _CLOSEST = 100
+
+# The stops of the last few runs: a loop of simulations looks for them once.
+_stops = Recent(8)
 
 _KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
@@ -84,6 +89,14 @@ def may_stop(controller: Any) -> bool:
     """Whether steps of a controller, None for the default, may be cut at times that it does not know of."""
     adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     return controller is None or (adapts and not isinstance(controller, diffrax.ClipStepSizeController))
+
+
+def stops_of(system: AbstractSystem, state: State, times: Mapping[str, Any], controller: Any, traced: bool) -> Any:
+    """Times that no step of a run may pass, or None; `traced`: whether anything of the run is."""
+    if not may_stop(controller):
+        return None
+    own = system, state, times["t0"], times["t1"]
+    return turning_times(*own) if traced else _stops.found(own, lambda: turning_times(*own))
 
 
 def with_restarts(controller: Any, restarts: Any, stops: Any, events: int | None) -> Any:

@@ -10,6 +10,7 @@ from jax.core import Tracer
 from .._results import RESULTS
 from ..formulations.friction import coupled_most
 from ..linalg.arrays import is_traced
+from ..linalg.recent import Recent
 from ..manifold import find_jumps
 from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
@@ -28,6 +29,8 @@ _UNMET = 0.1
 # What steps resolve in single precision and, at the default tolerance, in double precision, relative to the size of the
 # system.
 _MOVED_SINGLE, _MOVED = 1e-6, 1e-11
+# The jumps of the last few systems and intervals: a loop of simulations looks for them once.
+_jumps = Recent(8)
 
 
 class Flags(NamedTuple):
@@ -96,13 +99,13 @@ def warn_of_stiffness(stats) -> None:
 
 
 def warn_of_jumps(system, outcome: Outcome, times, restarts, announced) -> None:
-    """Warn of jumps of prescribed rates between restarts, unless the motion is traced; `announced` are those that the
+    """Warn of jumps of prescribed rates between restarts of a motion that is not traced; `announced` are those that the
     user gave, or None.
     """
     q, t0, t1 = outcome.y.q, times["t0"], times["t1"]
-    if is_traced((system, outcome.y, t0, t1, restarts)):
-        return
-    found = find_jumps(system, q, t0, t1, np.zeros(0) if restarts is None else restarts)
+    restarts = np.zeros(0) if restarts is None else np.asarray(restarts)
+    # What is prescribed jumps at the same times with other coordinates.
+    found = _jumps.found((system, t0, t1, restarts), lambda: find_jumps(system, q, t0, t1, restarts))
     if not found:
         return
     # The rows of ψ, then those of A.

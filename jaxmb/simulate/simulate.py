@@ -26,7 +26,7 @@ from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..states.refusals import lost_rank
 from ..system import AbstractSystem
-from ..system.inputs import Signals, input_break_times, turning_times, with_inputs
+from ..system.inputs import Signals, input_break_times, with_inputs
 from ..trajectory import Trajectory
 from .arguments import (
     DEFAULT_RTOL,
@@ -40,11 +40,11 @@ from .arguments import (
     checked_times,
     checked_tolerances,
     closer_tolerances,
-    may_stop,
     named_solver,
     padded,
     parameter_changes,
     rooms_for,
+    stops_of,
     with_end,
 )
 from .compiling import told_of_compiling
@@ -245,11 +245,16 @@ def simulate(
         "times": times,
         "saveat": saved,
         "restarts": restarts,
-        "stops": turning_times(system, state, times["t0"], times["t1"]) if may_stop(stepsize_controller) else None,
         "event": jax.tree.map(opened, event),
         "changes": {} if direction is None else parameter_changes(system, direction),
     }
     traced = is_traced((system, state, others))
+    if traced and solver == "switch":
+        raise ValueError(
+            "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
+            "once with solver='auto', outside, and then choose Adams() or Hermite()."
+        )
+    others["stops"] = stops_of(system, state, times, stepsize_controller, traced)
     if not traced and adjoint is None:
         others["saveat"] = padded(saved, times["t0"], times["t1"])
     taken = derivatives_of((system, state, others)) if traced else None

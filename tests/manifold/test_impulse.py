@@ -1,5 +1,6 @@
 """Drivers and forces with kinks and jumps that are announced."""
 
+import warnings
 from typing import Any
 
 import diffrax
@@ -12,7 +13,9 @@ from scipy.integrate import solve_ivp
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.linalg.recent import Recent
 from jaxmb.manifold.impulse import find_jumps
+from jaxmb.simulate import outcome
 
 
 @pytest.fixture(scope="module")
@@ -296,3 +299,22 @@ def test_a_pendulum_on_a_driven_cart_beside_a_fast_driver():
     after = solve_ivp(field, (0.0, 0.5), [angle, rate - 1.5 * np.cos(angle)], rtol=1e-12, atol=1e-13).y[0, -1]
     np.testing.assert_allclose(found, after, rtol=0, atol=1e-6)
     assert abs(missed["pendulum"].angle[-1] - after) > 0.1
+
+
+def test_jumps_are_looked_for_once_a_system_and_interval(arm, monkeypatch):
+    """And again where parameters, the interval or the times that are announced change; the warning comes each time."""
+    searches, known = [], outcome.find_jumps
+    monkeypatch.setattr(outcome, "find_jumps", lambda *own: searches.append(own) or known(*own))
+    monkeypatch.setattr(outcome, "_jumps", Recent(8))
+    start = mb.assemble(arm)
+
+    def warned(system=arm, **options):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            mb.simulate(system, start, **({"t1": 1.0, "rtol": 1e-4} | options))
+        return [str(warning.message).split(" t = ")[1][:3] for warning in found if "jump" in str(warning.message)]
+
+    assert [warned(), warned(), warned()] == [["0.6"]] * 3 and len(searches) == 1
+    assert warned(t1=0.5) == [] and len(searches) == 2
+    assert warned(jumps=[0.6]) == [] and len(searches) == 3
+    assert warned() == ["0.6"] and len(searches) == 3
