@@ -170,7 +170,7 @@ def about_steps(outcome: Outcome, times, stats, stiff) -> str:
 
 def is_stiff_at_end(probe, stats, solver) -> bool | None:
     """Whether a motion that took the largest number of steps is stiff where it stopped; None where too few of them
-    were taken to tell.
+    were taken to tell, or where Adams' method cannot go on from there.
 
     **Arguments:** `probe(solver, steps)`: the trajectory from there with a solver, in at most this number of steps.
     """
@@ -183,7 +183,10 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
     with warnings.catch_warnings():
         # The motion's own are said already.
         warnings.simplefilter("ignore")
-        return bool(probe(Adams(stiffness="count"), _LOOKED).stats["stiff"])
+        try:
+            return bool(probe(Adams(stiffness="count"), _LOOKED).stats["stiff"])
+        except ValueError:
+            return None
 
 
 def reason_of_failure(system, result, times, outcome: Outcome) -> str:

@@ -331,7 +331,9 @@ def simulate(
         if flags.failed and throw is not False:
             # Other runs of the same motion.
             on = functools.partial(again, system, outcome.y, t0=outcome.t, rtol=relative)
-            probe = lambda solver, steps: on(solver=solver, max_steps=steps, atol=absolute)
+            # What was chosen for another method need not serve the one that looks for stiffness.
+            own = {"formulation": None, "manifold": None} if problem.policy.restores else {}
+            probe = lambda solver, steps: on(solver=solver, max_steps=steps, atol=absolute, **own)
             text = message_of_failure(
                 system, trajectory.result, times, outcome, trajectory.stats, problem.solver, probe
             )
