@@ -16,7 +16,14 @@ from ..formulations.formulation import check_mass, solve_constrained
 from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
-from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation, cond_of_jumps, crossing
+from ..solvers import (
+    AbstractManifoldTerm,
+    AbstractMultistep,
+    AbstractMultistepState,
+    ManifoldEvaluation,
+    cond_of_jumps,
+    crossing,
+)
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .constraints import RestoredState, SolvedState, restore, solved
@@ -102,6 +109,10 @@ class Projection(AbstractManifold):
 
     def contact_tolerance(self, system, rtol):
         return contact_tolerance(system, self.newton_tol, rtol)
+
+    def statistics(self, solver_state):
+        # The states of Runge–Kutta methods have no charts.
+        return {"newton_iterations": solver_state.chart} if isinstance(solver_state, AbstractMultistepState) else {}
 
     def violated(self, system, t, y):
         return _violated(*lax.stop_gradient((system, t, y))) if drops_rows(system) else False
