@@ -280,7 +280,8 @@ def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool
         return [fewer, room] if traced and tries and fewer == MOST_ROWS else [room]
     if traced:
         return [max_steps]
-    rooms = [max(2 ** int(math.log2(_ROOM / (kept * (state.q.nbytes + state.u.nbytes)))), _FEWEST_STEPS)]
+    size = sum(x.nbytes for x in jax.tree.leaves(state))
+    rooms = [max(2 ** int(math.log2(_ROOM / (kept * size))), _FEWEST_STEPS)]
     while rooms[-1] < max_steps:
         rooms.append(_MORE_ROOM * rooms[-1])
     return [*rooms[:-1], max_steps]

@@ -1,5 +1,6 @@
 """From a system and a state to a motion."""
 
+import collections
 import contextlib
 import functools
 from collections.abc import Mapping
@@ -54,9 +55,10 @@ from .solve import Problem, made_precise, solved
 
 # Defaults, made once: their construction would take as long as the rest of a call.
 _ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
-# The structures of systems of which a motion in this process, with or without derivatives, took as many steps as
-# derivatives keep at once: the next derivative outside of `jit` does not try with room for no more.
-_long: set[Any] = set()
+# The structures of the last systems and solvers of which a motion in this process, with or without derivatives, took as
+# many steps as derivatives keep at once: the next derivative outside of `jit` does not try with room for no more. Only
+# so many are kept, since structures hold the functions of their users.
+_long: collections.deque[Any] = collections.deque(maxlen=16)
 _HIDDEN = (
     "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
     "an attribute of an object: make it a parameter, or let the function close over it."
@@ -263,7 +265,7 @@ def simulate(
         raise ValueError(NO_SECOND_DERIVATIVES)
     # Where values are known, so is after it how many steps a motion took.
     known = not traced or (taken is not None and taken.known)
-    tries = traced and known and jax.tree.structure(system) not in _long
+    tries = traced and known and jax.tree.structure((system, method)) not in _long
     rooms = [max_steps] if adjoint is not None else rooms_for(max_steps, saved, state, traced, tries)
     problem = Problem(
         system=system,
@@ -302,8 +304,9 @@ def simulate(
             if is_traced(outcome.flags):
                 return trajectory, outcome, None
             flags = Flags(*np.asarray(outcome.flags))
-            if flags.long:
-                _long.add(jax.tree.structure(system))
+            structure = jax.tree.structure((system, problem.solver))
+            if flags.long and structure not in _long:
+                _long.append(structure)
             return trajectory, outcome, None if traced else flags
 
     trajectory, outcome, flags = run(problem)

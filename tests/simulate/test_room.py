@@ -1,5 +1,6 @@
 """What is kept of each step has room for as many steps as a motion takes, and derivatives for a few at first."""
 
+import collections
 import importlib
 
 import diffrax
@@ -57,7 +58,7 @@ def rooms(monkeypatch):
     for where in (arguments, solve):
         monkeypatch.setattr(where, "MOST_ROWS", 16)
     monkeypatch.setattr(arguments, "_FEWEST_ROWS", 16)
-    monkeypatch.setattr(module, "_long", set())
+    monkeypatch.setattr(module, "_long", collections.deque(maxlen=2))
     monkeypatch.setattr(module, "solved", spied)
     return used
 
@@ -142,3 +143,16 @@ def test_too_few_steps_are_no_singularity(narrow, rooms):
     slope = jax.grad(long)(9.81)
     assert rooms == [16, 65536]
     np.testing.assert_allclose(slope, (long(9.82) - long(9.80)) / 0.02, rtol=1e-4)
+
+
+def test_room_counts_internal_states():
+    """Of which a system may have many more than coordinates."""
+    saveat = arguments.with_end(diffrax.SaveAt(steps=True))
+    few, many = mb.State(jnp.zeros(8), jnp.zeros(8)), mb.State(jnp.zeros(8), jnp.zeros(8), jnp.zeros(4096))
+    first = [arguments.rooms_for(2**30, saveat, state, False, False)[0] for state in (few, many)]
+    assert first == [2**17, 2**8 * 4]
+    assert first[1] * (16 + 4096) * 8 < 4 * arguments._ROOM
+
+
+def test_few_systems_are_remembered_as_long():
+    assert 0 < module._long.maxlen < 100
