@@ -198,6 +198,9 @@ def checked_saveat(saveat: Any, start: Any, end: Any) -> diffrax.SaveAt:
     if isinstance(saveat, diffrax.SaveAt):
         if not isinstance(saveat.subs, diffrax.SubSaveAt) and saveat.subs is not None:
             raise ValueError("simulate saves one series; use SaveAt without subs, or diffrax.diffeqsolve directly.")
+        for name in ("solver_state", "controller_state", "made_jump"):
+            if getattr(saveat, name):
+                raise ValueError(f"simulate does not return what SaveAt({name}=True) saves; leave it out.")
         if saveat.subs is not None and saveat.subs.ts is not None:
             times = _check_saved_times(saveat.subs.ts, start, end)
             return changed(saveat, subs=changed(saveat.subs, ts=times))

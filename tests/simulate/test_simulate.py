@@ -469,3 +469,34 @@ def test_derivatives_of_what_a_function_returns(rod):
     np.testing.assert_allclose(derivative, jit_quickly(jax.jacfwd(after))(at), rtol=1e-9)
     batch = jit_quickly(jax.vmap(jax.jacfwd(seen)))(jnp.stack([at, 1.1 * at]))
     np.testing.assert_allclose(batch[0], derivative, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["solver_state", "controller_state", "made_jump"])
+def test_states_of_the_solver_are_not_saved(rod, name):
+    with pytest.raises(ValueError, match=rf"SaveAt\({name}=True\)"):
+        mb.simulate(rod, mb.assemble(rod), t1=1.0, saveat=diffrax.SaveAt(t1=True, **{name: True}))
+
+
+@pytest.mark.parametrize("error", [False, True])
+def test_several_series_are_refused(rod, error):
+    several = diffrax.SaveAt(subs=(diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(t0=True)))
+    with pytest.raises(ValueError, match="saves one series"):
+        mb.simulate(rod, mb.assemble(rod), t1=1.0, saveat=several, error=error)
+
+
+def test_newton_iterations_of_a_projection_are_counted(rod):
+    found = mb.simulate(rod, mb.assemble(rod), t1=1.0, manifold=mb.manifold.Projection())
+    assert 0.5 < found.stats["newton_iterations"] / found.stats["num_steps"] < 5
+
+
+@pytest.mark.parametrize("redundant", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_too_few_steps_with_a_choice_for_runge_kutta_methods(rod, redundant):
+    """The method that then looks for stiffness has a manifold and a formulation that suit it."""
+    system = rod
+    if redundant:
+        body = planar.Body("rod", mass=3.0, inertia=planar.rod(3.0, 2.0), position=(1.0, 0.0))
+        pins = [planar.Revolute(name, "ground", "rod", point=(0.0, 0.0)) for name in ("pin", "other")]
+        system = mb.Scene([body], joints=pins, forces=[mb.Gravity((0.0, -G))]).compile()
+    own = {"manifold": mb.manifold.Projection()} | ({} if redundant else {"formulation": mb.formulations.NullSpace()})
+    with pytest.raises(RuntimeError, match=r"in max_steps = 250 steps.*A larger max_steps"):
+        mb.simulate(system, mb.assemble(system), t1=50.0, solver=diffrax.Tsit5(), max_steps=250, rtol=1e-6, **own)
