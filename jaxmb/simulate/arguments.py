@@ -109,17 +109,25 @@ def with_restarts(controller: Any, restarts: Any, stops: Any, events: int | None
     return diffrax.ClipStepSizeController(controller, step_ts=stops, jump_ts=restarts)
 
 
-def check_error_estimate(saveat, stepsize_controller, event) -> None:
-    """Refuse runs whose times a second run would not share."""
+def check_error_estimate(steps: Any, stepsize_controller: Any, event: Any, rtol: Any) -> None:
+    """Refuse runs whose times a second run would not share, and tolerances that leave it no room.
+
+    **Arguments:** `steps`: whether states are saved at the ends of steps.
+    """
     if stepsize_controller is not None:
         raise ValueError(
             "error=True repeats the run at tighter tolerances: give rtol and atol, no stepsize_controller."
         )
-    steps = isinstance(saveat, diffrax.SaveAt) and saveat.subs is not None and saveat.subs.steps
     if event is not None or steps:
         what = "an event" if event is not None else "SaveAt(steps=True)"
         raise ValueError(
             f"error=True compares two runs at the same times, which {what} does not have; give saveat=times."
+        )
+    least = _CLOSEST * float(jnp.finfo(rtol.dtype).eps)
+    if not is_traced(rtol) and rtol < least:
+        raise ValueError(
+            f"error=True repeats the run at tighter tolerances, which rtol={float(rtol):g} leaves no room for in a "
+            f"precision of {rtol.dtype}; give at least {_rounded_up(least)}."
         )
 
 
@@ -127,12 +135,6 @@ def closer_tolerances(solver: Any, rtol: Any, atol: Any) -> tuple[Any, Any]:
     """The tolerances of the second run of an error estimate, whose steps may err a hundredth as much; a tenth where the
     order is fixed, and a hundredth may take many times the steps.
     """
-    least = _CLOSEST * float(jnp.finfo(rtol.dtype).eps)
-    if not is_traced(rtol) and rtol < least:
-        raise ValueError(
-            f"error=True repeats the run at tighter tolerances, which rtol={float(rtol):g} leaves no room for in a "
-            f"precision of {rtol.dtype}; give at least {_rounded_up(least)}."
-        )
     is_multistep = isinstance(solver, AbstractMultistep)
     closer = closer_tolerance(rtol, solver.finest, rtol.dtype) if is_multistep else rtol / 10
     return closer, None if atol is None else atol * (closer / rtol)
@@ -150,16 +152,11 @@ def parameter_changes(system: AbstractSystem, direction: Mapping[str, VectorLike
     return {name: (known[name], array(name, x)) for name, x in direction.items()}
 
 
-def named_solver(name: str, state: State) -> Adams:
+def named_solver(name: str) -> Adams:
     if name not in ("auto", "switch"):
         raise ValueError(
             "solver must be an object, such as jaxmb.solvers.Adams(), jaxmb.solvers.Hermite() or diffrax.Tsit5(), or "
             f"one of the words 'auto' and 'switch'; got {name!r}."
-        )
-    if name == "switch" and is_traced(state):
-        raise ValueError(
-            "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
-            "once with solver='auto', outside, and then choose Adams() or Hermite()."
         )
     return Adams(stiffness="count" if name == "auto" else "stop")
 

@@ -228,15 +228,14 @@ def simulate(
     times = checked_times(t0, t1, dt0, state.q.dtype)
     check_steps(max_steps)
     check_steps(max_events, "max_events")
-    method = named_solver(solver, state) if isinstance(solver, str) else _ADAMS if solver is None else solver
+    method = named_solver(solver) if isinstance(solver, str) else _ADAMS if solver is None else solver
     check_kinds(method, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
     check_fixed_steps(method, stepsize_controller)
-    if error:
-        check_error_estimate(saveat, stepsize_controller, event)
-    closer = closer_tolerances(method, relative, absolute) if error else None
     restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
     saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]))
     first = saved.subs[0]
+    if error:
+        check_error_estimate(first.steps, stepsize_controller, event, relative)
     others = {
         "formulation": formulation,
         "manifold": manifold,
@@ -347,7 +346,8 @@ def simulate(
         trajectory = trajectory.trimmed()
         if throw:
             trajectory = trajectory.result.error_if(trajectory, outcome.flags[0])
-    if closer is not None:
+    if error:
+        closer = closer_tolerances(problem.solver, relative, absolute)
         second = again(
             *(lax.stop_gradient((system, state)) if traced else (system, state)),
             t0=t0,

@@ -269,6 +269,37 @@ def test_bad_words():
         jax.jit(lambda s: mb.simulate(mechanism.system, s, t1=1.0, solver="switch").ys)(mechanism.state)
 
 
+@pytest.mark.parametrize("traced", ["parameter", "tolerance", "saved time", "jump", "input"])
+def test_a_switch_sees_every_number(traced):
+    """Whatever is traced, a motion is not seen before it ends."""
+    mechanism = library("four_bar")
+    name, value = next((name, value) for name, value in mb.parameters(mechanism.system).items() if "point" in name)
+
+    def run(x):
+        own = mb.with_parameters(mechanism.system, {name: value * x}) if traced == "parameter" else mechanism.system
+        options = {
+            "tolerance": {"rtol": 1e-6 * x},
+            "saved time": {"saveat": jnp.array([0.5]) * x},
+            "jump": {"jumps": jnp.array([0.5]) * x},
+            "input": {"inputs": {name: lambda t: value * x}},
+        }.get(traced, {})
+        return mb.simulate(own, mechanism.state, t1=1.0, solver="switch", **options).ys
+
+    for transform in (jax.jit, lambda f: jax.vmap(f, axis_size=2), jax.jacfwd):
+        with pytest.raises(ValueError, match="under jit"):
+            transform(run)(jnp.ones(2) if transform not in (jax.jit, jax.jacfwd) else 1.0)
+
+
+@pytest.mark.long
+def test_the_error_estimate_of_a_switch_is_that_of_its_method():
+    mechanism = library("stiff_four_bar")
+    run = lambda solver: mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-9, solver=solver, error=True)
+    switched, implicit = run("switch"), run(mb.solvers.Hermite())
+    assert "past_points" in switched.stats
+    assert switched.stats["num_steps"] == implicit.stats["num_steps"]
+    assert switched.closer.stats["num_steps"] == implicit.closer.stats["num_steps"]
+
+
 def test_implicit_solvers_of_diffrax():
     mechanism = library("four_bar")
     other = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-6, solver=diffrax.Kvaerno5())
