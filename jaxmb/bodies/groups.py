@@ -394,6 +394,23 @@ class ForceGroup(AbstractGroup):
         wrenches = part.wrenches(space, *part.seen(space, x, v), t)
         return part.wrenches_on_bodies(space, x, wrenches)
 
+    def gaps(
+        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities
+    ) -> tuple[
+        Float[Array, "parts gaps"], Float[Array, "parts gaps"], Float[Array, "parts gaps"], Float[Array, "parts"]
+    ]:
+        """Gaps, their rates, the widths in which forces set in, and the pace of each part."""
+        space = self.group.layout.space
+
+        def single(at, x, v):
+            gaps = lambda t, x: at(t).gaps(space, at(t).seen_poses(space, x), t)
+            gap, rate = jax.jvp(gaps, (t, x), (jnp.ones_like(t), jax.vmap(space.rates)(x, v)))
+            part = at(t)
+            width = jnp.broadcast_to(jnp.asarray(part.gap_width, gap.dtype), gap.shape)
+            return gap, rate, width, part.gap_pace(space, *part.seen(space, x, v), t)
+
+        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+
     def state_rates(
         self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities
     ) -> dict[str, Float[Array, "parts *shape"]]:

@@ -21,6 +21,7 @@ from ..linalg.sums import placed_sums
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
 from ..parts.unilateral import AbstractUnilateralConstraint
+from ..solvers.manifold_term import GapsSeen
 from ..system.catalogue import AbstractSystem
 from ..system.design_variables import DesignVariables, variables_in_range
 from ..system.equation import Contacts, Frictions, Ranks
@@ -348,6 +349,22 @@ class RigidBodySystem(AbstractSystem):
             coefficient=coefficient,
             limit=limit,
         )
+
+    @property
+    def _closing(self):
+        """The groups of forces that act where a gap is closed only."""
+        return tuple(g for g in self.forces if g.group.part.has_gaps)
+
+    @property
+    def has_gaps(self):
+        return bool(self._closing)
+
+    @eqx.filter_jit
+    def gaps_seen(self, t, q, u):
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        seen = [g.gaps(t, poses, velocities) for g in self._closing]
+        *of_gaps, paces = (jnp.concatenate([x.ravel() for x in own]) for own in zip(*seen, strict=True))
+        return GapsSeen(*of_gaps, jnp.max(paces))
 
     @eqx.filter_jit
     def friction_reactions(self, t, q, u, multipliers):

@@ -14,7 +14,9 @@ import numpy as np
 from .._types import State
 from ..formulations import AbstractFormulation, accelerations
 from ..formulations.formulation import check_mass
+from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractEquation
+from .compliant_gaps import compliant_gaps
 from .manifold import AbstractManifold, normalize_state
 
 
@@ -50,12 +52,16 @@ class Baumgarte(AbstractManifold):
         return normalize_state
 
 
-class StabilisedField(eqx.Module):
+class StabilisedField(AbstractVectorField):
     """`(q, u) ↦ (K(t, q, u), u̇)` with accelerations that stabilise the constraints."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
     rate: float = eqx.field(static=True)
+
+    @property
+    def gaps(self):
+        return compliant_gaps(self.system)
 
     def __call__(self, t, y, args):
         del args

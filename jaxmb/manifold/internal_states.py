@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..solvers import AbstractManifoldTerm, Block
+from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractSystem
 from ..system.gaps import mode_places
 
@@ -36,10 +37,14 @@ def _mechanical(y):
     return State(y.q, y.u)
 
 
-class StatefulField(eqx.Module):
+class StatefulField(AbstractVectorField):
     """`(q, u, z) ↦ (q̇, u̇, ż)` from a vector field of (q, u)."""
 
-    field: Any
+    field: AbstractVectorField
+
+    @property
+    def gaps(self):
+        return self.field.gaps
 
     @property
     def system(self):
@@ -95,6 +100,10 @@ class StatefulTerm(AbstractManifoldTerm):
     @property
     def guards(self):
         return self.term.guards
+
+    @property
+    def gaps(self):
+        return self.term.gaps
 
     def after_jump(self, t, y, args):
         if self.guards is not None:

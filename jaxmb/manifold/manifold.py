@@ -13,7 +13,9 @@ from jaxtyping import Array, PyTree
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, accelerations
 from ..linalg.arrays import as_array, namespace
+from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractEquation
+from .compliant_gaps import compliant_gaps
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -93,11 +95,15 @@ class AbstractManifold(eqx.Module):
         return result
 
 
-class VectorField(eqx.Module):
+class VectorField(AbstractVectorField):
     """`(q, u) ↦ (K(t, q, u), u̇)` with the accelerations of a formulation."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
+
+    @property
+    def gaps(self):
+        return compliant_gaps(self.system)
 
     def __call__(self, t, y, args):
         del args

@@ -36,6 +36,7 @@ from ..linalg.newton import chord
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractEquation
 from ..system.residuals import drops_rows, row_sizes, violation_of_dropped_rows
+from .compliant_gaps import compliant_gaps
 from .constraints import (
     AbstractConstraints,
     RestoredState,
@@ -582,6 +583,10 @@ class PartitionTerm(AbstractManifoldTerm):
     @property
     def guards(self):
         return contact_guards(self.system, self.formulation, self.touch)
+
+    @property
+    def gaps(self):
+        return compliant_gaps(self.system)
 
     def after_jump(self, t, y, args):
         return after_jump(self, t, y)

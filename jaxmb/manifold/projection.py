@@ -26,6 +26,7 @@ from ..solvers import (
 )
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
+from .compliant_gaps import compliant_gaps
 from .constraints import RestoredState, SolvedState, restore, solved
 from .contact_guards import ContactGuards, after_jump, contact_guards
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
@@ -242,6 +243,10 @@ class ProjectionTerm(AbstractManifoldTerm):
     @property
     def guards(self):
         return contact_guards(self.system, self.formulation, self.touch)
+
+    @property
+    def gaps(self):
+        return compliant_gaps(self.system)
 
     def after_jump(self, t, y, args):
         return after_jump(self, t, y)

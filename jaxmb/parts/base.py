@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from .._compat import with_values
 from .._types import Scalar
 from ..linalg.arrays import namespace
+from ..linalg.rotations import norm
 from . import fields
 from .names import check_arguments
 from .shapes import AbstractShape
@@ -479,10 +480,30 @@ class AbstractForce(AbstractLink):
     """A force law without potential energy: all its power is dissipated or supplied."""
 
     conservative = False
+    # Whether it acts where a gap is closed only, for `gaps`; no step then passes over the force.
+    has_gaps: ClassVar[bool] = False
 
     @abc.abstractmethod
     def wrenches(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Wrenches:
         """The wrench on each of its bodies."""
+
+    def gaps(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "gaps"]:
+        """Hook: the gaps [m, rad] of a part that `has_gaps`, negative where the force acts. Each is a distance from a
+        convex shape, or varies with a joint.
+        """
+        raise NotImplementedError(f"{self.kind} says has_gaps = True, and needs a method gaps.")
+
+    @property
+    def gap_width(self) -> Any:
+        """Hook: the width [m, rad] of a smooth onset of the force, before a gap is closed."""
+        return 0.0
+
+    def gap_pace(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Float[Array, ""]:
+        """Hook: a rate [1/s]; in an interval of 1/pace no gap closes and opens unless its rates at both ends say so. By
+        default that at which two bodies turn by a radian relative to each other.
+        """
+        del poses, t
+        return 2 * jnp.max(norm(velocities[:, space.dimension :]))
 
 
 class AbstractPotentialForce(AbstractForce):

@@ -49,6 +49,8 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
         check_returns(
             part.label, "wrenches", of_bodies, lambda x, v, t: part.wrenches(space, x, v, t), poses, velocities, t
         )
+        if part.has_gaps:
+            _check_gaps(part, space, poses, t)
         if isinstance(part, AbstractDynamicForce):
             _check_state_rates(part, space, poses, velocities, t)
         if isinstance(part, AbstractPotentialForce):
@@ -58,6 +60,13 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
             raise ValueError(
                 f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce."
             )
+
+
+def _check_gaps(part: AbstractForce, space: AbstractSpace, *given: Any) -> None:
+    """The same for gaps, of which there may be any number."""
+    gaps = lambda x, t: part.gaps(space, x, t)
+    shape = getattr(_evaluated(part.label, "gaps", gaps, given), "shape", ())
+    check_returns(part.label, "gaps", shape if len(shape) == 1 else ("n",), gaps, *given)
 
 
 def _check_state_rates(part: AbstractDynamicForce, space: AbstractSpace, *given: Any) -> None:

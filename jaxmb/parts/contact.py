@@ -31,7 +31,7 @@ from .boundary import check_returns
 from .forces import over_ground
 from .shapes import Ground, marked_ball, wheel
 from .smooth import dry_friction, ramp, step
-from .terrain import AbstractTerrain, distance, outward
+from .terrain import AbstractTerrain, distance, outward, pace_over
 
 Number = Float[Array, ""]
 Vector = Float[Array, "d"]
@@ -185,6 +185,7 @@ class AbstractContact(AbstractPotentialForce):
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
+    has_gaps: ClassVar[bool] = True
 
     @abc.abstractmethod
     def distance(self, centre: Vector) -> Number:
@@ -217,6 +218,21 @@ class AbstractContact(AbstractPotentialForce):
     def energy(self, space, poses, t):
         single = lambda pose, point, radius: self.normal.energy(self._depth(space.point(pose, point), radius))
         return jnp.sum(self._each(space, single, poses))
+
+    def gaps(self, space, poses, t):
+        return self._each(space, lambda pose, point, radius: self.distance(space.point(pose, point)) - radius, poses)
+
+    @property
+    def gap_width(self):
+        return self.smoothing
+
+    def gap_pace(self, space, poses, velocities, t):
+        def passing(pose, velocity, point, radius):
+            del radius
+            return pace_over(self.terrain, space.point(pose, point), space.point_velocity(pose, velocity, point))
+
+        turning = super().gap_pace(space, poses, velocities, t)
+        return jnp.maximum(turning, jnp.max(self._each(space, passing, poses, velocities)))
 
     def shapes(self, space, size):
         n, solid = len(self.bodies), wheel if space.dimension == 2 else marked_ball

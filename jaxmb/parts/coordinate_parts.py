@@ -297,6 +297,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
     smoothing: fields.Number = fields.parameter(unit="rad or m", sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("lower", "upper")
+    has_gaps: ClassVar[bool] = True
 
     def validate(self):
         if not self.lower < self.upper:
@@ -313,9 +314,19 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
             )
         return super().with_numbers(given)
 
-    def _depths(self, value):
+    def gaps(self, space, poses, t):
+        return self._gaps(self.measured(space, poses))
+
+    @property
+    def gap_width(self):
+        return self.smoothing
+
+    def _gaps(self, value):
         value = self.near(value, 0.5 * (self.lower + self.upper))
-        return ramp(jnp.concatenate([self.lower - value, value - self.upper]), self.smoothing)
+        return jnp.concatenate([value - self.lower, self.upper - value])
+
+    def _depths(self, value):
+        return ramp(-self._gaps(value), self.smoothing)
 
     def wrenches(self, space, poses, velocities, t):
         def law(x, v):

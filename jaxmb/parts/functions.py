@@ -115,14 +115,17 @@ class Force(AbstractPotentialForce):
 
     - `bodies`: one name or several; `"ground"` may be among them (its wrench is dropped).
     - `function`: returns shape `(len(bodies), 3)` in the plane (force [N], moment [N m]) or `(len(bodies), 6)` in space
-        (force in the world frame, moment in the body frame). The force acts at the origin of the body's frame, whose
-        pose and velocity the function sees, and the moment is about it: the mass centre, unless the body was given
-        `centre=`.
+        (force in the world frame, moment in the body frame); of one body also shape `(3,)` or `(6,)`. The
+        force acts at the origin of the body's frame, whose pose and velocity the function sees, and the moment is about
+        it: the mass centre, unless the body was given `centre=`.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`. An equinox module, such as a
         neural network, may be among them: the function calls it as `parameters["net"](x)`, and all its weights are one
         parameter, a vector. `with_parameters` takes a vector or a module of new weights, and `jaxmb.modules` gives it.
     - `potential(poses, t, parameters)`: optional potential energy [J] of which these forces are the gradient, for the
         energy balance.
+    - `gap(poses, t, parameters)`: optional gap [m, rad], a number or a vector, of a force that acts only where it is
+        negative, such as a contact. No step of `simulate` then passes over the force, however short it acts. The gap is
+        a distance from a convex shape, or varies with a joint; other shapes need one for each of their convex parts.
     """
 
     name: str = fields.name()
@@ -130,11 +133,20 @@ class Force(AbstractPotentialForce):
     function: Callable[..., Array] = fields.function()
     parameters: fields.Numbers = fields.numbers()
     potential: Callable[..., Array] | None = fields.function(default=None, kw_only=True)
+    gap: Callable[..., Array] | None = fields.function(default=None, kw_only=True)
     of_time: ClassVar[bool] = True
 
     @property
     def conservative(self):
         return self.potential is not None
+
+    @property
+    def has_gaps(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.gap is not None
+
+    def gaps(self, space, poses, t):
+        assert self.gap is not None
+        return jnp.atleast_1d(jnp.asarray(self.gap(poses[:, : space.pose_size], t, self.parameters)))
 
     def given_in_time(self, space, poses, velocities, t):
         return self.wrenches(space, poses, velocities, t)

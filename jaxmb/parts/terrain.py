@@ -24,11 +24,14 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import is_traced
+from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw
 from .smooth import step
 
 Place = Float[Array, "h"]
+# The share of a bump or wave within which the ground rises or falls once.
+_SHARE = 0.25
 
 
 class AbstractTerrain(AbstractLaw):
@@ -41,6 +44,12 @@ class AbstractTerrain(AbstractLaw):
     @abc.abstractmethod
     def height(self, place: Place) -> Float[Array, ""]:
         """Height [m] above the world's origin at a place [m], continuously differentiable."""
+
+    def detail(self, place: Place) -> Float[Array, ""]:
+        """Hook: a length [m] within which the ground around a place rises or falls once at most; by default infinite.
+        Between two places that are so far apart no step looks at a contact.
+        """
+        return jnp.asarray(jnp.inf, place.dtype)
 
 
 def distance(terrain: AbstractTerrain, point: Float[Array, "d"]) -> Float[Array, ""]:
@@ -55,6 +64,16 @@ def outward(terrain: AbstractTerrain, point: Float[Array, "d"]) -> Float[Array, 
     """Unit outward normal of the ground below a point."""
     slope = jax.grad(terrain.height)(point[:-1])
     return jnp.ones_like(point).at[:-1].set(-slope) / jnp.sqrt(1 + jnp.dot(slope, slope))
+
+
+def pace_over(terrain: AbstractTerrain, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, ""]:
+    """The rate [1/s] at which a point passes over the details of the ground below."""
+    return norm(velocity[:-1]) / terrain.detail(point[:-1])
+
+
+def _beyond(place: Place, start: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
+    """How far a place lies before the start or behind the end of an uneven stretch along x."""
+    return jnp.maximum(jnp.maximum(start - place[0], place[0] - end), 0.0)
 
 
 class Flat(AbstractTerrain):
@@ -83,6 +102,9 @@ class Bump(AbstractTerrain):
         s = jnp.clip((place[0] - self.start) / self.length, 0.0, 1.0)
         return self.peak * jnp.sin(jnp.pi * s) ** 2
 
+    def detail(self, place):
+        return _beyond(place, self.start, self.start + self.length) + _SHARE * self.length
+
 
 class Sinusoid(AbstractTerrain):
     """Waves along x, `amplitude sin(2π x / wavelength + phase)`.
@@ -96,6 +118,9 @@ class Sinusoid(AbstractTerrain):
 
     def height(self, place):
         return self.amplitude * jnp.sin(2 * jnp.pi * place[0] / self.wavelength + self.phase)
+
+    def detail(self, place):
+        return _SHARE * self.wavelength
 
 
 class Slope(AbstractTerrain):
@@ -124,6 +149,9 @@ class Ramp(AbstractTerrain):
 
     def height(self, place):
         return self.rise * step((place[0] - self.start) / self.length)
+
+    def detail(self, place):
+        return _beyond(place, self.start, self.start + self.length) + _SHARE * self.length
 
 
 class Spline(AbstractTerrain):
@@ -166,6 +194,9 @@ class Spline(AbstractTerrain):
         first = (self.heights[1] - self.heights[0]) / (self.x[1] - self.x[0])
         last = (self.heights[-1] - self.heights[-2]) / (self.x[-1] - self.x[-2])
         return inside + jnp.minimum(before, 0.0) * first + jnp.maximum(after, 0.0) * last
+
+    def detail(self, place):
+        return _beyond(place, self.x[0], self.x[-1]) + jnp.min(jnp.diff(self.x))
 
     def _at_point(self, k):
         """Height, slope and curvature at a point; at the ends those of the straight continuation."""

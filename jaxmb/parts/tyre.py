@@ -20,7 +20,7 @@ from .forces import over_ground
 from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step
 from .space import AbstractSpace, Point, Pose
-from .terrain import AbstractTerrain, distance, outward
+from .terrain import AbstractTerrain, distance, outward, pace_over
 
 
 class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
@@ -57,6 +57,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     deflection: fields.Number = fields.internal_state(shape=None, unit="m")
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
+    has_gaps: ClassVar[bool] = True
 
     @abc.abstractmethod
     def axle(self, space: AbstractSpace) -> Float[Array, "3"]:
@@ -100,6 +101,18 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     def energy(self, space, poses, t):
         return self.normal.energy(self._depth(space, poses[0]))
 
+    def gaps(self, space, poses, t):
+        return self._gap(space, poses[0])[None]
+
+    @property
+    def gap_width(self):
+        return self.smoothing
+
+    def gap_pace(self, space, poses, velocities, t):
+        centre = space.point(poses[0], self.centre)
+        passing = pace_over(self.terrain, centre, space.point_velocity(poses[0], velocities[0], self.centre))
+        return jnp.maximum(super().gap_pace(space, poses, velocities, t), passing)
+
     def state_rates(self, space, poses, velocities, t):
         *_, slip, speed = self._contact(space, poses[0], velocities[0])
         return {"deflection": -slip - speed / self.relaxation_length * self.deflection}
@@ -111,10 +124,13 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         tyre = wheel(self.radius, axis=self.axle(space), position=space.in_space(self.centre))
         return (None, Ground(height=self.terrain.height)), *((0, shape) for shape in tyre)
 
-    def _depth(self, space, pose):
+    def _gap(self, space, pose):
         centre = space.point(pose, self.centre)
         rim = centre + self.lowest(space, pose, outward(self.terrain, centre))
-        return ramp(-distance(self.terrain, rim), self.smoothing)
+        return distance(self.terrain, rim)
+
+    def _depth(self, space, pose):
+        return ramp(-self._gap(space, pose), self.smoothing)
 
     def _velocity(self, space, pose, velocity, point):
         """The velocity of a point fixed in the body over the ground."""

@@ -21,6 +21,7 @@ from ..parts.names import unknown
 from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScales
 from ..solvers.closures import opened
 from ..solvers.events import EventController
+from ..solvers.gaps import GapController
 from ..solvers.one_step import OneStepController
 from ..solvers.tolerances import closer_tolerance
 from ..system import AbstractSystem
@@ -75,20 +76,24 @@ def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
         raise ValueError(
             f"{own} chooses its order by tolerances, which {steps} does not have: give them to the solver, as in "
             f"solver=jaxmb.solvers.{own}(rtol=1e-8, atol=1e-10), or take a method of one order, as diffrax.Tsit5(). "
-            "Steps that are only bounded have jaxmb.solvers.MultistepController(rtol, atol, dtmax=0.01)."
+            "Steps that are only bounded have simulate(..., dtmax=0.01)."
         )
 
 
-def default_controller(solver: Any, rtol: Any, atol: Any, scales: RunningScales | None) -> Any:
+def default_controller(solver: Any, rtol: Any, atol: Any, scales: RunningScales | None, dtmax: Any) -> Any:
     if isinstance(solver, AbstractMultistep):
-        return MultistepController(rtol, atol, scales=scales)
-    return OneStepController.around(diffrax.PIDController(rtol, atol), scales)
+        return MultistepController(rtol, atol, scales=scales, dtmax=dtmax)
+    return OneStepController.around(diffrax.PIDController(rtol, atol, dtmax=dtmax), scales)
+
+
+def adapts(controller: Any) -> bool:
+    """Whether a controller, None for the default, chooses steps by their errors."""
+    return controller is None or isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
 
 
 def may_stop(controller: Any) -> bool:
     """Whether steps of a controller, None for the default, may be cut at times that it does not know of."""
-    adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    return controller is None or (adapts and not isinstance(controller, diffrax.ClipStepSizeController))
+    return adapts(controller) and not isinstance(controller, diffrax.ClipStepSizeController)
 
 
 def stops_of(system: AbstractSystem, state: State, times: Mapping[str, Any], controller: Any, traced: bool) -> Any:
@@ -99,11 +104,12 @@ def stops_of(system: AbstractSystem, state: State, times: Mapping[str, Any], con
     return turning_times(*own) if traced else _stops.found(own, lambda: turning_times(*own))
 
 
-def with_restarts(controller: Any, restarts: Any, stops: Any, events: int | None) -> Any:
+def with_restarts(controller: Any, restarts: Any, stops: Any, events: int | None, gaps: bool) -> Any:
     """A controller that restarts at some times, steps to others, and restarts at as many events of contacts; None where
-    there are none.
+    there are none. Where forces have `gaps`, its steps hide none of these.
     """
     controller = controller if events is None else EventController(controller, events)
+    controller = GapController(controller) if gaps else controller
     if restarts is None and stops is None:
         return controller
     return diffrax.ClipStepSizeController(controller, step_ts=stops, jump_ts=restarts)
@@ -331,3 +337,19 @@ def checked_times(t0: Any, t1: Any, dt0: Any, dtype: Any) -> dict[str, Any]:
             f"dt0 must be a finite step from t0 = {t0} towards t1 = {t1}, got {dt0}; leave it out for the default."
         )
     return {"t0": start, "t1": end, "dt0": step}
+
+
+def checked_longest_step(dtmax: Any, stepsize_controller: Any, solver: Any, dtype: Any) -> Any:
+    """`dtmax`, or None."""
+    if dtmax is None:
+        return None
+    if stepsize_controller is not None:
+        raise ValueError(
+            "dtmax bounds the steps that rtol and atol choose: give it to the stepsize_controller, or leave that out."
+        )
+    if isinstance(solver, AbstractMultistep) and solver.tolerances.fixed:
+        raise ValueError(f"dtmax needs the tolerances of simulate: leave those of {type(solver).__name__} out.")
+    longest = real_array("dtmax", dtmax, dtype)
+    if not is_traced(longest) and not longest > 0:
+        raise ValueError(f"dtmax must be positive, got {dtmax}; leave it out for steps of any length.")
+    return longest

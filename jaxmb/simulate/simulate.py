@@ -36,6 +36,7 @@ from .arguments import (
     check_kinds,
     check_steps,
     checked_jumps,
+    checked_longest_step,
     checked_saveat,
     checked_state,
     checked_times,
@@ -79,6 +80,7 @@ def simulate(
     manifold: AbstractManifold | None = None,
     rtol: Scalar = DEFAULT_RTOL,
     atol: ArrayLike | None = None,
+    dtmax: Scalar | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     inputs: Signals | None = None,
@@ -127,8 +129,8 @@ def simulate(
         a held series jumps and, if it moves a point, an axis, a joint, a stop or the ground, or constraints depend on
         it, at every time of a linear one. No step passes a pulse of an input, however long steps are where nothing
         moves: a series is followed from value to value, a function at 513 times, and so are functions of time of
-        drivers, of `Force` and of constraints, with `of_time` those of one's own parts. Shorter ones need `jumps`, or a
-        `MultistepController` with `dtmax`, and so do those in a `LagrangianSystem`.
+        drivers, of `Force` and of constraints, with `of_time` those of one's own parts. Shorter ones need `jumps` or
+        `dtmax`, and so do those in a `LagrangianSystem`.
 
     **Other arguments, rarely needed:**
 
@@ -146,6 +148,7 @@ def simulate(
         rub; so it is for `Hermite` on such a scene, or one without joints, of 40 or more velocities, without friction,
         servos and internal states.
     - `dt0`: first step [s], default chosen from the motion.
+    - `dtmax`: longest step [s], default none. Tolerances and everything else stay as they are.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: how to differentiate instead, one of diffrax's. The default serves `jax.grad`, `jvp`, `jacfwd`,
         `jacrev`, `hessian`, `vmap` of them, and nested ones; it keeps some numbers of up to 2048 steps (at most
@@ -203,8 +206,12 @@ def simulate(
     parameters, while their sequence stays: the time of an impact has a derivative, its number has none.
     After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
     Gaps and forces of contacts are looked at in the middle of each step as well as at its ends. What comes and goes
-    between these is not seen, as a lone bump below a body in free flight: bound the steps there, with
-    `stepsize_controller=jaxmb.solvers.MultistepController(rtol, atol, dtmax=0.01)`.
+    between these is not seen, as a lone bump below a body in free flight: bound the steps there, with `dtmax=0.01`.
+
+    Compliant contacts and stops (`DiscContact`, `JointStop`, `Tyre`, …) have no events. Their gaps are followed along
+    each step, so that none closes and opens again within it unseen; a step that would hide that is tried again up to
+    where the gap is most closed. So it is with a `Force` that has a `gap`, and with parts that have `gaps`. The ground
+    of a `jaxmb.terrain.Surface` may rise and fall unseen where a body passes a hill within an eighth of a step.
 
     A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
     step to step, and a force whose strength is zero, as a control at the start of an optimisation, is seen by its
@@ -231,6 +238,7 @@ def simulate(
     method = named_solver(solver) if isinstance(solver, str) else _ADAMS if solver is None else solver
     check_kinds(method, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
     check_fixed_steps(method, stepsize_controller)
+    longest = checked_longest_step(dtmax, stepsize_controller, method, state.q.dtype)
     restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
     saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]))
     first = saved.subs[0]
@@ -243,6 +251,7 @@ def simulate(
         "controller": stepsize_controller,
         "rtol": relative,
         "atol": absolute,
+        "dtmax": longest,
         "times": times,
         "saveat": saved,
         "restarts": restarts,
@@ -316,7 +325,7 @@ def simulate(
         trajectory = eqx.tree_at(lambda trajectory: trajectory.stats, trajectory, trajectory.stats | found)
     if solver == "auto":
         warn_of_stiffness(trajectory.stats)
-    given = {"formulation": formulation, "manifold": manifold, "jumps": jumps, "max_events": max_events}
+    given = {"formulation": formulation, "manifold": manifold, "dtmax": dtmax, "jumps": jumps, "max_events": max_events}
     again = functools.partial(simulate, t1=t1, **given, throw=False)
     if flags is not None:
         if flags.inconsistent:

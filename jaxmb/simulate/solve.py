@@ -35,6 +35,7 @@ from ..manifold.diagnosis import diagnose_friction
 from ..solvers import (
     NO_STATE,
     AbstractMultistep,
+    GapSolver,
     MeshAdjoint,
     RunningScales,
     TangentControl,
@@ -47,7 +48,7 @@ from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
-from .arguments import MOST_ROWS, default_controller, kept_steps, with_restarts
+from .arguments import MOST_ROWS, adapts, default_controller, kept_steps, with_restarts
 from .compiling import tracing_begins
 from .loop import Loop
 from .moving_times import at_frozen_start, at_moving_times, saved_times
@@ -63,9 +64,9 @@ class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
 
     **Fields:** `system` and `state` at the start; `formulation` and `manifold`, None for those that suit the
-    `solver`; `controller`, None for that of `rtol` and `atol`, and atol None for running scales; `times`: t0, t1,
-    dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`; `limit`: the largest number of steps, and
-    `room`: that which the program has room for; `max_events`: the largest number of events of contacts;
+    `solver`; `controller`, None for that of `rtol` and `atol`, and atol None for running scales, with steps of `dtmax`
+    at most, None for any; `times`: t0, t1, dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`;
+    `limit`: the largest number of steps, and `room`: that which the program has room for; `max_events`: the largest number of events of contacts;
     `progress_meter`; times of `restarts`, and of `stops`, which no step passes, or None; `changes`: values of
     parameters with changes whose tangent is watched, by name; whether states are `interpolated`; whether anything is
     `traced`; by which leaves of the system and the state derivatives are taken (`differentiated`), empty where that is
@@ -80,6 +81,7 @@ class Problem(NamedTuple):
     controller: Any
     rtol: Any
     atol: Any
+    dtmax: Any
     times: dict[str, Any]
     saveat: diffrax.SaveAt
     adjoint: Any
@@ -124,9 +126,16 @@ class Problem(NamedTuple):
         """Whether states return to constraints after the steps of a method that does not know of them."""
         return self.system.velocity_rows > 0 and not isinstance(self.solver, AbstractMultistep)
 
+    @property
+    def watches_gaps(self) -> bool:
+        """Whether steps pass over no force that acts in a gap; those of a fixed length may."""
+        return self.system.has_gaps and adapts(self.controller)
+
     def assembled(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for it."""
         term, prepared = self.policy.prepare(system, self.method, self.solver, self.rtol)
+        if self.watches_gaps and not isinstance(prepared, AbstractMultistep):
+            prepared = GapSolver(prepared)
         return with_internal_states(term), prepared
 
     def options(self, start: State) -> dict[str, Any]:
@@ -134,13 +143,17 @@ class Problem(NamedTuple):
         controller, absolute = self.controller, self.rtol / 100 if self.atol is None else self.atol
         if controller is None:
             scales = running_scales(self.system, self.state, self.times) if self.atol is None else None
-            controller = default_controller(self.solver, self.rtol, absolute, scales)
+            controller = default_controller(self.solver, self.rtol, absolute, scales, self.dtmax)
         controller = with_counted(controller, counted_components(self.system))
         return self.times | {
             "y0": start,
             "saveat": self.saveat,
             "stepsize_controller": with_restarts(
-                controller, self.restarts, self.stops, None if self.system.contacts is None else self.max_events
+                controller,
+                self.restarts,
+                self.stops,
+                None if self.system.contacts is None else self.max_events,
+                self.watches_gaps,
             ),
             "event": self.event,
             "max_steps": self.room,

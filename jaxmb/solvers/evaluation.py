@@ -15,7 +15,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._compat import direction_of, inner_term, unwrapped
-from .manifold_term import AbstractGuards, AbstractManifoldTerm, Args, Chart, ManifoldEvaluation, stop
+from .manifold_term import (
+    AbstractGaps,
+    AbstractGuards,
+    AbstractManifoldTerm,
+    AbstractVectorField,
+    Args,
+    Chart,
+    ManifoldEvaluation,
+    stop,
+)
 
 
 class Evaluation(NamedTuple):
@@ -105,6 +114,13 @@ def guards_of(term: Any) -> AbstractGuards | None:
     """The guards of a term; None for a plain vector field."""
     manifold = _manifold(term)
     return None if manifold is None else manifold.guards
+
+
+def gaps_of(term: Any) -> AbstractGaps | None:
+    """The gaps of the forces of a term; None of a term that knows none."""
+    inner = inner_term(term)
+    known = inner.vector_field if isinstance(inner, diffrax.ODETerm) else inner
+    return known.gaps if isinstance(known, AbstractVectorField | AbstractManifoldTerm) else None
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:

@@ -79,14 +79,15 @@ class Crossing(AbstractErrorWithMore):
 
 def error_of(y_error: Any) -> PyTree:
     """The error estimate in what a solver returns as its error."""
-    return y_error.error if isinstance(y_error, AbstractErrorWithMore) else y_error
+    return error_of(y_error.error) if isinstance(y_error, AbstractErrorWithMore) else y_error
 
 
 def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
     """What a solver returns as its error, with a function of the error estimate in it."""
     if not isinstance(y_error, AbstractErrorWithMore):
         return function(y_error)
-    return eqx.tree_at(lambda y_error: y_error.error, y_error, function(y_error.error), is_leaf=lambda x: x is None)
+    within = map_error(function, y_error.error)
+    return eqx.tree_at(lambda y_error: y_error.error, y_error, within, is_leaf=lambda x: x is None)
 
 
 def cond_of_jumps(guards: AbstractGuards | None) -> Callable:
@@ -289,7 +290,8 @@ def _dipped(search: _Search, values, rates, known):
     again = _narrowed(search, rates[own])
     ends = _is_short(again)
     dips = ends & (values[own] < -known.touch)
-    bracket = again.bracket._replace(a=jnp.zeros_like(search.s), b=search.s)
+    # From rates to values of the guard.
+    bracket = again.bracket._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=values[own])
     risen = again._replace(
         phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, dips=jnp.array(True), count=jnp.array(0)
     )

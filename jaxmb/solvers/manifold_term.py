@@ -101,6 +101,42 @@ class AbstractGuards(eqx.Module):
         """Which guards are forces, of the size of one at most: the motion does not show how they vary in a step."""
 
 
+class GapsSeen(NamedTuple):
+    """The gaps of forces at a time.
+
+    **Fields:** the `gaps`, negative where a force acts; their `rates`; the `widths` in which forces set in, which are
+    as large as the gaps where these close; the `pace` [1/s]: in an interval of 1/pace no gap closes and opens unless
+    its rates at both ends say so.
+    """
+
+    gaps: Float[Array, " gaps"]
+    rates: Float[Array, " gaps"]
+    widths: Float[Array, " gaps"]
+    pace: Float[Array, ""]
+
+
+class AbstractGaps(eqx.Module):
+    """The gaps in which the forces of a term act, functions of time and state, in the term's own time.
+
+    **Fields:** `touch`: depths down to this count as zero.
+    """
+
+    touch: AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def seen(self, t: Any, y: PyTree[Array]) -> GapsSeen:
+        """The gaps at a time and state."""
+
+
+class AbstractVectorField(eqx.Module):
+    """A vector field that knows the `gaps` in which its forces act; None without any."""
+
+    @property
+    @abc.abstractmethod
+    def gaps(self) -> AbstractGaps | None:
+        """The gaps of its forces."""
+
+
 class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
     """A vector field on a manifold, with a chart that says which components of the state are independent.
 
@@ -182,6 +218,11 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
     @property
     def guards(self) -> AbstractGuards | None:
         """The functions at whose zeros `after_jump` is asked for the state after them; by default None."""
+        return None
+
+    @property
+    def gaps(self) -> AbstractGaps | None:
+        """The gaps in which forces act, which no step may pass over; by default None."""
         return None
 
     @abc.abstractmethod

@@ -19,10 +19,12 @@ from .evaluation import (
     check_term,
     derivative,
     first_chart,
+    gaps_of,
     guards_of,
     refused,
 )
 from .events import Crossing, cond_of_jumps, crossing
+from .gaps import Hidden, hidden
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
 from .steps import AbstractSteps
@@ -136,7 +138,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         args: Args,
         solver_state: Any,
         made_jump: Any,
-    ) -> tuple[Y, StepEstimate | Crossing | None, dict[str, Any], Any, diffrax.RESULTS]:
+    ) -> tuple[Y, StepEstimate | Crossing | Hidden | None, dict[str, Any], Any, diffrax.RESULTS]:
         y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
         before = state.chart
         y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
@@ -146,11 +148,13 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         if off is not False:
             failed, estimate = failed | off, refuse(estimate, off)
         estimate = None if self.tolerances.fixed else estimate
-        guards = guards_of(terms)
+        guards, gaps = guards_of(terms), None if estimate is None else gaps_of(terms)
+        at = lambda t: self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate(t)
         if guards is not None:
-            at = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
             retry = jnp.inf if estimate is None else estimate.retry
             estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), (y0, y1), at, retry)
+        if gaps is not None:
+            estimate = hidden(gaps, direction_of(terms), estimate, (t0, t1), y1, at)
         result: Any = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)

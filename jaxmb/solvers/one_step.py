@@ -161,8 +161,11 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
 
     def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
+        dtmax = self.controller.dtmax
         if self.scales is None:
             first, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+            if dtmax is not None:
+                first = jnp.minimum(first, t0 + jnp.asarray(dtmax, t0.dtype))
             return first, OneStepState(state, None, least, first - t0)
         flat = ravel(y0)
         sizes = self.scales.start(flat, ravel(func(terms, t0, y0, args)))
@@ -178,6 +181,8 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
         dt0 = None if dt0 is None else dt0 * rate
         first, state = self.controller.init(terms, t0 * rate, t1 * rate, y0, dt0, args, field, error_order)
         intended = (first - t0 * rate) / rate
+        if dtmax is not None:
+            intended = jnp.minimum(intended, jnp.asarray(dtmax, t0.dtype))
         return t0 + intended, OneStepState(state, sizes, least, intended)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):

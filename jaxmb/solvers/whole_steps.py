@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from .._compat import with_loops
 from .controller import MultistepController
 from .evaluation import freeze, ravel, unravel_like
+from .gaps import GapController
 from .multistep import AbstractMultistep
 from .one_step import OneStepController, WithTangents
 from .steps import AbstractSteps, LinearStep, refuse_moving_jumps
@@ -86,6 +87,8 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
     still = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
     # Concrete classes, since nothing else tells that a controller knows no jumps.
     if isinstance(controller, diffrax.ClipStepSizeController) and controller.jump_ts is None:
+        controller = controller.controller
+    if isinstance(controller, GapController):
         controller = controller.controller
     jumps = not isinstance(controller, still)
     if isinstance(solver, AbstractMultistep):

@@ -24,6 +24,7 @@ from ..linalg.block_jacobian import JointOrder
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..solvers import AbstractFieldJacobian
+from ..solvers.manifold_term import GapsSeen
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -290,6 +291,17 @@ class AbstractEquation(eqx.Module):
         """`C`, from the multipliers λ of the same equation."""
         del t, q, multipliers
         return jnp.zeros_like(u)
+
+    # Gaps of compliant contacts
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether some forces act where a gap is closed only, for `gaps_seen`."""
+        return False
+
+    def gaps_seen(self, t: Scalar, q: Coordinates, u: Velocities) -> GapsSeen:
+        """The gaps of these forces."""
+        raise ValueError(f"{type(self).__name__} has no forces with gaps.")
 
     # Unilateral constraints
 

@@ -5,6 +5,7 @@ body, so contact adds no constraint and no event.
 """
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -58,6 +59,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+    has_gaps: ClassVar[bool] = True
 
     @abc.abstractmethod
     def surfaces(self) -> Surface:
@@ -84,6 +86,19 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         centre = space.point(poses[0], self.centre)
         own = lambda pose, surface: self._energy(space.body_point(pose, centre), surface)
         return jnp.sum(jax.vmap(own)(poses[1:], self.surfaces()))
+
+    def gaps(self, space, poses, t):
+        centre = space.point(poses[0], self.centre)
+        own = lambda pose, surface: self.clearance(space.body_point(pose, centre), surface)
+        return jax.vmap(own)(poses[1:], self.surfaces())
+
+    @property
+    def gap_width(self):
+        return self.smoothing
+
+    def clearance(self, place: Vector, surface: Surface) -> Number:
+        """How far [m] the disc is from where a force acts, negative where it does."""
+        return self.distance(place, surface) - self.radius
 
     def shapes(self, space, size):
         return tuple((0, shape) for shape in wheel(self.radius, position=space.in_space(self.centre)))
@@ -225,6 +240,13 @@ class PlateContact(AbstractBodyContact):
     def share(self, place, surface):
         (past, _), length = _along(place, *surface)
         return self._fade(past) * self._fade(length - past)
+
+    def clearance(self, place, surface):
+        # A corner of a chain bears a disc whose centre is beyond both plates.
+        reach = jnp.maximum(self.edge, self.radius) if self.chain else self.edge
+        (past, _), length = _along(place, *surface)
+        outside = jnp.maximum(-past, past - length) - reach
+        return jnp.maximum(super().clearance(place, surface), outside)
 
     def wrenches(self, space, poses, velocities, t):
         out = super().wrenches(space, poses, velocities, t)

@@ -61,6 +61,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     point_a: fields.Number = fields.point(body=0, default="origin")
     point_b: fields.Number = fields.point(body=1, default="origin")
     path_kind: ClassVar[PathKind] = "coil"
+    has_gaps: ClassVar[bool] = True
 
     def validate(self):
         if self.unloading > 1:
@@ -93,6 +94,12 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
 
     def energy(self, space, poses, t):
         return self.stored(norm(separation(space, self, poses)) - self.free_length)
+
+    def gaps(self, space, poses, t):
+        extension = norm(separation(space, self, poses)) - self.free_length
+        strokes = jnp.stack([extension - self.slack, -extension - self.slack])
+        # The ramps begin half their width before.
+        return -jnp.concatenate([strokes, strokes - self.travel]) - 0.5 * self.smoothing
 
     def path(self, space, poses):
         return both_points(space, self, poses)

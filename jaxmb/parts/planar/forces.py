@@ -1,5 +1,7 @@
 """Planar forces that have no spatial counterpart of the same shape."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 
@@ -85,6 +87,7 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     upper: fields.Number = fields.parameter(unit="rad")
     exponent: fields.Number = fields.parameter(sign="positive", default=3.0)
     smoothing: fields.Number = fields.parameter(unit="rad", sign="positive", default=1e-3)
+    has_gaps: ClassVar[bool] = True
 
     def validate(self):
         if not self.lower < self.upper:
@@ -93,8 +96,18 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     def numbers_agree(self):
         return self.lower < self.upper
 
+    def gaps(self, space, poses, t):
+        return self._gaps(relative_angle(poses))
+
+    @property
+    def gap_width(self):
+        return self.smoothing
+
+    def _gaps(self, angle):
+        return jnp.stack([angle - self.lower, self.upper - angle])
+
     def _energy(self, angle):
-        depth = ramp(jnp.stack([self.lower - angle, angle - self.upper]), self.smoothing)
+        depth = ramp(-self._gaps(angle), self.smoothing)
         return self.stiffness * jnp.sum(depth ** (self.exponent + 1)) / (self.exponent + 1)
 
     def wrenches(self, space, poses, velocities, t):

@@ -1,0 +1,222 @@
+"""Steps that would pass over a force which sets in and ends within them.
+
+A method sees a force where it evaluates the equations, mostly at the ends of steps. A contact that closes and opens
+again between them would be missed. So the gaps in which forces act are followed along the interpolant of each step, and
+a step that hides one of them is tried again up to where it is most closed. All other steps stay as they are.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from .._compat import WrappedSolver, direction_of, loop_of_lanes
+from .evaluation import gaps_of
+from .events import AbstractErrorWithMore
+from .manifold_term import AbstractGaps
+
+# A stretch of a step is looked at in so many pieces; stretches that hide nothing grow by a factor.
+_PIECES, _GROWTH = 8, 4.0
+# A contact is hidden where it is this many times deeper than at both ends of the step, or where its depth is off from a
+# cubic polynomial of what is known at the ends by this fraction.
+_DEEPER, _OFF = 2.0, 0.2
+# Depths below this fraction of the width in which a force sets in do not count. (That of a ramp at a distance of 25 000
+# widths.) Those below the next fraction may differ from the polynomial: there is no contact yet.
+_FAINT, _NEAR = 1e-5, 0.25
+# Pieces that are this short, relative to the step, are not divided; after so many looks the step is shortened.
+_SHORTEST, _LOOKS = 1e-9, 256
+
+
+class Hidden(AbstractErrorWithMore):
+    """What a solver tells a `GapController`, as its `y_error`.
+
+    **Fields:** the `error` for the controller inside; the `target`: the time up to which the step may go; one where the
+    step hides a force (`hides`), and otherwise zero, since diffrax expects no truth values in an error.
+    """
+
+    error: PyTree
+    target: Any
+    hides: Float[Array, ""]
+
+
+class _Ends(NamedTuple):
+    """Gaps and their rates, in units of the step, at its start and its end, and the widths in which forces set in."""
+
+    first: Any
+    last: Any
+    first_rate: Any
+    last_rate: Any
+    widths: Any
+
+
+class _Walk(NamedTuple):
+    """The way along a step, whose times are fractions of it.
+
+    **Fields:** the `start` and the `length` of the stretch that is looked at next; the `ends` of the step; whether it
+    `hides` a force, and where it is most closed, `target`; the number of `looks`.
+    """
+
+    start: Any
+    length: Any
+    ends: _Ends
+    hides: Any
+    target: Any
+    looks: Any
+
+
+def hidden(gaps: AbstractGaps, direction: Any, error: PyTree, step: tuple[Any, Any], y1: Any, at: Any) -> Hidden:
+    """Look for forces that a step hides.
+
+    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's; `y1`: the state at its end;
+    `at(t)`: a state in between.
+    """
+    t0, t1 = step
+    sign = jnp.asarray(direction, t0.dtype)
+
+    def seen(s):
+        t = t0 + s * (t1 - t0)
+        y = jax.tree.map(lambda end, inside: jnp.where(s == 1, end, inside), y1, at(t))
+        return gaps.seen(t * sign, y)
+
+    # By the way that is measured: in the direction of the solver, and in units of the step.
+    unit = (t1 - t0) * sign
+
+    def advance(walk):
+        s = jnp.minimum(walk.start + walk.length * jnp.linspace(0.0, 1.0, _PIECES + 1, dtype=t0.dtype), 1.0)
+        found = jax.vmap(seen)(s)
+        rates = found.rates * unit.astype(found.rates.dtype)
+        own = _Ends(found.gaps[0], found.gaps[-1], rates[0], rates[-1], found.widths[0])
+        ends = jax.tree.map(lambda new, old: jnp.where(walk.looks == 0, new, old), own, walk.ends)
+        pace = found.pace * (t1 - t0).astype(found.pace.dtype)
+        return _advanced(walk._replace(ends=ends), s, found.gaps, rates, pace, gaps.touch)
+
+    zero, one = jnp.zeros_like(t0), jnp.ones_like(t0)
+    none = jax.eval_shape(seen, t0).gaps
+    none = jnp.zeros(none.shape, none.dtype)
+    first = _Walk(zero, one, _Ends(none, none, none, none, none), jnp.array(False), one, jnp.array(0))
+    goes = lambda walk: (walk.start < 1) & ~walk.hides
+    # Most steps of most lanes are seen at once.
+    last = loop_of_lanes(lambda walk: goes(walk) & (walk.looks < 2), goes, advance, first)
+    return Hidden(error, t0 + last.target * (t1 - t0), last.hides.astype(none.dtype))
+
+
+def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
+    """A stretch further, or into the first piece of this one in which something may be hidden.
+
+    **Arguments:** of times `s` in the step the `gaps`, their `rates` in units of the step, and the `pace`.
+    """
+    ends, piece = walk.ends, walk.length / _PIECES
+    score = jnp.max(_score(ends, s, gaps, touch), axis=1)
+    own = jnp.argmax(score)
+    width = piece.astype(gaps.dtype)
+    may_close = jnp.any(_deeper(ends, _least(gaps, rates, width), touch), axis=1)
+    fast = jnp.maximum(pace[:-1], pace[1:]) * width > 1
+    divided = (may_close | fast) & (piece > _SHORTEST)
+    first, divides = jnp.argmax(divided), jnp.any(divided)
+    start = jnp.where(divides, s[first], s[-1])
+    length = jnp.minimum(jnp.where(divides, piece, _GROWTH * walk.length), 1 - start)
+    looks = walk.looks + 1
+    tired = (looks >= _LOOKS) & (start < 1)
+    hides = score[own] > 0
+    target = jnp.where(hides, s[own], jnp.where(tired, jnp.maximum(start, piece), 1.0))
+    return walk._replace(start=start, length=length, hides=hides | tired, target=target, looks=looks)
+
+
+def _score(ends: _Ends, s, gaps, touch):
+    """How much deeper contacts are than their ends show, at times of a step; zero where nothing is hidden."""
+    s, widths = s.astype(gaps.dtype)[:, None], ends.widths[None]
+    depth, first, last = (_depth(gap, widths) for gap in (gaps, ends.first[None], ends.last[None]))
+    most = jnp.maximum(first, last)
+    shown = _depth(_cubic(ends, s), widths)
+    beyond = jnp.maximum(depth - jnp.maximum(shown, most), jnp.minimum(shown, jnp.minimum(first, last)) - depth)
+    size = jnp.maximum(depth, most)
+    off = (size > _NEAR * widths + touch) & (beyond > _OFF * size)
+    return jnp.where(_deeper(ends, gaps, touch) | off, 1 + depth / (most + _FAINT * widths + touch), 0.0)
+
+
+def _deeper(ends: _Ends, gaps, touch):
+    """Where gaps are closed much further than at both ends of a step."""
+    widths = ends.widths[None]
+    most = jnp.maximum(_depth(ends.first[None], widths), _depth(ends.last[None], widths))
+    return _depth(gaps, widths) > _DEEPER * jnp.maximum(most, _FAINT * widths + touch)
+
+
+def _depth(gaps, widths):
+    """The depth by which a gap is closed, a ramp that is as wide as that of the force; at a width of zero a kink."""
+    root = jnp.sqrt(gaps**2 + widths**2)
+    outside = 0.5 * widths**2 / jnp.where(root > 0, root + jnp.abs(gaps), 1.0)
+    return jnp.where(gaps < 0, 0.5 * (root - gaps), outside)
+
+
+def _cubic(ends: _Ends, s):
+    """The cubic polynomial with the gaps and rates at both ends of a step."""
+    difference = (ends.last - ends.first)[None]
+    first, last = ends.first_rate[None], ends.last_rate[None]
+    return ends.first[None] + s * (
+        first + s * (3 * difference - 2 * first - last + s * (first + last - 2 * difference))
+    )
+
+
+def _least(gaps, rates, piece):
+    """Lower bounds of gaps in pieces between times, where those that close and open again are convex: of a distance
+    from a convex body along a straight way, the value where tangents at both ends meet.
+    """
+    (before, after), (closing, opening) = (gaps[:-1], gaps[1:]), (rates[:-1], rates[1:])
+    turns = (closing < 0) & (opening > 0)
+    way = jnp.clip((after - before - piece * opening) / jnp.where(turns, closing - opening, 1.0), 0.0, piece)
+    least = jnp.minimum(before, after)
+    return jnp.where(turns, jnp.minimum(before + closing * way, least), least)
+
+
+class GapController(diffrax.AbstractAdaptiveStepSizeController):
+    """A controller around another one, whose steps pass over no force that sets in and ends within them."""
+
+    controller: Any
+
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.norm
+
+    def wrap(self, direction):
+        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
+
+    def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
+        before, found = controller_state, y_error
+        keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, found.error, error_order, before
+        )
+        again = keep & (found.hides > 0)
+        # The controller inside does not learn of a step that was good but hid something.
+        inner = jax.tree.map(lambda new, old: jnp.where(again, old, new), inner, before)
+        next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, found.target, next_t1)
+        return keep & ~again, next_t0, next_t1, made_jump, inner, result
+
+
+class GapSolver(WrappedSolver):
+    """A one-step solver that looks at the gaps in which the forces of its term act."""
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    # Compiled inside the whole program, so that it is traced once.
+    @eqx.filter_jit
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1, error, dense_info, *rest = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        gaps = gaps_of(terms)
+        assert gaps is not None, "a term without gaps needs no solver that looks at them"
+        at = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
+        return y1, hidden(gaps, direction_of(terms), error, (t0, t1), y1, at), dense_info, *rest
