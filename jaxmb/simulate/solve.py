@@ -66,11 +66,11 @@ class Problem(NamedTuple):
     **Fields:** `system` and `state` at the start; `formulation` and `manifold`, None for those that suit the
     `solver`; `controller`, None for that of `rtol` and `atol`, and atol None for running scales, with steps of `dtmax`
     at most, None for any; `times`: t0, t1, dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`;
-    `limit`: the largest number of steps, and `room`: that which the program has room for; `max_events`: the largest number of events of contacts;
-    `progress_meter`; times of `restarts`, and of `stops`, which no step passes, or None; `changes`: values of
-    parameters with changes whose tangent is watched, by name; whether states are `interpolated`; whether anything is
-    `traced`; by which leaves of the system and the state derivatives are taken (`differentiated`), empty where that is
-    not known; whether the start, and the end or a saved time, are `moving`.
+    `limit`: the largest number of steps, and `room`: that which the program has room for; `max_events`: the largest
+    number of events of contacts; `progress_meter`; times of `restarts`, and of `stops`, which no step passes, or None;
+    `changes`: values of parameters with changes whose tangent is watched, by name; whether states are `interpolated`;
+    whether anything is `traced`; by which leaves of the system and the state derivatives are taken (`differentiated`),
+    empty where that is not known; whether the start, and the end or a saved time, are `moving`.
     """
 
     system: AbstractSystem

@@ -28,6 +28,9 @@ _DEEPER, _OFF = 2.0, 0.2
 _FAINT, _NEAR = 1e-5, 0.25
 # Pieces that are this short, relative to the step, are not divided; after so many looks the step is shortened.
 _SHORTEST, _LOOKS = 1e-9, 256
+# A gap is as uncertain as this many times what it differs from the integral of its rates. Where a contact may be hidden
+# in that, the step is halved: a method whose interpolant has more stages than its step may have seen a force in these.
+_UNCERTAIN = 2.0
 
 
 class Hidden(AbstractErrorWithMore):
@@ -55,13 +58,15 @@ class _Ends(NamedTuple):
 class _Walk(NamedTuple):
     """The way along a step, whose times are fractions of it.
 
-    **Fields:** the `start` and the `length` of the stretch that is looked at next; the `ends` of the step; whether it
-    `hides` a force, and where it is most closed, `target`; the number of `looks`.
+    **Fields:** the `start` and the `length` of the stretch that is looked at next; the `ends` of the step; by how much
+    gaps are `uncertain`; whether the step `hides` a force, and where its gap is most closed, `target`; the number of
+    `looks`.
     """
 
     start: Any
     length: Any
     ends: _Ends
+    uncertain: Any
     hides: Any
     target: Any
     looks: Any
@@ -96,7 +101,7 @@ def hidden(gaps: AbstractGaps, direction: Any, error: PyTree, step: tuple[Any, A
     zero, one = jnp.zeros_like(t0), jnp.ones_like(t0)
     none = jax.eval_shape(seen, t0).gaps
     none = jnp.zeros(none.shape, none.dtype)
-    first = _Walk(zero, one, _Ends(none, none, none, none, none), jnp.array(False), one, jnp.array(0))
+    first = _Walk(zero, one, _Ends(none, none, none, none, none), none, jnp.array(False), one, jnp.array(0))
     goes = lambda walk: (walk.start < 1) & ~walk.hides
     # Most steps of most lanes are seen at once.
     last = loop_of_lanes(lambda walk: goes(walk) & (walk.looks < 2), goes, advance, first)
@@ -112,17 +117,19 @@ def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
     score = jnp.max(_score(ends, s, gaps, touch), axis=1)
     own = jnp.argmax(score)
     width = piece.astype(gaps.dtype)
-    may_close = jnp.any(_deeper(ends, _least(gaps, rates, width), touch), axis=1)
+    least = _least(gaps, rates, width)
     fast = jnp.maximum(pace[:-1], pace[1:]) * width > 1
-    divided = (may_close | fast) & (piece > _SHORTEST)
-    first, divides = jnp.argmax(divided), jnp.any(divided)
-    start = jnp.where(divides, s[first], s[-1])
-    length = jnp.minimum(jnp.where(divides, piece, _GROWTH * walk.length), 1 - start)
-    looks = walk.looks + 1
-    tired = (looks >= _LOOKS) & (start < 1)
-    hides = score[own] > 0
-    target = jnp.where(hides, s[own], jnp.where(tired, jnp.maximum(start, piece), 1.0))
-    return walk._replace(start=start, length=length, hides=hides | tired, target=target, looks=looks)
+    divided = (jnp.any(_deeper(ends, least, touch), axis=1) | fast) & (piece > _SHORTEST)
+    passed = jnp.cumsum(divided) == 0
+    unlike = jnp.where(passed[1::2, None], _unlike(gaps, rates, width), 0.0)
+    uncertain = walk.uncertain + jnp.sum(unlike, axis=0)
+    doubtful = jnp.any(_deeper(ends, least - _UNCERTAIN * uncertain[None], touch), axis=1)
+    looks, start = walk.looks + 1, jnp.where(passed[-1], s[-1], s[jnp.argmax(divided)])
+    length = jnp.minimum(jnp.where(passed[-1], _GROWTH * walk.length, piece), 1 - start)
+    hides, wrong, tired = score[own] > 0, jnp.any(doubtful & passed), (looks >= _LOOKS) & (start < 1)
+    shorter = jnp.where(wrong, 0.5, jnp.where(tired, jnp.maximum(start, piece), 1.0))
+    target = jnp.where(hides, s[own], shorter)
+    return _Walk(start, length, ends, uncertain, hides | wrong | tired, target, looks)
 
 
 def _score(ends: _Ends, s, gaps, touch):
@@ -158,6 +165,14 @@ def _cubic(ends: _Ends, s):
     return ends.first[None] + s * (
         first + s * (3 * difference - 2 * first - last + s * (first + last - 2 * difference))
     )
+
+
+def _unlike(gaps, rates, piece):
+    """What gaps differ from the integral of their rates, by Simpson's rule, in pairs of pieces in which none turns."""
+    closes = rates < 0
+    turns = (closes[:-2:2] != closes[1:-1:2]) | (closes[1:-1:2] != closes[2::2])
+    integral = piece / 3 * (rates[:-2:2] + 4 * rates[1:-1:2] + rates[2::2])
+    return jnp.where(turns, 0.0, jnp.abs(gaps[2::2] - gaps[:-2:2] - integral))
 
 
 def _least(gaps, rates, piece):
