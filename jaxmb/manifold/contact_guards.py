@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._compat import cond_of_any_lane
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
-from ..linalg.complementarity import placed_pairs
+from ..linalg.complementarity import of_pairs, placed_pairs
 from ..linalg.rotations import norm
 from ..solvers import AbstractGuards
 from ..system import AbstractEquation
@@ -108,6 +108,20 @@ class ContactGuards(AbstractGuards):
     def forces(self, y):
         modes, (n, _) = modes_of(self.system, self.system.normalize(y.q)), counts(self.system)
         return jnp.concatenate([modes[:n] == CLOSED, modes[n:] >= STICK])
+
+    def begins(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        if contacts_of(system).frictions is None:
+            return None
+        q, (n, _) = system.normalize(y.q), counts(system)
+        modes, rates = modes_of(system, q)[n:], direction_rates(system, jnp.asarray(t, q.dtype), q, y.u)[n:]
+        begins = (jnp.abs(modes) == FORWARD) & (modes * rates <= self.touch * system.length)
+        pairs = frictions_of(system).pairs
+        if pairs:
+            size = norm(modes[of_pairs(pairs)])
+            has_begun = (size > 0) & (size < _HALFWAY)
+            begins = placed_pairs(pairs, jnp.stack([has_begun, jnp.zeros_like(has_begun)], axis=1), begins)
+        return jnp.pad(begins, (n, 0))
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))

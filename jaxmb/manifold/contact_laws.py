@@ -28,6 +28,9 @@ REST = 1e-9
 # Friction that sticks slips from this fraction below its limit on: an event at which it still held would be followed by
 # the same one at once.
 _REACHED = 1e-7
+# Other friction sticks up to this fraction above its limit: at the limit itself the guard of its force then tells
+# whether it slips, by the first derivative that is not zero.
+_HELD = 1e-8
 # The normal forces of joints, which depend on the friction in them, are found by this many corrections.
 _CORRECTIONS = 6
 
@@ -117,7 +120,7 @@ class Laws(NamedTuple):
         joints depend.
         """
         # Friction that has just reached its limit is beyond it, up to what the search for the laws that hold resolves.
-        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REACHED, 1.0)
+        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REACHED, 1 + _HELD)
         coefficient = jnp.where(self.sizes(slips) == 0, limit, self.coefficient)
         bounds = jnp.zeros(self.m, opening.dtype)
         if reactions is not None:

@@ -150,7 +150,8 @@ def crossing(
     (t0, t1), (y0, y1) = step, ends
     sign = jnp.asarray(direction, t0.dtype)
     start = guards.rates(t0 * sign, y0) * sign.astype(ravel(y0).dtype)
-    known = _Known(start, guards.forces(y0), (t1 - t0).astype(start.dtype), guards.touch)
+    begins = guards.begins(t0 * sign, y0)
+    known = _Known(start, guards.forces(y0), begins, (t1 - t0).astype(start.dtype), guards.touch)
 
     def advance(search):
         # One evaluation for all that is looked for, so that the guards are compiled once.
@@ -183,12 +184,13 @@ def crossing(
 
 
 class _Known(NamedTuple):
-    """What a search knows of a step: the rates of guards at its start, which of them are forces, its length, and what
-    counts as zero.
+    """What a search knows of a step: the rates of guards at its start, which of them are forces, and which begin there;
+    its length, and what counts as zero.
     """
 
     start: Any
     forces: Any
+    begins: Any
     length: Any
     touch: Any
 
@@ -258,6 +260,8 @@ def _least_found(search: _Search, values, rates, known):
 def _negative_within(search: _Search, values, known):
     """Whether guards are negative at a point within the step, and the search back from there if they are."""
     below = values < -known.touch
+    if known.begins is not None:
+        below = below & ~known.begins
     bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
     dips = jnp.any(below)
     return dips, search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)

@@ -100,6 +100,14 @@ class AbstractGuards(eqx.Module):
     def forces(self, y: PyTree[Array]) -> Bool[Array, "guards"]:
         """Which guards are forces, of the size of one at most: the motion does not show how they vary in a step."""
 
+    def begins(self, t: Any, y: PyTree[Array]) -> Bool[Array, "guards"] | None:
+        """Which guards begin to grow from zero at the start of a step; None where no guard does.
+
+        Such a guard may be smaller than the error of the step between its ends, so it counts only at its end.
+        """
+        del t, y
+        return None
+
 
 class GapsSeen(NamedTuple):
     """The gaps of forces at a time.
