@@ -99,7 +99,7 @@ class Trajectory(eqx.Module):
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
-    … points of the past; `num_events`: steps that ended where an event was looked for; and `linearised_steps`: whether
+    … points of the past; `num_events`: times of `events`; and `linearised_steps`: whether
     derivatives take one linearisation of the equations at each step, and not the derivative of each step as it is,
     which costs more); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a `BodyMotion`, and
     `trajectory["hip"]` that of a joint, a frame or a part with internal states, a `PartMotion`; of a system in

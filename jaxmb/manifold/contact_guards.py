@@ -27,10 +27,12 @@ from ..system.gaps import (
     direction_rows,
     frictions_of,
     gaps,
+    kinds_of,
     modes_of,
     pairs_of,
 )
 from .contact_forces import contact_forces, largest_force, slow_slip, stick_reserve
+from .contact_laws import REST
 from .impact import Impact, impact
 from .impact_event import NEAR
 from .impulse import after_impulse
@@ -104,6 +106,15 @@ class ContactGuards(AbstractGuards):
     def impact(self, t: Scalar, y: State, dated: bool = False) -> Impact:
         """The event at a state; see `impact`."""
         return impact(self.system.at(y), self.formulation, self.touch, t, y, dated)
+
+    def changed(self, before, after):
+        system, before, after = lax.stop_gradient((self.system, before, after))
+        kinds = lambda y: kinds_of(system, modes_of(system, system.normalize(y.q)))
+        # Velocities change by rounding errors where impulses are none.
+        scale, change = system.velocity_scale(), jnp.abs(after.u - before.u)
+        sizes = jnp.abs(after.u) + jnp.abs(before.u)
+        least = REST * sizes + _RATE * jnp.finfo(sizes.dtype).eps * jnp.max(sizes / scale) * scale
+        return jnp.any(kinds(before) != kinds(after)) | ~jnp.all(change <= least)
 
     def forces(self, y):
         modes, (n, _) = modes_of(self.system, self.system.normalize(y.q)), counts(self.system)

@@ -277,6 +277,7 @@ class ProjectedSolver(WrappedSolver):
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system, direction = inner_term(terms).vector_field.system, direction_of(terms)
+        before = y0
         if made_jump is not False:
             after = lambda y: self._after_jump(system, t0 * direction, y)
             y0 = cond_of_jumps(self.guards)(made_jump, after, lambda y: y, y0)
@@ -296,7 +297,7 @@ class ProjectedSolver(WrappedSolver):
             result = diffrax.RESULTS.where(violated, _FAILED, result)
         if self.guards is not None:
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate
-            error = crossing(self.guards, direction, error, (first, last), (y0, y1), at)
+            error = crossing(self.guards, direction, error, (first, last), (before, y0, y1), at, made_jump)
         return y1, error, dense_info, solver_state, result
 
     def _after_jump(self, system, t, y):

@@ -303,7 +303,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     stats |= {"linearised_steps": jnp.array(linearised)}
     stats |= policy.statistics(solution.solver_state)
     if found is not None:
-        stats |= {"num_events": found.number}
+        stats |= {"num_events": jnp.minimum(found.number, problem.max_events)}
     motion = saved, solution.interpolation
     failed = has_failed(result)
     if problem.traced:

@@ -62,7 +62,8 @@ class Crossing(AbstractErrorWithMore):
     `lowest` guard at its end; one where a guard is `falling` through zero there; one where the term has `lost` the
     motion at the start of the step: there was no state after an event, and it gave an infinite one; how `coarse` the
     step is for guards that vary in it, more than one where it is too long; `touch` and `near` of the guards; the factor
-    by which a multistep method could `retry` the step, infinite for other methods, which do not start anew.
+    by which a multistep method could `retry` the step, infinite for other methods, which do not start anew; one where
+    the step starts anew though an event has changed nothing: it is `idle`.
     """
 
     error: PyTree
@@ -75,6 +76,7 @@ class Crossing(AbstractErrorWithMore):
     touch: Float[Array, ""]
     near: Float[Array, ""]
     retry: Float[Array, ""]
+    idle: Float[Array, ""]
 
 
 def error_of(y_error: Any) -> PyTree:
@@ -138,16 +140,18 @@ def crossing(
     direction: Any,
     error: PyTree,
     step: tuple[Any, Any],
-    ends: tuple[Any, Any],
+    ends: tuple[Any, Any, Any],
     at: Callable,
+    made_jump: Any,
     retry: Any = jnp.inf,
 ) -> Crossing:
     """Look for zeros of guards in a step.
 
-    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's; `ends`: the states there;
-    `at(t)`: a state in between; `retry`: see `Crossing`.
+    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's; `ends`: the state before a
+    jump at its start, and those at its start and end; `at(t)`: a state in between; `made_jump`: whether there was one;
+    `retry`: see `Crossing`.
     """
-    (t0, t1), (y0, y1) = step, ends
+    (t0, t1), (before, y0, y1) = step, ends
     sign = jnp.asarray(direction, t0.dtype)
     start = guards.rates(t0 * sign, y0) * sign.astype(ravel(y0).dtype)
     begins = guards.begins(t0 * sign, y0)
@@ -177,10 +181,11 @@ def crossing(
     found = loop_of_lanes(looks, goes, advance, first)
     falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
     lost = jnp.any(jnp.isinf(ravel(y0)))
-    falling, lost, within = (x.astype(start.dtype) for x in (falling, lost, found.dips))
+    idle = made_jump & ~guards.changed(before, y0)
+    falling, lost, within, idle = (x.astype(start.dtype) for x in (falling, lost, found.dips, idle))
     touch, near, retry = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near, retry))
     target = t0 + found.bracket.b * (t1 - t0)
-    return Crossing(error, target, within, jnp.min(found.end), falling, lost, found.coarse, touch, near, retry)
+    return Crossing(error, target, within, jnp.min(found.end), falling, lost, found.coarse, touch, near, retry, idle)
 
 
 class _Known(NamedTuple):
@@ -370,7 +375,8 @@ class EventState(AbstractControllerState):
     **Fields:** that of the controller `inner`; the `target` of the step that is tried, infinite without one; the
     `length` that it had before it was made to end there; the `count` of events, their `times` and the raveled `states`
     before them, in buffers; `touch` of the guards; how many times in a row a step was `halved`; whether the method
-    `starts` anew with this step, and the length that the error of the last `start` allows.
+    `starts` anew with this step, and the length that the error of the last `start` allows; whether the last step
+    `ended` at an event.
     """
 
     inner: Any
@@ -383,6 +389,7 @@ class EventState(AbstractControllerState):
     halved: Any
     starts: Any
     start: Any
+    ended: Any
 
     @property
     def intended(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -426,7 +433,7 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         states = jnp.zeros((self.most + 1, flat.size), flat.dtype)
         touch = jnp.zeros((), flat.dtype)
         none = jnp.asarray(jnp.inf, t0.dtype), jnp.zeros((), t0.dtype), jnp.array(0)
-        start = jnp.array(True), jnp.asarray(jnp.inf, t0.dtype)
+        start = jnp.array(True), jnp.asarray(jnp.inf, t0.dtype), jnp.array(False)
         return first, EventState(inner, *none, times, states, touch, jnp.array(0), *start)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
@@ -457,20 +464,23 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
         start = jnp.where(before.starts & accepted & ~empty, allowed, before.start)
         next_t1 = jnp.where(ends, jnp.minimum(next_t1, t1 + start), next_t1)
         target = jnp.where(keep & crossed, found.target, jnp.inf)
-        place = jnp.where(ends, jnp.minimum(before.count, self.most), self.most)
+        # A place at which nothing changed is that of the next event.
+        count = before.count - (accepted & before.ended & (found.idle > 0)).astype(before.count.dtype)
+        place = jnp.where(ends, jnp.minimum(count, self.most), self.most)
         state = EventState(
             inner,
             target,
             length,
-            before.count + ends.astype(before.count.dtype),
+            count + ends.astype(count.dtype),
             before.times.at[place].set(t1),
             before.states.at[place].set(ravel(y1_candidate)),
             found.touch,
             jnp.where(keep & coarse, before.halved + 1, 0),
             jnp.where(accepted, made_jump | ends, before.starts),
             start,
+            jnp.where(accepted, ends, before.ended),
         )
-        full = ends & (before.count >= self.most)
+        full = ends & (count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)
         lost = found.lost > 0
         result = diffrax.RESULTS.where(lost, NO_STATE, result)

@@ -100,6 +100,10 @@ class AbstractGuards(eqx.Module):
     def forces(self, y: PyTree[Array]) -> Bool[Array, "guards"]:
         """Which guards are forces, of the size of one at most: the motion does not show how they vary in a step."""
 
+    @abc.abstractmethod
+    def changed(self, before: PyTree[Array], after: PyTree[Array]) -> Bool[Array, ""]:
+        """Whether something changed in an event, from the states before and after it."""
+
     def begins(self, t: Any, y: PyTree[Array]) -> Bool[Array, "guards"] | None:
         """Which guards begin to grow from zero at the start of a step; None where no guard does.
 

@@ -139,6 +139,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         solver_state: Any,
         made_jump: Any,
     ) -> tuple[Y, StepEstimate | Crossing | Hidden | None, dict[str, Any], Any, diffrax.RESULTS]:
+        first = y0
         y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
         before = state.chart
         y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
@@ -152,7 +153,8 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         at = lambda t: self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate(t)
         if guards is not None:
             retry = jnp.inf if estimate is None else estimate.retry
-            estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), (y0, y1), at, retry)
+            ends = first, y0, y1
+            estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), ends, at, made_jump, retry)
         if gaps is not None:
             estimate = hidden(gaps, direction_of(terms), estimate, (t0, t1), y1, at)
         result: Any = diffrax.RESULTS.successful

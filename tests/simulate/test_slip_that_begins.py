@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from compiling import jit_quickly
 from oracles.block_on_belt import Belt, moved, smoothly_moved
+from scipy.integrate import solve_ivp
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -156,3 +157,128 @@ def test_random_belts():
         np.testing.assert_allclose(end, known, rtol=0, atol=np.max(100 * rtol * scale), err_msg=f"{k}: {belt} {x} {v} {rtol}")
         # Slip that grazes zero may stick for a moment, or not.
         assert times.size <= 2 * len(events) + 3, (k, belt, x, v, rtol)
+
+
+def _slips_once(belt, end):
+    """Displacement, velocity and the time of the slip in closed form: it swings about where it began to slip."""
+    first, w = belt.slip * belt.mass * G / belt.stiffness, jnp.sqrt(belt.stiffness / belt.mass)
+    angle = w * (end - first / belt.speed)
+    return jnp.stack([first + belt.speed / w * jnp.sin(angle), belt.speed * jnp.cos(angle), first / belt.speed])
+
+
+# Numbers that change together, so that the limit of stick stays the friction of slip.
+ALONG = jax.tree.map(jnp.zeros_like, BELT)._replace(slip=0.1, stick=0.1, mass=0.7, stiffness=-20.0, speed=0.2, fall=0.3)
+
+
+@functools.cache
+def derivatives():
+    """Of displacement, velocity and the time of the first event along a direction, and in reverse of one of these."""
+    scene()
+
+    def ended(belt, end):
+        out = motion(belt, 0.0, belt.speed, end, 1e-9, throw=False)
+        return jnp.stack([out["block"].position[-1, 0], out["block"].velocity[-1, 0], out.events.times[0]])
+
+    forward = lambda belt, along, end: jax.jvp(lambda belt: ended(belt, end), (belt,), (along,))
+    reverse = lambda belt, weights, end: jax.grad(lambda belt: weights @ ended(belt, end))(belt)
+    return jit_quickly(forward), jit_quickly(reverse)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name, end", [("spring", 1.2), ("falling friction", 2.0)])
+def test_derivatives_where_slip_begins(name, end):
+    """Forward, in reverse and by differences; its time moves with the numbers. Where friction falls with the velocity,
+    the block sticks and slips again.
+    """
+    forward, reverse = derivatives()
+    numbers = lambda step: jax.tree.map(lambda at, change: jnp.asarray(at + step * change), CASES[name][0], ALONG)
+    value, slope = forward(numbers(0.0), ALONG, end)
+    h, ends = 1e-4, []
+    for step in (h, -h):
+        belt = numbers(step)
+        at, times, _ = run(belt, 0.0, belt.speed, end, 1e-11)
+        ends.append(np.append(at, times[0]))
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-5)
+    if name == "spring":
+        exact, change = jax.jvp(lambda belt: _slips_once(belt, end), (numbers(0.0),), (ALONG,))
+        np.testing.assert_allclose(value, exact, rtol=1e-8)
+        np.testing.assert_allclose(slope, change, rtol=1e-7)
+    for k, weights in enumerate(np.eye(3)):
+        back = reverse(numbers(0.0), weights, end)
+        along = sum(jax.tree.leaves(jax.tree.map(jnp.multiply, back, ALONG)))
+        np.testing.assert_allclose(along, slope[k], rtol=1e-9)
+
+
+def _swings(end, weight, rate, radius=0.05, slip=0.3, mass=2.0, length=0.4, inertia=0.1):
+    """The angle and rate at the time `end` of a pendulum that a moment `rate t` pushes through the friction of its pin,
+    which is in proportion to the size of the force there.
+    """
+    first = slip * radius * weight / rate
+
+    def field(t, y):
+        angle, speed = y
+        turn = 0.0
+        for _ in range(60):
+            across = mass * length * turn + weight * np.sin(angle)
+            force = np.hypot(across, mass * length * speed**2 + weight * np.cos(angle))
+            moment = rate * t - weight * length * np.sin(angle) - slip * radius * force
+            turn = moment / (inertia + mass * length**2)
+        return speed, turn
+
+    run = solve_ivp(field, (first, end), (0.0, 0.0), "DOP853", rtol=1e-12, atol=1e-14)
+    return first, run.y[:, -1]
+
+
+@pytest.mark.long
+def test_a_pin_that_rubs_begins_to_turn():
+    """Its friction depends on the force of the pin, which depends on the motion."""
+    mass, length, rate = 2.0, 0.4, 2.0
+    moment = lambda x, v, t, p: jnp.stack([0.0 * t, 0.0 * t, p["rate"] * t])[None]
+    bob = planar.Body("bob", mass=mass, inertia=0.1, position=(0.0, -length))
+    pin = planar.Revolute("pin", "ground", "bob", point=(0.0, 0.0))
+    rub = mb.DryFriction("rub", "pin", coefficient=0.3, radius=0.05)
+    push = mb.Force("push", ["bob"], moment, parameters={"rate": rate})
+    system = mb.Scene([bob], joints=[pin], forces=[mb.Gravity((0.0, -G)), rub, push]).compile()
+    first, known = _swings(1.2, mass * G, rate)
+    for rtol in (1e-5, 1e-8):
+        out = mb.simulate(system, mb.assemble(system), t1=1.2, saveat=[1.2], rtol=rtol, max_events=10)
+        assert [event.kind for event in out.events] == ["slip"]
+        np.testing.assert_allclose(out.events.times, [first], rtol=10 * rtol)
+        np.testing.assert_allclose([out["bob"].angle[0], out["bob"].angular_velocity[0]], known, atol=30 * rtol)
+
+
+@functools.cache
+def _in_space(on):
+    push = lambda x, v, t, p: jnp.zeros((1, x.shape[-1])).at[0, :2].set(p["rate"] * t * jnp.array([0.6, 0.8]))
+    if on == "face":
+        joint = spatial.Planar(
+            "face", "ground", "block", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), x_a=(1.0, 0.0, 0.0), x_b=(1.0, 0, 0)
+        )
+        block = spatial.Body("block", mass=2.0, inertia=(0.1, 0.1, 0.1))
+    else:
+        joint = mb.RigidContact("floor", "block", terrain=terrain.Flat())
+        block = spatial.PointMass("block", mass=2.0)
+    rub = mb.DryFriction("rub", on, coefficient=0.2, speed=(0.3, 0.4))
+    spring = spatial.SpringDamper("spring", "ground", "block", stiffness=50.0, free_length=0.0)
+    push = mb.Force("push", ["block"], push, parameters={"rate": 0.0})
+    return mb.Scene([block], joints=[joint], forces=[mb.Gravity((0.0, 0.0, -G)), rub, spring, push]).compile()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("on", ["face", "floor"])
+def test_a_block_in_a_plane_in_space(on):
+    """On a belt, and under a ramp of force, it slips along a line."""
+    system = _in_space(on)
+    along = np.array([0.6, 0.8])
+    for name in ("spring", "ramp", "ramp from the limit", "ramp back from the limit"):
+        belt, x, v = CASES[name]
+        numbers = {"push.rate": belt.rate, "push.start": belt.push, "rub.speed": belt.speed * along}
+        numbers["spring.stiffness"] = belt.stiffness
+        changed = mb.with_parameters(system, jax.tree.map(jnp.asarray, numbers))
+        start = mb.assemble(changed, velocities={"block": jnp.asarray(np.append(v * along, 0.0))})
+        out = mb.simulate(changed, start, t1=1.3, saveat=[1.3], rtol=1e-6, max_events=10)
+        *known, events = moved(belt, x, v, 1.3)
+        np.testing.assert_allclose(out["block"].position[0, :2], known[0] * along, atol=1e-5)
+        np.testing.assert_allclose(out["block"].velocity[0, :2], known[1] * along, atol=1e-5)
+        late = out.events.times > 1e-6
+        np.testing.assert_allclose(out.events.times[late], [time for time, _ in events], rtol=1e-5)
