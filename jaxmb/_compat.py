@@ -260,9 +260,10 @@ def changed(module: T, **values: Any) -> T:
     """The same module with other values of some fields, as they are and unchecked; `equinox.tree_at` takes ten times as
     long.
 
-    (Fields are what `vars` finds, 0.13.)
+    (Fields are among what `vars` finds, 0.13.)
     """
-    return with_values(type(module), vars(module) | values)
+    fields = type(module).__dataclass_fields__
+    return with_values(type(module), {name: x for name, x in vars(module).items() if name in fields} | values)
 
 
 # diffrax

@@ -12,13 +12,17 @@ from jaxtyping import Array, Float, Int
 from ._arguments import package_for_tables
 from ._types import State
 from .formulations import AbstractFormulation
+from .linalg.arrays import is_traced
 from .linalg.jitted import jitted
+from .linalg.structures import of_structure
 from .manifold import contact_guards
 from .system import AbstractSystem
 from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
 
 # Impulses of contacts that are this small beside another one at the same time are none.
 _ROUNDING = 1e-12
+# So many impacts are computed together.
+_TOGETHER = 8
 
 
 class FoundEvents(NamedTuple):
@@ -157,17 +161,47 @@ class ContactEvents(eqx.Module):
 
 
 def contact_events(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> ContactEvents:
-    """The events of a run from what it notes of them."""
-    names, contacts = ((), 0) if system.contacts is None else (names_of(system), counts(system)[0])
-    out = ContactEvents(names, contacts, *_evaluated(system, formulation, found))
-    if isinstance(out.times, Tracer):
-        return out
-    count = int(np.sum(np.isfinite(np.asarray(out.times))))
-    return jax.tree.map(lambda x: x[:count], out)
+    """The events of a run, or of a batch of runs, from what is noted of them."""
+    evaluated = _evaluated if is_traced((system, formulation, found)) else _happened
+    return ContactEvents(**_parts(system), **dict(zip(_NUMBERS, evaluated(system, formulation, found), strict=True)))
+
+
+_NUMBERS = ("times", "impulses", "energy_lost", "before", "after", "rest")
+
+
+@of_structure
+def _parts(system):
+    return {"names": names_of(system), "contacts": counts(system)[0]}
+
+
+def _happened(system, formulation, found):
+    """The same of numbers that are known: of as many events as there are, in blocks, which all are one program."""
+    most, axis = found.times.shape[-1], found.times.ndim - 1
+    number, times, states = (np.asarray(x) for x in (found.number, found.times, found.states))
+    number, blocks = np.minimum(number, most), []
+    # Also where a function is traced that the run is no argument of.
+    with jax.ensure_compile_time_eval():
+        for first in range(0, max(int(np.max(number, initial=0)), 1), _TOGETHER):
+            own = np.minimum(np.arange(first, first + _TOGETHER), most - 1)
+            block = FoundEvents(number - first, times[..., own], states[..., own, :], found.touch)
+            blocks.append(_evaluated(system, formulation, block))
+    rows = [np.concatenate(column, axis) for column in zip(*blocks, strict=True)]
+    count = int(np.sum(np.isfinite(rows[0]))) if axis == 0 else most
+    order = np.argsort(np.isinf(rows[0]), axis=axis, kind="stable")[..., :count]
+
+    def placed(x, none):
+        along = order.reshape(order.shape + (1,) * (x.ndim - order.ndim))
+        happened = np.take_along_axis(x, along, axis)
+        rest = [(0, count - happened.shape[axis] if k == axis else 0) for k in range(x.ndim)]
+        return jax.device_put(np.pad(happened, rest, constant_values=none))
+
+    return placed(rows[0], np.inf), *(placed(x, 0.0) for x in rows[1:])
 
 
 @jitted
 def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> Any:
+    if found.times.ndim > 1:
+        return eqx.filter_vmap(_evaluated)(system, formulation, found)
     guards = contact_guards(system, formulation, found.touch)
     assert guards is not None, "a system without contacts has no events"
     nq, nu = system.nq, system.nu

@@ -21,6 +21,7 @@ from ._types import State
 from .contact_events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation, accelerations
 from .linalg.arrays import ARRAYS, is_traced
+from .linalg.jitted import jitted
 from .linalg.members import vmap_states
 from .manifold import after_jumps, next_number, project_normalized
 from .parts.names import UnknownNameError, unknown
@@ -87,6 +88,19 @@ def _of_each_member(view: Callable[..., Any]) -> Callable[..., Any]:
     return of_all
 
 
+def _view(view: Callable[["Trajectory"], Any]) -> Callable[["Trajectory"], Any]:
+    """A view of one motion as that of any batch of motions, compiled once for all runs of a system."""
+    compiled = jitted(_of_each_member(view))
+
+    @functools.wraps(view)
+    def of_motion(trajectory):
+        # How a run ended is no part of the program.
+        others = ("interpolation", "event_mask", "found_events", "closer")
+        return compiled(changed(trajectory, stats={}, result=None, **dict.fromkeys(others)))
+
+    return of_motion
+
+
 class Trajectory(eqx.Module):
     """The motion that `simulate` returns, or a batch of them.
 
@@ -147,7 +161,7 @@ class Trajectory(eqx.Module):
 
     def __getitem__(self, name: str) -> Any:
         if name in self.system.motion_names():
-            return self._motion(name)
+            return self.system.motion(name, self.ys)
         if name in self:
             return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
         if name in self._force_names():
@@ -177,10 +191,6 @@ class Trajectory(eqx.Module):
             return default
         return self[name]
 
-    @_of_each_member
-    def _motion(self, name):
-        return self.system.motion(name, self.ys)
-
     def quantity(self, name: str) -> Array:
         """A quantity by the name that `identify` takes, axis 0 is time: `"rod.position"` or `"rod.acceleration"` of a
         body, `"A.force"` of a joint; in generalized coordinates `"theta"`, `"theta_rate"`, and `"A.force"` of a
@@ -205,12 +215,13 @@ class Trajectory(eqx.Module):
             raise ValueError(
                 "There are no events, since the system has neither contacts such as jaxmb.Stop nor jaxmb.DryFriction."
             )
-        return self._events()
-
-    @_of_each_member
-    def _events(self):
-        found: Any = self.found_events
-        return contact_events(self.system, self.formulation, found)
+        kept = vars(self)
+        if "_events" not in kept:
+            events = contact_events(self.system, self.formulation, self.found_events)
+            if is_traced(events):
+                return events
+            kept["_events"] = events
+        return kept["_events"]
 
     @property
     def error(self) -> "GlobalError":
@@ -224,11 +235,11 @@ class Trajectory(eqx.Module):
             )
         return GlobalError(self, self.closer)
 
-    @_of_each_member
     def _measured(self, names):
-        known = {name: quantity for name, quantity in self.system.quantities().items() if name in names}
-        solved = Solved(*self._solved) if any(quantity.of_forces for quantity in known.values()) else None
-        return {name: quantity.value(self.ts, self.ys, solved) for name, quantity in known.items()}
+        known = self.system.quantities()
+        chosen = {name: known[name] for name in names}
+        solved = Solved(*self._solved) if any(quantity.of_forces for quantity in chosen.values()) else None
+        return {name: quantity.value(self.ts, self.ys, solved) for name, quantity in chosen.items()}
 
     def at(self, t: ArrayLike) -> State:
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints; in a batch, at the
@@ -249,15 +260,13 @@ class Trajectory(eqx.Module):
         return jax.tree.map(lambda y: y.reshape(t.shape + y.shape[1:]), out)
 
     @property
-    @eqx.filter_jit
-    @_of_each_member
+    @_view
     def kinetic_energy(self) -> Float[Array, "times"]:
         """Kinetic energy [J]."""
         return jax.vmap(lambda t, y: self.system.kinetic_energy(t, y.q, y.u))(self.ts, self.ys)
 
     @property
-    @eqx.filter_jit
-    @_of_each_member
+    @_view
     def potential_energy(self) -> Float[Array, "times"]:
         """Potential energy [J] of gravity and conservative forces."""
         return jax.vmap(lambda t, y: self.system.at(y).potential_energy(t, y.q))(self.ts, self.ys)
@@ -268,21 +277,18 @@ class Trajectory(eqx.Module):
         return self.kinetic_energy + self.potential_energy
 
     @property
-    @eqx.filter_jit
-    @_of_each_member
+    @_view
     def linear_momentum(self) -> Float[Array, "times d"]:
         """`Σ m v` [kg m/s], world axes."""
         return jax.vmap(lambda y: self.system.linear_momentum(y.q, y.u))(self.ys)
 
     @property
-    @eqx.filter_jit
-    @_of_each_member
+    @_view
     def angular_momentum(self) -> Float[Array, "times *d"]:
         """Moment of momentum about the world origin [kg m²/s]."""
         return jax.vmap(lambda y: self.system.angular_momentum(y.q, y.u))(self.ys)
 
     @property
-    @_of_each_member
     def rates(self) -> Float[Array, "times nq"]:
         """q̇ of every coordinate."""
         return self.system.rates_along(self.ts, self.ys)
@@ -298,8 +304,7 @@ class Trajectory(eqx.Module):
         return self._solved[1]
 
     @property
-    @eqx.filter_jit
-    @_of_each_member
+    @_view
     def _solved(self):
         single = lambda t, y: accelerations(self.system.at(y), self.formulation, t, y.q, y.u)
         return vmap_states(single, self.system.acceleration_rows * self.system.nu)(self.ts, self.ys)
@@ -313,7 +318,6 @@ class Trajectory(eqx.Module):
         """
         return _ByName("joint", self.system.joint_names(), self._reaction)
 
-    @_of_each_member
     def _reaction(self, name):
         return self.system.reaction(name, self.ts, self.ys, self.multipliers)
 
@@ -322,7 +326,6 @@ class Trajectory(eqx.Module):
         """Generalized forces `Aᵀ λ` of the constraints by name, shape (times, nu)."""
         return _ByName("joint", self.system.constraint_names(), self._constraint_force)
 
-    @_of_each_member
     def _constraint_force(self, name):
         return self.system.generalized_constraint_force(name, self.ts, self.ys, self.multipliers)
 
@@ -336,14 +339,12 @@ class Trajectory(eqx.Module):
         """
         return _ByName("force", self.system.force_names(), self._wrenches)
 
-    @_of_each_member
     def _wrenches(self, name):
         multipliers = None if self.system.ideal else self.multipliers
         return self.system.applied_wrenches(name, self.ts, self.ys, multipliers)
 
     @property
-    @eqx.filter_jit
-    @_of_each_member
+    @_view
     def constraint_violation(self) -> ConstraintViolation:
         """Largest scaled residuals of position and velocity constraints at every saved time."""
 
@@ -375,7 +376,7 @@ class Trajectory(eqx.Module):
         out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
         if self.ys.z is not None:
             out["z"] = np.asarray(self.ys.z)
-        free = {name for name, quantity in self.system.quantities().items() if not quantity.of_forces}
+        free = [name for name, quantity in self.system.quantities().items() if not quantity.of_forces]
         out |= {name: np.asarray(value) for name, value in self._measured(free).items()}
         out["energy"] = np.asarray(self.energy)
         for name, value in self.stats.items():

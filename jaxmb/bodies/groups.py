@@ -4,14 +4,14 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
@@ -42,7 +42,7 @@ class Input(eqx.Module):
 class Group(eqx.Module):
     """Stacked parts. `part` has the structure of one part with a leading axis on every number; `inputs` replace some
     numbers by functions of time; `inner`: where the parts hold other parts, the keys that lead there and the names of
-    these.
+    these; `chosen`: the numbers of the parts, None where they are all.
     """
 
     part: Any
@@ -51,13 +51,20 @@ class Group(eqx.Module):
     layout: Layout = eqx.field(static=True)
     inputs: tuple[Input, ...] = ()
     inner: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = eqx.field(static=True, default=())
+    chosen: Int[Array, "parts"] | None = None
+
+    def only(self, member: Any) -> Self:
+        """The group of one of its parts, whose number may be traced; names and bodies stay those of all."""
+        part = jax.tree.map(lambda leaf: leaf[member][None], self.part)
+        return dataclasses.replace(self, part=part, chosen=jnp.asarray(member)[None])
 
     def map(self, kernel: Callable[..., Any], *per_part: Array) -> Any:
         """`kernel(at, …)` of every part with its rows of some arrays, where `at(t)` is the part at a time."""
         if not self.inputs:
             return jax.vmap(lambda part, *own: kernel(lambda t: part, *own))(self.part, *per_part)
         single = lambda member, part, *own: kernel(lambda t: self._at(member, part, t), *own)
-        return jax.vmap(single)(jnp.arange(len(self.names)), self.part, *per_part)
+        members = jnp.arange(len(self.names)) if self.chosen is None else self.chosen
+        return jax.vmap(single)(members, self.part, *per_part)
 
     def single(self, member: int, t: Scalar) -> Any:
         """One part at a time."""
@@ -91,7 +98,8 @@ class Group(eqx.Module):
 
     def gather(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
         """Rows of each part's bodies, from those of all bodies and the ground."""
-        return unchecked_take(of_bodies, self.body_index)
+        index = self.body_index if self.chosen is None else jnp.asarray(self.body_index)[self.chosen]
+        return unchecked_take(of_bodies, index)
 
 
 def stack(
@@ -143,6 +151,11 @@ class AbstractGroup(eqx.Module):
     def part(self, name: str = "") -> AbstractPart:
         """The part of a group of one without the leading axis; of others a part with that axis on every number."""
         return self.group.part.named(name)
+
+    def only(self, member: Any) -> Self:
+        """The group of one of its parts, whose number may be traced."""
+        others = jax.tree.map(lambda leaf: leaf[member][None], dataclasses.replace(self, group=None))
+        return dataclasses.replace(others, group=self.group.only(member))
 
     def given_in_time(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts *shape"]:
         """What functions of time give in parts that have them, while nothing moves."""

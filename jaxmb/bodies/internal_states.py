@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..parts.fields import entry, internal_states
-from ..system.quantities import Quantity
+from ..system.quantities import Measure, entries_along
 from .groups import BodyPoses, BodyVelocities, ForceGroup
 
 
@@ -104,12 +104,10 @@ def state_scale(forces: Sequence[ForceGroup], fields: Sequence[StateField], dtyp
     return jnp.concatenate(out) if out else jnp.zeros(0, dtype)
 
 
-def state_quantities(fields: Sequence[StateField]) -> dict[str, Quantity]:
+def state_measures(fields: Sequence[StateField]) -> dict[str, Measure]:
     """The internal states as quantities, by name."""
-    shapes = {f"{part}.{own.name}": own.shape for own in fields for part in own.members}
-    out = {}
-    for name, index in state_names(fields).items():
-        shape = shapes[name]
-        value = lambda ts, ys, _, index=tuple(index), shape=shape: ys.z[:, np.array(index)].reshape(-1, *shape)
-        out[name] = Quantity(shape, value)
-    return out
+    return {
+        f"{part}.{own.name}": Measure(own.shape, entries_along, ("z", np.array(own.start + k * own.size), own.shape))
+        for own in fields
+        for k, part in enumerate(own.members)
+    }

@@ -1,10 +1,9 @@
 """The own coordinates of joints by name, `"hip.angle"`, `"slide.displacement"`, with rates and accelerations."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +14,7 @@ from jaxtyping import Array
 from .._compat import default_float
 from .._types import Scalar
 from ..parts.coordinate_parts import JointDriver
-from ..system.catalogue import AbstractSystem
-from ..system.quantities import Quantity
+from ..system.quantities import Measure, view_of_motion
 from .groups import ConstraintGroup, CoordinateGroup, Group
 from .layout import Layout
 
@@ -30,7 +28,7 @@ class JointCoordinate(NamedTuple):
     """
 
     group: int
-    member: int
+    member: Any
     field: str
     shape: tuple[int, ...]
     periodic: bool
@@ -55,21 +53,24 @@ def joint_coordinates(
     return out
 
 
-def joint_quantities(system: AbstractSystem, known: Mapping[str, JointCoordinate]) -> dict[str, Quantity]:
+def joint_measures(known: Mapping[str, JointCoordinate]) -> dict[str, Measure]:
     """Coordinates of joints, their rates and accelerations, as quantities of a motion.
 
     Angles known up to full turns are continued from time to time: a change in one interval is taken to be that by which
     the angle and the trapezoidal rule of its rate differ least.
     """
     out = {}
-    for name, coordinate in known.items():
+    for name, own in known.items():
+        coordinate = own._replace(member=np.array(own.member))
         for order, end in enumerate(ORDERS):
-            value = functools.partial(_along, system, coordinate, order)
-            out[f"{name}{end}"] = Quantity(coordinate.shape, value, of_forces=order == 2)
+            out[f"{name}{end}"] = Measure(own.shape, _of_joint, (coordinate, order), of_forces=order == 2)
     return out
 
 
-def _along(system, coordinate, order, ts, ys, solved):
+@view_of_motion
+def _of_joint(system, place, ts, ys, solved):
+    coordinate, order = place
+
     def with_rate(t, q, u):
         """The coordinate and its rate."""
         value = lambda t, q: system.joint_coordinate(coordinate, t, q)

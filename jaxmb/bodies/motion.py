@@ -2,14 +2,16 @@
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from .._types import State
-from ..system.catalogue import AbstractSystem
-from ..system.quantities import BodyMotion, Quantity
+from ..system.quantities import BodyMotion, Measure, entries_along, view_of_motion
 from .groups import FrameGroup
 from .layout import Layout
 
@@ -52,25 +54,30 @@ def _names(layout, bodies, index, fields, groups, of_scalars=""):
 
 
 def body_motion(layout: Layout, body: int, ys: State) -> BodyMotion:
-    """The motion of one body."""
-    d = layout.space.dimension
-    # The entries of a body are contiguous.
-    return _cut(
-        int(layout.pose_index[body][0]), int(layout.velocity_index[body][0]), d, layout.rotates[body], ys.q, ys.u
-    )
+    """The motion of one body, or its motions in a batch."""
+    return _cut(layout.space.dimension, layout.rotates[body], _starts(layout, body), ys.q, ys.u)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _cut(i: int, j: int, d: int, rotates: bool, q: Array, u: Array) -> BodyMotion:
-    position, velocity = q[:, i : i + d], u[:, j : j + d]
+def _starts(layout: Layout, body: int) -> np.ndarray:
+    """Where the entries of a body or scalar coordinate begin in q and u, in which they are contiguous."""
+    return np.array([layout.pose_index[body][0], layout.velocity_index[body][0]])
+
+
+# One program for all bodies.
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _cut(d: int, rotates: bool, starts: Any, q: Array, u: Array) -> BodyMotion:
+    entries = lambda values, start, count: lax.dynamic_slice_in_dim(values, start, count, axis=-1)
+    i, j = starts
+    position, velocity = entries(q, i, d), entries(u, j, d)
     if not rotates:
         return BodyMotion(position, velocity, None, None, None)
     if d == 2:
-        return BodyMotion(position, velocity, q[:, i + 2], None, u[:, j + 2])
-    return BodyMotion(position, velocity, None, q[:, i + 3 : i + 7], u[:, j + 3 : j + 6])
+        angle, rate = (entries(values, start + 2, 1)[..., 0] for values, start in ((q, i), (u, j)))
+        return BodyMotion(position, velocity, angle, None, rate)
+    return BodyMotion(position, velocity, None, entries(q, i + 3, 4), entries(u, j + 3, 3))
 
 
-def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]:
+def body_measures(layout: Layout, names: Sequence[str]) -> dict[str, Measure]:
     """The fields of `BodyMotion` of every body, `"crank.angle"`, and the accelerations of its velocities,
     `"crank.acceleration"`.
     """
@@ -79,39 +86,41 @@ def body_quantities(layout: Layout, names: Sequence[str]) -> dict[str, Quantity]
     translation = {"position": (d,), "velocity": (d,)}
     rotation = {"angle": (), "angular_velocity": ()} if d == 2 else {"orientation": (4,), "angular_velocity": turning}
     rates = {"acceleration": ("velocity", (d,)), "angular_acceleration": ("angular_velocity", turning)}
-
-    def changing(body, field, ys, solved):
-        # Velocities of a body are its own entries of u.
-        return getattr(body_motion(layout, body, State(ys.q, solved.accelerations)), field)
-
     out = {}
     for body, name in enumerate(names):
-        own = translation | rotation if layout.rotates[body] else translation
+        rotates, starts = layout.rotates[body], _starts(layout, body)
+        own = translation | rotation if rotates else translation
         for field, shape in own.items():
-            value = lambda ts, ys, _, body=body, field=field: getattr(body_motion(layout, body, ys), field)
-            out[f"{name}.{field}"] = Quantity(shape, value)
+            out[f"{name}.{field}"] = Measure(shape, _of_body, (field, rotates, False, starts))
         for rate, (field, shape) in rates.items():
             if field in own:
-                value = lambda ts, ys, solved, body=body, field=field: changing(body, field, ys, solved)
-                out[f"{name}.{rate}"] = Quantity(shape, value, of_forces=True)
+                place = field, rotates, True, starts
+                out[f"{name}.{rate}"] = Measure(shape, _of_body, place, of_forces=True)
     return out
 
 
-def scalar_quantities(layout: Layout) -> dict[str, Quantity]:
+@view_of_motion
+def _of_body(system, place, ts, ys, solved):
+    del ts
+    field, rotates, of_rate, starts = place
+    # Velocities of a body are its own entries of u.
+    u = solved.accelerations if of_rate else ys.u
+    return getattr(_cut(system.layout.space.dimension, rotates, starts, ys.q, u), field)
+
+
+def scalar_measures(layout: Layout) -> dict[str, Measure]:
     """Scalar coordinates that move, their rates and accelerations, `"rotor.angle"`, `"rotor.angle_rate"`."""
     out = {}
     for k, own in enumerate(layout.scalars, layout.bodies):
-        if not own.moves:
-            continue
-        i, j = int(layout.pose_index[k][0]), int(layout.velocity_index[k][0])
-        out[own.name] = Quantity((), lambda ts, ys, _, i=i: ys.q[:, i])
-        out[f"{own.name}_rate"] = Quantity((), lambda ts, ys, _, j=j: ys.u[:, j])
-        acceleration = lambda ts, ys, solved, j=j: solved.accelerations[:, j]
-        out[f"{own.name}_acceleration"] = Quantity((), acceleration, of_forces=True)
+        if own.moves:
+            i, j = _starts(layout, k)
+            out[own.name] = Measure((), entries_along, ("q", i, ()))
+            out[f"{own.name}_rate"] = Measure((), entries_along, ("u", j, ()))
+            out[f"{own.name}_acceleration"] = Measure((), entries_along, ("accelerations", j, ()), of_forces=True)
     return out
 
 
-def frame_quantities(system: AbstractSystem, groups: Sequence[FrameGroup], layout: Layout) -> dict[str, Quantity]:
+def frame_measures(groups: Sequence[FrameGroup], layout: Layout) -> dict[str, Measure]:
     """The quantities of all frames, by name."""
     d = layout.space.dimension
     turning = () if d == 2 else (3,)
@@ -123,27 +132,29 @@ def frame_quantities(system: AbstractSystem, groups: Sequence[FrameGroup], layou
         for k, name in enumerate(own.group.names):
             for field, shape in (at_velocities | at_accelerations).items():
                 of_forces = field in at_accelerations
-                value = functools.partial(_along, system, g, k, field, of_forces)
-                out[f"{name}.{field}"] = Quantity(shape, value, of_forces)
+                out[f"{name}.{field}"] = Measure(shape, _of_frame, (g, field, of_forces, np.array(k)), of_forces)
     return out
 
 
-def _along(system, group, member, field, of_forces, ts, ys, solved):
-    single = lambda t, y, a: _fields(system, group, member, t, y, a)[field]
+@view_of_motion
+def _of_frame(system, place, ts, ys, solved):
+    group, field, of_forces, member = place
+    frame = system.frames[group].only(member)
+    single = lambda t, y, a: _fields(system, frame, t, y, a)[field]
     if of_forces:
         return jax.vmap(single)(ts, ys, solved.accelerations)
     return jax.vmap(lambda t, y: single(t, y, None))(ts, ys)
 
 
-def _fields(system, group, member, t, y, acceleration):
-    layout, own = system.layout, system.frames[group]
+def _fields(system, frame, t, y, acceleration):
+    layout = system.layout
     d = layout.space.dimension
 
     def rates(t, q, u):
-        velocities = own.velocities(t, system.prepared_poses(q), system.all_velocities(u))[member]
+        velocities = frame.velocities(t, system.prepared_poses(q), system.all_velocities(u))[0]
         return velocities[:d], velocities[2] if d == 2 else velocities[3:]
 
-    pose = own.poses(t, system.prepared_poses(y.q))[member]
+    pose = frame.poses(t, system.prepared_poses(y.q))[0]
     velocity, angular_velocity = rates(t, y.q, y.u)
     out = {"position": pose[:d], "velocity": velocity, "angular_velocity": angular_velocity}
     out |= {"angle": pose[2]} if d == 2 else {"orientation": pose[3:7]}

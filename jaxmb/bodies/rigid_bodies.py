@@ -12,11 +12,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
-from ..linalg.arrays import is_traced, unchecked_take
+from ..linalg.arrays import add_up, is_traced, unchecked_take
 from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.rotations import cross, normalize, rotate
+from ..linalg.structures import of_structure
 from ..linalg.sums import placed_sums
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
@@ -25,7 +26,7 @@ from ..solvers.manifold_term import GapsSeen
 from ..system.catalogue import AbstractSystem
 from ..system.design_variables import DesignVariables, variables_in_range
 from ..system.equation import Contacts, Frictions, Ranks
-from ..system.quantities import Quantity
+from ..system.quantities import Measure, view_of_motion
 from .describe import describe_scene
 from .field_jacobian import motion_jacobian
 from .groups import (
@@ -48,15 +49,15 @@ from .internal_states import (
     initial_states,
     state_fields,
     state_names,
-    state_quantities,
+    state_measures,
     state_rates,
     state_scale,
     with_states,
 )
-from .joint_coordinates import held_groups, joint_coordinates, joint_quantities
+from .joint_coordinates import held_groups, joint_coordinates, joint_measures
 from .joint_graph import joint_order_with_more
 from .layout import Layout
-from .motion import body_motion, body_quantities, coordinate_names, frame_quantities, rate_names, scalar_quantities
+from .motion import body_motion, body_measures, coordinate_names, frame_measures, rate_names, scalar_measures
 from .parameters import (
     are_in_range,
     check_parts,
@@ -67,7 +68,7 @@ from .parameters import (
     with_signals,
 )
 from .picture import picture
-from .reactions import applied_wrenches, reaction, with_slip
+from .reactions import places, reaction, with_slip
 
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
 # velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
@@ -429,6 +430,7 @@ class RigidBodySystem(AbstractSystem):
 
     # Parameters and names
 
+    @of_structure
     def parameter_paths(self):
         return parameter_paths(None if self.gravity is None else self.gravity_name, self._groups, self.servos)
 
@@ -516,18 +518,17 @@ class RigidBodySystem(AbstractSystem):
     def motion(self, name, ys):
         return body_motion(self.layout, self.body_names.index(name), ys)
 
-    def quantities(self):
-        out = body_quantities(self.layout, self.body_names) | state_quantities(self._state_fields)
+    @of_structure
+    def measures(self):
+        out = body_measures(self.layout, self.body_names) | state_measures(self._state_fields)
         d = self.layout.space.dimension
         for name in self.joint_names():
             for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
-                value = lambda ts, ys, solved, name=name, field=field: getattr(
-                    self.reaction(name, ts, ys, solved.multipliers), field
-                )
-                out[f"{name}.{field}"] = Quantity(shape, value, of_forces=True)
-        out |= scalar_quantities(self.layout) | joint_quantities(self, self.joint_coordinates())
-        return out | frame_quantities(self, self.frames, self.layout)
+                out[f"{name}.{field}"] = Measure(shape, _of_reaction, (field, *self._joint_places(name)), of_forces=True)
+        out |= scalar_measures(self.layout) | joint_measures(self.joint_coordinates())
+        return out | frame_measures(self.frames, self.layout)
 
+    @of_structure
     def joint_coordinates(self):
         return joint_coordinates(self._measured, self.layout, batch=self.length.ndim)
 
@@ -537,8 +538,8 @@ class RigidBodySystem(AbstractSystem):
         return (*self.constraints, *self.tendons, *self.free_joints)
 
     def joint_coordinate(self, coordinate, t, q):
-        values = self._measured[coordinate.group].coordinates(t, self.prepared_poses(q))
-        return values[coordinate.field][coordinate.member]
+        alone = self._measured[coordinate.group].only(coordinate.member)
+        return alone.coordinates(t, self.prepared_poses(q))[coordinate.field][0]
 
     def holding(self, values, rates, t):
         held = held_groups(self._measured, self.joint_coordinates(), values, rates, t)
@@ -556,36 +557,19 @@ class RigidBodySystem(AbstractSystem):
     def joint_names(self):
         return self.constraint_names()
 
-    @eqx.filter_jit
-    def reaction(self, name, ts, ys, multipliers):
-        def single(t, y, own):
-            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
-            out = reaction(self.joints, name, t, poses, velocities, own)
-            slips = [g.law for g in self.frictions if name in g.group.names]
-            if not slips:
-                return out
-            wrenches = nonideal_wrenches(self.joints, slips, t, poses, velocities, own)
-            return with_slip(out, slips, name, poses, wrenches)
+    def _joint_places(self, name):
+        """Where a joint stands among the constraints, and among dry friction."""
+        return places(self.joints, name), places(self.frictions, name)
 
-        return jax.vmap(single)(ts, ys, multipliers)
+    def reaction(self, name, ts, ys, multipliers):
+        return _reactions(self, self._joint_places(name), ts, ys, multipliers)
 
     def force_names(self):
         return tuple(dict.fromkeys(name for g in (*self.forces, *self.nonideal) for name in g.group.names))
 
-    @eqx.filter_jit
     def applied_wrenches(self, name, ts, ys, multipliers):
-        forces = [k for k, g in enumerate(self.forces) if name in g.group.names]
-        laws = [g for g in self.nonideal if name in g.group.names]
-
-        def single(t, y, own):
-            poses, velocities = self.prepared_poses(y.q), self.all_velocities(y.u)
-            if laws:
-                wrenches = nonideal_wrenches(self.joints, laws, t, poses, velocities, own)
-                return applied_wrenches(laws, name, wrenches)
-            groups = [self.at(y).forces[k] for k in forces]
-            return applied_wrenches(groups, name, [g.wrenches(t, poses, velocities) for g in groups])
-
-        return jax.vmap(single)(ts, ys, multipliers)
+        own = places(self.forces, name), places(self.nonideal, name)
+        return _applied_wrenches(self, own, ts, ys, multipliers)
 
     def picture(self, ts, ys):
         return picture(self, [g.group for g in (*self.joints, *self.forces)], ts, ys)
@@ -851,6 +835,49 @@ class RigidBodySystem(AbstractSystem):
             if row[0] < size:
                 translation[row[0]] = own.is_length
         return jnp.where(np.array(translation), length, 1.0)
+
+
+@view_of_motion
+def _reactions(system, place, ts, ys, multipliers):
+    of_joint, of_friction = place
+
+    def single(t, y, own):
+        poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
+        out = reaction(system.joints, of_joint, t, poses, velocities, own)
+        slips = [system.frictions[at.group].law for at in of_friction]
+        if not slips:
+            return out
+        wrenches = nonideal_wrenches(system.joints, slips, t, poses, velocities, own)
+        return with_slip(out, slips, of_friction, poses, wrenches)
+
+    return jax.vmap(single)(ts, ys, multipliers)
+
+
+@view_of_motion
+def _of_reaction(system, place, ts, ys, solved):
+    field, *joint = place
+    return getattr(_reactions(system, tuple(joint), ts, ys, solved.multipliers), field)
+
+
+@view_of_motion
+def _applied_wrenches(system, place, ts, ys, multipliers):
+    of_forces, of_laws = place
+
+    def single(t, y, own):
+        poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
+        if of_laws:
+            laws = [system.nonideal[at.group] for at in of_laws]
+            wrenches = nonideal_wrenches(system.joints, laws, t, poses, velocities, own)
+            found = [values[at.member] for values, at in zip(wrenches, of_laws, strict=True)]
+        else:
+            alone = [system.at(y).forces[at.group].only(at.member) for at in of_forces]
+            found = [group.wrenches(t, poses, velocities)[0] for group in alone]
+        # A force element may have several components.
+        return add_up(
+            values[np.array(at.on_bodies)] for values, at in zip(found, of_laws or of_forces, strict=True)
+        )
+
+    return jax.vmap(single)(ts, ys, multipliers)
 
 
 class _MixedInertia(AbstractInertia):

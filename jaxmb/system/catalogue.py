@@ -8,16 +8,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced
+from ..linalg.structures import of_structure
 from ..parts.series import AbstractSignal
 from .description import Description, count_independent, count_rows, counted, remarks, shorten
 from .design_variables import DesignVariables, description_rows, variables_in_range
 from .equation import AbstractEquation
 from .picture import Picture
-from .quantities import Quantity, Reaction
+from .quantities import Measure, Quantities, Quantity, Reaction, entries_along, view_of_motion
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -177,42 +179,44 @@ class AbstractSystem(AbstractEquation):
 
     def motion(self, name: str, ys: State) -> Any:
         """The motion of one of `motion_names`: a `BodyMotion`, or the values of a coordinate, shape (times,)."""
-        return ys.q[:, self.coordinate_names()[name][0]]
+        return _coordinate(np.array(self.coordinate_names()[name][0]), ys.q)
 
-    def quantities(self) -> dict[str, Quantity]:
+    def quantities(self) -> Mapping[str, Quantity]:
         """The quantities that can be measured of a motion, by name."""
-        out = {name: Quantity((), lambda ts, ys, _, name=name: self.motion(name, ys)) for name in self.motion_names()}
-        for name, (index,) in self.coordinate_names().items():
-            rate = lambda ts, ys, _, index=index: self.rates_along(ts, ys)[:, index]
-            out[f"{name}_rate"] = Quantity((), rate)
+        return Quantities(self, self.measures())
+
+    @of_structure
+    def measures(self) -> dict[str, Measure]:
+        """The same for all systems of this structure."""
+        names, out = self.coordinate_names(), {}
+        for name in self.motion_names():
+            out[name] = Measure((), entries_along, ("q", np.array(names[name][0]), ()))
+        for name, (index,) in names.items():
+            out[f"{name}_rate"] = Measure((), _rate_along, np.array(index))
         for name in self.constraint_names():
-            force = lambda ts, ys, solved, name=name: self.generalized_constraint_force(
-                name, ts, ys, solved.multipliers
-            )
-            out[f"{name}.force"] = Quantity((self.nu,), force, of_forces=True)
+            out[f"{name}.force"] = Measure((self.nu,), _force_along, self._rows_of(name), of_forces=True)
         return out
 
     def position_quantities(self) -> tuple[str, ...]:
         """Names of the quantities that determine the configuration up to the attitude of bodies."""
         return self.motion_names()
 
-    @eqx.filter_jit
     def rates_along(self, ts: Float[Array, "times"], ys: State) -> Float[Array, "times nq"]:
         """q̇ along a motion."""
-        return jax.vmap(lambda t, y: self.rates(t, y.q, y.u))(ts, ys)
+        return _rates_along(self, (), ts, ys)
 
     def constraint_names(self) -> tuple[str, ...]:
         """Names of the parts that exert constraint forces."""
         return tuple(dict.fromkeys(name for name, _ in self.rows))
 
-    @eqx.filter_jit
+    def _rows_of(self, name) -> Bool[np.ndarray, "rows"]:
+        return np.array([row == name for row, _ in self.rows])
+
     def generalized_constraint_force(
         self, name: str, ts: Float[Array, "times"], ys: State, multipliers: Float[Array, "times rows"]
     ) -> Float[Array, "times nu"]:
         """The contribution of one constraint to `Aᵀ λ`, along a motion."""
-        own = jnp.array([row == name for row, _ in self.rows])
-        multipliers = jnp.where(own[None, :], multipliers, jnp.zeros_like(multipliers))
-        return jax.vmap(lambda t, y, own: self.constraint_force(t, y.q, y.u, own))(ts, ys, multipliers)
+        return _forces_along(self, self._rows_of(name), ts, ys, multipliers)
 
     # Forces on bodies; a system without bodies raises a `ValueError`.
 
@@ -285,6 +289,35 @@ class AbstractSystem(AbstractEquation):
 
     def _repr_html_(self) -> str:
         return self.describe()._repr_html_()
+
+
+# One program for all coordinates.
+@jax.jit
+def _coordinate(k, q):
+    return lax.dynamic_index_in_dim(q, k, axis=-1, keepdims=False)
+
+
+@view_of_motion
+def _rates_along(system, place, ts, ys):
+    del place
+    return jax.vmap(lambda t, y: system.rates(t, y.q, y.u))(ts, ys)
+
+
+@view_of_motion
+def _rate_along(system, index, ts, ys, solved):
+    del solved
+    return _coordinate(index, system.rates_along(ts, ys))
+
+
+@view_of_motion
+def _forces_along(system, rows, ts, ys, multipliers):
+    multipliers = jnp.where(rows[None, :], multipliers, jnp.zeros_like(multipliers))
+    return jax.vmap(lambda t, y, own: system.constraint_force(t, y.q, y.u, own))(ts, ys, multipliers)
+
+
+@view_of_motion
+def _force_along(system, rows, ts, ys, solved):
+    return _forces_along(system, rows, ts, ys, solved.multipliers)
 
 
 _NO_REACTIONS = "reactions are defined for joints between bodies; this system has constraint_forces."

@@ -9,11 +9,17 @@ One grammar of rates holds wherever names are given or read. The rate of a coord
 `rates={"crank.angle": 2.0}`.
 """
 
-from collections.abc import Callable, Mapping
+import functools
+import math
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
+
+from ..linalg.jitted import jitted
 
 
 class Solved(NamedTuple):
@@ -33,6 +39,61 @@ class Quantity(NamedTuple):
     shape: tuple[int, ...]
     value: Callable[[Any, Any, Any], Array]
     of_forces: bool = False
+
+
+class Measure(NamedTuple):
+    """A quantity of all systems of one structure.
+
+    **Fields:** `shape` at one time; `view(system, place, ts, ys, solved)`, made by `view_of_motion`; `place`: which
+    quantity of the view it is, and as arrays the numbers of the part; `of_forces` as in `Quantity`.
+    """
+
+    shape: tuple[int, ...]
+    view: Callable[..., Array]
+    place: Any
+    of_forces: bool = False
+
+
+class Quantities(Mapping[str, Quantity]):
+    """The quantities of a system by name, from those of its structure."""
+
+    def __init__(self, system: Any, measures: Mapping[str, Measure]):
+        self._system, self._measures = system, measures
+
+    def __getitem__(self, name: str) -> Quantity:
+        shape, view, place, of_forces = self._measures[name]
+        return Quantity(shape, functools.partial(view, self._system, place), of_forces)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._measures)
+
+    def __len__(self) -> int:
+        return len(self._measures)
+
+
+def view_of_motion(view: Callable[..., Any]) -> Callable[..., Any]:
+    """`view(system, place, ts, ys, …)` of a motion, compiled, as the same view of any batch of motions too: in a batch
+    all arrays have its axes before their own, but for those of `place`.
+
+    The program depends on what `place` holds besides arrays. The numbers of a part are arrays there, so that all parts
+    of one kind share a program.
+    """
+
+    def of_all(system, place, ts, *more):
+        if ts.ndim <= 1:
+            return view(system, place, ts, *more)
+        return eqx.filter_vmap(lambda system, *own: of_all(system, place, *own))(system, ts, *more)
+
+    return jitted(functools.wraps(view)(of_all))
+
+
+@view_of_motion
+def entries_along(system: Any, place: tuple[str, Any, tuple[int, ...]], ts: Any, ys: Any, solved: Any) -> Array:
+    """Entries of q, u, z or the accelerations: where they are, the first of them, and their shape."""
+    del system, ts
+    where, first, shape = place
+    values = solved.accelerations if where == "accelerations" else getattr(ys, where)
+    return lax.dynamic_slice_in_dim(values, first, math.prod(shape), axis=1).reshape(-1, *shape)
 
 
 class BodyMotion(NamedTuple):
