@@ -14,10 +14,10 @@ from ._types import State
 from .formulations import AbstractFormulation
 from .linalg.arrays import is_traced
 from .linalg.jitted import jitted
-from .linalg.structures import of_structure
 from .manifold import contact_guards
 from .system import AbstractSystem
 from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
+from .system.structures import of_structure
 
 # Impulses of contacts that are this small beside another one at the same time are none.
 _ROUNDING = 1e-12

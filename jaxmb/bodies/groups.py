@@ -17,7 +17,7 @@ from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
 from ..parts.fields import anonymous, entry, inner_parts
-from ..parts.series import AbstractSignal
+from ..parts.series import AbstractSignal, of_each, of_one_kind
 from ..parts.servo import Servo
 from ..parts.space import AbstractSpace
 from .layout import Layout
@@ -28,15 +28,48 @@ BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 
 
 class Input(eqx.Module):
-    """A number of stacked parts that is a function of time: the parameter's name, the keys that lead to it in the
-    part, the number of the part, and whether it `moves` what the part measures, so that its rate counts as well.
+    """A number of some stacked parts that is a function of time, or several functions of one kind: the parameters'
+    names, the keys that lead to the number in a part, the numbers of the parts, and whether it `moves` what the part
+    measures, so that its rate counts as well.
     """
 
     signal: AbstractSignal
-    name: str = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
     keys: tuple[str, ...] = eqx.field(static=True)
-    member: int = eqx.field(static=True)
+    members: tuple[int, ...] = eqx.field(static=True)
     moves: bool = eqx.field(static=True)
+
+    def alone(self) -> "list[Input]":
+        """The same of each part."""
+        signals = of_each(self.signal, len(self.names))
+        each = zip(signals, self.names, self.members, strict=True)
+        return [Input(signal, (name,), self.keys, (member,), self.moves) for signal, name, member in each]
+
+    def drives(self, member: Any) -> Any:
+        """Whether the number of a part is among these."""
+        if len(self.members) == 1:
+            return member == self.members[0]
+        return jnp.any(np.array(self.members) == member)
+
+    def value(self, member: Any, t: Scalar) -> Array:
+        """The number of a part that is among these; of one kind all are computed, once for all parts."""
+        if len(self.members) == 1:
+            return self.signal(t)
+        values = jax.vmap(lambda own: own(t))(self.signal)
+        return unchecked_take(values, jnp.argmax(np.array(self.members) == member))
+
+
+def together(inputs: Sequence[Input]) -> tuple[Input, ...]:
+    """Inputs of single parts with those of one kind together."""
+    kinds: dict[Any, list[Input]] = {}
+    for own in inputs:
+        kinds.setdefault((own.keys, own.moves), []).append(own)
+    out = []
+    for (keys, moves), same in kinds.items():
+        for numbers, signal in of_one_kind([own.signal for own in same]):
+            names, members = ([getattr(same[k], field)[0] for k in numbers] for field in ("names", "members"))
+            out.append(Input(signal, tuple(names), keys, tuple(members), moves))
+    return tuple(out)
 
 
 class Group(eqx.Module):
@@ -76,15 +109,15 @@ class Group(eqx.Module):
         for own in self.inputs:
             where = lambda part, keys=own.keys: entry(part, keys)
             given = where(part)
-            signal = lambda t, own=own, like=given: jnp.asarray(own.signal(t), like.dtype)
+            signal = lambda t, own=own, like=given: jnp.asarray(own.value(member, t), like.dtype)
             if own.moves and part.takes_drift:
                 time = jnp.asarray(t, jnp.result_type(float))
                 value, rate = jax.jvp(signal, (time,), (jnp.ones_like(time),))
-                rate = jnp.where(member == own.member, rate, jnp.zeros_like(rate))
+                rate = jnp.where(own.drives(member), rate, jnp.zeros_like(rate))
                 drift = eqx.tree_at(where, drift, rate, is_leaf=lambda x: x is None)
             else:
                 value = signal(t)
-            part = eqx.tree_at(where, part, jnp.where(member == own.member, value, given))
+            part = eqx.tree_at(where, part, jnp.where(own.drives(member), value, given))
         return part.with_fields(drift=drift) if jax.tree.leaves(drift) else part
 
     @property

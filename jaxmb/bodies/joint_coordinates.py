@@ -35,17 +35,16 @@ class JointCoordinate(NamedTuple):
 
 
 def joint_coordinates(
-    groups: Sequence[ConstraintGroup | CoordinateGroup], layout: Layout, batch: int = 0
+    groups: Sequence[ConstraintGroup | CoordinateGroup], layout: Layout
 ) -> dict[str, JointCoordinate]:
-    """The coordinates of all joints, by name; `batch`: the number of axes before those of a single system."""
+    """The coordinates of all joints, by name."""
     space, out, dtype = layout.space, {}, default_float()
     ground = np.asarray(space.ground, dtype)
     # Shapes only: nothing is computed.
     poses = jax.eval_shape(lambda ground: jnp.tile(space.prepare(ground), (layout.ground + 1, 1)), ground)
     time = jax.ShapeDtypeStruct((), dtype)
     for g, own in enumerate(groups):
-        single = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[batch:], x.dtype), own)
-        found = jax.eval_shape(lambda own, t, poses: own.coordinates(t, poses), single, time, poses)
+        found = jax.eval_shape(lambda own, t, poses: own.coordinates(t, poses), own, time, poses)
         for field, values in found.items():
             for k, name in enumerate(own.group.names):
                 coordinate = JointCoordinate(g, k, field, values.shape[1:], field in own.group.part.periodic)
@@ -119,9 +118,10 @@ def held_groups(
         )
         stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)
         inputs = tuple(
-            dataclasses.replace(signal, keys=("joints", "0", *signal.keys), member=0)
+            dataclasses.replace(alone, keys=("joints", "0", *alone.keys), members=(0,))
             for signal in group.inputs
-            if signal.member == own.member
+            for alone in signal.alone()
+            if alone.members == (own.member,)
         )
         out.append(ConstraintGroup(Group(stacked, (name,), (group.bodies[own.member],), group.layout, inputs)))
     return tuple(out)

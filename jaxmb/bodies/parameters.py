@@ -15,7 +15,7 @@ from ..parts.base import AbstractPart
 from ..parts.fields import Declaration, entry, in_range, inner_parts, paths
 from ..parts.series import AbstractSignal
 from ..system.catalogue import ParameterPath
-from .groups import Input
+from .groups import Input, together
 
 
 class StackedNumber(NamedTuple):
@@ -125,9 +125,10 @@ def signals_of(groups: Mapping[str, Sequence[Any]]) -> dict[str, tuple[AbstractS
     """
     out: dict[str, tuple[AbstractSignal, bool]] = {}
     for kind, of_kind in groups.items():
-        for own in (own for g in of_kind for own in g.group.inputs):
-            _, counts = out.get(own.name, (own.signal, False))
-            out[own.name] = own.signal, counts or kind in _BIND or own.moves
+        for own in (own for g in of_kind for each in g.group.inputs for own in each.alone()):
+            (name,) = own.names
+            _, counts = out.get(name, (own.signal, False))
+            out[name] = own.signal, counts or kind in _BIND or own.moves
     return out
 
 
@@ -162,7 +163,7 @@ def with_signals(
         varying.add(number.name)
         # All numbers of a joint place the coordinate that other parts measure.
         moves = places or number.keys[0] == "joints" or number.keys[0] in part.moving
-        own = Input(signal, number.name, number.keys, number.member, moves)
+        own = Input(signal, (number.name,), number.keys, (number.member,), moves)
         new.setdefault((number.kind, number.group), []).append(own)
     for name in signals:
         if name not in varying:
@@ -177,6 +178,6 @@ def with_signals(
 
 
 def _with_inputs(group, inputs):
-    names = {own.name for own in inputs}
-    kept = (own for own in group.group.inputs if own.name not in names)
-    return dataclasses.replace(group, group=dataclasses.replace(group.group, inputs=(*kept, *inputs)))
+    names = {own.names for own in inputs}
+    kept = (own for each in group.group.inputs for own in each.alone() if own.names not in names)
+    return dataclasses.replace(group, group=dataclasses.replace(group.group, inputs=together([*kept, *inputs])))

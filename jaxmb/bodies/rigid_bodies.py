@@ -17,7 +17,6 @@ from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.rotations import cross, normalize, rotate
-from ..linalg.structures import of_structure
 from ..linalg.sums import placed_sums
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
@@ -27,6 +26,7 @@ from ..system.catalogue import AbstractSystem
 from ..system.design_variables import DesignVariables, variables_in_range
 from ..system.equation import Contacts, Frictions, Ranks
 from ..system.quantities import Measure, view_of_motion
+from ..system.structures import of_structure
 from .describe import describe_scene
 from .field_jacobian import motion_jacobian
 from .groups import (
@@ -48,8 +48,8 @@ from .internal_states import (
     StateField,
     initial_states,
     state_fields,
-    state_names,
     state_measures,
+    state_names,
     state_rates,
     state_scale,
     with_states,
@@ -57,7 +57,7 @@ from .internal_states import (
 from .joint_coordinates import held_groups, joint_coordinates, joint_measures
 from .joint_graph import joint_order_with_more
 from .layout import Layout
-from .motion import body_motion, body_measures, coordinate_names, frame_measures, rate_names, scalar_measures
+from .motion import body_measures, body_motion, coordinate_names, frame_measures, rate_names, scalar_measures
 from .parameters import (
     are_in_range,
     check_parts,
@@ -524,13 +524,15 @@ class RigidBodySystem(AbstractSystem):
         d = self.layout.space.dimension
         for name in self.joint_names():
             for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
-                out[f"{name}.{field}"] = Measure(shape, _of_reaction, (field, *self._joint_places(name)), of_forces=True)
+                out[f"{name}.{field}"] = Measure(
+                    shape, _of_reaction, (field, *self._joint_places(name)), of_forces=True
+                )
         out |= scalar_measures(self.layout) | joint_measures(self.joint_coordinates())
         return out | frame_measures(self.frames, self.layout)
 
     @of_structure
     def joint_coordinates(self):
-        return joint_coordinates(self._measured, self.layout, batch=self.length.ndim)
+        return joint_coordinates(self._measured, self.layout)
 
     @property
     def _measured(self):
@@ -855,8 +857,8 @@ def _reactions(system, place, ts, ys, multipliers):
 
 @view_of_motion
 def _of_reaction(system, place, ts, ys, solved):
-    field, *joint = place
-    return getattr(_reactions(system, tuple(joint), ts, ys, solved.multipliers), field)
+    field, joint = place
+    return getattr(_reactions(system, joint, ts, ys, solved.multipliers), field)
 
 
 @view_of_motion
@@ -873,9 +875,7 @@ def _applied_wrenches(system, place, ts, ys, multipliers):
             alone = [system.at(y).forces[at.group].only(at.member) for at in of_forces]
             found = [group.wrenches(t, poses, velocities)[0] for group in alone]
         # A force element may have several components.
-        return add_up(
-            values[np.array(at.on_bodies)] for values, at in zip(found, of_laws or of_forces, strict=True)
-        )
+        return add_up(values[np.array(at.on_bodies)] for values, at in zip(found, of_laws or of_forces, strict=True))
 
     return jax.vmap(single)(ts, ys, multipliers)
 

@@ -1,10 +1,11 @@
 """Values as functions of time: measured or planned series, and functions."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -208,6 +209,28 @@ def as_signal(label: str, value: Any) -> AbstractSignal:
     if callable(value):
         return Signal(value)
     raise ValueError(f"The input {label!r} must be a jaxmb.Series or a function of time, got {value!r}.")
+
+
+def of_one_kind(signals: Sequence[AbstractSignal]) -> list[tuple[tuple[int, ...], AbstractSignal]]:
+    """Signals with those of one kind together: their numbers, and one signal with an axis of them before all others.
+
+    Series with the same interpolation and shapes are of one kind; a series or function alone has no such axis.
+    """
+    kinds: dict[Any, list[int]] = {}
+    for k, signal in enumerate(signals):
+        leaves, structure = jax.tree.flatten(signal)
+        shapes = tuple((x.shape, x.dtype) for x in leaves) if isinstance(signal, Series) else k
+        kinds.setdefault((structure, shapes), []).append(k)
+    # Times that are numbers stay numbers.
+    joined = lambda *leaves: jnp.stack(leaves) if is_traced(leaves) else np.stack(list(map(np.asarray, leaves)))
+    together = lambda same: signals[same[0]] if len(same) == 1 else jax.tree.map(joined, *(signals[k] for k in same))
+    return [(tuple(same), together(same)) for same in kinds.values()]
+
+
+def of_each(signals: AbstractSignal, count: int) -> list[AbstractSignal]:
+    """The signals that `of_one_kind` has put together."""
+    taken = lambda x, k: x[k] if is_traced(x) else np.asarray(x)[k]
+    return [signals] if count == 1 else [jax.tree.map(lambda x, k=k: taken(x, k), signals) for k in range(count)]
 
 
 def _spline_slopes(ts, values):

@@ -32,6 +32,7 @@ from ..manifold import (
     with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
+from ..parts.series import of_one_kind
 from ..solvers import (
     NO_STATE,
     AbstractMultistep,
@@ -290,8 +291,9 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if lost is not None:
         result = RESULTS.where(lost & ~has_failed(result), RESULTS.newton_failed, result)
     if problem.traced:
-        for signal, _ in system.signals.values():
-            known = signal.is_known(times["t0"], times["t1"])
+        of_signal = lambda signal: signal.is_known(times["t0"], times["t1"])
+        for numbers, signal in of_one_kind([signal for signal, _ in system.signals.values()]):
+            known = of_signal(signal) if len(numbers) == 1 else jnp.all(jax.vmap(of_signal)(signal))
             result = RESULTS.where(known | has_failed(result), result, RESULTS.input_ended)
     if outside is not False:
         result = RESULTS.where(outside & ~has_failed(result), RESULTS.saved_outside, result)

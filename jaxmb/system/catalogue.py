@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced
-from ..linalg.structures import of_structure
 from ..parts.series import AbstractSignal
 from .description import Description, count_independent, count_rows, counted, remarks, shorten
 from .design_variables import DesignVariables, description_rows, variables_in_range
 from .equation import AbstractEquation
 from .picture import Picture
 from .quantities import Measure, Quantities, Quantity, Reaction, entries_along, view_of_motion
+from .structures import of_structure
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar

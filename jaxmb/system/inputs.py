@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float
 from .._traced_functions import traced_by_jax
 from .._types import Scalar, State
 from ..parts.names import unknown
-from ..parts.series import AbstractSignal, as_signal, sample_times
+from ..parts.series import AbstractSignal, as_signal, of_one_kind, sample_times
 from ..solvers.evaluation import freeze
 from .catalogue import AbstractSystem
 from .parameters import parameters
@@ -90,7 +91,7 @@ def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) 
     signals = [signal for signal, binding in system.signals.values() if not signal.break_times(of_rates=binding).size]
     if not signals and not system.of_time:
         return None
-    return _turning_times(signals, system.at(state) if system.of_time else None, state, t0, t1)
+    return _turning_times(of_one_kind(signals), system.at(state) if system.of_time else None, state, t0, t1)
 
 
 @eqx.filter_jit
@@ -98,14 +99,17 @@ def _turning_times(signals, system, state, t0, t1):
     signals, system, state, t0, t1 = freeze((signals, system, state, t0, t1))
     first, last, found = jnp.minimum(t0, t1), jnp.maximum(t0, t1), []
     at_once = max(_AT_ONCE // state.q.size, 1)
-    functions = [(signal.samples(t0, t1), signal) for signal in signals]
-    if system is not None:
-        functions.append((sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u)))
-    for ts, function in functions:
-        at = lambda t, function=function: jnp.ravel(function(t))
+
+    def turns(ts, function):
+        at = lambda t: jnp.ravel(function(t))
         values = lax.map(at, jnp.clip(ts, first, last), batch_size=min(at_once, ts.size))
-        turned = _has_turned(values)
-        found.append(jnp.where(turned & (ts[:-1] > first) & (ts[:-1] < last), ts[:-1], jnp.inf))
+        return jnp.where(_has_turned(values) & (ts[:-1] > first) & (ts[:-1] < last), ts[:-1], jnp.inf)
+
+    of_signal = lambda signal: turns(signal.samples(t0, t1), signal)
+    for numbers, signal in signals:
+        found.append(of_signal(signal) if len(numbers) == 1 else jax.vmap(of_signal)(signal).ravel())
+    if system is not None:
+        found.append(turns(sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u)))
     return jnp.sort(jnp.concatenate(found))
 
 
