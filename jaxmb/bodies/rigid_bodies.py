@@ -523,10 +523,9 @@ class RigidBodySystem(AbstractSystem):
         out = body_measures(self.layout, self.body_names) | state_measures(self._state_fields)
         d = self.layout.space.dimension
         for name in self.joint_names():
+            own = self._joint_places(name)
             for field, shape in (("force", (d,)), ("moment", () if d == 2 else (3,))):
-                out[f"{name}.{field}"] = Measure(
-                    shape, _of_reaction, (field, *self._joint_places(name)), of_forces=True
-                )
+                out[f"{name}.{field}"] = Measure(shape, _of_reaction, (field, own), of_forces=True)
         out |= scalar_measures(self.layout) | joint_measures(self.joint_coordinates())
         return out | frame_measures(self.frames, self.layout)
 

@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.system.inputs import turning_times
 
 G, LENGTH, MASS = 9.81, 0.7, 1.3
 INERTIA = MASS * LENGTH**2 / 3
@@ -673,3 +674,140 @@ def test_a_run_backward_starts_before_a_jump_at_its_start(pendulum, t0):
     np.testing.assert_allclose(
         forward, central_differences(lambda v: motion(v, 1e-12)["rod"].angle[-1], values), atol=1e-7
     )
+
+
+# Motors of one kind, each with a series of its own.
+
+MOTORS = 24
+SERIES = np.random.default_rng(0).normal(size=(MOTORS, len(TS)))
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Rods side by side with a motor each."""
+    bodies = [planar.Body(f"rod{k}", mass=MASS + k, inertia=INERTIA, position=(k + 0.5, 0.0)) for k in range(MOTORS)]
+    motors = [planar.Torque(f"motor{k}", body=f"rod{k}", torque=0.1 * k) for k in range(MOTORS)]
+    return mb.Scene(bodies, forces=[mb.Gravity((0.0, -G)), *motors]).compile()
+
+
+def torques(system, ts):
+    """The moments on all rods at some times, shape (times, rods)."""
+    q, u = system.guess.q, system.guess.u
+    force = jax.jit(jax.vmap(lambda system, t: system.force(t, q, u), in_axes=(None, 0)))
+    return np.asarray(force(system, ts)).reshape(len(ts), -1, 3)[:, :, 2]
+
+
+def by_motor(count, interpolation="linear"):
+    return {f"motor{k}.torque": mb.Series(TS, SERIES[k], interpolation) for k in range(count)}
+
+
+def lines(function, *arguments):
+    return jax.jit(function).lower(*arguments).as_text().count("\n")
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic", "held"])
+def test_series_of_one_kind_are_one_part_of_the_program(driven, interpolation):
+    q, u = driven.guess.q, driven.guess.u
+    of = lambda count: mb.with_inputs(driven, by_motor(count, interpolation))
+    one, all_ = (lines(lambda s, t: s.force(t, q, u), of(count), 0.3) for count in (1, MOTORS))
+    assert one < all_ <= 1.3 * one
+
+
+@pytest.mark.long
+def test_a_simulation_with_many_series_of_one_kind_is_no_longer_program(driven):
+    def size(count):
+        inputs = by_motor(count)
+        return lines(lambda y: mb.simulate(driven, y, t1=0.1, inputs=inputs).ys.q, driven.guess)
+
+    assert size(MOTORS) <= 1.3 * size(1)
+
+
+def test_inputs_of_all_kinds_side_by_side(driven):
+    """Each motor has the torque of its own input, and the others their constants."""
+    kinds = [
+        *(mb.Series(TS, SERIES[k], ("linear", "cubic", "held")[k % 3]) for k in range(9)),
+        *(mb.Series(2.0 * TS[:4], SERIES[k][:4]) for k in (9, 10)),
+        lambda t: jnp.sin(3.0 * t),
+        lambda t: jnp.asarray(7.0),
+        mb.Series([0.0, 1.0], SERIES[13][:2], "held"),
+    ]
+    # In another order than that of the motors.
+    names = np.random.default_rng(1).permutation(MOTORS)[: len(kinds)]
+    inputs = {f"motor{name}.torque": own for name, own in zip(names, kinds, strict=True)}
+    at = np.sort([*np.linspace(-0.1, 1.2, 14), *TS])
+    found = torques(mb.with_inputs(driven, inputs), at)
+    for k in range(MOTORS):
+        own = inputs.get(f"motor{k}.torque")
+        expected = np.full(at.shape, 0.1 * k) if own is None else jax.jit(jax.vmap(own))(at)
+        np.testing.assert_allclose(found[:, k], expected, rtol=2e-15)
+
+
+def test_an_input_in_place_of_one_of_several(driven):
+    first = mb.with_inputs(driven, by_motor(4))
+    again = mb.with_inputs(first, {"motor2.torque": mb.Series(TS, -SERIES[2]), "motor9.torque": mb.Series(TS, TORQUES)})
+    assert list(again.signals) == [f"motor{k}.torque" for k in (0, 1, 3, 2, 9)]
+    found = torques(again, TS)
+    for k, values in {0: SERIES[0], 1: SERIES[1], 2: -SERIES[2], 3: SERIES[3], 9: TORQUES}.items():
+        np.testing.assert_allclose(found[:, k], values, rtol=2e-15)
+        np.testing.assert_array_equal(again.signals[f"motor{k}.torque"][0].values, values)
+    with pytest.raises(ValueError, match=r"The series of 'motor0.torque' is known from 0 to 1 s"):
+        mb.simulate(again, again.guess, t1=1.5)
+    with pytest.raises(ValueError, match=r"'motor3.torque' is an input of this system"):
+        mb.with_parameters(again, {"motor3.torque": 1.0})
+
+
+def test_series_of_a_batch_and_traced_ones(driven):
+    scales = jnp.array([1.0, -2.0])
+
+    @jax.jit
+    def moments(scale):
+        inputs = {name: mb.Series(own.ts, scale * own.values) for name, own in by_motor(5).items()}
+        system = mb.with_inputs(driven, inputs)
+        return jax.vmap(lambda t: system.force(t, driven.guess.q, driven.guess.u))(TS)
+
+    found = np.asarray(jax.vmap(moments)(scales)).reshape(2, len(TS), MOTORS, 3)[..., :5, 2]
+    np.testing.assert_allclose(found, np.asarray(scales)[:, None, None] * SERIES[:5].T, rtol=2e-15)
+
+
+def test_steps_pass_no_pulse_of_one_of_several_series(driven):
+    """Steps end where each of the series turns, as with each of them alone."""
+    q, u = driven.guess.q, driven.guess.u
+    pulses = {f"motor{k}.torque": mb.Series(TS, np.eye(len(TS))[k + 1]) for k in range(3)}
+    together = turning_times(mb.with_inputs(driven, pulses), mb.State(q, u), 0.0, 1.0)
+    alone = [
+        turning_times(mb.with_inputs(driven, {name: own}), mb.State(q, u), 0.0, 1.0) for name, own in pulses.items()
+    ]
+    np.testing.assert_array_equal(together, np.sort(np.concatenate(alone)))
+    assert np.sum(np.isfinite(together)) >= 3
+
+
+@pytest.fixture(scope="module")
+def two_motors():
+    """Two rods, one on the other, each with a motor; and a pin that a series moves."""
+    bodies = [planar.Body(f"rod{k}", mass=MASS, inertia=INERTIA, position=(k + 0.5, 0.0)) for k in range(2)]
+    pins = [planar.Revolute("pin0", "ground", "rod0", point=(0.0, 0.0))]
+    pins.append(planar.Revolute("pin1", "rod0", "rod1", point=(1.0, 0.0)))
+    motors = [planar.Torque(f"motor{k}", body=f"rod{k}", torque=0.0) for k in range(2)]
+    return mb.Scene(bodies, joints=pins, forces=[mb.Gravity((0.0, -G)), *motors]).compile()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_derivatives_by_values_and_times_of_several_series(two_motors, interpolation):
+    def angle(x, rtol):
+        values, shift = x[:-1].reshape(2, -1), x[-1]
+        ts = [TS, TS * (1.0 + 0.1 * shift)] if interpolation == "cubic" else [TS, TS]
+        series = [mb.Series(t, own, interpolation) for t, own in zip(ts, values, strict=True)]
+        inputs = {f"motor{k}.torque": own for k, own in enumerate(series)}
+        return mb.simulate(two_motors, two_motors.guess, t1=0.8, rtol=rtol, inputs=inputs, max_steps=512)["rod1"].angle[
+            -1
+        ]
+
+    x = jnp.append(jnp.asarray(SERIES[:2].ravel()), 0.1)
+    forward = jax.jit(jax.jacfwd(lambda x: angle(x, 1e-9)))(x)
+    reverse = jax.jit(jax.grad(lambda x: angle(x, 1e-9)))(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-7, atol=1e-10)
+    moved = 1e-3 * np.eye(len(x))
+    both = jax.jit(jax.vmap(lambda x: angle(x, 1e-11)))(jnp.concatenate([x + moved, x - moved]))
+    differences = (both[: len(x)] - both[len(x) :]) / 2e-3
+    np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-6)
