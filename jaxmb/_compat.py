@@ -262,8 +262,9 @@ def changed(module: T, **values: Any) -> T:
 
     (Fields are among what `vars` finds, 0.13.)
     """
-    fields = type(module).__dataclass_fields__
-    return with_values(type(module), {name: x for name, x in vars(module).items() if name in fields} | values)
+    any_module: Any = module
+    own = {name: x for name, x in vars(module).items() if name in any_module.__dataclass_fields__}
+    return with_values(type(module), own | values)
 
 
 # diffrax

@@ -183,7 +183,7 @@ def _happened(system, formulation, found):
     with jax.ensure_compile_time_eval():
         for first in range(0, max(int(np.max(number, initial=0)), 1), _TOGETHER):
             own = np.minimum(np.arange(first, first + _TOGETHER), most - 1)
-            block = FoundEvents(number - first, times[..., own], states[..., own, :], found.touch)
+            block = found._replace(number=number - first, times=times[..., own], states=states[..., own, :])
             blocks.append(_evaluated(system, formulation, block))
     rows = [np.concatenate(column, axis) for column in zip(*blocks, strict=True)]
     count = int(np.sum(np.isfinite(rows[0]))) if axis == 0 else most

@@ -215,7 +215,8 @@ class Trajectory(eqx.Module):
             raise ValueError(
                 "There are no events, since the system has neither contacts such as jaxmb.Stop nor jaxmb.DryFriction."
             )
-        kept = vars(self)
+        # Not a field, so that a copy with other fields is without it.
+        kept: Any = vars(self)
         if "_events" not in kept:
             events = contact_events(self.system, self.formulation, self.found_events)
             if is_traced(events):

@@ -135,7 +135,7 @@ class Group(eqx.Module):
 
     def gather(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
         """Rows of each part's bodies, from those of all bodies and the ground."""
-        index = self.body_index if self.chosen is None else jnp.asarray(self.body_index)[self.chosen]
+        index: Any = self.body_index if self.chosen is None else jnp.asarray(self.body_index)[self.chosen]
         return unchecked_take(of_bodies, index)
 
 

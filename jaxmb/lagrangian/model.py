@@ -1,7 +1,7 @@
 """The equations of a Lagrangian system in any velocities, and the ways to write them, before its structure is known."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
-from ..parts.series import AbstractSignal
+from ..parts.series import AbstractSignal, of_each
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.catalogue import ParameterPath
 from ..system.description import Description, count_independent, count_rows, counted, remarks, shorten
@@ -37,11 +37,21 @@ class AbstractEquations(eqx.Module):
         """`F(t, q, u)`."""
 
 
-class DrivenParameter(eqx.Module):
-    """A parameter that is a function of time, and whether constraints or the meaning of velocities depend on it."""
+class DrivenParameters(eqx.Module):
+    """Parameters that are functions of time, several of one kind together, and whether constraints or the meaning of
+    velocities depend on them.
+    """
 
+    names: tuple[str, ...] = eqx.field(static=True)
     signal: AbstractSignal
     binds: bool = eqx.field(static=True)
+
+    def at(self, t: Scalar) -> Sequence[Array]:
+        """The values at a time."""
+        if len(self.names) == 1:
+            return [self.signal(t)]
+        values = jax.vmap(lambda own: own(t))(self.signal)
+        return [values[k] for k in range(len(self.names))]
 
 
 class AbstractLagrangian(AbstractSystem):
@@ -65,7 +75,7 @@ class AbstractLagrangian(AbstractSystem):
     length: Float[Array, ""]
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
-    inputs: dict[str, DrivenParameter]
+    inputs: tuple[DrivenParameters, ...]
     design: tuple[DesignVariables, ...] = eqx.field(default=(), kw_only=True)
 
     diagonal: AbstractVar[bool]
@@ -130,12 +140,13 @@ class AbstractLagrangian(AbstractSystem):
 
     def parameters_at(self, t: Scalar) -> Parameters:
         """The parameters at a time, the last argument of every function."""
-        at = lambda name: jnp.asarray(self.inputs[name].signal(t), self.parameters[name].dtype)
-        return self.parameters | {name: at(name) for name in self.inputs}
+        driven = ((name, x) for own in self.inputs for name, x in zip(own.names, own.at(t), strict=True))
+        return self.parameters | {name: jnp.asarray(x, self.parameters[name].dtype) for name, x in driven}
 
     @property
     def signals(self):
-        return {name: (own.signal, own.binds) for name, own in self.inputs.items()}
+        each = ((own, of_each(own.signal, len(own.names))) for own in self.inputs)
+        return {name: (x, own.binds) for own, alone in each for name, x in zip(own.names, alone, strict=True)}
 
     # Kinematics
 

@@ -13,12 +13,12 @@ from .._compat import with_values
 from .._types import State, VectorLike
 from ..parts.fields import as_jax
 from ..parts.module_weights import ModuleWeights, as_weights
-from ..parts.series import AbstractSignal
+from ..parts.series import AbstractSignal, of_one_kind
 from ..system.equation import Ranks
 from .constraints import check_names
 from .dataflow import depends
 from .kinematics import AbstractKinematics, Rates
-from .model import AbstractEquations, AbstractLagrangian, DrivenParameter, Projected
+from .model import AbstractEquations, AbstractLagrangian, DrivenParameters, Projected
 from .nonideal import AbstractNonIdealForce
 from .structure import Unanalysed, constraint_sizes, find_structure
 
@@ -119,7 +119,7 @@ class LagrangianSystem(AbstractLagrangian):
             length=as_jax(length),
             coordinates=names,
             sizes=constraint_sizes(energies, force, constraints, kinematics, guess, numbers),
-            inputs={},
+            inputs=(),
         )
         for field in dataclasses.fields(model):
             setattr(self, field.name, getattr(model, field.name))
@@ -128,14 +128,26 @@ class LagrangianSystem(AbstractLagrangian):
         self.equations.check(self)
 
     def with_signals(self, signals):
-        inputs = self.inputs | _inputs_of(self, signals)
-        drift_free = self.drift_free and not any(own.binds for own in inputs.values())
+        inputs = _together(self.signals | _inputs_of(self, signals))
+        drift_free = self.drift_free and not any(own.binds for own in inputs)
         same = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return with_values(type(self), same | {"inputs": inputs, "drift_free": drift_free})
 
 
-def _inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]) -> dict[str, DrivenParameter]:
-    """Signals as inputs of a system, by name.
+def _together(inputs: Mapping[str, tuple[AbstractSignal, bool]]) -> tuple[DrivenParameters, ...]:
+    """Inputs by name with those of one kind together."""
+    out = []
+    for binds in (True, False):
+        names = [name for name, own in inputs.items() if own[1] == binds]
+        kinds = of_one_kind([inputs[name][0] for name in names])
+        out += [DrivenParameters(tuple(names[k] for k in numbers), signal, binds) for numbers, signal in kinds]
+    return tuple(out)
+
+
+def _inputs_of(
+    system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]
+) -> dict[str, tuple[AbstractSignal, bool]]:
+    """Signals as inputs of a system, by name, and whether constraints depend on them.
 
     **Raises:** `ValueError` for a value that jumps and that position constraints or rates of the coordinates depend on.
     """
@@ -155,7 +167,7 @@ def _inputs_of(system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]
                 f"A position constraint or the rates of coordinates depend on {name!r}, so it must not jump: use "
                 "interpolation='linear' or 'cubic' instead of 'held'."
             )
-        out[name] = DrivenParameter(signal, of_rates or reaches(lambda s: s.acceleration_residual(t, q, u, u)))
+        out[name] = signal, of_rates or reaches(lambda s: s.acceleration_residual(t, q, u, u))
     return out
 
 

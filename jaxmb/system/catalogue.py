@@ -141,6 +141,11 @@ class AbstractSystem(AbstractEquation):
         """The parameters that are functions of time, by name; and whether constraints depend on them."""
         return {}
 
+    @of_structure
+    def input_names(self) -> dict[str, None]:
+        """The names of these parameters."""
+        return dict.fromkeys(self.signals)
+
     def with_signals(self, signals: Mapping[str, AbstractSignal]) -> Self:
         """A copy with some parameters as functions of time; shapes have been checked.
 

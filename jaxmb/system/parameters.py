@@ -87,7 +87,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
                     f"{'those' if several else 'that'} instead."
                 )
     given: dict[str, Any] = dict(values)
-    design, before = [], system
+    design, before, inputs = [], system, system.input_names()
     # Variables of a design may follow from those of a later one.
     for own in reversed(system.design):
         mine = {name: given.pop(name) for name in own.values if name in given}
@@ -96,7 +96,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
             given |= own.parameters()
         design.insert(0, own)
     for name, value in given.items():
-        if name in system.signals:
+        if name in inputs:
             raise ValueError(
                 f"{name!r} is an input of this system, a function of time, which its value would not change; give "
                 "another input instead."

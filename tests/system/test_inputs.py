@@ -807,7 +807,8 @@ def test_derivatives_by_values_and_times_of_several_series(two_motors, interpola
     forward = jax.jit(jax.jacfwd(lambda x: angle(x, 1e-9)))(x)
     reverse = jax.jit(jax.grad(lambda x: angle(x, 1e-9)))(x)
     np.testing.assert_allclose(forward, reverse, rtol=1e-7, atol=1e-10)
-    moved = 1e-3 * np.eye(len(x))
-    both = jax.jit(jax.vmap(lambda x: angle(x, 1e-11)))(jnp.concatenate([x + moved, x - moved]))
+    changes = 1e-3 * np.eye(len(x))
+    moved = np.asarray(x)[None] + np.concatenate([changes, -changes])
+    both = jax.jit(jax.vmap(lambda x: angle(x, 1e-11)))(moved)
     differences = (both[: len(x)] - both[len(x) :]) / 2e-3
     np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-6)
