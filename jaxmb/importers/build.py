@@ -19,7 +19,7 @@ from ..parts.spatial.forces import RotationalDamper
 from ..parts.spatial.frames import Frame
 from ..parts.spatial.joints import Fixed, Spherical
 from . import chains
-from .description import Joint, Machine
+from .description import WORLD, Joint, Machine
 from .fuse import Fused, fuse
 from .light import rigid, with_rotors, without_ends
 from .notes import Notes
@@ -68,7 +68,7 @@ def build_scene(machine: Machine, notes: Notes) -> Built:
 class _Builder:
     def __init__(self, machine: Machine, notes: Notes, left_out: list[str]):
         self.machine, self.notes, self.left_out = machine, notes, left_out
-        self.of_name = {joint.name: joint for joint in machine.joints}
+        self.of_name = {joint.name: joint for joint in machine.joints if joint.kind != "fixed"}
         before = len(notes.refused)
         self.fused = fuse(machine, notes)
         self.unplaced = len(notes.refused) > before
@@ -81,6 +81,7 @@ class _Builder:
         self.scalars: list[Scalar] = []
         self.counted: dict[str, str] = {}
         self.names: set[str] = {GROUND}
+        self.given = _names(machine)
         self.tendons: dict[str, str | None] = {}
 
     def build(self) -> Built:
@@ -116,10 +117,11 @@ class _Builder:
         return Built(scene, self.coordinates, self.controls, self.fused, self.scalars, shapes, collisions)
 
     def _named(self, name, kind=""):
-        """A name that nothing in the scene has yet."""
+        """A name that nothing in the scene has yet: the one of the file, or one that no other of its kind has there."""
         own = name.replace(".", "_") or kind
         tries = itertools.chain([own, f"{own} {kind}".strip()], (f"{own} {k}" for k in itertools.count(2)))
-        out = next(each for each in tries if each not in self.names)
+        is_free = lambda each: each not in self.names and (each == name or each not in self.given.get(kind, ()))
+        out = next(each for each in tries if is_free(each))
         self.names.add(out)
         if name and out != name:
             self.notes.say("Elements have other names, since names are unique in a scene: {}.", f"{name} → {out}")
@@ -400,7 +402,7 @@ class _Builder:
     # Frames, weights and pictures
 
     def _marks(self):
-        for name, (carrier, position, rotation) in self.fused.frames.items():
+        for name, (carrier, position, rotation) in self.fused.frames().items():
             own = {"position": position, "orientation": from_matrix(rotation)}
             self.frames.append(Frame(self._named(name, "link"), carrier, **own))
         for mark in self.machine.marks:
@@ -412,7 +414,7 @@ class _Builder:
     def _buoyancy(self, name, share):
         link = self.machine.links[name]
         carrier, centre = self.fused.point(name, link.centre)
-        if carrier != GROUND:
+        if self.fused.of[name] is not WORLD:
             force = -share * link.mass * self.machine.gravity
             self.forces.append(PointForce(self._named(f"{name} buoyancy"), carrier, force=force, point=centre))
             self.notes.say(
@@ -427,6 +429,20 @@ class _Builder:
             placed = shape.moved(position, from_matrix(self.fused.rotation(link)))
             out[body] = (*out.get(body, ()), placed)
         return out
+
+
+def _names(machine: Machine):
+    """The names in a file, by kinds of elements."""
+    elements = {
+        "link": machine.links.values(),
+        "joint": machine.joints,
+        "loop": machine.loops,
+        "coupling": machine.couplings,
+        "tendon": machine.tendons,
+        "actuator": machine.actuators,
+        "frame": machine.marks,
+    }
+    return {kind: {own.name for own in of_kind} for kind, of_kind in elements.items()}
 
 
 def _range(joint: Joint):

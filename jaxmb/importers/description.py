@@ -5,14 +5,23 @@ matrices from the link to the world.
 """
 
 import dataclasses
+import enum
+import itertools
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
 
 from ..parts.shapes import AbstractShape
 
-GROUND = "ground"
 
+class _Fixed(enum.Enum):
+    WORLD = enum.auto()
+
+
+# The key of the fixed world among the links, which are known by their names in the file: no name is equal to it.
+WORLD = _Fixed.WORLD
+LinkKey = str | Literal[_Fixed.WORLD]
 Kind = Literal["hinge", "slide", "ball", "free", "fixed"]
 
 
@@ -40,7 +49,8 @@ class Link:
 
 @dataclasses.dataclass
 class Joint:
-    """A joint of one of the elementary kinds, of `child` on `parent`, with what acts on its coordinate.
+    """A joint of one of the elementary kinds, of `child` on `parent`, with what acts on its coordinate. A weld that the
+    file does not call a joint has an empty name.
 
     `point` [m] and `axis`, unit; `reference` [rad, m]: the coordinate at the reference pose; `stiffness` and `free`,
     `damping`, `armature`, `friction`, and `limits`, a pair or None. `stop`: the inertia [kg m², kg] and the time [s]
@@ -49,8 +59,8 @@ class Joint:
 
     name: str
     kind: Kind
-    parent: str
-    child: str
+    parent: LinkKey
+    child: LinkKey
     point: np.ndarray = dataclasses.field(default_factory=_zeros)
     axis: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     reference: float = 0.0
@@ -81,8 +91,8 @@ class Loop:
     """Two links whose points [m], in the links' axes, coincide; with `rotation`, that of B in A, they are welded."""
 
     name: str
-    link_a: str
-    link_b: str
+    link_a: LinkKey
+    link_b: LinkKey
     point_a: np.ndarray
     point_b: np.ndarray
     rotation: np.ndarray | None = None
@@ -112,7 +122,7 @@ class TendonPath:
 
     name: str
     joints: list[tuple[str, float]] = dataclasses.field(default_factory=list)
-    points: list[tuple[str, np.ndarray]] = dataclasses.field(default_factory=list)
+    points: list[tuple[LinkKey, np.ndarray]] = dataclasses.field(default_factory=list)
     stiffness: float = 0.0
     free: float = 0.0
     damping: float = 0.0
@@ -143,7 +153,7 @@ class Mark:
     """A named frame on a link; `position` [m] and `rotation` in the link's axes."""
 
     name: str
-    link: str
+    link: LinkKey
     position: np.ndarray
     rotation: np.ndarray
 
@@ -164,9 +174,23 @@ class Machine:
     tendons: list[TendonPath] = dataclasses.field(default_factory=list)
     actuators: list[ActuatorElement] = dataclasses.field(default_factory=list)
     marks: list[Mark] = dataclasses.field(default_factory=list)
-    shapes: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)
-    collisions: list[tuple[str, AbstractShape]] = dataclasses.field(default_factory=list)
+    shapes: list[tuple[LinkKey, AbstractShape]] = dataclasses.field(default_factory=list)
+    collisions: list[tuple[LinkKey, AbstractShape]] = dataclasses.field(default_factory=list)
     buoyancy: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def add(self, link: Link) -> str:
+        """Add a link that the file does not have.
+
+        **Returns:** its name, that of `link` or a similar one that no other link has.
+        """
+        link.name = unused(link.name, self.links.__contains__)
+        self.links[link.name] = link
+        return link.name
+
+
+def unused(name: str, is_used: Callable[[str], bool]) -> str:
+    """A name, with a number behind it if it is used already."""
+    return next(own for own in itertools.chain([name], (f"{name} {k}" for k in itertools.count(2))) if not is_used(own))
 
 
 # Rotations

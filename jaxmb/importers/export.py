@@ -77,7 +77,9 @@ def _body(parent, node: TreeBody, tree: Tree, mass, inertia):
     above: Any = tree.place(node.parent)
     own: Any = tree.place(node.body)
     back = rotation_of(above[3:]).T
-    element = ElementTree.SubElement(parent, "body", name=node.body, pos=numbers(back @ (own[:3] - above[:3])))
+    element = ElementTree.SubElement(
+        parent, "body", name=tree.bodies[node.body], pos=numbers(back @ (own[:3] - above[:3]))
+    )
     element.set("quat", numbers(multiply(conjugate(above[3:]), own[3:])))
     full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] if np.any(inertia) else np.array([mass] * 3 + [0.0] * 3)
     ElementTree.SubElement(element, "inertial", pos="0 0 0", mass=numbers(mass), fullinertia=numbers(full))

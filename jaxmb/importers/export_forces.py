@@ -24,15 +24,15 @@ def write_forces(
 ) -> None:
     """Write the forces, inertias of joints, tendons and frames of a system."""
     writer = _Writer(tree, elements, sections, notes)
-    for part in parts_of(system, system.tendons, tree.poses, tree.scalars):
+    for part in parts_of(system, system.tendons, tree):
         writer.tendon(part)
-    for part in parts_of(system, system.forces, tree.poses, tree.scalars):
+    for part in parts_of(system, system.forces, tree):
         if notes.leaves_out("forces", part.name):
             continue
         write = getattr(writer, f"write_{part.kind}", None)
         if write is None or write(part) is False:
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
-    for part in parts_of(system, system.constraints, tree.poses, tree.scalars):
+    for part in parts_of(system, system.constraints, tree):
         if not isinstance(part.part, AbstractInertialConstraint) or notes.leaves_out("joints", part.name):
             continue
         if isinstance(part.part, AbstractUnilateralConstraint):
@@ -89,8 +89,9 @@ class _Writer:
         if part.kind == "Tendon":
             element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
             for k, (owner, point) in enumerate(zip(own.owners, np.asarray(own.points), strict=True)):
-                self.site(f"{part.name} {k}", part.bodies[owner], np.asarray(SPACE.point(part.poses[owner], point)))
-                ElementTree.SubElement(element, "site", site=f"{part.name} {k}")
+                site = part.named(str(k))
+                self.site(site, part.bodies[owner], np.asarray(SPACE.point(part.poses[owner], point)))
+                ElementTree.SubElement(element, "site", site=site)
         else:
             element = ElementTree.SubElement(self.sections["tendon"], "fixed", name=part.name)
             counts, ahead = iter(part.scalars), 0.0
@@ -142,8 +143,9 @@ class _Writer:
         own = part.part
         element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
         for k, body in enumerate(part.bodies):
-            self.site(f"{part.name} {'ab'[k]}", body, part.point(k))
-            ElementTree.SubElement(element, "site", site=f"{part.name} {'ab'[k]}")
+            site = part.named("ab"[k])
+            self.site(site, body, part.point(k))
+            ElementTree.SubElement(element, "site", site=site)
         element.set("stiffness", numbers(own.stiffness))
         element.set("damping", numbers(own.damping))
         element.set("springlength", numbers(own.free_length))

@@ -14,8 +14,11 @@ from ..parts.base import GROUND, AbstractInertialConstraint
 from ..parts.coordinate_parts import turns
 from ..parts.spatial.composite import coordinate_names
 from ..parts.spatial.kinematics import SPACE
-from .description import rotation_of, turn_about
+from .description import rotation_of, turn_about, unused
 from .notes import Notes
+
+# What MuJoCo calls the fixed world.
+_WORLD = "world"
 
 
 def numbers(values: Any) -> str:
@@ -26,7 +29,7 @@ def numbers(values: Any) -> str:
 @dataclasses.dataclass
 class PlacedPart:
     """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, the coordinates of
-    joints that it acts on, and the values of its scalar coordinates.
+    joints that it acts on, the values of its scalar coordinates, and the names in the scene and the file.
     """
 
     name: str
@@ -36,6 +39,11 @@ class PlacedPart:
     poses: np.ndarray
     acts_on: tuple[str, ...]
     scalars: tuple[float, ...]
+    names: set[str]
+
+    def named(self, word: str) -> str:
+        """A name for an element of the file that the part needs."""
+        return _new(f"{self.name} {word}", self.names)
 
     def point(self, k: int) -> np.ndarray:
         """The part's point on its k-th body, in the world [m]."""
@@ -96,11 +104,14 @@ class LoopEqualities:
 @dataclasses.dataclass
 class Tree:
     """The bodies in order, parents first; the constraints that close loops; and for each coordinate, `"hip.angle"`, the
-    name of MuJoCo's joint. `scalars`: the scalar coordinates of the scene; `elements`: the XML elements of joints.
+    name of MuJoCo's joint. `scalars`: the scalar coordinates of the scene; `names`: those of the scene and of elements
+    that have none there; `bodies`: what MuJoCo calls the bodies; `elements`: the XML elements of joints.
     """
 
     poses: dict[str, np.ndarray]
     scalars: np.ndarray
+    names: set[str]
+    bodies: dict[str, str]
     nodes: list[TreeBody] = dataclasses.field(default_factory=list)
     loops: list[LoopEqualities] = dataclasses.field(default_factory=list)
     coordinates: dict[str, TreeJoint] = dataclasses.field(default_factory=dict)
@@ -111,20 +122,22 @@ class Tree:
         return self.poses[body]
 
 
-def parts_of(
-    system: RigidBodySystem, groups: Any, poses: dict[str, np.ndarray], scalars: np.ndarray
-) -> list[PlacedPart]:
-    """The parts of some groups, at the poses of bodies by name and the values of the system's scalar coordinates."""
+def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPart]:
+    """The parts of some groups, where the tree has the bodies and the scalar coordinates."""
     # Scalar coordinates are no bodies; their numbers are those after the bodies'.
     names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
     for group in groups:
         for k, name in enumerate(group.group.names):
             own = group.group.single(k, jnp.zeros(()))
             bodies = tuple(names[body] for body in group.group.bodies[k] if body in names)
-            values = tuple(float(scalars[n - len(system.body_names)]) for n in group.group.bodies[k] if n not in names)
-            places = np.stack([poses[body] for body in bodies])
+            values = tuple(
+                float(tree.scalars[n - len(system.body_names)]) for n in group.group.bodies[k] if n not in names
+            )
+            places = np.stack([tree.poses[body] for body in bodies])
             places = np.asarray(own.seen_poses(SPACE, places))
-            out.append(PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k), values))
+            out.append(
+                PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k), values, tree.names)
+            )
     return out
 
 
@@ -141,10 +154,12 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
     poses = np.asarray(system.poses(q))
     scalars = np.asarray(system.prepared_poses(q))[len(poses) : -1, 0]
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
-    tree = Tree(places, scalars)
+    groups = (*system.constraints, *system.free_joints, *system.tendons, *system.forces, *system.frames)
+    names = {*system.body_names, *(name for group in groups for name in group.group.names)}
+    tree = Tree(places, scalars, names, _bodies(system, names, notes))
     parts = [
         p
-        for p in parts_of(system, (*system.constraints, *system.free_joints), places, scalars)
+        for p in parts_of(system, (*system.constraints, *system.free_joints), tree)
         if not isinstance(p.part, AbstractInertialConstraint) and not notes.leaves_out("joints", p.name)
     ]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
@@ -155,7 +170,7 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
     while left:
         part = next((p for p in waiting if len({*p.bodies} & reached) == 1), None)
         if part is None:
-            body, joints = left[0], _free(left[0], places[left[0]], rotates[left[0]])
+            body, joints = left[0], _free(left[0], tree, rotates[left[0]])
             tree.nodes.append(TreeBody(body, GROUND, joints))
         else:
             waiting.remove(part)
@@ -176,10 +191,27 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
     return tree
 
 
-def _free(body, place, rotates):
+def _new(name, names):
+    """A name that no element of the file has, to be one of them."""
+    out = unused(name, names.__contains__)
+    names.add(out)
+    return out
+
+
+def _bodies(system, names, notes):
+    """What MuJoCo calls the bodies: it keeps one name for the fixed world."""
+    out = {name: name for name in system.body_names}
+    if _WORLD in out:
+        out[_WORLD] = _new(f"{_WORLD} body", names)
+        notes.say("Bodies have other names, since MuJoCo has these: {}.", f"{_WORLD} → {out[_WORLD]}")
+    return out
+
+
+def _free(body, tree, rotates):
+    place, named = tree.place(body), lambda word: _new(f"{body} {word}", tree.names)
     if rotates:
-        return [TreeJoint(f"{body} free", "free", place[:3], np.zeros(3))]
-    return [TreeJoint(f"{body} {way}", "slide", place[:3], axis) for way, axis in zip("xyz", np.eye(3), strict=True)]
+        return [TreeJoint(named("free"), "free", place[:3], np.zeros(3))]
+    return [TreeJoint(named(way), "slide", place[:3], axis) for way, axis in zip("xyz", np.eye(3), strict=True)]
 
 
 def _oriented(part, tree, child):
@@ -199,7 +231,7 @@ def _hinges(part, **axes):
     """Joints by the names of their coordinates, each with its type and its axis in the world."""
     values, out = part.coordinates(), []
     for field, (kind, axis) in axes.items():
-        name = part.name if len(axes) == 1 else f"{part.name} {field}"
+        name = part.name if len(axes) == 1 else part.named(field)
         joint = TreeJoint(name, kind, part.point(1), axis, float(values[field].reshape(-1)[0]))
         out.append((f"{part.name}.{field}", joint))
     return out
@@ -242,7 +274,7 @@ def _composite(part):
     place, turn = part.poses[0][:3], rotation_of(part.poses[0][3:7])
     for word, axis, field in zip(own.sequence, np.asarray(own.axes), coordinate_names(own.sequence), strict=True):
         value, point = values[field], next(points) if word == "hinge" else start
-        joint = TreeJoint(f"{part.name} {field}", word, place + turn @ point, turn @ axis)
+        joint = TreeJoint(part.named(field), word, place + turn @ point, turn @ axis)
         if word == "ball":
             size = float(np.linalg.norm(value))
             axis, angle = (value / size, size) if size > 0 else (axis, 0.0)
@@ -265,9 +297,11 @@ def _planar(part):
     axis, x = part.direction("axis_a"), part.direction("x_a")
     values = part.coordinates()
     ways = zip("xy", (x, np.cross(axis, x)), values["displacement"], strict=True)
-    slides = [TreeJoint(f"{part.name} {w}", "slide", part.point(1), a, float(v)) for w, a, v in ways]
-    hinge = TreeJoint(f"{part.name} angle", "hinge", part.point(1), axis, float(values["angle"]))
-    return [*((f"{joint.name}.displacement", joint) for joint in slides), (f"{part.name}.angle", hinge)]
+    slides = [TreeJoint(part.named(w), "slide", part.point(1), a, float(v)) for w, a, v in ways]
+    hinge = TreeJoint(part.named("angle"), "hinge", part.point(1), axis, float(values["angle"]))
+    # Nothing acts on one of the two displacements.
+    own = {f"{part.name}.displacement {way}": slide for way, slide in zip("xy", slides, strict=True)}
+    return [*own.items(), (f"{part.name}.angle", hinge)]
 
 
 _JOINTS = {
@@ -283,15 +317,15 @@ _JOINTS = {
 # Loops
 
 
-def _ends(part):
+def _ends(part, tree):
     """Attributes that name the bodies, a moving one first, and the number of that."""
     k = 0 if part.bodies[0] != GROUND else 1
     other = part.bodies[1 - k]
-    return {"body1": part.bodies[k]} | ({} if other == GROUND else {"body2": other}), k
+    return {"body1": tree.bodies[part.bodies[k]]} | ({} if other == GROUND else {"body2": tree.bodies[other]}), k
 
 
 def _connect(part, tree, name, point):
-    bodies, k = _ends(part)
+    bodies, k = _ends(part, tree)
     place = tree.place(part.bodies[k])
     anchor = rotation_of(place[3:]).T @ (point - place[:3])
     return "connect", {"name": name, **bodies, "anchor": numbers(anchor)}
@@ -305,12 +339,11 @@ def _close_revolute(part, tree):
     """Two points of the axis coincide."""
     point = part.point(1)
     second = point + part.direction("axis_a")
-    return [_connect(part, tree, part.name, point), _connect(part, tree, f"{part.name} axis", second)]
+    return [_connect(part, tree, part.name, point), _connect(part, tree, part.named("axis"), second)]
 
 
 def _close_fixed(part, tree):
-    bodies, _ = _ends(part)
-    del tree
+    bodies, _ = _ends(part, tree)
     return [("weld", {"name": part.name, **bodies})]
 
 

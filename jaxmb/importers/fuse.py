@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 
+from ..parts.base import GROUND
 from .chains import PlacedLink
-from .description import GROUND, Joint, Link, Machine
+from .description import WORLD, Joint, Link, LinkKey, Machine
 from .light import bodies_of
 from .notes import Notes
 
@@ -15,34 +16,32 @@ class Chain:
     """Joints in succession from one body to the next."""
 
     joints: list[Joint]
-    parent: str
-    child: str
+    parent: LinkKey
+    child: LinkKey
 
 
 @dataclasses.dataclass
 class Fused:
     """What links became.
 
-    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with their own names; `of`:
-    for each link the name of its carrier or the ground; `frames`: for each link that is fixed to another one its body,
-    and position and rotation in it; `chains`.
+    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with the names that they
+    have in the scene; `of`: for each link the name of its carrier, or the world; `links` by their names; `chains`.
     """
 
-    carriers: dict[str, Link]
-    of: dict[str, str]
-    links: dict[str, Link]
-    frames: dict[str, tuple[str, np.ndarray, np.ndarray]]
+    carriers: dict[LinkKey, Link]
+    of: dict[LinkKey, LinkKey]
+    links: dict[LinkKey, Link]
     chains: list[Chain]
 
-    def placed(self, link: str) -> PlacedLink:
+    def placed(self, link: LinkKey) -> PlacedLink:
         """The body of a link, at the reference pose."""
         carrier = self.of[link]
-        if carrier == GROUND:
+        if carrier is WORLD:
             return PlacedLink(GROUND, np.zeros(3), np.eye(3))
         own = self.carriers[carrier]
         return PlacedLink(own.name, own.position, own.rotation)
 
-    def point(self, link: str, at: np.ndarray) -> tuple[str, np.ndarray]:
+    def point(self, link: LinkKey, at: np.ndarray) -> tuple[str, np.ndarray]:
         """The body of a link, and a point of the link in that body's frame."""
         body = self.placed(link)
         if self.of[link] == link:
@@ -50,12 +49,20 @@ class Fused:
         own = self.links[link]
         return body.name, body.point(own.position + own.rotation @ at)
 
-    def rotation(self, link: str) -> np.ndarray:
+    def rotation(self, link: LinkKey) -> np.ndarray:
         """The rotation matrix from a link's axes to those of its body."""
         body = self.placed(link)
         if self.of[link] == link:
             return np.eye(3)
         return body.rotation.T @ self.links[link].rotation
+
+    def frames(self) -> dict[str, tuple[str, np.ndarray, np.ndarray]]:
+        """For each link that is fixed to another one its body, and position and rotation in it."""
+        out = {}
+        for name, carrier in self.of.items():
+            if name is not WORLD and carrier != name and (carrier is WORLD or carrier in self.carriers):
+                out[name] = *self.point(name, np.zeros(3)), self.rotation(name)
+        return out
 
     def moved_inertia(self, joint: Joint) -> float:
         """The inertia [kg m²] or mass [kg] that moves with a joint, all other joints held; in a closed loop only that
@@ -70,7 +77,7 @@ class Fused:
                 if joint in chain.joints or body not in ends:
                     continue
                 other = ends[1] if ends[0] == body else ends[0]
-                if other in (GROUND, blocked):
+                if other in (WORLD, blocked):
                     seen, queue = {start}, []
                     break
                 if other not in seen:
@@ -90,26 +97,21 @@ def _about(link, joint):
 
 def fuse(machine: Machine, notes: Notes) -> Fused:
     """Fuse links that are fixed to each other, the later ones of the file to the earlier ones."""
-    links = {GROUND: Link(GROUND), **machine.links}
+    links: dict[LinkKey, Link] = {WORLD: Link(GROUND), **machine.links}
     of = bodies_of(machine)
     groups = {name: [links[own] for own in links if of[own] == name] for name in dict.fromkeys(of.values())}
     moving = [joint for joint in machine.joints if joint.kind != "fixed"]
     weighs = lambda link: link.mass or np.any(link.inertia)
-    light = {name for name, own in groups.items() if name != GROUND and not any(weighs(link) for link in own)}
+    light = {name for name, own in groups.items() if name is not WORLD and not any(weighs(link) for link in own)}
     chains = _chains(moving, of, light, links, notes)
-    carriers = {name: _summed(links[name], own) for name, own in groups.items() if name != GROUND and name not in light}
-    fused = Fused(carriers, of, links, {}, chains)
-    for name, carrier in of.items():
-        if carrier != name and carrier not in light:
-            body = fused.placed(name)
-            own = links[name]
-            fused.frames[name] = (body.name, body.point(own.position), body.rotation.T @ own.rotation)
-    return fused
+    heavy = [name for name in groups if name is not WORLD and name not in light]
+    carriers: dict[LinkKey, Link] = {name: _summed(links[name], groups[name]) for name in heavy}
+    return Fused(carriers, of, links, chains)
 
 
 def _chains(joints, of, light, links, notes):
     """Joints in succession between bodies with mass."""
-    at: dict[str, list[Joint]] = {}
+    at: dict[LinkKey, list[Joint]] = {}
     for joint in joints:
         for link in (joint.parent, joint.child):
             at.setdefault(of[link], []).append(joint)

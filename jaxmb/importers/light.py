@@ -5,16 +5,16 @@ from collections import Counter
 import numpy as np
 
 from ..linalg.graphs import connected
-from .description import GROUND, Joint, Link, Machine
+from .description import WORLD, Joint, Link, LinkKey, Machine
 from .notes import Notes
 
 # The share of the largest moment of inertia that is taken for rounding.
 _ROUNDED = 0.05
 
 
-def bodies_of(machine: Machine) -> dict[str, str]:
-    """For each link and the ground the first one of the file that it is fixed to."""
-    names = (GROUND, *machine.links)
+def bodies_of(machine: Machine) -> dict[LinkKey, LinkKey]:
+    """For each link and the world the first one of the file that it is fixed to."""
+    names: tuple[LinkKey, ...] = (WORLD, *machine.links)
     number = {name: k for k, name in enumerate(names)}
     welds = [(number[own.parent], number[own.child]) for own in machine.joints if own.kind == "fixed"]
     return {name: names[k] for name, k in zip(names, connected(len(names), welds), strict=True)}
@@ -31,14 +31,14 @@ def without_ends(machine: Machine, notes: Notes) -> list[str]:
     before = list(machine.links)
     while True:
         of = bodies_of(machine)
-        heavy = {GROUND, *(of[name] for name, link in machine.links.items() if link.mass or np.any(link.inertia))}
+        heavy = {WORLD, *(of[name] for name, link in machine.links.items() if link.mass or np.any(link.inertia))}
         # A free joint holds nothing.
         moving = [joint for joint in machine.joints if joint.kind not in ("fixed", "free")]
         held = Counter(of[link] for joint in moving for link in (joint.parent, joint.child))
         held.update(of[link] for loop in machine.loops for link in (loop.link_a, loop.link_b))
         held.update(of[link] for tendon in machine.tendons for link, _ in tendon.points)
         # Bodies to leave out, and the joints that they hang at.
-        ends: dict[str, str | None] = {body: None for body in of.values() if body not in heavy and held[body] == 0}
+        ends: dict[LinkKey, str | None] = {body: None for body in of.values() if body not in heavy and held[body] == 0}
         for joint in moving:
             for link in (joint.parent, joint.child):
                 if of[link] not in heavy and held[of[link]] == 1 and _alone(machine, notes, joint):
@@ -66,7 +66,8 @@ def _coupled(coupling):
 def _take_out(machine, links, joints, notes):
     notes.say("Links without mass at the ends of the machine take no force and are left out: {}.", *links)
     machine.links = {name: link for name, link in machine.links.items() if name not in links}
-    machine.joints = [own for own in machine.joints if own.name not in joints and own.child not in links]
+    hangs = lambda joint: joint.child in links or (joint.kind != "fixed" and joint.name in joints)
+    machine.joints = [own for own in machine.joints if not hangs(own)]
     machine.buoyancy = {name: share for name, share in machine.buoyancy.items() if name not in links}
     machine.couplings = [own for own in machine.couplings if not _coupled(own) & joints]
     machine.marks = [own for own in machine.marks if own.link not in links]
@@ -83,18 +84,17 @@ def with_rotors(machine: Machine, notes: Notes) -> None:
     of = bodies_of(machine)
     heavy = {of[name] for name, link in machine.links.items() if link.mass}
     for joint in list(machine.joints):
-        alone = of[joint.parent] == GROUND and of[joint.child] in heavy
-        if joint.kind not in ("free", "ball") or not joint.armature or not alone:
+        child = joint.child
+        alone = of[joint.parent] is WORLD and of[child] in heavy
+        if joint.kind not in ("free", "ball") or not joint.armature or child is WORLD or not alone:
             continue
         armature, joint.armature = joint.armature, 0.0
         if notes.leaves_out("armature", joint.name):
             continue
-        beside, name = machine.links[joint.child], f"{joint.name} armature"
-        mass = armature if joint.kind == "free" else 0.0
-        machine.links[name] = Link(
-            name, mass, np.zeros(3), armature * np.eye(3), beside.position, beside.rotation, joint.where
-        )
-        machine.joints.append(Joint(f"{name} weld", "fixed", joint.child, name))
+        beside, mass = machine.links[child], armature if joint.kind == "free" else 0.0
+        rotor = f"{joint.name} armature", mass, np.zeros(3), armature * np.eye(3)
+        name = machine.add(Link(*rotor, beside.position, beside.rotation, joint.where))
+        machine.joints.append(Joint("", "fixed", child, name))
         if mass:
             machine.buoyancy[name] = 1.0
         notes.say("Armature of free joints, and of ball joints on the ground, is part of their bodies: {}.", joint.name)

@@ -9,7 +9,7 @@ import numpy as np
 from .._types import State
 from ..parts.shapes import Box, Cylinder, Ellipsoid, Ground, Mesh, Sphere, capsule
 from .build import build_scene
-from .description import GROUND, Coupling, Joint, Link, Loop, Machine, Mark, TendonPath, rotation_of
+from .description import WORLD, Coupling, Joint, Link, LinkKey, Loop, Machine, Mark, TendonPath, rotation_of, unused
 from .geometry import color_of
 from .mjcf_actuators import read_actuators
 from .mjcf_file import compiled, load_mujoco
@@ -84,19 +84,26 @@ class _Names:
     """Names of elements by kind and number; elements without a name are numbered."""
 
     def __init__(self, mujoco: Any, model: Any):
-        self._find = lambda kind, k: mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k)
+        of_kind = lambda kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+        self._find = lambda kind, k: mujoco.mj_id2name(model, of_kind(kind), k)
+        self._is_there = lambda kind, name: mujoco.mj_name2id(model, of_kind(kind), name) >= 0
         text = model.names[: model.names.find(b"\0")].decode()
         self.model = text or "model"
         self._model = model
 
     def __call__(self, kind: str, k: int) -> str:
-        if kind == "body" and k == 0:
-            return GROUND
-        return self._find(kind, k) or f"{kind} {k}"
+        return self._find(kind, k) or self._unused(kind, f"{kind} {k}")
+
+    def _unused(self, kind, name):
+        return unused(name, lambda own: self._is_there(kind, own))
+
+    def link(self, k: int) -> LinkKey:
+        """A body, or the world."""
+        return self("body", k) if k else WORLD
 
     def joint(self, k: int) -> str:
         """A joint; one without a name is called after its body."""
-        return self._find("joint", k) or f"{self('body', self._model.jnt_bodyid[k])} joint {k}"
+        return self._find("joint", k) or self._unused("joint", f"{self('body', self._model.jnt_bodyid[k])} joint {k}")
 
 
 def _read_links(model, data, names, machine):
@@ -118,23 +125,23 @@ def _read_links(model, data, names, machine):
         if model.body_gravcomp[k]:
             machine.buoyancy[name] = float(model.body_gravcomp[k])
         if not model.body_jntnum[k] and not machine.links[name].moved:
-            parent = names("body", model.body_parentid[k])
-            machine.joints.append(Joint(f"{name} weld", "fixed", parent, name))
+            parent = names.link(model.body_parentid[k])
+            machine.joints.append(Joint("", "fixed", parent, name))
 
 
 def _read_joints(model, data, names, machine, off):
     fixed, machine.joints = machine.joints, []
+    child: LinkKey = WORLD
     for k in range(model.njnt):
         body, dof, q = model.jnt_bodyid[k], model.jnt_dofadr[k], model.jnt_qposadr[k]
         first, last = model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body] - 1
         kind = _KINDS[model.jnt_type[k]]
+        parent = names.link(model.body_parentid[body]) if k == first else child
         child = names("body", body)
-        # Between joints in succession there are links without mass.
-        between = lambda j, child=child: f"{child} after {names.joint(j)}"
         if k < last:
-            source = machine.links[child]
-            machine.links[between(k)] = Link(between(k), position=source.position, rotation=source.rotation)
-        parent = names("body", model.body_parentid[body]) if k == first else between(k - 1)
+            # Between joints in succession there are links without mass.
+            place = {"position": machine.links[child].position, "rotation": machine.links[child].rotation}
+            child = machine.add(Link(f"{child} after {names.joint(k)}", **place))
         scalar = kind in ("hinge", "slide")
         stop = None
         if model.jnt_solref[k][0] > 0 and model.dof_invweight0[dof] > 0:
@@ -145,7 +152,7 @@ def _read_joints(model, data, names, machine, off):
                 names.joint(k),
                 kind,
                 parent,
-                child if k == last else between(k),
+                child,
                 point=np.array(data.xanchor[k]),
                 axis=np.array(data.xaxis[k]),
                 reference=float(model.qpos0[q]) if scalar else 0.0,
@@ -212,11 +219,11 @@ def _loop(mujoco, model, names, name, k, data):
     # MuJoCo multiplies the residuals of a weld's rotation by this number: with zero it holds the point only.
     holds_rotation = weld and data[10] != 0
     if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
-        a, b = (names("body", model.site_bodyid[site]) for site in (one, two))
+        a, b = (names.link(model.site_bodyid[site]) for site in (one, two))
         turns = [rotation_of(model.site_quat[site]) for site in (one, two)]
         points = [np.array(model.site_pos[site]) for site in (one, two)]
         return Loop(name, a, b, points[0], points[1], turns[0] @ turns[1].T if holds_rotation else None)
-    a, b = names("body", one), names("body", two)
+    a, b = names.link(one), names.link(two)
     if weld:
         return Loop(name, a, b, data[3:6], data[0:3], rotation_of(data[6:10]) if holds_rotation else None)
     return Loop(name, a, b, data[0:3], data[3:6])
@@ -243,24 +250,24 @@ def _read_tendons(mujoco, model, names, machine, off):
             if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT:
                 own.joints.append((names.joint(item), float(model.wrap_prm[w])))
             elif model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_SITE:
-                own.points.append((names("body", model.site_bodyid[item]), np.array(model.site_pos[item])))
+                own.points.append((names.link(model.site_bodyid[item]), np.array(model.site_pos[item])))
         machine.tendons.append(own)
 
 
 def _read_marks(model, names, machine):
     for k in range(model.nsite):
-        link = names("body", model.site_bodyid[k])
+        link = names.link(model.site_bodyid[k])
         machine.marks.append(Mark(names("site", k), link, np.array(model.site_pos[k]), rotation_of(model.site_quat[k])))
 
 
 def _read_shapes(mujoco, model, names, machine, notes):
     for k in range(model.ngeom):
-        color, body = color_of(model.geom_rgba[k]), names("body", model.geom_bodyid[k])
+        color, number = color_of(model.geom_rgba[k]), model.geom_bodyid[k]
         place = {"position": np.array(model.geom_pos[k]), "orientation": np.array(model.geom_quat[k]), "color": color}
-        own = [(body, shape) for shape in _shape(mujoco.mjtGeom, model, k, place)]
+        own = [(names.link(number), shape) for shape in _shape(mujoco.mjtGeom, model, k, place)]
         if model.geom_contype[k] or model.geom_conaffinity[k]:
             machine.collisions += own
-        elif color is not None and not notes.leaves_out("pictures", body):
+        elif color is not None and not notes.leaves_out("pictures", names("body", number)):
             machine.shapes += own
 
 
@@ -294,7 +301,7 @@ class _Locate:
 
     def __init__(self, mujoco: Any, model: Any, names: _Names, built: Any):
         self._mujoco, self.model = mujoco, model
-        links = {names("body", k): k for k in range(model.nbody)}
+        links = {names.link(k): k for k in range(model.nbody)}
         numbers = {own.name: links[link] for link, own in built.fused.carriers.items()}
         bodies = () if built.scene is None else built.scene.bodies
         self._bodies = [(numbers[body.name], np.asarray(body.centre)) for body in bodies]

@@ -3,13 +3,14 @@
 import itertools
 import os
 import re
+from collections import Counter
 from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 
 from ..linalg.rotations import from_matrix
-from .description import GROUND, Joint, Kind, Link, Machine, roll_pitch_yaw
+from .description import WORLD, Joint, Kind, Link, Machine, roll_pitch_yaw, unused
 from .geometry import read_shapes
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
@@ -111,9 +112,10 @@ def _read_model(model, scope, machine, version, notes, files):
         _read_link(element, scope, machine, place, notes, files)
         if static:
             name = f"{scope}{element.need('name')}"
-            machine.joints.append(Joint(f"{name} weld", "fixed", GROUND, name))
+            machine.joints.append(Joint("", "fixed", WORLD, name))
+    names = Counter(f"{scope}{element.need('name')}" for element in model.all("joint"))
     for element in model.all("joint"):
-        _read_joint(element, scope, machine, place[1], version, notes)
+        _read_joint(element, scope, machine, place[1], version, notes, names)
 
 
 def _version(root: Element) -> tuple[int, ...]:
@@ -176,13 +178,15 @@ def _read_link(element, scope, machine, place, notes, files):
         if _true(inertial.attributes.get("auto", "")):
             notes.refused.append(f"{inertial.where}the inertia of link {name!r} comes from its shapes: write it out.")
     elif name == f"{scope}{_WORLD}":
-        machine.joints.append(Joint(f"{name} weld", "fixed", GROUND, name))
+        machine.joints.append(Joint("", "fixed", WORLD, name))
     else:
         link.mass, link.inertia = 1.0, np.eye(3)
         notes.say("Links without <inertial> have the mass 1 kg and moments of inertia of 1 kg m²: {}.", name)
     weighs = element.first("gravity")
     if weighs is not None and not _true(weighs.text):
         machine.buoyancy[name] = 1.0
+    if inertial is not None and name == f"{scope}{_WORLD}":
+        notes.say("A link called world that has an <inertial> is no ground, and moves as its joints let it: {}.", name)
     machine.links[name] = link
 
     def seen(element):
@@ -192,7 +196,7 @@ def _read_link(element, scope, machine, place, notes, files):
     read_shapes(element, name, machine, notes, files, seen)
 
 
-def _read_joint(element, scope, machine, of_model, version, notes):
+def _read_joint(element, scope, machine, of_model, version, notes, names):
     name, kind = f"{scope}{element.need('name')}", element.need("type")
     if kind not in _KINDS:
         known = ", ".join(_KINDS)
@@ -201,26 +205,30 @@ def _read_joint(element, scope, machine, of_model, version, notes):
             notes.refuse("gearboxes", name, f"{element.where}joint {name!r} is of type {kind!r}")
             return
         raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
+    if names[name] > 1:
+        raise ValueError(f"{element.where}joint {name!r} is there twice.")
     ends = []
     for tag in ("parent", "child"):
         own = element.first(tag)
         given = "" if own is None else own.text.strip()
-        link = GROUND if given == _WORLD else f"{scope}{given}"
-        if link not in machine.links and link != GROUND:
-            raise ValueError(f"{element.where}joint {name!r} has the {tag} {given!r}, and there is no such link.")
+        link = f"{scope}{given}"
+        if link not in machine.links:
+            if given != _WORLD:
+                raise ValueError(f"{element.where}joint {name!r} has the {tag} {given!r}, and there is no such link.")
+            link = WORLD
         ends.append(link)
     if ends[0] == ends[1]:
-        raise ValueError(f"{element.where}parent and child of joint {name!r} are the same, {link!r}.")
-    child = machine.links.get(ends[1], Link(GROUND))
+        raise ValueError(f"{element.where}parent and child of joint {name!r} are the same, {given!r}.")
+    child = machine.links.get(ends[1], Link(_WORLD))
     position, rotation = _pose(element, notes)
     frame = child.rotation @ rotation
     point = child.position + child.rotation @ position
     axes = [own for tag in ("axis", "axis2") if (own := element.first(tag)) is not None]
     if kind == "universal" and len(axes) == 2:
-        between = f"{name} cross"
-        machine.links[between] = Link(between, position=point, rotation=frame, where=element.where)
-        first = Joint(f"{name} 1", "hinge", ends[0], between, point, where=element.where)
-        second = Joint(f"{name} 2", "hinge", between, ends[1], point, where=element.where)
+        between = machine.add(Link(f"{name} cross", position=point, rotation=frame, where=element.where))
+        one, two = (unused(f"{name} {k}", names.__contains__) for k in (1, 2))
+        first = Joint(one, "hinge", ends[0], between, point, where=element.where)
+        second = Joint(two, "hinge", between, ends[1], point, where=element.where)
         pairs = list(zip((first, second), axes, strict=True))
     else:
         joint = Joint(name, _KINDS[kind], ends[0], ends[1], point, where=element.where)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..linalg.rotations import from_matrix
 from ..parts.names import unknown
-from .description import GROUND, Coupling, Joint, Kind, Link, Machine, roll_pitch_yaw
+from .description import WORLD, Coupling, Joint, Kind, Link, Machine, roll_pitch_yaw, unused
 from .geometry import color_of, read_shapes
 from .model import ImportedModel
 from .notes import Notes, checked_ignore
@@ -70,7 +70,7 @@ def urdf(
     for element in root.all("link"):
         _read_link(element, machine, notes, files)
     joints = [_read_joint(element, machine, notes) for element in root.all("joint")]
-    _place(machine, joints, base, root)
+    _place(machine, joints, base, root, notes)
     for joint, element, _ in joints:
         machine.joints.append(joint)
         _read_mimic(joint, element, machine, [own.name for own, _, _ in joints], notes)
@@ -160,8 +160,12 @@ def _limits(limit, name, notes):
     return lower, upper
 
 
-def _place(machine, joints, base, root):
+def _place(machine, joints, base, root, notes):
     """Place the links where all coordinates are zero."""
+    names = Counter(joint.name for joint, _, _ in joints)
+    for joint, _, _ in joints:
+        if names[joint.name] > 1:
+            raise ValueError(f"{joint.where}joint {joint.name!r} is there twice.")
     children = [joint.child for joint, _, _ in joints]
     twice = [name for name, number in Counter(children).items() if number > 1]
     if twice:
@@ -169,10 +173,12 @@ def _place(machine, joints, base, root):
     roots = [name for name in machine.links if name not in children]
     if len(roots) != 1:
         raise ValueError(f"{root.where}the links make no tree: roots are {', '.join(map(repr, roots)) or 'none'}.")
+    if base == "free" and roots[0] == "world" and machine.links["world"].mass:
+        notes.say("The root link 'world' is the ground, whatever its mass, though base='free': give it another name.")
     if base == "fixed" or roots[0] == "world":
-        machine.joints.append(Joint("base", "fixed", GROUND, roots[0]))
+        machine.joints.append(Joint("", "fixed", WORLD, roots[0]))
     else:
-        machine.joints.append(Joint("base", "free", GROUND, roots[0]))
+        machine.joints.append(Joint(unused("base", names.__contains__), "free", WORLD, roots[0]))
     of_parent: dict[str, list[Any]] = {}
     for own in joints:
         of_parent.setdefault(own[0].parent, []).append(own)
@@ -187,24 +193,24 @@ def _place(machine, joints, base, root):
             joint.point, joint.axis = child.position, child.rotation @ joint.axis
             queue.append(child.name)
             if element.attributes["type"] == "planar":
-                _spread(machine, joint)
+                _spread(machine, joint, names)
     if unreached:
         listed = ", ".join(map(repr, sorted(unreached)))
         raise ValueError(f"{root.where}the links make no tree: no joints lead from {roots[0]!r} to {listed}.")
 
 
-def _spread(machine, joint):
+def _spread(machine, joint, names):
     """A planar joint as two slides and a hinge, with links without mass between them."""
     child = machine.links[joint.child]
     u = child.rotation[:, int(np.argmin(np.abs(child.rotation.T @ joint.axis)))]
     u = np.cross(np.cross(joint.axis, u), joint.axis)
     u /= np.linalg.norm(u)
-    names = [f"{joint.name} {way}" for way in "xy"]
-    for name in names:
-        machine.links[name] = Link(name, position=child.position, rotation=child.rotation, where=joint.where)
-    machine.joints.append(Joint(names[0], "slide", joint.parent, names[0], joint.point, u))
-    machine.joints.append(Joint(names[1], "slide", names[0], names[1], joint.point, np.cross(joint.axis, u)))
-    joint.parent = names[1]
+    place = {"position": child.position, "rotation": child.rotation, "where": joint.where}
+    for way, axis in (("x", u), ("y", np.cross(joint.axis, u))):
+        name = unused(f"{joint.name} {way}", names.__contains__)
+        between = machine.add(Link(name, **place))
+        machine.joints.append(Joint(name, "slide", joint.parent, between, joint.point, axis))
+        joint.parent = between
 
 
 def _read_mimic(joint, element, machine, names, notes):
