@@ -47,6 +47,10 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     limit: fields.Number = fields.parameter(unit="N m or N", sign="positive", optional=True)
     force: fields.Number = fields.internal_state(shape=None, unit="N m or N")
 
+    def unit(self, field, alternatives):
+        known = super().unit(field, alternatives)
+        return known.split(", ")[("force", "speed", "position").index(self.mode)] if field == "command" else known
+
     def validate(self):
         if self.mode == "force" and (np.any(self.gain) or np.any(self.damping)):
             raise ValueError(f"{self.label}: gain and damping belong to the modes 'speed' and 'position'.")
@@ -107,7 +111,7 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     """
 
     control: fields.Number = fields.parameter(default=0.0)
-    gear: fields.Number = fields.parameter(default=1.0)
+    gear: fields.Number = fields.parameter(unit="1", default=1.0)
     gain: fields.Number = fields.parameter(shape=(3,), default=(1.0, 0.0, 0.0))
     bias: fields.Number = fields.parameter(shape=(3,), default=(0.0, 0.0, 0.0))
     middle: fields.Number = fields.parameter(unit="rad or m", default=0.0)

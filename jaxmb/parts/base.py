@@ -117,6 +117,10 @@ class AbstractPart(eqx.Module):
         """Hook: whether the numbers are as `validate` asks, which it cannot tell of those that are traced."""
         return True
 
+    def unit(self, field: str, alternatives: str) -> str | None:
+        """Hook: of the units that a number is declared with, `"N m or N"`, the one that it has; None if not known."""
+        del field, alternatives
+
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
         own = fields.values_of(self)

@@ -14,7 +14,7 @@ from .._types import VectorLike
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
-from .coordinate_parts import AbstractOfJoints, is_length, shortest, turns
+from .coordinate_parts import AbstractOfJoints, is_length, shortest, turns, unit_of
 
 # Points of a tendon coincide if they are no farther apart than this share of its length.
 _APART = 1e-9
@@ -49,6 +49,9 @@ class AbstractCombination(AbstractOfJoints):
                 raise ValueError(f"{self.label}: {name!r} must be a number, it has shape {value.shape}.")
             given.append(float(value.reshape(())))
         return self.with_given(np.array(given))
+
+    def unit(self, field, alternatives):
+        return unit_of(self.within, alternatives)
 
     def with_given(self, given: np.ndarray) -> Any:
         """Hook: a checked copy with omitted numbers filled in, from the coordinates at the given poses."""
@@ -107,6 +110,9 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
         twice = [name for name in self.combined if self.combined.count(name) > 1]
         if twice:
             raise ValueError(f"{self.label} couples {twice[0]!r} with itself.")
+
+    def unit(self, field, alternatives):
+        return unit_of(self.within[:1] if field == "zero" else self.within[1:], alternatives)
 
     def with_given(self, given):
         return self.filled(zero=given[0], other_zero=given[1] if len(given) == 2 else given[1:])

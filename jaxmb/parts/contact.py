@@ -71,7 +71,7 @@ class Hertz(AbstractNormalLaw):
     `1/E = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂`.
     """
 
-    stiffness: fields.Number = fields.parameter(unit="N/m", sign="positive", kw_only=False)
+    stiffness: fields.Number = fields.parameter(unit="N/m^1.5", sign="positive", kw_only=False)
 
     def force(self, depth):
         return self.stiffness * depth**1.5
@@ -94,7 +94,7 @@ class Bekker(AbstractNormalLaw):
 
     cohesive_modulus: fields.Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
     frictional_modulus: fields.Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
-    exponent: fields.Number = fields.parameter(sign="positive")
+    exponent: fields.Number = fields.parameter(unit="1", sign="positive")
     width: fields.Number = fields.parameter(unit="m", sign="positive")
     area: fields.Number = fields.parameter(unit="m²", sign="positive")
 
@@ -125,7 +125,7 @@ class Coulomb(AbstractFrictionLaw):
     **Arguments:** `coefficient` ≥ 0; `transition_speed` [m/s] > 0, the slip at which 76 % of the friction acts.
     """
 
-    coefficient: fields.Number = fields.parameter(sign="non-negative", kw_only=False)
+    coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", kw_only=False)
     transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive")
 
     def force(self, load, engaged, slip, travel):

@@ -110,10 +110,8 @@ class AbstractCoordinatePart(AbstractOfJoints):
     def complete(self, space, poses):
         return self.with_numbers(self.given_coordinate(0, self.coordinate, space, poses))
 
-    def unit(self, alternatives: str) -> str:
-        """Of the units of an angle and of a displacement, `"N m or N"`, that of the coordinate."""
-        of_angle, of_displacement = alternatives.split(" or ")
-        return of_displacement if is_length(self.within) else of_angle
+    def unit(self, field, alternatives):
+        return unit_of([self.within], alternatives)
 
     @abc.abstractmethod
     def with_numbers(self, given: np.ndarray) -> Any:
@@ -162,6 +160,15 @@ class AbstractCoordinatePart(AbstractOfJoints):
 def is_length(within: str) -> bool:
     """Whether the coordinate of this name within its joint is a length, otherwise an angle."""
     return within.startswith(("displacement", "length", "gap"))
+
+
+def unit_of(coordinates: Sequence[str], alternatives: str) -> str | None:
+    """Of the units for an angle and for a displacement, `"N m or N"`, the one for coordinates with these names in
+    their joints; None if some are angles and others are displacements.
+    """
+    kinds = {is_length(name) for name in coordinates}
+    of_angle, _, of_displacement = alternatives.partition(" or ")
+    return None if len(kinds) > 1 else of_displacement if kinds.pop() else of_angle
 
 
 def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:

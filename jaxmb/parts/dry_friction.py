@@ -48,8 +48,8 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     """
 
     joint: str = fields.name()
-    coefficient: fields.Number = fields.parameter(sign="non-negative", constant=True)
-    static_coefficient: fields.Number = fields.parameter(sign="non-negative", optional=True, constant=True)
+    coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", constant=True)
+    static_coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", optional=True, constant=True)
     directions: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
     linear: ClassVar[bool] = True
 

@@ -55,7 +55,8 @@ class Declaration:
         `"module"` for a module whose weights are one number, `"law"` for one with parameters of its own, `"part"` for
         another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
         `"internal"` for an internal state (`"internals"` for a dictionary of them); these are not parameters.
-    - `shape`: of a number, None for any, and None in it for any size; `sign`; `unit`, `""` for a number without one.
+    - `shape`: of a number, None for any, and None in it for any size; `sign`; `unit`, `"1"` for a number without one,
+        `""` where it is not known, and `"N m or N"` where it is the first for an angle, the second for a displacement.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters; of
         several points or unit vectors each row is one.
@@ -262,11 +263,11 @@ def parameter(
     stiffness: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N/m", sign="positive")
     ```
 
-    **Arguments:** `shape`, in which `"d"` is the dimension of the space and None any size, None for any; `unit`, for
-    information; `sign` of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a
-    matrix; `default`; `optional`: default None, which the part's `complete` replaces; `sizes`: whether the scene's size
-    is computed from this length; `converter`, applied before the checks; `constant`: whether it cannot be a function of
-    time.
+    **Arguments:** `shape`, in which `"d"` is the dimension of the space and None any size, None for any; `unit`, `"1"`
+    of a number without one, which `report.stress_test` needs to know of lengths; `sign` of every component:
+    `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`; `optional`: default
+    None, which the part's `complete` replaces; `sizes`: whether the scene's size is computed from this length;
+    `converter`, applied before the checks; `constant`: whether it cannot be a function of time.
     """
     declaration = Declaration(
         "number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes, constant=constant
@@ -349,6 +350,7 @@ def axis(
     declaration = Declaration(
         "number",
         shape=shape,
+        unit="1",
         body=body,
         is_direction=True,
         optional=optional or bool(gives),
@@ -366,7 +368,8 @@ def attitude(*, default: Any = dataclasses.MISSING, optional: bool = False, stat
     orientation: jaxmb.parts.Number = jaxmb.parts.attitude(default=(1.0, 0.0, 0.0, 0.0))
     ```
     """
-    declaration = Declaration("state" if state else "number", shape=(4,), is_attitude=True, optional=optional)
+    kind = "state" if state else "number"
+    declaration = Declaration(kind, shape=(4,), unit="1", is_attitude=True, optional=optional)
     default = None if optional else default
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
 

@@ -37,7 +37,7 @@ class Friction(AbstractNonIdeal):
 
     name: str = fields.name()
     joint: str = fields.name()
-    coefficient: fields.Number = fields.parameter(sign="non-negative")
+    coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative")
     radius: fields.Number = fields.parameter(unit="m", sign="non-negative", default=0.0)
     point: fields.Number = fields.point(body=None, optional=True)
     transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=1e-4)

@@ -44,7 +44,7 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     **Fields:** `restitution` from 0 to 1, default 0; `impact_law`: `"newton"`, the default, or `"poisson"`.
     """
 
-    restitution: fields.Number = fields.parameter(sign="non-negative", default=0.0, constant=True)
+    restitution: fields.Number = fields.parameter(unit="1", sign="non-negative", default=0.0, constant=True)
     impact_law: Literal["newton", "poisson"] = fields.choice("newton", "poisson", default="newton")
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False

@@ -1,6 +1,7 @@
 """Variants of a system whose exact motion is known, or which have more than the system needs."""
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,14 +23,14 @@ _LENGTH = {"m": 1, "N": 1, "Pa": -1, "kg": 0, "s": 0, "1": 0}
 
 
 def units(system: AbstractSystem) -> dict[str, str | None]:
-    """The units of all parameters by name; None where a user's function gives a number its meaning."""
+    """The units of all parameters by name; None where it is not declared, or a user's function gives it."""
     out: dict[str, str | None] = dict.fromkeys(parameters(system))
     for g in _groups(system):
         for _, shown, declared in paths(g.group.part):
-            known = declared.unit if declared.unit or declared.shape is not None else None
-            if known is not None and " or " in known:
-                known = g.group.part.unit(known)
-            out |= {f"{name}.{'.'.join(shown)}": known for name in g.group.names}
+            known, field = declared.unit, ".".join(shown)
+            if " or " in known:
+                known = g.group.part.unit(field, known)
+            out |= {f"{name}.{field}": known or None for name in g.group.names}
     gravity = f"{getattr(system, 'gravity_name', '')}.acceleration"
     return out | ({gravity: "m/s²"} if gravity in out else {})
 
@@ -62,19 +63,21 @@ def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State
     return scaled, State(state.q * own[0], state.u * own[1])
 
 
-def _powers(unit: str | None) -> tuple[int, ...] | None:
-    """The power of the length in a unit, or in two of them."""
+def _powers(unit: str | None) -> tuple[float, ...] | None:
+    """The power of the length in a unit, or in two of them; None where it is not known."""
     if unit is None:
         return None
     out = []
     for one in unit.replace(" (3)", "").split(", "):
-        power = 0
+        power = 0.0
         for sign, side in zip((1, -1), one.split("/"), strict=False):
             for word in side.split():
-                base = word.rstrip("²")
-                if base not in _LENGTH and not base.startswith("rad"):
+                base, _, exponent = word.replace("²", "^2").partition("^")
+                if base == "rad":
+                    continue
+                if base not in _LENGTH or re.fullmatch(r"[\d.]*", exponent) is None:
                     return None
-                power += sign * _LENGTH.get(base, 0) * (1 + word.endswith("²"))
+                power += sign * _LENGTH[base] * float(exponent or 1)
         out.append(power)
     return tuple(out)
 

@@ -228,9 +228,7 @@ def test_a_scene_with_names_that_mujoco_has():
     assert "Bodies have other names, since MuJoCo has these: 'world → world body'." in exported.notes
     back = importers.mjcf(exported.text)
     assert [own.name for own in back.scene.bodies] == ["world body"]
-    assert back.coordinates == {
-        "ball 0": "ball 0.rotation"
-    }
+    assert back.coordinates == {"ball 0": "ball 0.rotation"}
     assert part(back, "ball 1").body_a == "world body" and kinds(back)["ball 1"] == "Spherical"
     own = {"rubber a": "ground", "rubber a 2": "world body", "rubber b": "ground"}
     assert {own.name: own.body for own in back.scene.frames} == own

@@ -156,3 +156,20 @@ def test_reports_on_the_command_line(capsys, tmp_path, monkeypatch):
     for name, message in ((f"{where}s", "has no attribute"), ("no_such_module:scene", "No module named")):
         assert main(["report", "stress_test", name, "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_stress_of_a_machine_with_a_rotor_a_mimic_joint_and_a_servo():
+    """Variants whose masses alone change, while numbers of no known unit leave out those of other lengths."""
+    bodies = [planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0)) for name, x in (("rod", 0.5), ("tip", 1.5))]
+    joints = [
+        planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0)),
+        planar.Revolute("elbow", "rod", "tip", point=(1.0, 0.0)),
+        mb.JointInertia("rotor", "pin.angle", inertia=0.7),
+        mb.JointCoupling("mimic", "elbow.angle", "pin.angle", coefficients=(0.0, 0.5)),
+    ]
+    servo = mb.Actuator("servo", "pin.angle", control=0.3, gain=(50.0, 0.0, 0.0), bias=(0.0, -50.0, -5.0))
+    system = mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81)), servo]).compile()
+    report = stress_test(system, mb.assemble(system), t1=0.3, only=["mass", "lengths"])
+    assert report.remarks[0].startswith("lengths: left out, the units of mimic.coefficients, servo.control, servo.gain")
+    assert len(report.cases) == 6 and all(case.error < 1e-8 for case in report.cases)

@@ -1,13 +1,16 @@
 """Variants of a machine that reports compare: the motions that they say."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import planar
-from jaxmb.report.variants import doubled, in_time, nonholonomic, scaled_lengths, units, with_damper
+from jaxmb import parts, planar
+from jaxmb.parts.fields import declarations
+from jaxmb.report.variants import _powers, doubled, in_time, nonholonomic, scaled_lengths, units, with_damper
 
 
 @eqx.filter_jit
@@ -54,6 +57,87 @@ def test_numbers_on_a_joint_have_the_units_of_its_coordinate():
     scaled, start = scaled_lengths(system, system.guess, 1e3)
     size = jnp.array([1e3, 1e3, 1.0] * 2)
     np.testing.assert_allclose(udot(scaled, start), size * udot(system, system.guess), rtol=1e-9, atol=1e-9)
+
+
+ON_ANGLE, ON_BOTH = ("angle", "displacement"), ("angle", "angle", "displacement")
+
+
+@pytest.mark.parametrize(
+    "part, within, field, expected",
+    [
+        (mb.JointInertia("j", "a.angle", inertia=0.2), ("angle",), "inertia", "kg m²"),
+        (mb.JointInertia("j", "a.displacement", inertia=0.2), ("displacement",), "inertia", "kg"),
+        (mb.JointCoupling("j", "a.angle", "b.displacement", coefficients=(0.0, 1.0)), ON_ANGLE, "zero", "rad"),
+        (mb.JointCoupling("j", "a.angle", "b.displacement", coefficients=(0.0, 1.0)), ON_ANGLE, "other_zero", "m"),
+        (mb.JointCoupling("j", "a.angle", ("b", "c"), coefficients=[(0.0, 1.0)] * 2), ON_BOTH, "other_zero", None),
+        (mb.Motor("m", "a.angle", command=1.0, lag=0.1), "angle", "command", "N m"),
+        (mb.Motor("m", "a.angle", mode="speed", gain=1.0, command=1.0, lag=0.1), "displacement", "command", "m/s"),
+        (mb.Motor("m", "a.angle", command=1.0, lag=0.1), "displacement", "limit", "N"),
+    ],
+)
+def test_units_by_the_coordinates_that_a_part_acts_on(part, within, field, expected):
+    declared = declarations(type(part))[field].unit
+    assert part.with_fields(within=within).unit(field, declared) == expected
+
+
+def test_every_unit_of_the_library_is_known():
+    """But for those that depend on other numbers, or on whether a coordinate is an angle."""
+    classes, open_ends = [], [eqx.Module]
+    while open_ends:
+        classes += (more := open_ends.pop().__subclasses__())
+        open_ends += more
+    numbers = {
+        (cls.__name__, name): declared.unit
+        for cls in classes
+        if cls.__module__.startswith("jaxmb.") and dataclasses.is_dataclass(cls)
+        for name, declared in declarations(cls).items()
+        if declared.kind == "number"
+    }
+    unknown = {own for own, unit in numbers.items() if not unit or None in map(_powers, unit.split(" or "))}
+    of_actuator = {("Actuator", name) for name in ("control", "gain", "bias", "control_range", "force_range")}
+    of_bekker = {("Bekker", "cohesive_modulus"), ("Bekker", "frictional_modulus")}
+    assert unknown == of_actuator | of_bekker | {("JointCoupling", "coefficients"), ("Motor", "gain")}
+
+
+class Rub(parts.AbstractForce):
+    """A force of a user's own on a body, whose numbers have units that nothing chooses from, and none."""
+
+    name: str = parts.name()
+    body: str = parts.body_name()
+    force: parts.Number = parts.parameter(unit="N m or N", default=1.0)
+    share: parts.Number = parts.parameter(default=0.5)
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.zeros((1, space.velocity_size))
+
+
+def test_units_of_a_part_of_a_user():
+    system = mb.Scene([planar.Body("rod", mass=1.0, inertia=1.0)], forces=[Rub("rub", "rod")]).compile()
+    assert units(system)["rub.force"] is units(system)["rub.share"] is None
+    with pytest.raises(ValueError, match=r"units of rub\.force, rub\.share are not known"):
+        scaled_lengths(system, system.guess, 2.0)
+
+
+def test_laws_of_contact_and_rotors_are_scaled_by_dimension():
+    """A ball on elastic ground, and a rod with a rotor: the same accelerations in units of the system's size."""
+    ball = planar.Body("ball", mass=1.0, inertia=0.1, position=(0.0, 0.099))
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.6, 0.3))
+    joints = [
+        planar.Revolute("pin", "ground", "rod", point=(0.1, 0.3)),
+        mb.JointInertia("rotor", "pin.angle", inertia=0.7),
+    ]
+    forces = [
+        planar.Contact("touch", "ball", terrain=mb.terrain.Flat(), normal=mb.contact.Hertz(1e5), radius=0.1),
+        mb.JointForce("motor", "pin.angle", force=2.0),
+    ]
+    system = mb.Scene([ball, rod], joints=joints, forces=forces).compile()
+    assert units(system)["touch.normal.stiffness"] == "N/m^1.5"
+    natural = lambda s, y: np.asarray(udot(s, y) / s.velocity_scale())
+    expected = natural(system, system.guess)
+    assert abs(expected[1]) > 1.0 and abs(expected[-1]) > 0.1
+    for factor in (1e-3, 1e3):
+        found = natural(*scaled_lengths(system, system.guess, factor))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_variants_do_not_change_the_motion(pendulum):

@@ -49,7 +49,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     """
 
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
-    unloading: fields.Number = fields.parameter(sign="non-negative", default=0.4)
+    unloading: fields.Number = fields.parameter(unit="1", sign="non-negative", default=0.4)
     preload: fields.Number = fields.parameter(unit="N", sign="non-negative", default=5e4)
     slack: fields.Number = fields.parameter(unit="m", sign="non-negative", default=0.02)
     travel: fields.Number = fields.parameter(unit="m", sign="positive", default=0.11)

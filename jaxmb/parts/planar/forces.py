@@ -85,7 +85,7 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     stiffness: fields.Number = fields.parameter(unit="N m/rad^exponent", sign="non-negative")
     lower: fields.Number = fields.parameter(unit="rad")
     upper: fields.Number = fields.parameter(unit="rad")
-    exponent: fields.Number = fields.parameter(sign="positive", default=3.0)
+    exponent: fields.Number = fields.parameter(unit="1", sign="positive", default=3.0)
     smoothing: fields.Number = fields.parameter(unit="rad", sign="positive", default=1e-3)
     has_gaps: ClassVar[bool] = True
 

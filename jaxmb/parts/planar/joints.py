@@ -294,7 +294,7 @@ class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     - `offset` [rad], default that of the given poses.
     """
 
-    ratio: fields.Number = fields.parameter(sign="nonzero")
+    ratio: fields.Number = fields.parameter(unit="1", sign="nonzero")
     carrier: str = fields.body_name(default="ground")
     offset: fields.Number = fields.parameter(unit="rad", optional=True)
     rows: ClassVar[int] = 1
