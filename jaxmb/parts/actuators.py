@@ -49,7 +49,9 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
 
     def unit(self, field, alternatives):
         known = super().unit(field, alternatives)
-        return known.split(", ")[("force", "speed", "position").index(self.mode)] if field == "command" else known
+        if known is None or field != "command":
+            return known
+        return known.split(", ")[("force", "speed", "position").index(self.mode)]
 
     def validate(self):
         if self.mode == "force" and (np.any(self.gain) or np.any(self.damping)):
