@@ -17,7 +17,8 @@ import numpy as np
 from diffrax._integrate import SaveState
 from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
-from jax._src import xla_bridge
+from jax._src import compilation_cache, xla_bridge
+from jax._src.compilation_cache_interface import CacheInterface
 from jax.core import ShapedArray
 from jax.extend import core
 from jax.extend.core import Primitive
@@ -26,7 +27,8 @@ from jax.interpreters.ad import Zero
 from jaxtyping import Array
 
 # The makers of new operations of JAX. (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10.)
-__all__ = ["Primitive", "ShapedArray", "Zero", "ad", "batching", "mlir", "partial_eval"]
+# The base of what keeps compiled programs. (jax._src.compilation_cache_interface, 0.9 and 0.10.)
+__all__ = ["CacheInterface", "Primitive", "ShapedArray", "Zero", "ad", "batching", "mlir", "partial_eval"]
 
 T = TypeVar("T")
 
@@ -60,6 +62,14 @@ def has_started() -> bool:
     (jax._src.xla_bridge.backends_are_initialized, 0.9 and 0.10.)
     """
     return xla_bridge.backends_are_initialized()
+
+
+def keep_programs_as(store: type[CacheInterface]) -> None:
+    """Let JAX make such a store of the folder that it keeps compiled programs in, as `store(path, max_size=bytes)`.
+
+    (jax._src.compilation_cache.LRUCache, which JAX makes when it first compiles, 0.9 and 0.10.)
+    """
+    compilation_cache.LRUCache = store  # pyright: ignore[reportPrivateImportUsage]
 
 
 def is_weakly_typed(array: Array) -> bool:
@@ -326,11 +336,11 @@ class WrappedSolver(diffrax.AbstractWrappedSolver):
     # Of implicit solvers: where diffrax looks for their tolerances, and fills them in.
     @property
     def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+        return self.solver.root_finder  # pyright: ignore[reportPrivateImportUsage]
 
     @property
     def root_find_max_steps(self) -> int:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
+        return self.solver.root_find_max_steps  # pyright: ignore[reportPrivateImportUsage]
 
     def order(self, terms):
         return self.solver.order(terms)

@@ -1,6 +1,7 @@
 """The machine that a process runs on."""
 
 import os
+import re
 
 
 def cores() -> int:
@@ -9,5 +10,17 @@ def cores() -> int:
 
 
 def threads() -> int:
-    """The number of threads that computations may take: `NPROC` in the environment, which XLA knows, or all cores."""
-    return int(os.environ.get("NPROC") or cores())
+    """The number of threads that computations may take: by the environment, as XLA reads it, or all cores."""
+    return limit_of_threads() or cores()
+
+
+def limit_of_threads() -> int | None:
+    """The whole number in `PJRT_NPROC` or, without one there, in `NPROC`, at least one; None without a number.
+
+    XLA takes less than one for one, and passes over any other text, such as `auto`.
+    """
+    for variable in ("PJRT_NPROC", "NPROC"):
+        given = os.environ.get(variable, "").strip()
+        if re.fullmatch(r"[+-]?[0-9]+", given) and abs(int(given)) < 2**31:
+            return max(int(given), 1)
+    return None

@@ -11,7 +11,8 @@ from typing import Any
 
 import jax
 
-from ._compat import has_started
+from ._compat import has_started, keep_programs_as
+from ._kept_programs import KeptPrograms
 
 # What XLA is told by `compile_quickly`: one kernel of a simulation is a few numbers, for which its older way to emit
 # loops gives code that is as fast and compiles in half the time; the passes pay for themselves in large arrays only. A
@@ -132,9 +133,10 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None, *, max_bytes: in
     ```
 
     The name says what is kept, which "cache" alone would not. JAX's persistent compilation cache keeps it, for all of
-    JAX in this process. Importing jaxmb never switches that on; the command line does, but for reports. Call it first:
-    what was compiled before is not kept. What JAX does not recognise is compiled again: another version of it or
-    another processor, another scene or number of its bodies, another method; other numbers are the same program.
+    JAX in this process; any number of processes share the folder, and none waits for another one. Importing jaxmb never
+    switches that on; the command line does, but for reports. Call it first: what was compiled before is not kept. What
+    JAX does not recognise is compiled again: another version of it or another processor, another scene or number of its
+    bodies, another method; other numbers are the same program.
     Programs that call Python are not kept: those with `throw=True`, and those of second derivatives where there may be
     more than 2048 steps, as under `jit` with a `max_steps` above that.
 
@@ -146,6 +148,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None, *, max_bytes: in
         macOS `~/Library/Caches`, on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes its place:
         another folder, or `off` to keep nothing.
     - `max_bytes`: size of the folder beyond which programs that have not been used for longest are dropped [bytes].
+        Each process that writes may exceed it by a 32nd.
 
     **Returns:** the folder that programs are kept in; None if they are not. Where JAX has a folder already, from
     `JAX_COMPILATION_CACHE_DIR` or from `jax.config`, that one stays, with its settings.
@@ -175,6 +178,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None, *, max_bytes: in
     for name, value in (SETTINGS | {"jax_compilation_cache_max_size": max_bytes}).items():
         jax.config.update(name, value)
     jax.config.update("jax_compilation_cache_dir", str(path))
+    keep_programs_as(KeptPrograms)
     return path
 
 

@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 
 from .. import mechanisms
-from .._machine import cores
+from .._machine import cores, limit_of_threads
 from .._programs import VARIABLE, kept_in
 from .._results import RESULTS
 from .._version import __version__
@@ -134,9 +134,9 @@ def _processor() -> str:
 
 def _cores() -> str:
     """Those that this process may use."""
-    count = cores()
-    limit = os.environ.get("NPROC")
-    return f"{count} core{'s' * (count > 1)}" + (f", NPROC={limit}" if limit else "")
+    count, limit, given = cores(), limit_of_threads(), os.environ.get("NPROC", "").strip()
+    told = f", NPROC={given}, which is no number: all of them" if given else ""
+    return f"{count} core{'s' * (count > 1)}" + (told if limit is None else f", of which computations take {limit}")
 
 
 def _kept() -> str:

@@ -129,3 +129,13 @@ def test_the_readme_quotes_what_is_printed():
     names = [line.split("  ")[0] for line in block.splitlines() if re.match(r"\w.*  ", line)]
     printed = [*doctor._SHOWN, *doctor._STEPPED]
     assert names and names == [name for name in printed if name in names]
+
+
+@pytest.mark.parametrize(
+    "given, told",
+    [("3", ", of which computations take 3"), ("auto", ", NPROC=auto, which is no number: all of them"), ("", "")],
+)
+def test_threads(given, told, monkeypatch):
+    monkeypatch.delenv("PJRT_NPROC", raising=False)
+    monkeypatch.setenv("NPROC", given)
+    assert re.fullmatch(rf"\d+ cores?{told}", doctor._cores())

@@ -24,7 +24,7 @@ COMPAT = ROOT / "_compat.py"
 PRIVATE_MODULES = ("equinox.internal", "jax.extend", "jax.interpreters", "jax._src", "jax.custom_batching")
 PRIVATE_ATTRIBUTES = {
     *("custom_batching", "weak_type", "canonicalize_dtype", "unvmap_any", "scan_kind", "with_stepsize_controller_tols"),
-    *("backends_are_initialized", "_enumeration", "_name_to_item", "_index_to_message", "_processes"),
+    *("backends_are_initialized", "_enumeration", "_name_to_item", "_index_to_message", "_processes", "LRUCache"),
 }
 
 
@@ -120,6 +120,26 @@ def test_weak_types(compat):
 def test_whether_jax_has_started(compat):
     jnp.zeros(1)
     assert compat.has_started() is True, "jax._src.xla_bridge no longer tells whether there are backends"
+
+
+def test_jax_makes_the_store_of_programs_that_it_is_told(compat, monkeypatch, tmp_path):
+    of_jax = importlib.import_module("jax._src.compilation_cache")
+    monkeypatch.setattr(of_jax, "LRUCache", of_jax.LRUCache)
+
+    class Store(compat.CacheInterface):
+        def __init__(self, path, *, max_size):
+            self.made_of = path, max_size
+
+        def get(self, key):
+            return None
+
+        def put(self, key, value):
+            pass
+
+    compat.keep_programs_as(Store)
+    store, path = of_jax.get_file_cache(str(tmp_path))
+    expected = str(tmp_path), jax.config.jax_compilation_cache_max_size
+    assert isinstance(store, Store) and store.made_of == expected and path == str(tmp_path)
 
 
 def test_programs_can_be_read(compat):

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import filelock
 import jax
 import numpy as np
 import pytest
@@ -204,6 +205,15 @@ def test_the_size_is_bounded(tmp_path):
     assert sum(sizes) <= 20_000 and 0 < len(sizes) < counts["kept"]
     with pytest.raises(ValueError, match="max_bytes must be positive, got 0"):
         mb.keep_compiled(max_bytes=0)
+
+
+def test_no_process_waits_for_another_one(tmp_path):
+    """While another process of JAX holds its lock of the folder: nothing is said, and all is kept."""
+    code = "mb.keep_compiled()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
+    with filelock.FileLock(tmp_path / ".lockfile"):
+        first, second = (process(code, JAXMB_CACHE=str(tmp_path)) for _ in range(2))
+    assert not any("compilation cache" in said for _, said in (first, second))
+    assert second[0] == {"asked": first[0]["asked"], "found": first[0]["kept"], "kept": 0}
 
 
 def test_a_folder_that_cannot_be_written_to(new_user, tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from ..._compat import processes_of
-from ..._machine import cores
+from ..._machine import cores, limit_of_threads
 from ..._programs import SETTINGS
 from .batch import Batch
 from .dataset import packages
@@ -170,7 +170,8 @@ def _compute(settings: dict[str, Any], work: bytes, task: Task) -> tuple[int, di
 def _start_worker(threads: int) -> None:
     """Share the cores, leave Ctrl-C to the session that started the sweep, and end with it."""
     # Read when JAX first computes, and so late enough here.
-    os.environ.setdefault("NPROC", str(threads))
+    if limit_of_threads() is None:
+        os.environ["NPROC"] = str(threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
