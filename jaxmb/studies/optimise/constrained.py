@@ -4,19 +4,27 @@ Where a trial fails, the objective is far above all others and everything else i
 both methods shorten the step: SLSQP its line search, trust-constr its trust region.
 """
 
+import dataclasses
+import importlib
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from .trials import HOLDS, Trial, Trials
+from .trials import HOLDS, Trial, Trials, nearer
 
 # The objective of a trial that failed, in units of the size of the objective.
 _FAILED = 1e10
 
 # Largest number of runs, each with an objective of unit size and a fresh Hessian.
 _RUNS = 10
+
+# How far from its last point a method that cannot go on starts anew, in units of the scales of parameters.
+_ASIDE = (0.0, 0.1)
+
+# A gradient of unit length is a combination of others where no more than this is left of it.
+_DEPENDENT = 1e-8
 
 # The factor from run to run of the first barrier of trust-constr.
 _BARRIER = 1e-2
@@ -32,9 +40,10 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
         del number
         unit = _unit(trials, here, size, tol)
         values, slopes, equal = _one_sided(trials, unit, trials.scales)
+        kept = _independent(slopes(here.z / unit), equal)
         constraints = [
             {"type": kind, "fun": lambda y, own=own: values(y)[own], "jac": lambda y, own=own: slopes(y)[own]}
-            for kind, own in (("eq", equal), ("ineq", ~equal))
+            for kind, own in (("eq", kept & equal), ("ineq", kept & ~equal))
             if own.any()
         ]
         result = _quietly(
@@ -61,10 +70,6 @@ def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[
     # A side that is almost zero beside the other one would have slopes that SciPy's method cannot follow.
     scales = np.maximum(trials.scales, _LEAST_SIDE * np.max(trials.scales, axis=0, initial=0.0))
     values, slopes, equal = _one_sided(trials, 1.0, scales)
-    constraints = []
-    if equal.size:
-        high = np.where(equal, 0.0, np.inf)
-        constraints = [optimize.NonlinearConstraint(values, 0.0, high, jac=slopes, hess=optimize.BFGS())]
 
     def ended(z, state):
         """SciPy's own test disregards the barrier, which keeps the result off the bounds of constraints."""
@@ -72,6 +77,12 @@ def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[
         return max(state.optimality, state.constr_violation, state.get("barrier_parameter", 0.0)) < tol
 
     def run(here, size, left, number):
+        kept = _independent(slopes(here.z), equal)
+        constraints = []
+        if kept.any():
+            high = np.where(equal[kept], 0.0, np.inf)
+            functions = (lambda z: values(z)[kept], 0.0, high, lambda z: slopes(z)[kept])
+            constraints = [optimize.NonlinearConstraint(*functions, hess=optimize.BFGS())]
         result = _quietly(
             optimize.minimize,
             lambda z: _value(trials, z, size),
@@ -87,7 +98,7 @@ def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[
         )
         # The trust region may have become too small for steps as well; without a tolerance SciPy calls that 4.
         well = result.status == 3 or (result.status in (2, 4) and result.constr_violation <= tol)
-        return result.nit, well, "converged" if well else str(result.message)
+        return result.nit, well, str(result.message)
 
     return _repeated(run, trials, start, tol, limit)
 
@@ -95,8 +106,11 @@ def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[
 def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: Trial, tol: float, limit: int):
     """Run a method from its own result, with the objective in units of what is left of it and of its gradient, until a
     run gains no more than the tolerance: SciPy's tolerances are absolute, and its Hessians and barriers may mislead it.
+
+    A method that cannot go on starts anew at a point where constraints hold better, or a little aside.
     """
     here, left, ended, message = start, limit, False, ""
+    aside = list(_ASIDE)
     for number in range(1, _RUNS + 1):
         size = objective_size(here)
         spent, well, how = run(here, size, left, number)
@@ -105,21 +119,42 @@ def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: 
         gained = trials.merit(here)[0] > trials.merit(new)[0] or here.rows[0] - new.rows[0] > tol * size
         # A run that gains nothing confirms the one before, however it ends.
         if gained or not ended:
-            ended, message = well, how
+            message = "no step leads on from here" + f" (SciPy: {how.strip()!r})" * (not well)
+            ended = (well and trials.violation(new) <= HOLDS) or _balanced(trials, new, tol)
         here = new
-        if not gained and (well or number > 1):
+        if not gained and (ended or not aside):
             break
+        if not gained:
+            here, spent = nearer(trials, here, aside.pop(0), left)
+            left -= spent
         if left <= 0:
             return False, "the iterations are used up"
-    return ended, message.strip().rstrip(".")
+    return ended, "converged" if ended else message
 
 
-def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What one unit more of each constraint's bound would gain of the objective, which constraints are active, and the
-    part of the gradient of the objective that they and the bounds of parameters do not balance.
+def _balanced(trials: Trials, trial: Trial, tol: float) -> bool:
+    """Whether constraints hold and no change of the parameters by their scales promises more than the tolerance."""
+    rest = float(np.linalg.norm(balance_at(trials, trial).rest))
+    return trials.violation(trial) <= HOLDS and rest <= tol * objective_size(trial)
 
-    The multipliers are those that come closest, in least squares, to balancing the gradient of the objective with those
-    of active constraints and bounds, each of which only pushes inwards.
+
+@dataclasses.dataclass(frozen=True)
+class Balance:
+    """How constraints and the bounds of parameters balance the gradient of the objective.
+
+    **Fields:** `pull`: the objective's gain of one unit more of each constraint's output, shape (constraints,);
+    `active` constraints; `push` of bounds and `rest`, the part of the gradient that is not balanced, shape (n,).
+    """
+
+    pull: np.ndarray
+    active: np.ndarray
+    push: np.ndarray
+    rest: np.ndarray
+
+
+def balance_at(trials: Trials, trial: Trial) -> Balance:
+    """The multipliers that come closest, in least squares, to balancing the gradient of the objective by those of
+    active constraints and bounds, each of which only pushes inwards.
     """
     low, high, values = trials.limits.low, trials.limits.high, trial.rows[1:]
     near = 10 * HOLDS
@@ -134,10 +169,10 @@ def multipliers(trials: Trials, trial: Trial) -> tuple[np.ndarray, np.ndarray, n
     # SciPy's solver crashes without unknowns.
     if inwards.size:
         found = _scipy().nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
-    sides = np.zeros((2, low.size))
-    sides[0, below], sides[1, above], _ = np.split(found, np.cumsum([below.sum(), above.sum()]))
-    sizes = np.where(low == high, np.abs(sides[0] - sides[1]), sides.sum(axis=0))
-    return sizes, below | above, gradient - inwards.T @ found
+    sides, bounds = np.zeros((2, low.size)), np.zeros((2, trial.z.size))
+    ends = np.cumsum([below.sum(), above.sum(), at_low.sum()])
+    sides[0, below], sides[1, above], bounds[0, at_low], bounds[1, at_high] = np.split(found, ends)
+    return Balance(sides[0] - sides[1], below | above, bounds[0] - bounds[1], gradient - inwards.T @ found)
 
 
 def _one_sided(trials: Trials, unit: float, sizes: np.ndarray):
@@ -155,6 +190,24 @@ def _one_sided(trials: Trials, unit: float, sizes: np.ndarray):
     return values, slopes, np.concatenate([equal[lower], np.zeros(upper.size, bool)])
 
 
+def _independent(slopes: np.ndarray, equal: np.ndarray) -> np.ndarray:
+    """Constraints for SciPy's methods, which take any point for an optimum where gradients of equations are linearly
+    dependent, or where an inequality's gradient is a combination of them.
+    """
+    linalg: Any = importlib.import_module("scipy.linalg")
+    lengths = np.linalg.norm(slopes, axis=1)
+    units = slopes / np.where(lengths > 0, lengths, 1.0)[:, None]
+    equations = np.flatnonzero(equal & (lengths > 0))
+    kept = lengths == 0
+    if equations.size == 0:
+        return np.ones(kept.size, bool)
+    basis, triangle, order = linalg.qr(units[equations].T, mode="economic", pivoting=True)
+    rank = int(np.sum(np.abs(np.diag(triangle)) > _DEPENDENT))
+    kept[equations[order[:rank]]] = True
+    left = units - (units @ basis[:, :rank]) @ basis[:, :rank].T
+    return kept | (~equal & (np.linalg.norm(left, axis=1) > _DEPENDENT))
+
+
 def objective_size(trial: Trial) -> float:
     """The size of the objective, or of its change where parameters change by their scales, if that is larger."""
     size = max(abs(float(trial.rows[0])), float(np.max(np.abs(trial.jacobian[0]), initial=0.0)))
@@ -168,8 +221,9 @@ def _unit(trials: Trials, here: Trial, size: float, tol: float) -> float:
 
     A power of two, so that nothing is rounded.
     """
-    slope = float(np.linalg.norm(multipliers(trials, here)[2])) / size
-    if slope == 0 or slope**2 >= tol:
+    slope = float(np.linalg.norm(balance_at(trials, here).rest)) / size
+    # Where constraints are violated, they make the step; a smaller slope is that of an optimum, and may be rounding.
+    if slope <= tol or slope**2 >= tol or trials.violation(here) > HOLDS:
         return 1.0
     return 2.0 ** np.round(-0.5 * np.log2(max(slope, slope**2 / (10 * tol))))
 

@@ -14,7 +14,7 @@ from ...parts.names import names_arguments
 from ...system import AbstractSystem
 from ...system.design import Bounds
 from ...system.quantities import component_names
-from .constrained import multipliers, objective_size, slsqp, trust_constr
+from .constrained import balance_at, slsqp, trust_constr
 from .evaluation import (
     Limits,
     Program,
@@ -27,15 +27,13 @@ from .evaluation import (
 from .space import Space, space
 from .trials import HOLDS, Iteration, Trial, Trials, evaluate, first_feasible
 from .unconstrained import bfgs, first_order
+from .verdict import objection
 
 # Local optimisations from the best of several starts.
 _LOCAL = 4
 
 # Gradients below this, relative to that at the start, are those of an optimum.
 _BALANCED = 1e-3
-
-# How far beside the result a leap of the objective is looked for, in units of the scales of parameters.
-_BESIDE = 1e-5
 
 # Lines of the log that are printed.
 _FIRST, _LAST = 3, 9
@@ -44,7 +42,8 @@ _FIRST, _LAST = 3, 9
 @dataclasses.dataclass(frozen=True)
 class ConstrainedOutput:
     """A component of a constrained output at the optimum: its bounds, the values before and after, whether a bound is
-    active, and its multiplier, what one unit more of that bound would gain of the objective.
+    active, its multiplier, what one unit more of that bound would gain of the objective, and the `tolerance` by which
+    the value may be out of bounds, in the output's unit.
     """
 
     name: str
@@ -54,6 +53,7 @@ class ConstrainedOutput:
     after: float
     active: bool
     multiplier: float
+    tolerance: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,8 +90,9 @@ class Optimum:
     - `iterations`: the log of the local optimisation that gave the result; `trials`: how often the function was
         differentiated for it, of which `failed` trials were rejected.
     - `attempts`: all local optimisations, the best first, if there were several.
-    - `success`: whether the method converged, at no edge beyond which trials fail or the objective leaps up, and all
-        constraints hold, to 1e-6 of the bound, or where it is zero of their size; `message`: how it ended.
+    - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. An edge
+        beyond which trials fail or the objective leaps up is no minimum, nor is a maximum, a saddle, or a point where
+        the objective changes in steps; `message`: how it ended.
     - `derivatives`: the mode, `"forward"` or `"reverse"`.
     """
 
@@ -121,10 +122,12 @@ class Optimum:
             if value.ndim == 0:
                 rows.append((name, f"{float(self.before[name]):.6g}", f"{float(value):.6g}"))
         if self.constraints:
-            rows += [(), ("constraint", "before", "after", "low", "high", "multiplier")]
+            rows += [(), ("constraint", "before", "after", "low", "high", "within", "multiplier")]
             for c in self.constraints:
                 shown = f"{c.multiplier:.3g}" if c.active else ""
-                rows.append((c.name, *(f"{x:.6g}" for x in (c.before, c.after, c.low, c.high)), shown))
+                rows.append(
+                    (c.name, *(f"{x:.6g}" for x in (c.before, c.after, c.low, c.high)), f"{c.tolerance:.1g}", shown)
+                )
         if len(self.attempts) > 1:
             rows += [(), ("attempt", "before", "after", "violation")]
             rows += [
@@ -208,8 +211,15 @@ def optimise(
     assembled and gives no warning of it: where the best designs lie there, constrain a margin as well, such as the sine
     of the transmission angle.
 
-    **Returns:** an `Optimum`, the best of all trials whose constraints hold to a millionth of their bounds; of
-    `"slsqp"`, where it converged, the last one, unless a better one breaks them by no more.
+    **Constraints hold** to a millionth of their bound, or of the distance of both bounds where that is smaller. A bound
+    of zero has no size: there it is a millionth of the output at the start, or of its change where a parameter changes
+    by its scale, whichever is larger. `Optimum.constraints` has the tolerances.
+
+    **A minimum** is told from a maximum, a saddle and a flat objective by some trials beside the result, which `trials`
+    does not count.
+
+    **Returns:** an `Optimum`, the best of all trials whose constraints hold; of `"slsqp"`, where it converged, the last
+    one, unless a better one breaks them by no more.
 
     **Raises:** `ValueError` for unknown names, bounds that are reversed, a start out of bounds, an objective that is no
     number, a function without derivatives, and a start that fails if no constraint leads away from it.
@@ -247,24 +257,26 @@ def optimise(
     )
     trials, _, ok, message = runs[0]
     best = trials.best
-    sizes, active, unbalanced = multipliers(trials, best)
+    balance = balance_at(trials, best)
     slope = np.max(np.abs(trials.start.jacobian[0]), initial=0.0)
-    stuck = trials.failed > 0 and np.max(np.abs(unbalanced), initial=0.0) > _BALANCED * slope
-    if stuck:
-        message = f"{message}; trials fail where the objective decreases: constrain a margin from there"
-    elif ok and (beside := _leap(program, trials, unbalanced)) is not None:
-        stuck = True
-        message = (
-            f"{message}; beside the result the objective leaps to {beside:.6g}, where its gradient promises less: "
-            "constrain a margin from there, or, where a mechanism is assembled, give a guess closer to the branch"
-        )
+    against = None
+    if trials.failed > 0 and np.max(np.abs(balance.rest), initial=0.0) > _BALANCED * slope:
+        against = "trials fail where the objective decreases: constrain a margin from there"
+    elif ok:
+        against = objection(lambda z: evaluate(program, z), trials, balance, where.components())
+    if against:
+        message = against if ok else f"{message}; {against}"
     if spent:
         message = f"{message}; {spent} trials led from the start, which failed, to one that does not"
     if trials.violation(best) > HOLDS:
         worst = limited.worst(best.rows[1:], trials.scales)
         message = f"{message}; constraints are violated, most of all {worst}"
     rows_before = _rows(before, names)
-    columns = (limited.components, limited.low, limited.high, rows_before[1:], best.rows[1:], active, sizes)
+    columns = (
+        limited.components,
+        *(limited.low, limited.high, rows_before[1:], best.rows[1:]),
+        *(balance.active, np.abs(balance.pull), HOLDS * np.min(trials.scales, axis=0)),
+    )
     return Optimum(
         parameters=named(best.z),
         start=named(before.z),
@@ -272,33 +284,17 @@ def optimise(
         outputs=best.outputs,
         before=before.outputs or {name: np.full(shape, np.nan) for name, shape in shapes.items()},
         constraints=tuple(
-            ConstrainedOutput(name, float(low), float(high), float(a), float(b), bool(on), float(size))
-            for name, low, high, a, b, on, size in zip(*columns, strict=True)
+            ConstrainedOutput(own, float(low), float(high), float(a), float(b), bool(on), float(pull), float(within))
+            for own, low, high, a, b, on, pull, within in zip(*columns, strict=True)
         ),
         iterations=tuple(trials.log),
         trials=trials.count,
         failed=trials.failed,
         attempts=attempts,
-        success=ok and not stuck and trials.violation(best) <= HOLDS,
+        success=ok and not against and trials.violation(best) <= HOLDS,
         message=message,
         derivatives="forward" if program.forward else "reverse",
     )
-
-
-def _leap(program: Program, trials: Trials, unbalanced: np.ndarray) -> float | None:
-    """The objective beside the best trial, against its gradient, if it rises there by far more than any slope explains,
-    as where a mechanism is assembled on another branch; without an evaluation where the gradient is balanced.
-    """
-    best = trials.best
-    length = float(np.linalg.norm(unbalanced))
-    if length <= _BALANCED * objective_size(best):
-        return None
-    beside = evaluate(program, np.clip(best.z - _BESIDE * unbalanced / length, *trials.box))
-    if not beside.good:
-        return None
-    slope = max(np.linalg.norm(trial.jacobian[0]) for trial in (best, beside))
-    leaps = beside.rows[0] - best.rows[0] > 10 * slope * _BESIDE
-    return float(beside.rows[0]) if leaps else None
 
 
 def _check(method: Any, limited: Limits, starts: Any, local: Any, max_iterations: Any, tol: Any) -> None:

@@ -1,7 +1,9 @@
 """The trials of an optimisation: each is evaluated once, and those that fail are told apart."""
 
 import dataclasses
+import importlib
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,9 @@ from .evaluation import Limits, Program, linearised
 
 # Constraints that are violated by no more than this, relative to their size, hold.
 HOLDS = 1e-6
+
+# The smallest size of a constraint's side, relative to its output.
+_ROUNDED = 1e-7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,13 +114,45 @@ def evaluate(program: Program, z: np.ndarray) -> Trial:
 
 def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
     """Sizes of the lower and the upper side of constraints: their bounds, each its own, so that a far one does not
-    loosen the other; where it is zero, the other bound, or the first value or derivative if that is smaller.
+    loosen the other, or the distance of both if that is smaller.
+
+    Where the bound is zero, the first value, or its change where a parameter changes by its scale if that is larger,
+    but no more than the other bound. A bound that is almost zero has a size far above rounding errors of these.
     """
     known = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
     own = known(np.abs([limits.low, limits.high]))
     first = known(np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0)))
     size = np.where(np.isfinite(own), own, np.minimum(own[::-1], first))
+    size = np.minimum(size, known(limits.high - limits.low))
+    size = np.maximum(size, np.where(np.isfinite(first), _ROUNDED * first, 0.0))
     return np.where(np.isfinite(size), size, 1.0)
+
+
+def nearer(trials: Trials, here: Trial, aside: float, most: int) -> tuple[Trial, int]:
+    """A trial whose constraints hold better, by least squares of their violations within the box, and the number of
+    trials; linearised constraints that contradict each other stop it no more than a slope of zero at `here`.
+
+    **Arguments:** `aside`: how far from `here` to begin, in a random direction; `most`: largest number of trials.
+    """
+    optimize: Any = importlib.import_module("scipy.optimize")
+    limits, count = trials.limits, trials.count
+    step = aside * np.random.default_rng(0).uniform(-1.0, 1.0, here.z.size)
+    low, high = trials.box
+    start = trials(here.z + np.where((here.z + step < low) | (here.z + step > high), -step, step))
+    if not start.good or most < 1:
+        return here, trials.count - count
+
+    def slopes(z):
+        trial = trials(z)
+        values = trial.rows[1:]
+        weights = (values > limits.high) / trials.scales[1] - (values < limits.low) / trials.scales[0]
+        return weights[:, None] * trial.jacobian[1:]
+
+    excess = lambda z: limits.excess(trials(z).rows[1:], trials.scales)
+    if excess(start.z).any():
+        found = optimize.least_squares(excess, start.z, slopes, bounds=trials.box, max_nfev=most)
+        start = trials(found.x)
+    return start, trials.count - count
 
 
 def first_feasible(
