@@ -23,6 +23,9 @@ _RUNS = 10
 # How far from its last point a method that cannot go on starts anew, in units of the scales of parameters.
 _ASIDE = (0.0, 0.1)
 
+# A gain is what leaves no more than this of the violation of constraints; less may be errors of simulations.
+_LESS = 0.9
+
 # A gradient of unit length is a combination of others where no more than this is left of it.
 _DEPENDENT = 1e-8
 
@@ -116,7 +119,9 @@ def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: 
         spent, well, how = run(here, size, left, number)
         left -= max(spent, 1)
         new = trials.best
-        gained = trials.merit(here)[0] > trials.merit(new)[0] or here.rows[0] - new.rows[0] > tol * size
+        gained = _nearer(trials, new, here) or (
+            trials.merit(here)[0] >= trials.merit(new)[0] and here.rows[0] - new.rows[0] > tol * size
+        )
         # A run that gains nothing confirms the one before, however it ends.
         if gained or not ended:
             message = "no step leads on from here" + f" (SciPy: {how.strip()!r})" * (not well)
@@ -125,11 +130,20 @@ def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: 
         if not gained and (ended or not aside):
             break
         if not gained:
-            here, spent = nearer(trials, here, aside.pop(0), left)
-            left -= spent
+            count = trials.count
+            others = (nearer(trials, new, aside.pop(0), left) for _ in _ASIDE if aside)
+            here = next((z for z in others if trials.merit(new)[0] == 0 or _nearer(trials, z, new)), None)
+            left -= trials.count - count
+            if here is None:
+                break
         if left <= 0:
             return False, "the iterations are used up"
     return ended, "converged" if ended else message
+
+
+def _nearer(trials: Trials, trial: Trial, other: Trial) -> bool:
+    """Whether constraints that do not hold at another trial are violated far less."""
+    return trials.merit(trial)[0] < _LESS * trials.merit(other)[0]
 
 
 def _balanced(trials: Trials, trial: Trial, tol: float) -> bool:

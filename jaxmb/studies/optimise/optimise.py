@@ -271,6 +271,8 @@ def optimise(
     if trials.violation(best) > HOLDS:
         worst = limited.worst(best.rows[1:], trials.scales)
         message = f"{message}; constraints are violated, most of all {worst}"
+        if ends := where.at_bounds(best.z):
+            message = f"{message}, with {', '.join(map(repr, ends))} at a bound"
     rows_before = _rows(before, names)
     columns = (
         limited.components,

@@ -60,6 +60,11 @@ class Space(eqx.Module):
             name for own, shape in zip(self.names, self.shapes, strict=True) for name in component_names(own, shape)
         ]
 
+    def at_bounds(self, z: np.ndarray) -> list[str]:
+        """The names of components that are at a bound."""
+        low, high = self.box
+        return [name for name, own, a, b in zip(self.components(), z, low, high, strict=True) if own in (a, b)]
+
     def unbounded(self) -> FreeParameters:
         """The same parameters as a function of a vector that may take any value; zero at the start.
 

@@ -13,6 +13,9 @@ from .evaluation import Limits, Program, linearised
 # Constraints that are violated by no more than this, relative to their size, hold.
 HOLDS = 1e-6
 
+# Violations that decrease by less than this part are as small as they become.
+_STALLED = 1e-3
+
 # The smallest size of a constraint's side, relative to its output.
 _ROUNDED = 1e-7
 
@@ -128,19 +131,19 @@ def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
     return np.where(np.isfinite(size), size, 1.0)
 
 
-def nearer(trials: Trials, here: Trial, aside: float, most: int) -> tuple[Trial, int]:
-    """A trial whose constraints hold better, by least squares of their violations within the box, and the number of
-    trials; linearised constraints that contradict each other stop it no more than a slope of zero at `here`.
+def nearer(trials: Trials, here: Trial, aside: float, most: int) -> Trial:
+    """A trial whose constraints hold better, by least squares of their violations within the box; linearised
+    constraints that contradict each other do not stop it, nor, with `aside`, a slope of zero.
 
     **Arguments:** `aside`: how far from `here` to begin, in a random direction; `most`: largest number of trials.
     """
     optimize: Any = importlib.import_module("scipy.optimize")
-    limits, count = trials.limits, trials.count
+    limits = trials.limits
     step = aside * np.random.default_rng(0).uniform(-1.0, 1.0, here.z.size)
     low, high = trials.box
     start = trials(here.z + np.where((here.z + step < low) | (here.z + step > high), -step, step))
     if not start.good or most < 1:
-        return here, trials.count - count
+        return here
 
     def slopes(z):
         trial = trials(z)
@@ -150,9 +153,9 @@ def nearer(trials: Trials, here: Trial, aside: float, most: int) -> tuple[Trial,
 
     excess = lambda z: limits.excess(trials(z).rows[1:], trials.scales)
     if excess(start.z).any():
-        found = optimize.least_squares(excess, start.z, slopes, bounds=trials.box, max_nfev=most)
+        found = optimize.least_squares(excess, start.z, slopes, bounds=trials.box, ftol=_STALLED, max_nfev=most)
         start = trials(found.x)
-    return start, trials.count - count
+    return start
 
 
 def first_feasible(
