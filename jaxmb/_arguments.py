@@ -54,6 +54,30 @@ def real_shape(name: str, value: Any, expected: str = "a real number or an array
     return array.shape
 
 
+def whole_number(name: str, value: Any, least: int = 1, otherwise: str = "") -> int:
+    """An integer argument, of Python or NumPy, as one of Python.
+
+    **Arguments:** `otherwise`: what else the argument may be, for the message: `", or None"`.
+
+    **Raises:** `ValueError` for another kind of value, True and False among them, and for one below the least.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} must be an integer of at least {least}{otherwise}, got {value!r}.")
+    return int(value)
+
+
+def probability(name: str, value: Any) -> float:
+    """An argument between zero and one, both excluded.
+
+    **Raises:** `ValueError` for any other value; for a percentage it names the fraction.
+    """
+    number = float(real_array(name, value, np.dtype(float)))
+    if not 0 < number < 1:
+        meant = f": for {number:g} % give {number / 100:g}" if 1 < number < 100 else ""
+        raise ValueError(f"{name} must be a probability between 0 and 1, got {value!r}{meant}.")
+    return number
+
+
 def warn_of_degrees(label: str, angle: Any, stacklevel: int) -> None:
     """Warn of an angle [rad] of more than a full turn; `stacklevel`: the user's place as this function's caller."""
     if not is_traced(angle) and abs(float(angle)) > 2 * np.pi:

@@ -250,6 +250,11 @@ def messages_of(item: Any) -> dict[str, str]:
     return {name: kind[own] for name, own in kind._name_to_item.items()}
 
 
+def set_message(item: Any, message: str) -> None:
+    """Give an item of an enumeration another message. (Enumeration._index_to_message, 0.13.)"""
+    item._enumeration._index_to_message[int(item._value)] = message
+
+
 def codes_of(item: Any) -> np.ndarray:
     """The codes of an item, or of a batch of them. (EnumerationItem._value, 0.13.)"""
     return np.asarray(item._value)

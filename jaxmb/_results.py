@@ -2,6 +2,8 @@
 
 import diffrax
 
+from ._compat import set_message
+
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """Outcomes; diffrax's, and those of mechanics. Each text says what to try next.
@@ -53,3 +55,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "too much (Painlevé's paradox). A smaller coefficient, or a compliant contact, has one. With `throw=False` the "
         "motion up to there is kept."
     )
+
+
+# That of diffrax is empty, which shows nothing of a good run.
+set_message(RESULTS.successful, "successful")

@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from ._arguments import package_for_tables
+from ._printed import preformatted
 from ._types import State
 from .formulations import AbstractFormulation
 from .linalg.arrays import is_traced
@@ -99,7 +100,17 @@ class ContactEvents(eqx.Module):
     def __getitem__(self, k: int) -> Event:
         return self._rows()[k]
 
+    def __repr__(self) -> str:
+        if isinstance(self.times, Tracer) or self.times.ndim != 1:
+            return f"ContactEvents: of {', '.join(dict.fromkeys(self.names))}, times of shape {self.times.shape}"
+        return f"ContactEvents: {int(np.sum(np.isfinite(self.times)))} of {', '.join(dict.fromkeys(self.names))}"
+
+    def _repr_html_(self) -> str:
+        return preformatted(self)
+
     def __str__(self) -> str:
+        if isinstance(self.times, Tracer) or self.times.ndim != 1:
+            return repr(self)
         events = self._rows()
         # The energy that parts lose together stands at the first of them.
         first = [k == 0 or event.time != events[k - 1].time for k, event in enumerate(events)]

@@ -152,9 +152,7 @@ class Trajectory(eqx.Module):
             good = np.sum(ended == RESULTS.successful._value)
             text = f"Trajectories of {ended.size} runs of shape {ended.shape}, {good} successful: {span}"
         else:
-            text = (
-                f"Trajectory: {finite.size} saved from {span} in {steps} steps; {RESULTS[self.result] or 'successful'}"
-            )
+            text = f"Trajectory: {finite.size} saved from {span} in {steps} steps; {RESULTS[self.result]}"
         forces = self._force_names()
         own = f"\nForces, in motion.forces: {_listed(forces)}" if forces else ""
         return f"{text}\nNames: {_listed(names)}{own}"

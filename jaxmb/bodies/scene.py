@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from .._printed import preformatted
 from .._traced_functions import traced_by_jax
 from .._types import State
 from ..linalg.arrays import ARRAYS, is_traced
@@ -134,6 +135,19 @@ class Scene(eqx.Module):
             forces=kept(self.forces, forces),
             frames=kept(self.frames, frames),
         )
+
+    def __repr__(self) -> str:
+        parts = {name: getattr(self, name) for name in ("bodies", "joints", "forces", "frames")}
+        return f"Scene: {', '.join(f'{len(own)} {name}' for name, own in parts.items() if own)}"
+
+    def __str__(self) -> str:
+        lines = [f"{self!r}; compile() makes a system of it"]
+        for kind in ("bodies", "joints", "forces", "frames"):
+            lines += [f"  {type(part).__name__} {part.name!r}" for part in getattr(self, kind)]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return preformatted(self)
 
     def describe(self) -> Description:
         """Compile the scene and describe the result, as text and as HTML."""

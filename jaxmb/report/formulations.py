@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from .._printed import Printed
 from .._types import State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
 from ..formulations.formulation import row_levels, solve_constrained
@@ -62,8 +63,8 @@ class FormulationCost:
     deviation: float
 
 
-@dataclasses.dataclass(frozen=True)
-class FormulationCosts:
+@dataclasses.dataclass(frozen=True, repr=False)
+class FormulationCosts(Printed):
     """The result of `formulation_costs`; `print` shows a table."""
 
     mechanism: str

@@ -10,6 +10,7 @@ import diffrax
 import equinox as eqx
 import numpy as np
 
+from .._printed import Printed
 from .._types import State
 from ..manifold import Partition, default_manifold
 from ..mechanisms import Mechanism
@@ -55,8 +56,8 @@ class Measured:
         return f"{self.trace:.2f}", f"{self.compile:.2f}", f"{1e6 * self.evaluation:.1f}"
 
 
-@dataclasses.dataclass(frozen=True)
-class LeftOut:
+@dataclasses.dataclass(frozen=True, repr=False)
+class LeftOut(Printed):
     """The result of `left_out`; `print` shows a table.
 
     **Fields:** `cases`: first the motion as it is, then with one thing put in; `specialised`: sentences of the system's

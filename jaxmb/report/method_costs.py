@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .._printed import Printed
 from .._results import RESULTS
 from .._types import State
 from ..bodies.motion_graph import motion_order
@@ -55,8 +56,8 @@ class MethodCost:
     ratio: float
 
 
-@dataclasses.dataclass(frozen=True)
-class MethodCosts:
+@dataclasses.dataclass(frozen=True, repr=False)
+class MethodCosts(Printed):
     """The result of `method_costs`; `print` shows a table. `remarks`: methods that were skipped, and why."""
 
     mechanism: str

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .._printed import Printed
 from .._results import RESULTS
 from .._types import State, VectorLike
 from ..mechanisms import Mechanism
@@ -57,8 +58,8 @@ class Case:
         return "unknown" if self.known_to is None else "small"
 
 
-@dataclasses.dataclass(frozen=True)
-class StressTest:
+@dataclasses.dataclass(frozen=True, repr=False)
+class StressTest(Printed):
     """The result of `stress_test`; `print` shows a table. `remarks`: cases that do not apply, and why."""
 
     mechanism: str

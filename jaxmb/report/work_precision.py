@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import diffrax
 import numpy as np
 
+from .._printed import Printed
 from .._results import RESULTS
 from .._types import State
 from .._version import __version__
@@ -70,8 +71,8 @@ class Run:
         return float(np.median(self.times))
 
 
-@dataclasses.dataclass(frozen=True)
-class WorkPrecision:
+@dataclasses.dataclass(frozen=True, repr=False)
+class WorkPrecision(Printed):
     """The result of `work_precision`; `print` and notebooks show a table.
 
     **Fields:** `mechanism`: its name; `title`: what it is, in words; `t1` [s]; `runs`; `source` of the reference

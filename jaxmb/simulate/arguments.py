@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._arguments import check_kind, real_array
+from .._arguments import check_kind, real_array, whole_number
 from .._compat import changed, default_float
 from .._types import State, VectorLike
 from ..formulations import AbstractFormulation
@@ -55,8 +55,7 @@ _KINDS: dict[str, tuple[type, str]] = {
 
 
 def check_steps(number: Any, name: str = "max_steps") -> None:
-    if not isinstance(number, int | np.integer) or number < 1:
-        raise ValueError(f"{name} must be an integer of at least 1, got {number!r}.")
+    whole_number(name, number)
 
 
 def check_kinds(*given: Any) -> None:

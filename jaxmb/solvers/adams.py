@@ -12,6 +12,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._arguments import whole_number
 from ._history import HIGHEST_ORDER, INDEX, LENGTH, History, advance, start
 from ._interpolation import RateInterpolation
 from ._stiffness import Stiffness, none_found, observed
@@ -176,8 +177,8 @@ class Adams(AbstractMultistep):
             )
         self.tolerances = tolerances_of("Adams", rtol, atol, norm)
         self.tangent_control = None
-        self.min_order = min_order
-        self.max_order = max_order
+        self.min_order = whole_number("min_order", min_order)
+        self.max_order = whole_number("max_order", max_order)
         self.stiffness = stiffness
 
     def order(self, terms: PyTree[diffrax.AbstractTerm]) -> int:

@@ -12,6 +12,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._arguments import whole_number
 from ._damping import is_resolved
 from ._dense import DenseLinearization
 from ._field import derivatives
@@ -202,7 +203,7 @@ class Hermite(AbstractMultistep):
         self.tolerances = tolerances_of("Hermite", rtol, atol, norm)
         self.tangent_control = None
         self.family = family
-        self.past_points = past_points
+        self.past_points = tuple(whole_number("past_points", k) for k in past_points)
 
     @property
     def interpolation_cls(self) -> Callable[..., MultistepInterpolation]:  # pyright: ignore[reportIncompatibleMethodOverride]

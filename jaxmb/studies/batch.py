@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from .._arguments import whole_number
 from .._compat import ClosedJaxpr, Jaxpr
 from .._programs import bytes_of_kernel_loops
 from .._traced_functions import NEED_NUMBERS
@@ -60,8 +61,7 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     """
     if not callable(function):
         raise ValueError(f"batch needs a function, got {function!r}.")
-    if size is not None and (not isinstance(size, int | np.integer) or isinstance(size, bool) or size < 1):
-        raise ValueError(f"size must be an integer of at least 1, or None, got {size!r}.")
+    size = None if size is None else whole_number("size", size, 1, ", or None")
 
     @eqx.filter_jit
     def of_all(members, count):

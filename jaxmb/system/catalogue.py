@@ -289,6 +289,11 @@ class AbstractSystem(AbstractEquation):
         forces = () if np.all(np.isfinite(self.force(t, q, u))) else ("the force on the coordinates",)
         return (*forces, *dict.fromkeys(f"the residual of {name!r}" for name in wrong))
 
+    def __repr__(self) -> str:
+        facts = dict(self.describe().facts)
+        free = f", degrees of freedom: {facts['degrees of freedom']}" if "degrees of freedom" in facts else ""
+        return f"{type(self).__name__}: {facts['system']}{free}"
+
     def __str__(self) -> str:
         return str(self.describe())
 

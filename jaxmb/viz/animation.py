@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._arguments import whole_number
 from ..parts.names import names_arguments
 from ..parts.shapes import AbstractShape
 from ..trajectory import Trajectory
@@ -97,8 +98,7 @@ def show(
     **Raises:** `ValueError` for unknown names, batches, motions saved at fewer than two times, states that are not
     finite, and systems without bodies; `ImportError` without viser, which `jaxmb[view]` installs.
     """
-    if not isinstance(frames, int | np.integer) or frames < 2:
-        raise ValueError(f"frames must be an integer of at least 2, got {frames!r}.")
+    frames = whole_number("frames", frames, 2)
     for value, name in ((height, "height"), (1.0 if speed is None else speed, "speed")):
         if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be a positive number, got {value!r}.")

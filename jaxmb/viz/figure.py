@@ -12,7 +12,7 @@ def new_figure(width: float, height: float) -> "Figure":
     **Raises:** `ImportError` naming the extra to install if matplotlib is not there.
     """
     try:
-        from matplotlib.figure import Figure
+        from .shown import ShownFigure
     except ImportError as error:
         raise ImportError('Figures need matplotlib; install it with: pip install "jaxmb[plot]"') from error
-    return Figure(figsize=(width, height), layout="constrained")
+    return ShownFigure(figsize=(width, height), layout="constrained")

@@ -4,12 +4,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .._arguments import whole_number
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
 from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
 from ..trajectory import Trajectory
 from .figure import new_figure
 from .meshes import heights
+from .one_motion import check_finite, one_motion
 from .silhouettes import area, edges, stroke
 from .solids import COLORS, solids
 
@@ -36,17 +38,20 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
 
     **Arguments:** `trajectory`: a motion of a planar or spatial scene; `frames`: how many poses to draw, at least 1.
 
-    **Returns:** a matplotlib `Figure`, axes in m.
+    **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
+    left out.
 
-    **Raises:** `ValueError` for `frames < 1`, and for a system that has no bodies; `ImportError` without matplotlib.
+    **Raises:** `ValueError` for `frames < 1`, a batch, states that are not finite, and a system without bodies;
+    `ImportError` without matplotlib.
     """
-    if frames < 1:
-        raise ValueError(f"frames must be at least 1, got {frames}.")
+    frames = whole_number("frames", frames)
     if not trajectory.system.body_names:
         raise ValueError(
             f"plot_mechanism draws bodies, and a {type(trajectory.system).__name__} has none; plot_motion shows its "
             "coordinates."
         )
+    trajectory = one_motion(trajectory, "plot_mechanism", 1)
+    check_finite(trajectory)
     picture = trajectory.system.picture(trajectory.ts, trajectory.ys)
     shapes = solids(picture, {}, None)
     times = trajectory.ts.shape[0]

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ..parts.names import names_arguments, unknown
 from ..trajectory import Trajectory
 from .figure import new_figure
+from .one_motion import one_motion
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,12 +76,12 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
 
     **Returns:** a matplotlib `Figure` with one panel for each kind of quantity [s; m, rad and their rates; N, N m; J].
     Of the components along x, y and z in a panel the first is solid, then come dashed and dotted ones.
-    `figure.savefig(path)` writes it; in a notebook, `%matplotlib inline` shows it.
+    `figure.savefig(path)` writes it; as the last line of a notebook's cell it is shown. Times that a run did not reach
+    are left out.
 
-    **Raises:** `ValueError` for an unknown name or fewer than two times; `ImportError` without matplotlib.
+    **Raises:** `ValueError` for an unknown name, a batch or fewer than two times; `ImportError` without matplotlib.
     """
-    if trajectory.ts.shape[0] < 2:
-        raise ValueError("plot_motion needs a motion saved at two times or more; give simulate saveat=…")
+    trajectory = one_motion(trajectory, "plot_motion")
     if names is None:
         panels = _moving(_panels(trajectory, _default(trajectory.system)))
         checks = _CHECKS if trajectory.system.velocity_rows else _CHECKS[:1]

@@ -17,6 +17,7 @@ from ..system.picture import Picture
 from ..trajectory import Trajectory
 from . import stage
 from .meshes import Triangles, unit_mesh
+from .one_motion import check_finite, one_motion
 from .solids import COLORS, Placed, solids
 
 _SPRING: Color = (95, 100, 110)
@@ -204,13 +205,7 @@ def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
     **Raises:** `ValueError` for a batch, for a motion saved at fewer than two times, and for states that are not
     finite.
     """
-    if trajectory.ts is None or trajectory.ts.ndim != 1:
-        shape = () if trajectory.ts is None else trajectory.ts.shape[:-1]
-        raise ValueError(
-            f"A picture shows single motions, and this is a batch of shape {shape}; choose members of it, such as "
-            "jax.tree.map(lambda leaf: leaf[0], trajectory), and show them as a list or a dictionary."
-        )
-    trajectory = trajectory.trimmed()
+    trajectory = one_motion(trajectory, "A moving picture")
     ts, order = np.unique(np.asarray(trajectory.ts), return_index=True)
     if ts.size < 2:
         raise ValueError("A picture needs a motion saved at two times or more; give simulate saveat=…")
@@ -219,10 +214,9 @@ def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
     near = near - (wanted - ts[near - 1] < ts[near] - wanted)
     rows = order if ts.size <= frames else order[np.unique(near)]
     ys = jax.tree.map(lambda y: np.asarray(y)[rows], trajectory.ys)
-    for t, *values in zip(np.asarray(trajectory.ts)[rows], *jax.tree.leaves(ys), strict=True):
-        if not all(np.all(np.isfinite(value)) for value in values):
-            raise ValueError(f"The state at {t:g} s is not finite: the simulation failed; see trajectory.result.")
-    return dataclasses.replace(trajectory, ts=jax.numpy.asarray(trajectory.ts)[rows], ys=jax.device_put(ys))
+    found = dataclasses.replace(trajectory, ts=jax.numpy.asarray(trajectory.ts)[rows], ys=jax.device_put(ys))
+    check_finite(found)
+    return found
 
 
 def _in_space(values):

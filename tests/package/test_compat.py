@@ -264,6 +264,8 @@ def test_enumerations(compat):
     batch = jax.vmap(lambda bad: Results.where(bad, Results.stuck, Results.successful))(jnp.array([True, False]))
     codes = compat.codes_of(batch)
     assert [list(messages)[code] for code in codes] == ["stuck", "successful"], about
+    compat.set_message(Results.successful, "fine")
+    assert Results[Results.successful] == "fine" and diffrax.RESULTS[diffrax.RESULTS.successful] == "", about
 
 
 def test_modules_can_be_copied_without_their_checks(compat):

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from jaxmb.linalg.rotations import rotate
 from jaxmb.parts import contact
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
+from jaxmb.viz.motion_nodes import chosen
 
 TS = np.linspace(0.0, 1.0, 5)
 
@@ -51,6 +53,53 @@ def test_a_sliding_piston_shows_its_place_and_its_stroke(piston):
     assert [axes.get_ylabel() for axes in (position, velocity, displacement, rate, energy)] == labels
     assert list(drawn(residual)) == ["position", "velocity [1/s]"]
     np.testing.assert_allclose(drawn(energy)["sum"], (0.1 * np.cos(TS)) ** 2)
+
+
+def padded(motion, value=np.inf):
+    """The same motion as of a run that ended before two more times at which it was to be saved."""
+    more = lambda x: jnp.concatenate([x, jnp.full((2, *x.shape[1:]), value)])
+    return dataclasses.replace(motion, ts=more(motion.ts), ys=mb.State(more(motion.ys.q), more(motion.ys.u)))
+
+
+def test_times_that_a_run_did_not_reach_are_left_out(piston):
+    """Of a run that failed or ended at an event, saved under `jit`."""
+    early = padded(piston)
+    for axes, other in zip(viz.plot_motion(early).axes, viz.plot_motion(piston).axes, strict=True):
+        for name, values in drawn(other).items():
+            np.testing.assert_array_equal(drawn(axes)[name], values)
+    (poses, *_), (same, *_) = viz.plot_mechanism(early).axes, viz.plot_mechanism(piston).axes
+    assert poses.get_title() == same.get_title() == "t = 0, 0.25, 0.5, 0.75, 1 s"
+    assert chosen(early, 10).ts.size == 5
+    stuck = dataclasses.replace(early, ts=early.ts.at[1:].set(jnp.inf), result=mb.RESULTS.newton_failed)
+    for picture in (viz.plot_motion, lambda motion: chosen(motion, 10)):
+        with pytest.raises(ValueError, match="two times or more at which it is saved: Newton's method found no state"):
+            picture(stuck)
+
+
+def test_a_batch_is_refused_with_the_way_to_its_members(piston):
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), piston)
+    for picture in (viz.plot_motion, viz.plot_mechanism, lambda motion: chosen(motion, 10)):
+        with pytest.raises(ValueError, match=r"batch of shape \(2,\); choose members of it, such as jax.tree.map"):
+            picture(batch)
+        picture(jax.tree.map(lambda leaf: leaf[1], batch))
+
+
+def test_states_that_are_not_finite_are_named(piston):
+    ys = mb.State(piston.ys.q.at[3].set(jnp.nan), piston.ys.u)
+    for picture in (viz.plot_mechanism, lambda motion: chosen(motion, 10)):
+        with pytest.raises(ValueError, match=r"The state at 0\.75 s is not finite"):
+            picture(dataclasses.replace(piston, ys=ys))
+
+
+@pytest.mark.parametrize("frames", [0, 2.0, True])
+def test_poses_are_counted(piston, frames):
+    with pytest.raises(ValueError, match="frames must be an integer of at least 1"):
+        viz.plot_mechanism(piston, frames=frames)
+
+
+def test_a_cell_of_a_notebook_shows_a_figure(piston):
+    for figure in (viz.plot_motion(piston, "energy"), viz.plot_mechanism(piston, frames=np.int64(2))):
+        assert figure._repr_png_().startswith(b"\x89PNG")
 
 
 def test_events_are_lines_in_every_panel():

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..._printed import Printed
 from ..._types import State
 from ...simulate.arguments import DEFAULT_RTOL
 from ...system import AbstractSystem
@@ -28,8 +29,8 @@ _NO_FIT = "These estimates are not to be trusted"
 _UNDETERMINED = "undetermined"
 
 
-@dataclasses.dataclass(frozen=True)
-class Identification:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Identification(Printed):
     """The result of `identify`; `print` shows a table.
 
     ```python
@@ -124,9 +125,10 @@ class Identification:
         If the fit did not converge, or does not explain its data, there are no bands: they are NaN.
 
         **Arguments:** `quantities`: names, as `Trajectory.quantity` takes them; `ts`: times [s], default those of the
-        data; `experiment`: its name, default the first; `level`: probability within the band.
+        data; `experiment`: its name, default the first; `level`: probability within the band, 0.95 for 95 %.
 
-        **Raises:** `ValueError` for unknown names, wrong times, and after multiple shooting.
+        **Raises:** `ValueError` for unknown names, wrong times, a level that is not between 0 and 1, and after multiple
+        shooting.
         """
         return predict(self.fit, quantities, ts=ts, experiment=experiment, level=level)
 
@@ -174,6 +176,9 @@ class Identification:
             self.reasons.get(name, f"{value:.2g}")
             for name, value in zip(self.components, _flat(self.deviations), strict=True)
         )
+
+    def __repr__(self) -> str:
+        return f"Identification of {', '.join(self.parameters)}: {self.message}"
 
     def __str__(self) -> str:
         headline, *reasons = self._verdict

@@ -8,6 +8,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike
 
+from ..._arguments import whole_number
 from ..._results import RESULTS
 from ..._types import Scalar, State, VectorLike
 from ...linalg.arrays import ARRAYS
@@ -139,7 +140,9 @@ def identify(
     )
     if method != "lm" and not isinstance(method, optax.GradientTransformation):
         raise ValueError(f"method must be 'lm' or an optax optimiser, got {method!r}.")
-    limit = _ITERATIONS["lm" if method == "lm" else "optax"] if max_iterations is None else max_iterations
+    default = _ITERATIONS["lm" if method == "lm" else "optax"]
+    limit = default if max_iterations is None else whole_number("max_iterations", max_iterations, 1, ", or None")
+    segments = whole_number("segments", segments)
 
     points = _starts(problem, starts, seed)
     if segments != 1:
@@ -250,7 +253,7 @@ def _starts(problem: Problem, starts: int | Sequence[Mapping[str, VectorLike]], 
     """The vectors to start from."""
     free = problem.free
     first = jnp.zeros(free.size, problem.trials[0].ts.dtype)
-    if not isinstance(starts, int):
+    if isinstance(starts, Sequence) and not isinstance(starts, str):
         points = [first]
         for given in starts:
             for name in given:
@@ -262,8 +265,7 @@ def _starts(problem: Problem, starts: int | Sequence[Mapping[str, VectorLike]], 
                 raise ValueError(f"The start {dict(given)} has wrong shapes or lies out of the bounds.")
             points.append(point)
         return points
-    if starts < 1:
-        raise ValueError(f"starts must be at least 1, got {starts}.")
+    starts = whole_number("starts", starts, 1, ", or starting values by name, in a list")
     random = np.random.default_rng(seed)
     draw = lambda: jnp.concatenate([r.draw(random) for r in free.ranges])
     return [first, *(draw() for _ in range(starts - 1))]

@@ -11,6 +11,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import ArrayLike
 
+from ..._arguments import probability
 from ...parts.names import unknown
 from ...system.quantities import with_shapes
 from .experiment import measured_times
@@ -47,6 +48,7 @@ def predict(
     level: float = 0.95,
 ) -> Prediction:
     """As `Identification.predict`."""
+    level = probability("level", level)
     fit.whole_motions("A prediction")
     problem = fit.problem
     if experiment is not None and experiment not in problem.names:

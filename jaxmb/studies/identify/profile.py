@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 
+from ..._arguments import probability
 from ...parts.names import unknown
 from ..minimise import Minimum, levenberg_marquardt
 from .fit import Fit
@@ -39,10 +40,9 @@ class Profile:
 
 def profile(fit: Fit, component: str, *, level: float = 0.95, values=None) -> Profile:
     """As `Identification.profile`."""
+    level = probability("level", level)
     if component not in fit.components:
         raise unknown("component", component, fit.components)
-    if not 0 < level < 1:
-        raise ValueError(f"level must be between 0 and 1, got {level}.")
     fit.whole_motions("A profile")
     walk = _Walk(fit, component)
     limit = float(ndtri((1 + level) / 2)) ** 2

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..._arguments import real_array
+from ..._printed import preformatted
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
 from ...linalg.failure import nan_where
@@ -62,6 +63,12 @@ class Floquet(eqx.Module):
         """`log(multiplier) / period` [1/s], up to multiples of `2πi / period`."""
         values = self.multipliers
         return jnp.log(values) / self.period.astype(values.dtype)
+
+    def __repr__(self) -> str:
+        return f"Floquet: {len(self.states)} states over one period"
+
+    def _repr_html_(self) -> str:
+        return preformatted(self)
 
     def __str__(self) -> str:
         if is_traced(self.monodromy) or self.monodromy.ndim != 2:

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from ..._arguments import real_array
+from ..._printed import preformatted
 from ..._types import Scalar, State, VectorLike
 from ...linalg.arrays import is_traced
 from ...manifold import project_normalized
@@ -179,6 +180,13 @@ class Linearisation(eqx.Module):
         own = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
         names = {kind: [name.replace(".", "_") for name in of_kind] for kind, of_kind in own.items()}
         return ss(*map(np.asarray, (self.A, self.B, self.C, self.D)), **names)
+
+    def __repr__(self) -> str:
+        numbers = (len(self.states), len(self.inputs), len(self.outputs))
+        return "Linearisation: {} states, {} inputs, {} outputs".format(*numbers)
+
+    def _repr_html_(self) -> str:
+        return preformatted(self)
 
     def __str__(self) -> str:
         if is_traced(self.A) or self.A.ndim != 2:

@@ -9,6 +9,8 @@ import numpy as np
 import optax
 from jaxtyping import ArrayLike
 
+from ..._arguments import whole_number
+from ..._printed import Printed
 from ..._types import VectorLike
 from ...parts.names import names_arguments
 from ...system import AbstractSystem
@@ -71,8 +73,8 @@ class Attempt:
     message: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Optimum:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Optimum(Printed):
     """The result of `optimise`; `print` shows tables.
 
     ```python
@@ -109,6 +111,9 @@ class Optimum:
     success: bool
     message: str
     derivatives: str
+
+    def __repr__(self) -> str:
+        return f"Optimum: objective {self.objective:.6g}, {self.message}"
 
     def __str__(self) -> str:
         rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
@@ -310,8 +315,7 @@ def _check(method: Any, limited: Limits, starts: Any, local: Any, max_iterations
         ("max_iterations", max_iterations),
         ("local", 1 if local is None else local),
     ):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+        whole_number(name, value)
     if local is not None and local > starts:
         raise ValueError(f"There are {starts} starts, so local can be {starts} at most; got {local}.")
     if not tol > 0:

@@ -13,6 +13,9 @@ from .evaluation import Limits, Program, linearised
 # Constraints that are violated by no more than this, relative to their size, hold.
 HOLDS = 1e-6
 
+# Trials that are kept, in case they are asked for again.
+_KEPT = 32
+
 # Violations that decrease by less than this part are as small as they become.
 _STALLED = 1e-3
 
@@ -62,20 +65,25 @@ class Trials:
         self.scales = constraint_scales(limits, start)
         self.log: list[Iteration] = []
         self._noted = start.z
+        self._kept = {np.asarray(start.z, float).tobytes(): start}
         self.record(start.z)
 
     def __call__(self, z: np.ndarray) -> Trial:
         z = np.clip(np.asarray(z, float), *self.box)
-        if not np.array_equal(z, self.last.z):
+        trial = self._kept.get(z.tobytes())
+        # A line search that found nothing begins again with the same points.
+        if trial is None:
+            trial = evaluate(self.program, z)
             self.count += 1
-            self.last = evaluate(self.program, z)
-            if not self.last.good:
-                self.failed += 1
-            else:
-                self.good = self.last
-                if self.merit(self.last) < self.merit(self.best):
-                    self.best = self.last
-        return self.last
+            self.failed += not trial.good
+            self._kept[z.tobytes()] = trial
+            if len(self._kept) > _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+        self.last = trial
+        if trial.good:
+            self.good = trial
+            self.best = min(self.best, trial, key=self.merit)
+        return trial
 
     def ended(self, z: np.ndarray) -> None:
         """Take the end of a run that converged as the best trial where that one breaks constraints by more.

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
+from ..._arguments import whole_number
 from ...parts.names import unknown
 
 MEMBER = "member"
@@ -110,16 +111,15 @@ def sobol(
 ) -> Cases:
     """A scrambled Sobol sample, which fills a box more evenly than random numbers; from `scipy.stats.qmc`.
 
-    **Arguments:** `members`, best a power of two; the lowest and the highest value of each parameter by its name, as a
-    dictionary or as keyword arguments, numbers or arrays of one shape; `log`, the names of parameters whose logarithm
-    is sampled evenly; `seed` of the scrambling.
+    **Arguments:** `members`, best a power of two, which fills the box most evenly; the lowest and the highest value of
+    each parameter by its name, as a dictionary or as keyword arguments, numbers or arrays of one shape; `log`, the
+    names of parameters whose logarithm is sampled evenly; `seed` of the scrambling.
 
     **Raises:** `ValueError` that names the parameter, for ranges that are empty or not finite.
     """
     from scipy.stats import qmc
 
-    if not isinstance(members, int | np.integer) or members < 1:
-        raise ValueError(f"members must be an integer of at least 1, got {members!r}.")
+    members = whole_number("members", members)
     box, log = {name: _range(name, given) for name, given in _named(ranges, more).items()}, tuple(log)
     for name in log:
         if name not in box:
@@ -127,7 +127,9 @@ def sobol(
         if np.any(box[name] <= 0):
             raise ValueError(f"The range of {name!r} must be positive, since its logarithm is sampled.")
     size = sum(ends[0].size for ends in box.values())
-    points, columns = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(int(members)), {}
+    # The first points of a power of two are those of any other number, of which SciPy would warn in every process.
+    sequence = qmc.Sobol(size, rng=np.random.default_rng(seed))
+    points, columns = sequence.random_base2((members - 1).bit_length())[:members], {}
     for name, ends in box.items():
         own, points = points[:, : ends[0].size].reshape(members, *ends[0].shape), points[:, ends[0].size :]
         low, high = np.log(ends) if name in log else ends

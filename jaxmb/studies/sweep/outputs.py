@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from ..._arguments import whole_number
 from ..._compat import ClosedJaxpr, Jaxpr, Literal, canonical, codes_of, is_enumerated, messages_of
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
@@ -105,9 +106,7 @@ def step_limit(function: Callable[..., Any], names: Any) -> int | None:
     if argument is None or "max_steps" in names:
         return None
     default = 65536 if argument.default is argument.empty else argument.default
-    if not isinstance(default, int):
-        raise ValueError(f"The default of the function's argument max_steps must be an integer, got {default!r}.")
-    return default
+    return whole_number("The default of the function's argument max_steps", default)
 
 
 def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray], **fixed: Any) -> Outputs:

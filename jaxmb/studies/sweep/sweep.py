@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..._arguments import whole_number
 from ..._machine import threads
 from ..._version import __version__
 from ...parts.names import names_arguments
@@ -100,7 +101,8 @@ def sweep(
         the environment for two of them. On several hosts, each with devices, start the same script on every host with
         `jax.distributed.initialize()`, give each call its own part of the cases and its own store, and
         `devices=jax.local_devices()`; a sweep needs no communication.
-    - `progress`: whether to show what is done and the time that is left, in one line.
+    - `progress`: whether to show in one line that the function is being compiled, then what is done and the time that
+        is left.
     - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by its cases, its outputs, its
         function and all that this one refers to: functions and classes by their code, systems and other objects by all
         that they hold, names and choices as well as numbers. What an installed package defines counts by its name, and
@@ -204,17 +206,22 @@ def _results(
 
 
 class _Progress:
-    """A line with the members that are done, the time that is left, and the number of failed members."""
+    """A line with the members that are done, the time that is left, and the number of failed members.
+
+    Until the first of them, or the program that computes them, is there, it says that it compiles.
+    """
 
     def __init__(self, shown: bool, cases: Cases, done: Mapping[int, np.ndarray]):
         from tqdm import tqdm
 
         statuses = list(done.values())
         self._failed = sum(int(np.sum(own != OK)) for own in statuses)
-        self.bar = tqdm(total=len(cases), initial=sum(own.size for own in statuses), unit="member", disable=not shown)
+        there = sum(own.size for own in statuses)
+        self.bar = tqdm(desc="compiling", total=len(cases), initial=there, unit="member", disable=not shown)
 
     def advance(self, members: int) -> None:
         """Some members more are done; none after compiling, whose time is left out of the rate."""
+        self.bar.set_description_str("", refresh=False)
         if members == 0:
             self.bar.unpause()
         self.bar.update(members)
@@ -248,8 +255,7 @@ def _chunks(
 
 
 def _check_engine(processes: Any, executor: Any, devices: Any) -> None:
-    if not isinstance(processes, int | np.integer) or isinstance(processes, bool) or processes < 1:
-        raise ValueError(f"processes must be an integer of at least 1, got {processes!r}.")
+    whole_number("processes", processes)
     if executor is not None and not isinstance(executor, Executor):
         raise ValueError(
             f"executor must be a concurrent.futures.Executor, got {executor!r}; Dask's is client.get_executor()."
@@ -290,9 +296,7 @@ def _chunk(given: Any, members: int, processes: int) -> int:
         on_cpu = jax.default_backend() == "cpu"
         most = _CHUNK if processes > 1 else max(_CHUNK, _OF_THREAD * threads())
         return min(most if on_cpu else _OF_ACCELERATOR, -(-members // processes))
-    if not isinstance(given, int | np.integer) or isinstance(given, bool) or given < 1:
-        raise ValueError(f"chunk must be an integer of at least 1, got {given!r}.")
-    return min(int(given), members)
+    return min(whole_number("chunk", given), members)
 
 
 def _checked_budget(batch: Batch, budget: Any) -> int | Literal["auto"] | None:
@@ -300,19 +304,18 @@ def _checked_budget(batch: Batch, budget: Any) -> int | Literal["auto"] | None:
     can_be_cut_off = batch.max_steps is not None and batch.outputs.can_be_cut_off
     if budget is None or budget == "auto":
         return budget if can_be_cut_off else None
-    if not isinstance(budget, int | np.integer) or budget < 1:
-        raise ValueError(f"budget must be 'auto', None or an integer of at least 1, got {budget!r}.")
+    budget = whole_number("budget", budget, 1, ", 'auto' or None")
     if not can_be_cut_off:
         raise ValueError(
             "A budget needs a function with an argument max_steps that hands it to simulate(..., max_steps=max_steps) "
             "and that returns the trajectory as 'result'."
         )
-    return min(int(budget), batch.max_steps or int(budget))
+    return min(budget, batch.max_steps or budget)
 
 
 def _check_version(version: Any, unknown: Mapping[str, str]) -> None:
     """Refuse what a store cannot know again, unless a version stands for it."""
-    if isinstance(version, bool) or not isinstance(version, str | int | None):
+    if isinstance(version, bool) or not isinstance(version, str | int | np.integer | None):
         raise ValueError(f"version must be a text or an integer, got {version!r}.")
     if unknown and version is None:
         place, kind = next(iter(unknown.items()))

@@ -1,6 +1,7 @@
 """Several experiments, sensors, priors, profiles, densities, shooting, predictions and reports of identification."""
 
 import dataclasses
+from typing import Any
 
 import diffrax
 import jax
@@ -16,6 +17,8 @@ from jaxmb import planar, spatial
 from jaxmb.studies.identify.covariance import combinations, covariance
 from jaxmb.studies.identify.experiment import with_times
 from jaxmb.studies.identify.loss import LOSSES
+from jaxmb.studies.identify.prediction import predict
+from jaxmb.studies.identify.profile import profile
 from jaxmb.studies.minimise import levenberg_marquardt, minimise_together
 from jaxmb.studies.ranges import second_moments
 
@@ -178,6 +181,18 @@ def test_bands_of_predictions(three):
     np.testing.assert_allclose(found.deviations["pin.force"], deviations, rtol=1e-3, atol=1e-9)
     width = found.high["rod.angle"] - found.low["rod.angle"]
     np.testing.assert_allclose(width, 2 * float(ndtri(0.95)) * found.deviations["rod.angle"])
+
+
+@pytest.mark.parametrize(
+    "level, message",
+    [(95, "got 95: for 95 % give 0.95"), (0.0, "got 0.0"), (1.0, "got 1.0"), (np.nan, "NaN"), ("95%", "real number")],
+)
+def test_a_level_is_a_probability(level, message):
+    """It is looked at before the fit is."""
+    fit: Any = None
+    for ask in (predict, profile):
+        with pytest.raises(ValueError, match=f"level must.*{message}"):
+            ask(fit, "rod.angle", level=level)
 
 
 def test_a_profile_is_what_fits_with_a_known_value_give(motion):

@@ -89,7 +89,8 @@ def test_result(system, motion):
     residuals = (np.asarray(again) - measured["rod.angle"]) / SIGMA["rod.angle"]
     np.testing.assert_allclose(residuals[np.isfinite(residuals)], fit.residuals, rtol=0, atol=1e-4)
     np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), np.concatenate([[v] for v in fit.deviations.values()]))
-    assert "spring.stiffness" in str(fit) and "converged" in str(fit)
+    assert "spring.stiffness" in str(fit) and "converged" in str(fit) and str(fit) in fit._repr_html_()
+    assert repr([fit]).startswith("[Identification of spring.stiffness, spring.damping: converged")
 
 
 def test_without_sigma_the_noise_is_estimated(system, motion):
@@ -122,6 +123,19 @@ def test_lengths_with_the_state_assembled_anew(system):
     np.testing.assert_allclose(fit.parameters["pin.point_b"], [-0.45, 0.02], rtol=0, atol=1e-6)
     np.testing.assert_allclose(fit.state.u[2], 1.0)
     assert fit.components == ("pin.point_b[0]", "pin.point_b[1]")
+
+
+def test_numbers_of_starts_are_integers_of_python_or_numpy(system, motion):
+    data = {"ts": TS, "free": ["spring.stiffness"], "solver": TSIT5}
+    fit = mb.identify(system, noisy(motion, 2), **data, starts=np.int64(2), max_iterations=np.int32(20))
+    assert fit.converged
+    for name, value in (
+        *(("starts", value) for value in (0, 2.0, True, "two")),
+        *(("segments", value) for value in (0, 2.0, "x")),
+        *(("max_iterations", value) for value in (0, 5.5, "x")),
+    ):
+        with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1.*, got {value!r}"):
+            mb.identify(system, noisy(motion, 2), **data, **{name: value})
 
 
 def test_everything_listed_can_be_measured(system, motion):

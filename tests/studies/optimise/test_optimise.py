@@ -468,6 +468,7 @@ def test_mean_and_spread_of_a_robust_design():
         ("method must be", {"objective": "f", "method": "newton"}),
         ("need method='slsqp'", {"objective": "f", "method": "bfgs", "constraints": {"square": (0, 1)}}),
         ("starts must be", {"objective": "f", "starts": 0}),
+        ("starts must be", {"objective": "f", "starts": True}),
         ("local can be 2 at most", {"objective": "f", "starts": 2, "local": 3}),
         ("tol must be positive", {"objective": "f", "tol": 0.0}),
         ("derivatives must be", {"objective": "f", "derivatives": "both"}),

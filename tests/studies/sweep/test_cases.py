@@ -42,6 +42,15 @@ def test_a_sobol_sample_fills_its_box_evenly():
     assert np.any(again != other)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("members", [1, 3, 100, np.int64(64)])
+def test_any_number_of_sobol_points_begins_the_same_sequence(members):
+    found = sobol(members, a=(1.0, 3.0), b=(0.0, 1.0), seed=3)
+    assert len(found) == members
+    for name, column in sobol(128, a=(1.0, 3.0), b=(0.0, 1.0), seed=3).columns.items():
+        np.testing.assert_array_equal(found.columns[name], column[:members])
+
+
 def test_a_frame_and_a_dataset():
     frame = pd.DataFrame({"a": [1.0, 2.0, 3.0], "n": [1, 2, 3]})
     cases = table(frame)
@@ -79,6 +88,7 @@ def test_a_frame_and_a_dataset():
         (lambda: table(xr.DataArray([1.0])), "has no name"),
         (lambda: table(xr.Dataset({"a": ("r", [1.0])}, coords={"t": ("r", [2.0])})), "reset_coords"),
         (lambda: sobol(0, a=(0, 1)), "members must be"),
+        (lambda: sobol(True, a=(0, 1)), "members must be an integer"),
         (lambda: sobol(4, a=(1, 0)), "range of 'a' must be finite, the lowest"),
         (lambda: sobol(4, a=3.0), "range of 'a' must be the lowest"),
         (lambda: sobol(4, a=(0, 1), log=["a"]), "must be positive"),

@@ -598,3 +598,9 @@ sys.exit(1)
     flags = {"JAX_ENABLE_X64": "1", "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "NPROC": "4"}
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | flags, timeout=300, capture_output=True)
     assert done.returncode == 0, done.stderr.decode()
+
+
+def test_the_line_of_progress_says_that_it_compiles(capsys):
+    mb.sweep(lambda a: {"b": 2 * a}, mb.cases.table(a=np.arange(3.0)))
+    first, *_, last = capsys.readouterr().err.replace("\n", "\r").strip().split("\r")
+    assert first.startswith("compiling:   0%") and "0/3" in first and last.startswith("100%") and "3/3" in last

@@ -1,0 +1,39 @@
+"""The motion that a picture shows: one of a batch's, without the times that a run did not reach."""
+
+import numpy as np
+
+from .._results import RESULTS
+from ..trajectory import Trajectory
+
+
+def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
+    """A single motion, without the padding of a run that ended early.
+
+    **Arguments:** `name` of the picture, for messages; `least`: how many times it needs.
+
+    **Raises:** `ValueError` for a batch, and for a motion that was saved at fewer times.
+    """
+    if trajectory.ts is None or trajectory.ts.ndim != 1:
+        shape = () if trajectory.ts is None else trajectory.ts.shape[:-1]
+        raise ValueError(
+            f"{name} shows single motions, and this is a batch of shape {shape}; choose members of it, such as "
+            "jax.tree.map(lambda leaf: leaf[0], trajectory), and show them one by one; viz.show takes a list or a "
+            "dictionary of them."
+        )
+    found = trajectory.trimmed()
+    if found.ts.shape[0] < least:
+        count = ("one time", "two times")[least - 1]
+        if found.ts.shape[0] < trajectory.ts.shape[0] and not bool(trajectory.result == RESULTS.successful):
+            why = RESULTS[trajectory.result]  # pyright: ignore[reportInvalidTypeArguments]
+            raise ValueError(f"{name} needs a motion that came to {count} or more at which it is saved: {why}")
+        raise ValueError(f"{name} needs a motion saved at {count} or more; give simulate saveat=…")
+    return found
+
+
+def check_finite(trajectory: Trajectory) -> None:
+    """Raise a `ValueError` that names the first time at which a state is not finite."""
+    ys = (trajectory.ys.q, trajectory.ys.u) if trajectory.ys.z is None else tuple(trajectory.ys)
+    good = np.all([np.all(np.isfinite(np.asarray(y)), axis=-1) for y in ys], axis=0)
+    if not good.all():
+        t = float(np.asarray(trajectory.ts)[np.argmin(good)])
+        raise ValueError(f"The state at {t:g} s is not finite: the simulation failed; see trajectory.result.")
