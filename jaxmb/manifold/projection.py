@@ -113,7 +113,8 @@ class Projection(AbstractManifold):
 
     def statistics(self, solver_state):
         # The states of Runge–Kutta methods have no charts.
-        return {"newton_iterations": solver_state.chart} if isinstance(solver_state, AbstractMultistepState) else {}
+        chart: Any = solver_state.chart if isinstance(solver_state, AbstractMultistepState) else None
+        return {} if chart is None else {"newton_iterations": chart}
 
     def violated(self, system, t, y):
         return _violated(*lax.stop_gradient((system, t, y))) if drops_rows(system) else False
