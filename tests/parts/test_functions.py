@@ -1,0 +1,67 @@
+"""Shapes that functions of the user's parts may return."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+
+
+def pulled(space, rows):
+    """A body on a spring from a function that returns its wrench in some form."""
+
+    def pull(poses, velocities, t, p):
+        d = space_of(space)
+        return rows(jnp.zeros(velocities.shape[1]).at[:d].set(-p["k"] * poses[0, :d]))
+
+    energy = lambda poses, t, p: 0.5 * p["k"] * jnp.sum(poses[0, : space_of(space)] ** 2)
+    d = space_of(space)
+    body = space.Body("body", mass=1.0, inertia=1.0 if d == 2 else np.eye(3), position=np.arange(1.0, 1.0 + d))
+    spring = mb.Force("spring", "body", pull, parameters={"k": 3.0}, potential=energy)
+    return mb.Scene([body], forces=[spring]).compile()
+
+
+def space_of(space):
+    return 2 if space is planar else 3
+
+
+@pytest.mark.parametrize("space", [planar, spatial])
+def test_a_force_on_one_body_may_return_a_vector(space):
+    row, vector = (pulled(space, rows) for rows in (lambda w: w[None], lambda w: w))
+    state = row.guess
+    np.testing.assert_array_equal(vector.force(0.0, state.q, state.u), row.force(0.0, state.q, state.u))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("space", [planar, spatial])
+def test_the_motion_under_a_force_that_returns_a_vector(space):
+    d, size = space_of(space), 3 if space is planar else 6
+    system = pulled(space, lambda w: w)
+    motion = mb.simulate(system, system.guess, t1=1.0, rtol=1e-8)
+    start, rate = np.arange(1.0, 1.0 + d), np.sqrt(3.0)
+    np.testing.assert_allclose(motion["body"].position[0], start * np.cos(rate), rtol=1e-6)
+    assert motion.forces["spring"].shape == (1, 1, size)
+    np.testing.assert_allclose(motion.forces["spring"][0, 0, :d], -3.0 * motion["body"].position[0])
+    np.testing.assert_allclose(motion.energy[-1], 1.5 * start @ start, rtol=1e-6)
+
+
+def test_a_force_on_two_bodies_returns_a_row_for_each():
+    bodies = [planar.Body(name, mass=1.0, inertia=1.0) for name in ("a", "b")]
+    lone = mb.Force("lone", ("a", "b"), lambda x, v, t, p: v[0])
+    with pytest.raises(ValueError, match=r"'lone' must return shape \(2, 3\), got \(3,\)"):
+        mb.Scene(bodies, forces=[lone]).compile()
+
+
+def test_a_gap_is_a_number_or_a_vector():
+    def scene(gap):
+        body = planar.Body("body", mass=1.0, inertia=1.0)
+        return mb.Scene([body], forces=[mb.Force("layer", "body", lambda x, v, t, p: 0 * v, gap=gap)])
+
+    for gap, count in ((lambda x, t, p: x[0, 0], 1), (lambda x, t, p: jnp.stack([x[0, 0] - 1.0, 2.0 - x[0, 0]]), 2)):
+        system = scene(gap).compile()
+        seen = system.gaps_seen(jnp.array(0.0), system.guess.q, system.guess.u.at[0].set(2.0))
+        assert system.has_gaps and seen.gaps.shape == (count,) and abs(seen.rates[0]) == 2
+    assert not scene(None).compile().has_gaps
+    with pytest.raises(ValueError, match=r"'layer': gaps must return shape \('n',\), got \(1, 3\)"):
+        scene(lambda x, t, p: x).compile()
