@@ -1,5 +1,6 @@
 """How the zero of a guard is found in a step."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,7 +57,8 @@ class Dip(AbstractGuards):
 @jax.jit
 def first_zero(first, last):
     ends, one = (jnp.array(0.0), jnp.array(1.0)), jnp.ones(1)
-    found = events.crossing(Dip(first, last, jnp.array(1e-13)), 1, None, ends, (0 * one, one), lambda t: t * one)
+    guards, states = Dip(first, last, jnp.array(1e-13)), (0 * one, 0 * one, one)
+    found = events.crossing(guards, 1, None, ends, states, lambda t: t * one, jnp.array(False))
     return found.target, found.within
 
 
@@ -64,3 +66,48 @@ def first_zero(first, last):
 def test_the_first_zero_of_a_guard_that_is_negative_within_a_step(first, last):
     target, within = first_zero(jnp.array(first), jnp.array(last))
     assert within == 1 and abs(target - first) < 2e-13
+
+
+class Slip(AbstractGuards):
+    """A guard that is the state, and may begin at the start of a step."""
+
+    touch: Array
+    near: Array
+    is_new: bool = eqx.field(static=True)
+
+    def values(self, t, y):
+        return y
+
+    def rates(self, t, y):
+        return jnp.full_like(y, jnp.inf)
+
+    def forces(self, y):
+        return jnp.zeros_like(y, bool)
+
+    def changed(self, before, after):
+        return jnp.any(before != after)
+
+    def begins(self, t, y):
+        return y <= self.touch if self.is_new else None
+
+
+def found(is_new, middle, end, made_jump=False, before=0.0):
+    """The search in a step from zero to one, whose interpolant passes through a point in its middle."""
+    guards = Slip(jnp.asarray(1e-10), jnp.asarray(1e-8), is_new)
+    at = lambda t: 4 * t * (1 - t) * jnp.array([middle]) + t * (2 * t - 1) * jnp.array([end])
+    states = jnp.array([before]), jnp.zeros(1), jnp.array([end])
+    times = jnp.zeros(()), jnp.ones(())
+    return events.crossing(guards, 1.0, None, times, states, at, jnp.array(made_jump))
+
+
+def test_a_guard_that_begins_counts_at_the_end_of_a_step():
+    """Between its ends a step errs by more than such a guard is."""
+    assert found(False, -1e-4, 1e-4).within == 1
+    assert found(True, -1e-4, 1e-4).within == 0
+    # It has come back to zero before the end.
+    turned = found(True, 1e-4, -1e-4)
+    assert turned.lowest < -1e-5 and 0.5 < turned.target < 1
+
+
+def test_an_event_at_which_nothing_changes_is_idle():
+    assert [int(found(True, 1.0, 1.0, *given).idle) for given in ((True, 0.0), (True, 0.5), (False, 0.0))] == [1, 0, 0]

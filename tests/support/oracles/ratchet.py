@@ -93,14 +93,14 @@ def moved(ratchet: Ratchet, q, u, end: float, rtol=1e-12):
 
     while t < end:
         others = [k for k in range(ratchet.teeth) if k not in closed]
-        field = lambda t, y: np.concatenate([y[2:], forces(t, y[:2], y[2:], closed)[0]])
+        field = lambda t, y, closed=closed: np.concatenate([y[2:], forces(t, y[:2], y[2:], closed)[0]])
         looks = [lambda t, y, k=k: ratchet.gaps(y[:2], y[2:])[0][k] for k in others]
-        looks += [lambda t, y, k=k: forces(t, y[:2], y[2:], closed)[1][k] for k in range(len(closed))]
+        looks += [lambda t, y, k=k, own=closed: forces(t, y[:2], y[2:], own)[1][k] for k in range(len(closed))]
         for look in looks:
             look.terminal, look.direction = True, -1
         # The first steps are short, since a gap that has just opened may close again in one that is not.
-        y = np.append(q, u)
-        run = solve_ivp(field, (t, end), y, "DOP853", None, False, looks, rtol=rtol, atol=1e-13, first_step=1e-8, max_step=0.01)
+        options = {"rtol": rtol, "atol": 1e-13, "first_step": min(1e-8, end - t), "max_step": 0.01}
+        run = solve_ivp(field, (t, end), np.append(q, u), "DOP853", events=looks, **options)
         t, q, u = run.t[-1], run.y[:2, -1], run.y[2:, -1]
         if run.status != 1:
             break

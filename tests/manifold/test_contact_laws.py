@@ -1,0 +1,32 @@
+"""Which laws of dry friction hold at the limit of stick."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmb.linalg.complementarity import Dry
+from jaxmb.manifold.contact_laws import Laws
+from jaxmb.system.gaps import FREE, STICK
+
+NORMAL, COEFFICIENT = 10.0, 0.3
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    "mode, load, sticks",
+    [(FREE, 1.0, True), (FREE, 1 + 1e-7, False), (STICK, 1.0, False), (STICK, 1 - 1e-6, True)],
+    ids=["at the limit", "above it", "held at the limit", "held below it"],
+)
+def test_friction_at_its_limit(mode, load, sticks, sign):
+    """At its limit friction sticks: the guard of its force tells whether it slips. Friction that has stuck until then
+    slips, in the direction of the load.
+    """
+    one, none = jnp.ones(1), jnp.zeros(0)
+    joint = Dry((-1,), (), COEFFICIENT * one, 0 * one, 0 * one)
+    laws = Laws(jnp.eye(1), joint, 0, 1, COEFFICIENT * one, COEFFICIENT * one)
+    reactions = jnp.array([[[0.0, NORMAL]], [[0.0, 0.0]]])
+    opening = sign * load * COEFFICIENT * NORMAL * one
+    problem = laws.of_forces(opening, reactions, none > 0, 0 * one, mode * one, 0 * one)
+    answers = laws.answers(problem)
+    assert bool(answers.solvable) and bool(answers.sticks[0]) == sticks
+    np.testing.assert_array_equal(answers.slips, [0.0 if sticks else sign])
