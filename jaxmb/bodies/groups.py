@@ -45,22 +45,23 @@ class Input(eqx.Module):
         each = zip(signals, self.names, self.members, strict=True)
         return [Input(signal, (name,), self.keys, (member,), self.moves) for signal, name, member in each]
 
-    def place(self, member: Any) -> tuple[Any, Any]:
-        """Whether the number of a part is among these, and which of several signals is its own."""
+    def value(self, member: Any, t: Scalar) -> Array:
+        """The number of a part that is among these; of one kind all are computed, once for all parts."""
         if len(self.members) == 1:
-            return member == self.members[0], None
-        # Parts after the last one with a signal have the last entry.
-        places = np.full(max(self.members) + 2, -1, np.int32)
-        places[list(self.members)] = np.arange(len(self.members))
-        place = jnp.asarray(places).at[member].get(mode="clip", wrap_negative_indices=False)
-        return place >= 0, place
-
-    def value(self, place: Any, t: Scalar) -> Array:
-        """The number of the part at a place; of one kind all are computed, once for all parts."""
-        if place is None:
             return self.signal(t)
         values = jax.vmap(lambda own: own(t))(self.signal)
+        place = self._entry(np.arange(len(self.members)), 0, member)
         return values.at[place].get(mode="clip", wrap_negative_indices=False)
+
+    def drives(self, member: Any) -> Any:
+        """Whether the number of a part is among these."""
+        return member == self.members[0] if len(self.members) == 1 else self._entry(True, False, member)
+
+    def _entry(self, of_members, of_others, member):
+        """An entry of the parts that are among these, or of the other parts, the last ones of which have the last."""
+        entries = np.full(max(self.members) + 2, of_others)
+        entries[list(self.members)] = of_members
+        return jnp.asarray(entries).at[member].get(mode="clip", wrap_negative_indices=False)
 
 
 def together(inputs: Sequence[Input]) -> tuple[Input, ...]:
@@ -112,16 +113,16 @@ class Group(eqx.Module):
         drift = jax.tree.map(lambda _: None, part)
         for own in self.inputs:
             where = lambda part, keys=own.keys: entry(part, keys)
-            given, (drives, place) = where(part), own.place(member)
-            signal = lambda t, own=own, place=place, like=given: jnp.asarray(own.value(place, t), like.dtype)
+            given = where(part)
+            signal = lambda t, own=own, like=given: jnp.asarray(own.value(member, t), like.dtype)
             if own.moves and part.takes_drift:
                 time = jnp.asarray(t, jnp.result_type(float))
                 value, rate = jax.jvp(signal, (time,), (jnp.ones_like(time),))
-                rate = jnp.where(drives, rate, jnp.zeros_like(rate))
+                rate = jnp.where(own.drives(member), rate, jnp.zeros_like(rate))
                 drift = eqx.tree_at(where, drift, rate, is_leaf=lambda x: x is None)
             else:
                 value = signal(t)
-            part = eqx.tree_at(where, part, jnp.where(drives, value, given))
+            part = eqx.tree_at(where, part, jnp.where(own.drives(member), value, given))
         return part.with_fields(drift=drift) if jax.tree.leaves(drift) else part
 
     @property

@@ -97,19 +97,21 @@ def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) 
 @eqx.filter_jit
 def _turning_times(signals, system, state, t0, t1):
     signals, system, state, t0, t1 = freeze((signals, system, state, t0, t1))
-    first, last, found = jnp.minimum(t0, t1), jnp.maximum(t0, t1), []
+    first, last = jnp.minimum(t0, t1), jnp.maximum(t0, t1)
     at_once = max(_AT_ONCE // state.q.size, 1)
 
     def turns(ts, function):
         at = lambda t: jnp.ravel(function(t))
         values = lax.map(at, jnp.clip(ts, first, last), batch_size=min(at_once, ts.size))
-        return jnp.where(_has_turned(values) & (ts[:-1] > first) & (ts[:-1] < last), ts[:-1], jnp.inf)
+        turned = _has_turned(values)
+        return jnp.where(turned & (ts[:-1] > first) & (ts[:-1] < last), ts[:-1], jnp.inf)
 
-    of_signal = lambda signal: turns(signal.samples(t0, t1), signal)
-    for numbers, signal in signals:
-        found.append(of_signal(signal) if len(numbers) == 1 else jax.vmap(of_signal)(signal).ravel())
+    of_kind = lambda function, numbers: function if len(numbers) == 1 else jax.vmap(function)
+    sampled = lambda signal: signal.samples(t0, t1)
+    kinds = [(of_kind(sampled, numbers)(signal), signal, of_kind(turns, numbers)) for numbers, signal in signals]
     if system is not None:
-        found.append(turns(sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u)))
+        kinds.append((sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u), turns))
+    found = [jnp.ravel(turned(ts, function)) for ts, function, turned in kinds]
     return jnp.sort(jnp.concatenate(found))
 
 

@@ -756,6 +756,32 @@ def test_an_input_in_place_of_one_of_several(driven):
         mb.with_parameters(again, {"motor3.torque": 1.0})
 
 
+def test_series_of_one_kind_of_a_lagrangian_system():
+    names = [f"torque{k}" for k in range(MOTORS)]
+    system = mb.lagrangian.LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * v @ v,
+        potential=lambda t, q, p: 0.0 * q[0],
+        force=lambda t, q, v, p: jnp.stack([p[name] for name in names]),
+        q=np.zeros(MOTORS),
+        parameters=dict.fromkeys(names, 0.5),
+    )
+
+    def forces(inputs):
+        driven = mb.with_inputs(system, inputs)
+        force = jax.jit(lambda t: driven.force(t, driven.guess.q, driven.guess.u))
+        return force.lower(0.3).as_text().count("\n"), force
+
+    series = {name: mb.Series(TS, values, "cubic") for name, values in zip(names, SERIES, strict=True)}
+    (of_one, _), (of_all, force) = forces({"torque3": series["torque3"]}), forces(series)
+    # Each of them is a slice for the user's function.
+    assert of_all <= 1.4 * of_one
+    np.testing.assert_allclose(force(TS[2]), SERIES[:, 2], rtol=1e-14)
+    _, force = forces(series | {"torque5": lambda t: 2.0 * t, "torque7": mb.Series(TS, TORQUES)})
+    np.testing.assert_allclose(
+        np.asarray(force(TS[3]))[[4, 5, 6, 7]], [SERIES[4, 3], 2.0 * TS[3], SERIES[6, 3], TORQUES[3]]
+    )
+
+
 def test_series_of_a_batch_and_traced_ones(driven):
     scales = jnp.array([1.0, -2.0])
 
