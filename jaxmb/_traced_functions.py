@@ -1,11 +1,17 @@
-"""Functions of the user that JAX traces: a message about the line that needs a number or a name that is not there."""
+"""Functions of the user: errors of their own, and messages about the line that needs a number or a name that is not
+there.
+"""
 
+import ast
 import contextlib
 import functools
+import linecache
 import sysconfig
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import jax
 
@@ -20,6 +26,10 @@ _PACKAGES = {
     Path(place).resolve()
     for place in (*(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")), Path(__file__).parent)
 }
+
+
+# What computes for the user's functions: its errors are about values that they return or pass on.
+_COMPUTE = {"jaxmb", "jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping"}
 
 
 @functools.cache
@@ -37,25 +47,110 @@ def traced_by_jax(what: str, argument: str) -> Iterator[None]:
     parameter".
 
     **Raises:** `ValueError` that says which line of the user's needs a number, and what to write instead; or which one
-    asks a dictionary for a name, and what names are in it.
+    asks a dictionary among the function's arguments for a name, and what names are in it. Other errors pass.
     """
     try:
         yield
     except KeyError as error:
-        if isinstance(error, ValueError):
-            # It says more: an unknown name of a system.
+        asked = asked_argument(error)
+        if asked is None:
+            _add_note(error, what)
             raise
-        frames = [own for own, _ in traceback.walk_tb(error.__traceback__) if not is_installed(own.f_code.co_filename)]
-        near = frames[-1].f_locals if frames else {}
-        there = {name: own for name, own in near.items() if isinstance(own, Mapping)}
-        listed = [f"; {name} has {', '.join(map(repr, own)) or 'no names'}" for name, own in there.items()]
-        raise ValueError(f"{_line(error)} asks for {error}, which {what} does not get{''.join(listed)}.") from error
+        name, there = asked
+        listed = ", ".join(map(repr, there)) or "no names"
+        raise ValueError(f"{_line(error)} asks for {error}, which {what} does not get; {name} has {listed}.") from error
     except NEED_NUMBERS as error:
         raise ValueError(
             f"{_line(error)} needs {argument} as a number, and {what} is traced by JAX: there is no `if`, `while`, "
             f"`float()`, `int()`, or function of NumPy or `math` of what depends on {argument}. Use jnp.where or "
             "jax.lax.cond for `if`, jax.lax.while_loop for `while`, and jax.numpy for NumPy and `math`."
         ) from error
+    except Exception as error:
+        _add_note(error, what)
+        raise
+
+
+def _add_note(error, what):
+    note = note_of(what)
+    if _users_frames(error) and note not in getattr(error, "__notes__", ()):
+        error.add_note(note)
+
+
+def note_of(what: str) -> str:
+    """What an error of the user's says of the place where it was raised."""
+    return f"This was raised in {what}."
+
+
+def _users_frames(error):
+    walked = traceback.walk_tb(error.__traceback__)
+    return [frame for frame, _ in walked if not is_installed(frame.f_code.co_filename)]
+
+
+def is_of_user(error: BaseException) -> bool:
+    """Whether a line of the user's raised an error, by itself or through the standard library or another package, and
+    not JAX, NumPy or jaxmb, unless it is that of a file.
+    """
+    if isinstance(error, OSError):
+        return bool(_users_frames(error))
+    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
+        if frame.f_globals.get("__name__", "").partition(".")[0] in _COMPUTE:
+            return False
+        if not is_installed(frame.f_code.co_filename):
+            return True
+    return False
+
+
+def with_note(function: Callable[..., Any], what: str) -> Callable[..., Any]:
+    """A function whose errors have a note if they are the user's; JAX takes its frames out of tracebacks later."""
+
+    @functools.wraps(function)
+    def noted(*given):
+        try:
+            return function(*given)
+        except Exception as error:
+            if is_of_user(error) and not isinstance(error, NEED_NUMBERS):
+                _add_note(error, what)
+            raise
+
+    return noted
+
+
+def asked_argument(error: KeyError) -> tuple[str, Mapping[Any, Any]] | None:
+    """The dictionary among the arguments of the user's function that a line asked for a name that is not in it, with
+    the name that it has there; None for another dictionary, which is the user's, and for an `UnknownNameError`.
+    """
+    walked = list(traceback.walk_tb(error.__traceback__))
+    frames = _users_frames(error)
+    if isinstance(error, ValueError) or not frames or frames[-1] is not walked[-1][0]:
+        return None
+    given, last = _arguments(frames[0]), frames[-1]
+    there = {name: own for name, own in last.f_locals.items() if any(own is each for each in given)}
+    subscripted = _subscripted(traceback.extract_tb(error.__traceback__)[-1])
+    if subscripted is not None:
+        there = {name: own for name, own in there.items() if name == subscripted}
+    missed = ((name, own) for name, own in there.items() if error.args and error.args[0] not in own)
+    return next(missed, None)
+
+
+def _arguments(frame: FrameType) -> list[Mapping[Any, Any]]:
+    """The dictionaries among the arguments of a call."""
+    code = frame.f_code
+    names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+    return [own for name in names if isinstance(own := frame.f_locals.get(name), Mapping)]
+
+
+def _subscripted(place: traceback.FrameSummary) -> str | None:
+    """The expression in front of the brackets where an error was raised, `"p"` of `p["mass"]`; None without a source
+    file, and for anything else.
+    """
+    if place.lineno is None or place.colno is None or place.lineno != place.end_lineno:
+        return None
+    line = linecache.getline(place.filename, place.lineno).encode()
+    try:
+        parsed = ast.parse(line[place.colno : place.end_colno].decode(), mode="eval").body
+    except (SyntaxError, UnicodeDecodeError):
+        return None
+    return ast.unparse(parsed.value) if isinstance(parsed, ast.Subscript) else None
 
 
 def _line(error: Exception) -> str:

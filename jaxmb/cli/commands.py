@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 
@@ -10,6 +11,7 @@ import jax
 
 from .. import mechanisms
 from .._programs import VARIABLE, compile_quickly, keep_compiled
+from .._traced_functions import is_of_user
 from . import doctor, help, report, run, sweep
 
 
@@ -19,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     **Arguments:** `argv`: the words after `jaxmb`, default those of the process.
 
     **Returns:** the exit code: 0; with a message on stderr 1 if a simulation failed or a file could not be written, 2
-    for a name or value that does not fit, and 130 after Ctrl-C.
+    for a name or value that does not fit, and 130 after Ctrl-C. Errors of a user's file have their tracebacks.
     """
     arguments = parser().parse_args(argv)
     jax.config.update("jax_enable_x64", True)
@@ -33,7 +35,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"jaxmb: {error}", file=sys.stderr)
+        if is_of_user(error):
+            traceback.print_exception(error)
+        else:
+            print(f"jaxmb: {error}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
     except KeyboardInterrupt:
         print("jaxmb: interrupted", file=sys.stderr)

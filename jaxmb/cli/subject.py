@@ -24,7 +24,7 @@ def mechanism_of(arguments: argparse.Namespace) -> Mechanism:
     try:
         mechanism = mechanisms.get(arguments.mechanism, **parameters) if own is None else _made(own, arguments)
     except Exception as error:
-        if not parameters:
+        if own is not None or not parameters:
             raise
         # A value of the wrong type may fail anywhere in the mechanism.
         given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())
@@ -40,15 +40,23 @@ def mechanism_of(arguments: argparse.Namespace) -> Mechanism:
 def _function(where: str) -> Callable[..., Any]:
     """A function from `module:function` or `file.py:function`."""
     source, _, name = where.rpartition(":")
-    try:
-        if source.endswith(".py"):
-            module = module_from(source)
-        else:
-            sys.path.insert(0, "")
+    cure = "give module:function or file.py:function"
+    if source.endswith(".py"):
+        if not Path(source).is_file():
+            raise ValueError(f"{where}: there is no file {source}; {cure}.")
+        module = module_from(source)
+    else:
+        sys.path.insert(0, "")
+        try:
             module = importlib.import_module(source)
-        return getattr(module, name)
-    except (ImportError, FileNotFoundError, AttributeError) as error:
-        raise ValueError(f"{where}: {error}; give module:function or file.py:function.") from error
+        except ModuleNotFoundError as error:
+            # What the module itself imports may be missing as well.
+            if error.name is None or not f"{source}.".startswith(f"{error.name}."):
+                raise
+            raise ValueError(f"{where}: {error}; {cure}.") from error
+    if not hasattr(module, name):
+        raise ValueError(f"{where}: {source} has no {name!r}; {cure}.")
+    return getattr(module, name)
 
 
 def _made(function: Callable[..., Any], arguments: argparse.Namespace) -> Mechanism:

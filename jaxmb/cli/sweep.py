@@ -41,24 +41,17 @@ def _sweep(arguments: argparse.Namespace) -> None:
         raise ValueError(f"The source must be file.py or file.py:function:cases, got {arguments.source!r}.")
     if not Path(source).is_file():
         raise ValueError(f"There is no file {source}.")
-    try:
-        module = module_from(source)
-        function, cases = (_named(module, source, name) for name in (names or ("function", "cases")))
-        found = sweep(
-            function,
-            cases,
-            arguments.out,
-            **{name: getattr(module, name) for name in _OPTIONS if hasattr(module, name)},
-            chunk=arguments.chunk,
-            processes=arguments.processes,
-            overwrite=arguments.overwrite,
-        )
-    except (ValueError, RuntimeError, OSError):
-        raise
-    except Exception as error:
-        # Whatever the user's file or function raises.
-        reason = str(error).split("\n")[0]
-        raise RuntimeError(f"{source}: {type(error).__name__}: {reason}") from error
+    module = module_from(source)
+    function, cases = (_named(module, source, name) for name in (names or ("function", "cases")))
+    found = sweep(
+        function,
+        cases,
+        arguments.out,
+        **{name: getattr(module, name) for name in _OPTIONS if hasattr(module, name)},
+        chunk=arguments.chunk,
+        processes=arguments.processes,
+        overwrite=arguments.overwrite,
+    )
     status = found["status"].to_numpy()
     print(f"Wrote {arguments.out}: {status.size} members, {int(np.sum(status != OK))} of them failed.")
     words = found["status"].attrs["flag_meanings"].split()

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._traced_functions import traced_by_jax
+from .._traced_functions import note_of, traced_by_jax, with_note
 from .._types import State
 from ..linalg.elimination import full_pivot
 from ..parts.names import unknown
@@ -67,8 +67,10 @@ def constraint_sizes(
 def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[..., Any], *given: Any) -> tuple[int, ...]:
     try:
         with traced_by_jax(name, "an argument"):
-            shape = jax.eval_shape(lambda *given: jnp.asarray(evaluate(*given)), *given).shape
+            shape = jax.eval_shape(with_note(lambda *given: jnp.asarray(evaluate(*given)), name), *given).shape
     except TypeError as error:
+        if note_of(name) in getattr(error, "__notes__", ()):
+            raise
         raise ValueError(f"{name} does not fit the system: {error}") from error
     if expected is not None and shape != expected:
         raise ValueError(f"{name} must have shape {expected}, got {shape}.")

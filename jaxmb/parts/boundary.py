@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._traced_functions import NEED_NUMBERS, traced_by_jax
+from .._traced_functions import NEED_NUMBERS, note_of, traced_by_jax, with_note
 from .base import (
     AbstractConstraint,
     AbstractDynamicForce,
@@ -101,13 +101,14 @@ def _evaluated(label: str, name: str, kernel: Callable[..., Any], given: tuple[A
         if isinstance(error, IndexError) and "out of bounds" in str(error):
             raise ValueError(f"{label}: {name} indexes out of bounds: {error}.") from error
         of_numbers = None
-    with traced_by_jax(f"{name} of {label}", "an argument"):
+    what = f"{name} of {label}"
+    with traced_by_jax(what, "an argument"):
         try:
-            return jax.eval_shape(kernel, *given)
+            return jax.eval_shape(with_note(kernel, what), *given)
         except NEED_NUMBERS:
             raise
         except Exception as error:
-            if isinstance(error, KeyError) and not isinstance(error, ValueError):
+            if note_of(what) in getattr(error, "__notes__", ()):
                 raise
             if of_numbers is None:
                 cause = str(error).strip().splitlines()[0]

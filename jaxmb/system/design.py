@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._arguments import check_kind, real_shape
-from .._traced_functions import traced_by_jax
+from .._traced_functions import asked_argument, traced_by_jax
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
-from ..parts.names import UnknownNameError, unknown
+from ..parts.names import unknown
 from .catalogue import AbstractSystem
 from .design_variables import DesignVariables, Variable
 from .parameters import System, parameters, with_parameters
@@ -107,9 +107,9 @@ def _checked(own: DesignVariables, known: Mapping[str, Array]) -> dict[str, Arra
     """The derived parameters of the first values."""
     try:
         derived: Any = own.derive(dict(own.values))
-    except UnknownNameError:
-        raise
     except KeyError as error:
+        if asked_argument(error) is None:
+            raise
         raise unknown("design variable", str(error.args[0]), own.values) from None
     if not isinstance(derived, Mapping) or not derived:
         raise ValueError(f"derive must return parameters by name, at least one; got {derived!r}.")

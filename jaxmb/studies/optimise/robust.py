@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._arguments import real_array
+from ..._traced_functions import asked_argument
 from ..._types import VectorLike
-from ...parts.names import UnknownNameError, names_arguments, unknown
+from ...parts.names import names_arguments, unknown
 from ..batch import batch
 
 
@@ -61,9 +62,9 @@ def robust(
             moved = {name: values[name] + x if name in values else x for name, x in sample.items()}
             try:
                 out = function({**values, **moved}, **options)
-            except UnknownNameError:
-                raise
             except KeyError as error:
+                if asked_argument(error) is None:
+                    raise
                 raise unknown("parameter", str(error.args[0]), [*values, *arrays]) from None
             return out if isinstance(out, Mapping) else {"objective": out}
 

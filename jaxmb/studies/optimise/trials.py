@@ -5,6 +5,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -114,11 +115,13 @@ class Trials:
 
 
 def evaluate(program: Program, z: np.ndarray) -> Trial:
-    """One trial. An error at run time, such as that of a simulation that throws, is a trial that failed."""
+    """One trial. An error of the program, such as that of a simulation that throws, is a trial that failed; one of the
+    machine, or of a function of the user that the program calls, is not.
+    """
     try:
         rows, jacobian, outputs = linearised(program, jnp.asarray(z, jnp.result_type(float)))
         rows = np.asarray(rows)
-    except RuntimeError:
+    except eqx.EquinoxRuntimeError:
         return Trial(z, np.full(1, np.nan), np.full((1, z.size), np.nan), {})
     return Trial(z, rows, np.asarray(jacobian), {name: np.asarray(value) for name, value in outputs.items()})
 
