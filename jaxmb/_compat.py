@@ -41,6 +41,12 @@ sequential_vmap = jax.custom_batching.sequential_vmap
 
 # The parts of traced programs. (jax.extend.core, 0.7 to 0.10; jax 0.11 changes what `scan` holds.)
 ClosedJaxpr, Jaxpr, Literal = core.ClosedJaxpr, core.Jaxpr, core.Literal
+# What equations of functions with derivative rules of their own hold besides: functions of Python, `bwd` only where
+# there is one for reverse mode. (custom_jvp_call and custom_vjp_call, 0.9 and 0.10.)
+REVERSE = "bwd"
+RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
+# A closed jaxpr as a function of its operands. (jax.extend.core.jaxpr_as_fun, 0.9 and 0.10.)
+jaxpr_as_function = core.jaxpr_as_fun
 
 
 def default_float() -> np.dtype:

@@ -13,9 +13,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._captured import Captured
 from .._types import Scalar
 from ..linalg.arrays import unchecked_take
 from ..parts.base import AbstractPart
+from ..parts.boundary import captured
 from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal, of_each, of_one_kind
 from ..parts.servo import Servo
@@ -80,7 +82,8 @@ def together(inputs: Sequence[Input]) -> tuple[Input, ...]:
 class Group(eqx.Module):
     """Stacked parts. `part` has the structure of one part with a leading axis on every number; `inputs` replace some
     numbers by functions of time; `inner`: where the parts hold other parts, the keys that lead there and the names of
-    these; `chosen`: the numbers of the parts, None where they are all.
+    these; `chosen`: the numbers of the parts, None where they are all; `kernels` of a class of the user's by name, as
+    they were when the scene was compiled.
     """
 
     part: Any
@@ -89,6 +92,7 @@ class Group(eqx.Module):
     layout: Layout = eqx.field(static=True)
     inputs: tuple[Input, ...] = ()
     inner: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = eqx.field(static=True, default=())
+    kernels: tuple[tuple[str, Captured], ...] = eqx.field(static=True, default=())
     chosen: Int[Array, "parts"] | None = None
 
     def only(self, member: Any) -> Self:
@@ -103,6 +107,16 @@ class Group(eqx.Module):
         single = lambda member, part, *own: kernel(lambda t: self._at(member, part, t), *own)
         members = jnp.arange(len(self.names)) if self.chosen is None else self.chosen
         return jax.vmap(single)(members, self.part, *per_part)
+
+    def kernel(self, name: str) -> Callable[..., Any]:
+        """A kernel as a function of one part and of what it takes after `space`; one that takes nothing is a property."""
+        space = self.layout.space
+        plain = lambda part, *own: getattr(part, name)(space, *own) if own else getattr(part, name)
+        return dict(self.kernels).get(name, plain)
+
+    def coordinates(self, part: Any, poses: Float[Array, "k p"]) -> dict[str, Array]:
+        """The coordinates of one part at these poses of its bodies."""
+        return self.kernel("coordinates")(part, part.seen_poses(self.layout.space, poses))
 
     def single(self, member: int, t: Scalar) -> Any:
         """One part at a time."""
@@ -148,16 +162,20 @@ def stack(
     """Group parts that share type, static fields and shapes; order of first appearance.
 
     **Arguments:** `parts` with the numbers of their bodies; `check(part, space, bodies)`: called for one part of each
-    group.
+    group, whose functions are those of all others.
     """
     groups: dict[Any, list] = {}
+    known: dict[Any, tuple[Any, Any]] = {}
     for part, bodies in parts:
         leaves, structure = jtu.tree_flatten(anonymous(part))
         if not all(eqx.is_array_like(leaf) for leaf in leaves):
             raise ValueError(_not_numbers(part))
         key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
-        if key not in groups and check is not None:
-            check(part, layout.space, len(bodies))
+        if key not in groups:
+            if check is not None:
+                check(part, layout.space, len(bodies))
+            part_now, kernels = captured(anonymous(part), layout.space, len(bodies))
+            known[key] = jtu.tree_structure(part_now), tuple(kernels.items())
         groups.setdefault(key, []).append((leaves, part.name, bodies, list(inner_parts(part))))
     out = []
     for key, members in groups.items():
@@ -166,7 +184,8 @@ def stack(
         leaves = [jax.device_put(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
         inner = tuple((keys, tuple(m[3][k][1].name for m in members)) for k, (keys, _) in enumerate(members[0][3]))
-        out.append(Group(jtu.tree_unflatten(key[0], leaves), names, bodies, layout, inner=inner))
+        structure, kernels = known[key]
+        out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout, inner=inner, kernels=kernels))
     return tuple(out)
 
 
@@ -197,11 +216,11 @@ class AbstractGroup(eqx.Module):
 
     def given_in_time(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts *shape"]:
         """What functions of time give in parts that have them, while nothing moves."""
-        space = self.group.layout.space
+        space, kernel = self.group.layout.space, self.group.kernel("given_in_time")
 
         def single(at, x, v):
             part = at(t)
-            return part.given_in_time(space, *part.seen(space, x, v), t)
+            return kernel(part, *part.seen(space, x, v), t)
 
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
@@ -212,12 +231,12 @@ class BodyGroup(AbstractGroup):
     @property
     def mass(self) -> Float[Array, "parts"]:
         """Masses [kg]."""
-        return jax.vmap(lambda body: body.mass)(self.group.part)
+        return jax.vmap(self.group.kernel("mass"))(self.group.part)
 
     @property
     def inertia(self) -> Float[Array, "parts *matrix"]:
         """Moments of inertia [kg m²] about the mass centres."""
-        return jax.vmap(lambda body: body.inertia)(self.group.part)
+        return jax.vmap(self.group.kernel("inertia"))(self.group.part)
 
 
 class CoordinateGroup(AbstractGroup):
@@ -229,8 +248,7 @@ class CoordinateGroup(AbstractGroup):
 
     def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
         """Their coordinates, by name within the part."""
-        space = self.group.layout.space
-        return self.group.map(lambda at, x: at(t).coordinates_at(space, x), self.group.gather(poses))
+        return self.group.map(lambda at, x: self.group.coordinates(at(t), x), self.group.gather(poses))
 
 
 class FrameGroup(AbstractGroup):
@@ -309,14 +327,14 @@ class ConstraintGroup(AbstractConstraintGroup):
 
     def _residual(self, at, t, x):
         part = at(t)
-        return part.residual(self._space, part.seen_poses(self._space, x), t)
+        return self.group.kernel("residual")(part, part.seen_poses(self._space, x), t)
 
     def residual(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts rows"]:
         return self._map(lambda at, x: self._residual(at, t, x), poses)
 
     def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
         """The joints' own coordinates, by name within the joint."""
-        return self._map(lambda at, x: at(t).coordinates_at(self._space, x), poses)
+        return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
 
     def along(self, t: Scalar, poses: BodyPoses, moves: Float[Array, "b_ground n p"]) -> Float[Array, "parts rows k n"]:
         """Derivatives along `n` motions of every body, one at a time."""
@@ -398,7 +416,7 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
 
     def _residual(self, at, t, x, v):
         part, space = at(t), self._space
-        return part.residual(space, *part.seen(space, x, v), t)
+        return self.group.kernel("residual")(part, *part.seen(space, x, v), t)
 
     def velocity(self, t, poses, velocities):
         return self._map(lambda at, x, v: self._residual(at, t, x, v), poses, velocities)
@@ -442,7 +460,7 @@ class ForceGroup(AbstractGroup):
 
     def _wrenches(self, at, t, x, v):
         part, space = at(t), self.group.layout.space
-        wrenches = part.wrenches(space, *part.seen(space, x, v), t)
+        wrenches = self.group.kernel("wrenches")(part, *part.seen(space, x, v), t)
         return part.wrenches_on_bodies(space, x, wrenches)
 
     def gaps(
@@ -454,11 +472,11 @@ class ForceGroup(AbstractGroup):
         space = self.group.layout.space
 
         def single(at, x, v):
-            gaps = lambda t, x: at(t).gaps(space, at(t).seen_poses(space, x), t)
+            gaps = lambda t, x: self.group.kernel("gaps")(at(t), at(t).seen_poses(space, x), t)
             gap, rate = jax.jvp(gaps, (t, x), (jnp.ones_like(t), jax.vmap(space.rates)(x, v)))
             part = at(t)
             width = jnp.broadcast_to(jnp.asarray(part.gap_width, gap.dtype), gap.shape)
-            return gap, rate, width, part.gap_pace(space, *part.seen(space, x, v), t)
+            return gap, rate, width, self.group.kernel("gap_pace")(part, *part.seen(space, x, v), t)
 
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
@@ -470,7 +488,7 @@ class ForceGroup(AbstractGroup):
 
         def single(at, x, v):
             part = at(t)
-            return part.state_rates(space, *part.seen(space, x, v), t)
+            return self.group.kernel("state_rates")(part, *part.seen(space, x, v), t)
 
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
 
@@ -495,7 +513,7 @@ class ForceGroup(AbstractGroup):
 
         def single(at, x):
             part = at(t)
-            return part.energy(space, part.seen_poses(space, x), t)
+            return self.group.kernel("energy")(part, part.seen_poses(space, x), t)
 
         return jnp.sum(self.group.map(single, self.group.gather(poses)))
 
@@ -513,7 +531,8 @@ class NonIdealGroup(AbstractGroup):
 
         def single(at, x, v, own):
             part = at(t)
-            wrenches = part.wrenches(space, *part.seen(space, x, v), part.seen_wrenches(space, x, own), t)
+            seen = *part.seen(space, x, v), part.seen_wrenches(space, x, own)
+            wrenches = self.group.kernel("wrenches")(part, *seen, t)
             return part.wrenches_on_bodies(space, x, wrenches)
 
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities), reactions)

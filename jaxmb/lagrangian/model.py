@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._captured import Captured
 from .._types import Coordinates, Scalar, State, Velocities
 from ..parts.series import AbstractSignal, of_each
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
@@ -60,8 +61,8 @@ class AbstractLagrangian(AbstractSystem):
     **Fields:** those that `LagrangianSystem` takes; `lagrangian(t, q, v, parameters)`; `applied`, the forces without
     potential, or None; `constraints`, ordered by level; `sizes`, the number of rows of each.
 
-    `inputs` are the parameters that are functions of time. `diagonal` says whether the mass matrix is diagonal and
-    constant.
+    `inputs` are the parameters that are functions of time; `known`: all kernels where classes of the user's have a
+    share in them, which tell the system from others. `diagonal` says whether the mass matrix is diagonal and constant.
     """
 
     lagrangian: Callable[..., Array] = eqx.field(static=True)
@@ -76,6 +77,7 @@ class AbstractLagrangian(AbstractSystem):
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
     inputs: tuple[DrivenParameters, ...]
+    known: Captured | None = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = eqx.field(default=(), kw_only=True)
 
     diagonal: AbstractVar[bool]
@@ -151,12 +153,14 @@ class AbstractLagrangian(AbstractSystem):
     # Kinematics
 
     def rates(self, t, q, u):
+        t = jnp.asarray(t, q.dtype)
         return self.kinematics.rates(t, q, u, self.parameters_at(t))
 
     # Constraints
 
     @eqx.filter_jit
     def position_residual(self, t, q):
+        t = jnp.asarray(t, q.dtype)
         return self._join(c.value(t, q, q, q, self.parameters_at(t)) for c in self.constraints if c.level == 0)
 
     @eqx.filter_jit
@@ -245,6 +249,7 @@ class AbstractLagrangian(AbstractSystem):
     @eqx.filter_jit
     def potential_energy(self, t, q):
         """`−L(t, q, 0)`."""
+        t = jnp.asarray(t, q.dtype)
         return -self.lagrangian(t, q, jnp.zeros_like(q), self.parameters_at(t))
 
     # Scales

@@ -10,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._captured import Captured
+from .._compat import changed
 from .._traced_functions import note_of, traced_by_jax, with_note
 from .._types import State
 from ..linalg.elimination import full_pivot
+from ..parts.boundary import is_of_user, with_captured
 from ..parts.names import unknown
 from ..states.closest import meet_constraints, residual_size, tolerance
 from ..states.redundancy import check_gradients, check_implied_as_one
@@ -75,6 +78,34 @@ def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[..., 
     if expected is not None and shape != expected:
         raise ValueError(f"{name} must have shape {expected}, got {shape}.")
     return shape
+
+
+def with_programs(system: Unanalysed) -> Unanalysed:
+    """A system whose functions have been checked, with these as JAX traces them now."""
+    system, functions = with_captured(system)
+
+    def kernels(own: Unanalysed, t: Any, q: Any, u: Any) -> Any:
+        v, p = own.kinematics.rates(t, q, u, own.parameters), own.parameters
+        sizes = {c.name: jnp.zeros(n, q.dtype) for c, n in zip(own.constraints, own.sizes, strict=True)}
+        # That of a constraint that is not there is refused later.
+        laws = [law for law in own.nonideal if law.constraint in sizes]
+        return (
+            own.lagrangian(t, q, v, p),
+            own.applied_force(t, q, v),
+            [c.value(t, q, v, v, p) for c in own.constraints],
+            [law.force(t, q, v, q, sizes[law.constraint], p) for law in laws],
+        )
+
+    given = jnp.zeros((), system.guess.q.dtype), system.guess.q, system.guess.u
+    eqx.filter_eval_shape(kernels, system, *given)
+    for function in functions:
+        function.keep()
+    if not is_of_user((system.constraints, system.nonideal, system.kinematics, system.equations)):
+        return system
+    known = Captured(kernels)
+    known.trace(system, *given)
+    known.keep()
+    return changed(system, known=known)
 
 
 class Structure(NamedTuple):

@@ -20,7 +20,7 @@ from .dataflow import depends
 from .kinematics import AbstractKinematics, Rates
 from .model import AbstractEquations, AbstractLagrangian, DrivenParameters, Projected
 from .nonideal import AbstractNonIdealForce
-from .structure import Unanalysed, constraint_sizes, find_structure
+from .structure import Unanalysed, constraint_sizes, find_structure, with_programs
 
 # Names that a saved motion holds besides the coordinates, and the argument of `numpy.savez` that no array can have.
 _TAKEN = ("t", "q", "u", "energy", "file")
@@ -68,6 +68,8 @@ class LagrangianSystem(AbstractLagrangian):
     - `coordinates`: names of the coordinates, which a saved motion keeps them under, so no `t`, `q`, `u`, `energy`,
         `file`, and no slashes; default `q0`, `q1`, ….
     - `length`: the size that residuals of positions are relative to.
+
+    Functions count with the values that they read now: after a change of a global variable, make the system anew.
 
     **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
     that no positions satisfy near the guess, constraints on velocities or accelerations that contradict others, a guess
@@ -120,7 +122,9 @@ class LagrangianSystem(AbstractLagrangian):
             coordinates=names,
             sizes=constraint_sizes(energies, force, constraints, kinematics, guess, numbers),
             inputs=(),
+            known=None,
         )
+        model = with_programs(model)
         for field in dataclasses.fields(model):
             setattr(self, field.name, getattr(model, field.name))
         for name, value in find_structure(model)._asdict().items():

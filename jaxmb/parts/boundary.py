@@ -1,23 +1,36 @@
-"""Checks of what the kernels of a part return, by abstract evaluation: nothing is computed or compiled."""
+"""Where the functions of a part enter a scene: checks of what its kernels return, by abstract evaluation, and its
+functions as JAX traces them then. Nothing is computed or compiled.
+"""
 
-from collections.abc import Callable
-from typing import Any
+import dataclasses
+import functools
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._traced_functions import NEED_NUMBERS, note_of, traced_by_jax, with_note
+from .._captured import Captured
+from .._compat import with_values
+from .._traced_functions import NEED_NUMBERS, is_installed, note_of, traced_by_jax, with_note
 from .base import (
+    AbstractBody,
     AbstractConstraint,
     AbstractDynamicForce,
     AbstractForce,
+    AbstractLink,
     AbstractNonIdeal,
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
 from .fields import entry, internal_states
+from .module_weights import ModuleWeights
 from .space import AbstractSpace
+
+T = TypeVar("T")
 
 
 def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
@@ -27,59 +40,143 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
 
     **Arguments:** `part`: with every number filled in; `bodies`: number of bodies that it acts on.
     """
-    dtype = np.dtype(jnp.result_type(float))
-    ground: Any = np.asarray(space.ground, dtype)
-    poses = np.tile(space.prepare(ground), (bodies, 1))
-    velocities, t = np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
-    of_bodies = velocities.shape
     if internal_states(part) and not isinstance(part, AbstractDynamicForce):
         raise ValueError(
             f"{part.label} has internal states; derive it from AbstractDynamicForce, which has their rates."
         )
-    if isinstance(part, AbstractConstraint):
-        check_returns(part.label, "residual", (part.rows,), lambda x, t: part.residual(space, x, t), poses, t)
-    elif isinstance(part, AbstractVelocityConstraint):
-        check_returns(
-            part.label, "residual", (part.rows,), lambda x, v, t: part.residual(space, x, v, t), poses, velocities, t
-        )
+    for name, shape, given in _kernels(part, space, bodies):
+        kernel = lambda *own, name=name: getattr(part, name)(space, *own)
+        if name == "gaps":
+            _check_gaps(part, kernel, given)
+        elif shape is None:
+            _check_state_rates(part, kernel, given)
+        else:
+            check_returns(part.label, name, shape, kernel, *given)
+    if isinstance(part, AbstractForce) and not isinstance(part, AbstractPotentialForce) and hasattr(part, "energy"):
+        raise ValueError(f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce.")
+
+
+def captured(part: T, space: AbstractSpace, bodies: int) -> tuple[T, dict[str, Captured]]:
+    """A part whose kernels have been checked, with its functions as JAX traces them now.
+
+    **Returns:** the part, and by their names kernels that a class of the user's may have a share in: functions of the
+    part and of what the kernel takes after `space`.
+    """
+    part, functions = with_captured(part)
+    kernels = dict(_traced_kernels(part, space, bodies)) if functions or is_of_user(part) else {}
+    for kernel, given in kernels.values():
+        jax.eval_shape(functools.partial(kernel, part), *given)
+    for function in functions:
+        function.keep()
+    out = {}
+    for name, (kernel, given) in kernels.items() if is_of_user(part) else ():
+        out[name] = Captured(kernel)
+        out[name].trace(part, *given)
+        out[name].keep()
+    return part, out
+
+
+def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[Any, list[Any]]]]:
+    """The kernels of a part by name, each with its arguments besides the part."""
+    if isinstance(part, AbstractBody):
+        yield "mass", (lambda part: part.mass, [])
+        yield "inertia", (lambda part: part.inertia, [])
+    for name, _, given in _kernels(part, space, bodies):
+        yield name, (lambda part, *own, name=name: getattr(part, name)(space, *own), given)
+    if isinstance(part, AbstractLink):
+        poses, velocities, t = _arguments(space, bodies)
+        yield "coordinates", (lambda part, poses: part.coordinates(space, poses), [poses])
+        if part.of_time:
+            moving = lambda part, *own: part.given_in_time(space, *own)
+            yield "given_in_time", (moving, [poses, velocities, t])
+
+
+def is_of_user(value: Any) -> bool:
+    """Whether there is a module in a part, or in a collection of modules, of a class that no installed package defines.
+
+    Modules whose weights are a number do not count: functions call them.
+    """
+    if isinstance(value, dict):
+        return any(map(is_of_user, value.values()))
+    if isinstance(value, tuple):
+        return any(map(is_of_user, value))
+    if not isinstance(value, eqx.Module) or isinstance(value, ModuleWeights):
+        return False
+    kinds = [kind for kind in type(value).__mro__ if kind is not object]
+    of_packages = all(is_installed(getattr(sys.modules.get(kind.__module__), "__file__", None)) for kind in kinds)
+    return not of_packages or any(map(is_of_user, vars(value).values()))
+
+
+def with_captured(module: T) -> tuple[T, list[Captured]]:
+    """A module with all functions in its fields captured, also in modules that it holds, and these functions.
+
+    Modules whose weights are a number stay: other functions call them.
+    """
+    found: list[Captured] = []
+
+    def own(value: Any, is_static: bool) -> Any:
+        if isinstance(value, ModuleWeights | type):
+            return value
+        if isinstance(value, eqx.Module) and not is_static:
+            static = {field.name: field.metadata.get("static", False) for field in dataclasses.fields(value)}
+            return with_values(type(value), {name: own(x, static.get(name, False)) for name, x in vars(value).items()})
+        if isinstance(value, dict):
+            return {name: own(x, is_static) for name, x in value.items()}
+        if type(value) is tuple:
+            return tuple(own(x, is_static) for x in value)
+        if callable(value):
+            found.append(Captured(value))
+            return found[-1]
+        return value
+
+    new = own(module, False)
+    return (new if found else module), found
+
+
+def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[int, ...] | None, list[Any]]]:
+    """The name of each kernel of a part, the shape that it must return, None where there is none, and its arguments."""
+    poses, velocities, t = _arguments(space, bodies)
+    if isinstance(part, AbstractVelocityConstraint):
+        yield "residual", (part.rows,), [poses, velocities, t]
+    elif hasattr(part, "residual"):
+        yield "residual", (part.rows,), [poses, t]
     elif isinstance(part, AbstractNonIdeal):
-        kernel = lambda x, v, r, t: part.wrenches(space, x, v, r, t)
-        check_returns(part.label, "wrenches", of_bodies, kernel, poses, velocities, velocities, t)
+        yield "wrenches", velocities.shape, [poses, velocities, velocities, t]
     elif isinstance(part, AbstractForce):
-        check_returns(
-            part.label, "wrenches", of_bodies, lambda x, v, t: part.wrenches(space, x, v, t), poses, velocities, t
-        )
+        yield "wrenches", velocities.shape, [poses, velocities, t]
         if part.has_gaps:
-            _check_gaps(part, space, poses, t)
+            yield "gaps", None, [poses, t]
+            yield "gap_pace", (), [poses, velocities, t]
         if isinstance(part, AbstractDynamicForce):
-            _check_state_rates(part, space, poses, velocities, t)
-        if isinstance(part, AbstractPotentialForce):
-            if part.conservative:
-                check_returns(part.label, "energy", (), lambda x, t: part.energy(space, x, t), poses, t)
-        elif hasattr(part, "energy"):
-            raise ValueError(
-                f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce."
-            )
+            yield "state_rates", None, [poses, velocities, t]
+        if isinstance(part, AbstractPotentialForce) and part.conservative:
+            yield "energy", (), [poses, t]
 
 
-def _check_gaps(part: AbstractForce, space: AbstractSpace, *given: Any) -> None:
+def _check_gaps(part: AbstractForce, kernel: Callable[..., Any], given: list[Any]) -> None:
     """The same for gaps, of which there may be any number."""
-    gaps = lambda x, t: part.gaps(space, x, t)
-    shape = getattr(_evaluated(part.label, "gaps", gaps, given), "shape", ())
-    check_returns(part.label, "gaps", shape if len(shape) == 1 else ("n",), gaps, *given)
+    shape = getattr(_evaluated(part.label, "gaps", kernel, tuple(given)), "shape", ())
+    check_returns(part.label, "gaps", shape if len(shape) == 1 else ("n",), kernel, *given)
 
 
-def _check_state_rates(part: AbstractDynamicForce, space: AbstractSpace, *given: Any) -> None:
+def _arguments(space: AbstractSpace, bodies: int) -> tuple[Any, Any, Any]:
+    """Poses, velocities and a time that kernels take."""
+    dtype = np.dtype(jnp.result_type(float))
+    ground: Any = np.asarray(space.ground, dtype)
+    poses = np.tile(space.prepare(ground), (bodies, 1))
+    return poses, np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
+
+
+def _check_state_rates(part: AbstractDynamicForce, kernel: Callable[..., Any], given: list[Any]) -> None:
     """The same for the rates of internal states, each of which must have a rate of its shape."""
     states = internal_states(part)
-    rates = lambda *given: part.state_rates(space, *given)
-    found = _evaluated(part.label, "state_rates", rates, given)
+    found = _evaluated(part.label, "state_rates", kernel, tuple(given))
     if not isinstance(found, dict) or set(found) != set(states):
         names = ", ".join(states) or "none"
         raise ValueError(f"{part.label}: state_rates must return a dictionary of the internal states, {names}.")
     for name, keys in states.items():
         shape = np.shape(entry(part, keys))
-        check_returns(part.label, f"state_rates[{name!r}]", shape, lambda *own, name=name: rates(*own)[name], *given)
+        check_returns(part.label, f"state_rates[{name!r}]", shape, lambda *own, name=name: kernel(*own)[name], *given)
 
 
 def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:

@@ -11,9 +11,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._captured import CapturedModule
 from .._types import Scalar, VectorLike
 from ..linalg.arrays import is_traced
-from ..solvers.closures import opened
 from .fields import as_jax, as_parameter
 
 Interpolation = Literal["linear", "cubic", "held"]
@@ -32,6 +32,9 @@ class AbstractSignal(eqx.Module):
     @abc.abstractmethod
     def __call__(self, t: Scalar) -> Array:
         """The value at a time [s]."""
+
+    def keep(self) -> None:
+        """Hook: stay as it is now, after a call; see `Captured`."""
 
     @abc.abstractmethod
     def break_times(self, *, of_rates: bool) -> np.ndarray:
@@ -168,14 +171,13 @@ class Signal(AbstractSignal):
     function closes over.
     """
 
-    function: Any
-
-    def __init__(self, function: Callable[..., Any]):
-        function = opened(function)
-        self.function = function if isinstance(function, eqx.Module) else _Static(function)
+    function: CapturedModule = eqx.field(converter=CapturedModule)
 
     def __call__(self, t):
         return jnp.asarray(self.function(t))
+
+    def keep(self):
+        self.function.known.keep()
 
     def break_times(self, *, of_rates):
         # What a function does is not known; `simulate(..., jumps=)` says it.
@@ -193,13 +195,6 @@ class Signal(AbstractSignal):
     @property
     def continuous(self):
         return True
-
-
-class _Static(eqx.Module):
-    function: Callable[[Scalar], Array] = eqx.field(static=True)
-
-    def __call__(self, t):
-        return self.function(t)
 
 
 def as_signal(label: str, value: Any) -> AbstractSignal:

@@ -1,5 +1,6 @@
 """Checks of the arguments of `simulate`, and their defaults."""
 
+import contextlib
 import math
 import warnings
 from collections.abc import Mapping
@@ -11,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arguments import check_kind, real_array, whole_number
+from .._captured import CapturedModule
 from .._compat import changed, default_float
+from .._traced_functions import is_installed
 from .._types import State, VectorLike
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import ARRAYS, as_array, is_traced
@@ -19,7 +22,6 @@ from ..linalg.recent import Recent
 from ..manifold import AbstractManifold
 from ..parts.names import unknown
 from ..solvers import AbstractMultistep, Adams, MultistepController, RunningScales
-from ..solvers.closures import opened
 from ..solvers.events import EventController
 from ..solvers.gaps import GapController
 from ..solvers.one_step import OneStepController
@@ -229,6 +231,32 @@ def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
     return ts
 
 
+# What diffrax gives a function of an event besides the time, the state and the arguments.
+_OF_EVENTS = ("terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller", "max_steps")
+
+
+def captured_event(event: diffrax.Event | None, t: Any, state: State) -> diffrax.Event | None:
+    """An event whose functions are told apart by what they compute now."""
+    if event is None:
+        return None
+    own = jax.tree.map(lambda f: _captured_call(f, t, state, None, **dict.fromkeys(_OF_EVENTS)), event.cond_fn)
+    return changed(event, cond_fn=own)
+
+
+def _captured_call(function: Any, *args: Any, **named: Any) -> Any:
+    """A function of the user's, told apart from others by what it computes now of such arguments; anything else, and a
+    function of a package, as it is.
+    """
+    if not callable(function) or is_installed(getattr(getattr(function, "__code__", None), "co_filename", None)):
+        return function
+    own = CapturedModule(function)
+    # One that needs other arguments is told apart as a function.
+    with contextlib.suppress(Exception):
+        own.trace(*args, **named)
+    own.known.keep()
+    return own
+
+
 def checked_jumps(jumps: Any, of_inputs: np.ndarray) -> Any:
     """Times at which to restart: those that the user announces and those of inputs; None if there are none."""
     if jumps is None:
@@ -245,12 +273,12 @@ _END = diffrax.SaveAt(subs=_AT_END)
 _ENDS = diffrax.SaveAt(subs=(_AT_END, _AT_END), solver_state=True, controller_state=True)
 
 
-def with_end(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
+def with_end(saveat: diffrax.SaveAt, t: Any, state: State) -> diffrax.SaveAt:
     """The user's series and, for statistics and diagnosis, the end state."""
     if saveat is _END:
         return _ENDS
     first = _AT_END if saveat.subs is None else saveat.subs
-    return changed(_ENDS, subs=(changed(first, fn=opened(first.fn)), _AT_END), dense=saveat.dense)
+    return changed(_ENDS, subs=(changed(first, fn=_captured_call(first.fn, t, state, None)), _AT_END), dense=saveat.dense)
 
 
 def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:

@@ -22,7 +22,6 @@ from ..manifold import AbstractManifold
 from ..manifold.impact import NO_SECOND_DERIVATIVES
 from ..parts.names import names_arguments
 from ..solvers import Adams, Hermite
-from ..solvers.closures import opened
 from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..states.refusals import lost_rank
@@ -31,6 +30,7 @@ from ..system.inputs import Signals, input_break_times, with_inputs
 from ..trajectory import Trajectory
 from .arguments import (
     DEFAULT_RTOL,
+    captured_event,
     check_error_estimate,
     check_fixed_steps,
     check_kinds,
@@ -240,7 +240,7 @@ def simulate(
     check_fixed_steps(method, stepsize_controller)
     longest = checked_longest_step(dtmax, stepsize_controller, method, state.q.dtype)
     restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
-    saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]))
+    saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]), times["t0"], state)
     first = saved.subs[0]
     if error:
         check_error_estimate(first.steps, stepsize_controller, event, relative)
@@ -255,7 +255,7 @@ def simulate(
         "times": times,
         "saveat": saved,
         "restarts": restarts,
-        "event": jax.tree.map(opened, event),
+        "event": captured_event(event, times["t0"], state),
         "changes": {} if direction is None else parameter_changes(system, direction),
     }
     traced = is_traced((system, state, others))

@@ -42,7 +42,8 @@ def with_inputs(system: System, inputs: Signals) -> System:
     Derivatives with respect to the values of a series work as those with respect to parameters.
 
     **Arguments:** `inputs`: a `Series`, or a function of time [s] that JAX can differentiate, by the name of the
-    parameter that it replaces, `{"motor.torque": Series(ts, torques)}`.
+    parameter that it replaces, `{"motor.torque": Series(ts, torques)}`. A function counts with the values that it reads
+    now.
 
     **Raises:** `ValueError` for an unknown name, a parameter that cannot be an input, a value of the wrong shape, and
     a value that jumps where a position constraint depends on it.
@@ -59,6 +60,7 @@ def with_inputs(system: System, inputs: Signals) -> System:
         t: Any = np.zeros((), known[name].dtype)
         with traced_by_jax(f"the input {name!r}", "the time"):
             found = eqx.filter_eval_shape(signals[name], t)
+        signals[name].keep()
         if not hasattr(found, "shape") or found.shape != known[name].shape:
             raise ValueError(
                 f"The input {name!r} must have shape {known[name].shape} at each time, as the parameter has; got "

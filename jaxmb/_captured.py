@@ -1,0 +1,193 @@
+"""Functions of the user's as JAX traced them, which do not change with what they read.
+
+A function may read a global variable, an attribute or a dictionary. JAX keeps programs by the function alone, and would
+return the old motion after a change. So a system holds traced programs in place of functions: they stay what they were
+when it was compiled, and are equal where they compute the same.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ._compat import ClosedJaxpr, canonical, jaxpr_as_function
+from ._jaxpr_digest import digest_of_program
+from .linalg.arrays import ARRAYS
+from .solvers.closures import opened
+
+_SHAPED = (*ARRAYS, jax.ShapeDtypeStruct)
+
+
+class Captured:
+    """A function, and its programs for the arguments that it was called with before it was kept.
+
+    It computes with these programs, whatever has become of what the function reads; with arguments of other shapes it
+    calls the function. Two are equal where all their programs compute the same. A function that was not called, or that
+    closes over values that JAX traces, has no programs, and is as the function itself.
+    """
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self._programs: dict[Any, _Program | None] = {}
+        self._examples: list[Any] = []
+        # What tells it from others: until it is kept, that it is another object.
+        self._key: tuple[Any, ...] = ("open", id(self))
+
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        if self._key[0] == "open":
+            self.trace(*args, **named)
+        leaves, structure = jax.tree.flatten((args, named))
+        program = self._programs.get((structure, tuple(map(_kind, leaves))))
+        if program is None:
+            return self.function(*args, **named)
+        return program.computed([x for x in leaves if isinstance(x, _SHAPED)])
+
+    def trace(self, *args: Any, **named: Any) -> None:
+        """Find the program for arguments of these shapes, for which arrays or `jax.ShapeDtypeStruct` stand."""
+        leaves, structure = jax.tree.flatten((args, named))
+        kinds = structure, tuple(map(_kind, leaves))
+        if kinds not in self._programs:
+            self._programs[kinds] = _traced(self.function, leaves, structure)
+            self._examples.append(jax.tree.unflatten(structure, map(_like, leaves)))
+
+    def keep(self) -> None:
+        """From now on, compute with the programs that there are."""
+        keys = tuple((kinds, program.key) for kinds, program in self._programs.items() if program is not None)
+        known = 0 < len(keys) == len(self._programs)
+        self._key = ("known", keys) if known else ("alone", self.function)
+
+    @property
+    def digests(self) -> tuple[bytes, ...]:
+        """The hashes of all programs, the same in every process."""
+        return tuple(program.key[0] for program in self._programs.values() if program is not None)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Captured) and self._key == other._key)
+
+    def __hash__(self) -> int:
+        return hash(self.digests if self._key[0] == "known" else self._key)
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+    def __deepcopy__(self, memo: Any) -> "Captured":
+        return self
+
+    def __reduce__(self) -> Any:
+        # Traced programs cannot be sent to another process.
+        return _again, (self.function, self._examples, self.digests)
+
+
+class CapturedModule(eqx.Module):
+    """A captured function, differentiable by the arrays of an equinox module, and by traced values that a function
+    closes over.
+
+    **Fields:** `module`: what has these, None for a function without; `known`: the function, of the module as well
+    where there is one.
+    """
+
+    module: Any
+    known: Captured = eqx.field(static=True)
+
+    def __init__(self, function: Callable[..., Any]):
+        function = opened(function)
+        self.module = function if isinstance(function, eqx.Module) else None
+        self.known = Captured(function if self.module is None else _called)
+
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        return self.known(*self._held, *args, **named)
+
+    def trace(self, *args: Any, **named: Any) -> None:
+        """As of `Captured`."""
+        self.known.trace(*self._held, *args, **named)
+
+    @property
+    def _held(self) -> tuple[Any, ...]:
+        return () if self.module is None else (self.module,)
+
+
+def _called(module: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    return module(*args, **named)
+
+
+def _again(function: Callable[..., Any], examples: list[Any], digests: tuple[bytes, ...]) -> Captured:
+    """A captured function in another process."""
+    out = Captured(function)
+    for args, named in examples:
+        out.trace(*args, **named)
+    out.keep()
+    if out.digests != digests:
+        raise ValueError(
+            f"{function!r} computes something else than when the system that uses it was compiled: a value that it "
+            "reads has changed since. Compile the system anew."
+        )
+    return out
+
+
+class _Program(NamedTuple):
+    """A traced function.
+
+    **Fields:** `function` of the list of all arrays among its arguments, which returns those among its results; the
+    `structure` of results and their `rest`, None for each array; `key`: equal where programs compute the same; `held`:
+    objects that the key has the addresses of.
+    """
+
+    function: Callable[..., list[Any]]
+    structure: Any
+    rest: tuple[Any, ...]
+    key: tuple[Any, ...]
+    held: tuple[Any, ...]
+
+    def computed(self, arrays: list[Any]) -> Any:
+        return _filled(self.rest, self.structure, self.function(*arrays))
+
+
+def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> _Program | None:
+    """The program of a function for arguments like these; None if it closes over values that are traced."""
+    results: list[Any] = []
+
+    # JAX remembers what it has traced, by the function: this one is new each time.
+    def of_arrays(*arrays: Any) -> list[Any]:
+        args, named = _filled(leaves, structure, arrays)
+        out, tree = jax.tree.flatten(function(*args, **named))
+        results[:] = tree, tuple(None if isinstance(x, ARRAYS) else x for x in out)
+        return [x for x in out if isinstance(x, ARRAYS)]
+
+    closed = jax.make_jaxpr(of_arrays)(*(_like(x) for x in leaves if isinstance(x, _SHAPED)))
+    if any(isinstance(constant, Tracer) for constant in closed.consts):
+        return None
+    tree, rest = results
+    digest = digest_of_program(closed, rules=True)
+    own = [_own(v.aval, constant) for v, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True)]
+    key = digest.value, tuple(map(id, digest.unknown)), tree, rest
+    return _Program(jaxpr_as_function(ClosedJaxpr(closed.jaxpr, own)), tree, rest, key, digest.unknown)
+
+
+def _own(kind: Any, constant: Any) -> Any:
+    """A copy of a constant, which may share the memory of a NumPy array that the user changes."""
+    if kind.weak_type or jnp.issubdtype(kind.dtype, jax.dtypes.extended):
+        return constant
+    return np.array(constant)
+
+
+def _kind(leaf: Any) -> Any:
+    return (leaf.shape, _dtype(leaf)) if isinstance(leaf, _SHAPED) else (type(leaf), leaf)
+
+
+def _like(leaf: Any) -> Any:
+    return jax.ShapeDtypeStruct(leaf.shape, _dtype(leaf)) if isinstance(leaf, _SHAPED) else leaf
+
+
+def _dtype(array: Any) -> Any:
+    return canonical(array.dtype) if isinstance(array, np.ndarray | np.generic) else array.dtype
+
+
+def _filled(leaves: Iterable[Any], structure: Any, arrays: Iterable[Any]) -> Any:
+    """A pytree of these leaves, with other arrays, one after the other, in place of arrays and of None."""
+    left = iter(arrays)
+    own = [next(left) if x is None or isinstance(x, _SHAPED) else x for x in leaves]
+    return jax.tree.unflatten(structure, own)

@@ -1,0 +1,162 @@
+"""Hashes of traced programs: equal for programs that compute the same in the same way, also in another process."""
+
+import dataclasses
+import enum
+import functools
+import hashlib
+import types
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ._compat import REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function
+from ._traced_functions import is_installed
+
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), type, enum.Enum, np.dtype)
+
+
+class Digest(NamedTuple):
+    """The hash of a program.
+
+    **Fields:** `value`: the same in every process; `unknown`: functions of the user's that the program calls from
+    Python, and objects that only their address tells apart. Of these the hash has the names.
+    """
+
+    value: bytes
+    unknown: tuple[Any, ...]
+
+
+def digest_of_program(program: Any, *, rules: bool) -> Digest:
+    """The hash of a closed jaxpr: its equations with all their parameters, the programs within, literals and constants.
+
+    **Arguments:** `rules`: whether derivative rules of functions count, `custom_jvp` and `custom_vjp`. A program that
+    is not differentiated has no use for them.
+    """
+    own = _Digest()
+    value = own.of(program)
+    if rules and own.rules:
+        value = _joined("rules", [value, own.of_derivative(program)])
+    return Digest(value, tuple(own.unknown))
+
+
+class _Digest:
+    """Hashes of programs, of which the `rules` are named that equations have for derivatives."""
+
+    def __init__(self):
+        self.unknown: list[Any] = []
+        self.rules: set[str] = set()
+        # Programs that occur several times. With each hash the program itself, so that no other one gets its address.
+        self._done: dict[int, tuple[Any, bytes]] = {}
+
+    def of(self, value: Any) -> bytes:
+        """The hash of a program, or of a parameter of an equation."""
+        kind = type(value)
+        name = f"{kind.__module__}.{kind.__qualname__}"
+        if isinstance(value, ClosedJaxpr):
+            return _joined("closed", [self.of(value.jaxpr), *map(self._array, value.consts)])
+        if isinstance(value, Jaxpr):
+            if id(value) not in self._done:
+                self._done[id(value)] = value, self._program(value)
+            return self._done[id(value)][1]
+        if isinstance(value, np.ndarray | np.generic | jax.Array):
+            return self._array(value)
+        if isinstance(value, Mapping):
+            items = sorted(value.items(), key=lambda item: repr(item[0]))
+            return _joined(name, [part for item in items for part in map(self.of, item)])
+        if isinstance(value, list | tuple):
+            return _joined(name, list(map(self.of, value)))
+        if isinstance(value, set | frozenset):
+            return _joined(name, sorted(map(self.of, value)))
+        if isinstance(value, jax.tree_util.PyTreeDef):
+            return _joined(name, [self.of(value.node_data()), *map(self.of, value.children())])
+        if isinstance(value, functools.partial):
+            return _joined(name, [self.of(value.func), self.of(value.args), self.of(value.keywords)])
+        if isinstance(value, types.MethodType):
+            return _joined(name, [self.of(value.__func__), self.of(value.__self__)])
+        if isinstance(value, types.FunctionType):
+            return self._function(value)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            fields = [(own.name, getattr(value, own.name, None)) for own in dataclasses.fields(value)]
+            return _joined(name, [part for field in fields for part in map(self.of, field)])
+        if hasattr(value, "__wrapped__"):
+            return _joined(name, [self.of(value.__wrapped__)])
+        return _joined(name, [self._shown(value)])
+
+    def _program(self, program: Any) -> bytes:
+        numbers: dict[Any, int] = {}
+
+        def named(variables: Iterable[Any]) -> list[bytes]:
+            return [f"{numbers.setdefault(v, len(numbers))} {v.aval!r}".encode() for v in variables]
+
+        def given(operands: Iterable[Any]) -> list[bytes]:
+            return [
+                _joined(repr(v.aval), [self._array(v.val)]) if isinstance(v, Literal) else str(numbers[v]).encode()
+                for v in operands
+            ]
+
+        parts = named([*program.constvars, *program.invars])
+        for equation in program.eqns:
+            parts += [equation.primitive.name.encode(), *given(equation.invars)]
+            for name, value in sorted(equation.params.items()):
+                if name in RULES:
+                    self.rules.add(name)
+                else:
+                    parts += [name.encode(), self.of(value)]
+            parts += named(equation.outvars)
+        return _joined("program", [*parts, *given(program.outvars)])
+
+    def of_derivative(self, program: Any) -> bytes:
+        """The hash of the derivative of a program, in which the rules of its equations are used."""
+        function = jaxpr_as_function(program)
+        likes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in program.in_avals]
+        real = [k for k, like in enumerate(likes) if jnp.issubdtype(like.dtype, jnp.floating)]
+
+        def derivative(values: list[Any]) -> Any:
+            of_real = lambda *own: function(*(dict(enumerate(values)) | dict(zip(real, own, strict=True))).values())
+            own = [values[k] for k in real]
+            if REVERSE in self.rules:
+                out, pull = jax.vjp(of_real, *own)
+                return pull(jax.tree.map(jnp.ones_like, out))
+            return jax.jvp(of_real, own, [jnp.ones_like(x) for x in own])
+
+        try:
+            return self.of(jax.make_jaxpr(derivative)(likes))
+        except Exception:  # Whatever a rule raises that is not meant for this derivative: it is like no other.
+            self.unknown.append(program)
+            return b""
+
+    def _array(self, value: Any) -> bytes:
+        if isinstance(value, Tracer):
+            self.unknown.append(value)
+            return b""
+        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            return _joined(repr(value.dtype), [self._array(jax.random.key_data(value))])
+        array = np.asarray(value)
+        return _joined(f"{array.dtype} {array.shape}", [array.tobytes()])
+
+    def _function(self, function: types.FunctionType) -> bytes:
+        """A function that is called from Python, as in a callback: one of a package counts by its name."""
+        if not is_installed(function.__code__.co_filename):
+            self.unknown.append(function)
+        return _joined("function", [f"{function.__module__}.{function.__qualname__}".encode()])
+
+    def _shown(self, value: Any) -> bytes:
+        if isinstance(value, _PLAIN):
+            return repr(value).encode()
+        shown = repr(value)
+        if " at 0x" in shown:
+            self.unknown.append(value)
+            return b""
+        return shown.encode()
+
+
+def _joined(tag: str, parts: list[bytes]) -> bytes:
+    """A hash of parts that tells where one ends and the next begins."""
+    digest = hashlib.sha256(tag.encode())
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little") + part)
+    return digest.digest()
