@@ -1,7 +1,6 @@
 """Hashes of traced programs: equal for programs that compute the same in the same way, also in another process."""
 
 import dataclasses
-import enum
 import functools
 import hashlib
 import types
@@ -16,7 +15,7 @@ from jax.core import Tracer
 from ._compat import REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function
 from ._traced_functions import is_installed
 
-_PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), type, enum.Enum, np.dtype)
+_PLAIN = {bool, int, float, complex, str, bytes, type(None), type(Ellipsis)}
 
 
 class Digest(NamedTuple):
@@ -51,10 +50,13 @@ class _Digest:
         self.rules: set[str] = set()
         # Programs that occur several times. With each hash the program itself, so that no other one gets its address.
         self._done: dict[int, tuple[Any, bytes]] = {}
+        self._shapes: dict[Any, str] = {}
 
     def of(self, value: Any) -> bytes:
         """The hash of a program, or of a parameter of an equation."""
         kind = type(value)
+        if kind in _PLAIN:
+            return _joined(kind.__name__, [repr(value).encode()])
         name = f"{kind.__module__}.{kind.__qualname__}"
         if isinstance(value, ClosedJaxpr):
             return _joined("closed", [self.of(value.jaxpr), *map(self._array, value.consts)])
@@ -90,11 +92,13 @@ class _Digest:
         numbers: dict[Any, int] = {}
 
         def named(variables: Iterable[Any]) -> list[bytes]:
-            return [f"{numbers.setdefault(v, len(numbers))} {v.aval!r}".encode() for v in variables]
+            return [f"{numbers.setdefault(v, len(numbers))} {self._shape(v.aval)}".encode() for v in variables]
 
         def given(operands: Iterable[Any]) -> list[bytes]:
             return [
-                _joined(repr(v.aval), [self._array(v.val)]) if isinstance(v, Literal) else str(numbers[v]).encode()
+                _joined(self._shape(v.aval), [self._array(v.val)])
+                if isinstance(v, Literal)
+                else str(numbers[v]).encode()
                 for v in operands
             ]
 
@@ -104,6 +108,9 @@ class _Digest:
             for name, value in sorted(equation.params.items()):
                 if name in RULES:
                     self.rules.add(name)
+                elif hasattr(value, "program_of"):
+                    operands = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
+                    parts += [name.encode(), self.of(value.program_of(operands))]
                 else:
                     parts += [name.encode(), self.of(value)]
             parts += named(equation.outvars)
@@ -129,11 +136,17 @@ class _Digest:
             self.unknown.append(program)
             return b""
 
+    def _shape(self, kind: Any) -> str:
+        if kind not in self._shapes:
+            self._shapes[kind] = repr(kind)
+        return self._shapes[kind]
+
     def _array(self, value: Any) -> bytes:
         if isinstance(value, Tracer):
             self.unknown.append(value)
             return b""
-        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        if isinstance(value, jax.Array) and not isinstance(value.dtype, np.dtype):
+            # The key of random numbers.
             return _joined(repr(value.dtype), [self._array(jax.random.key_data(value))])
         array = np.asarray(value)
         return _joined(f"{array.dtype} {array.shape}", [array.tobytes()])
@@ -145,8 +158,6 @@ class _Digest:
         return _joined("function", [f"{function.__module__}.{function.__qualname__}".encode()])
 
     def _shown(self, value: Any) -> bytes:
-        if isinstance(value, _PLAIN):
-            return repr(value).encode()
         shown = repr(value)
         if " at 0x" in shown:
             self.unknown.append(value)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._compat import Primitive, ShapedArray, Zero, ad, batching, mlir, partial_eval
+from .._compat import ClosedJaxpr, Primitive, ShapedArray, Zero, ad, batching, mlir, partial_eval
 
 _SECOND_REVERSE = (
     "A derivative of a motion is differentiated in forward mode only: take jax.hessian, or jax.jacfwd of jax.grad, "
@@ -29,6 +29,11 @@ class _Programs:
     def __init__(self, there: Callable, back: Callable, again: tuple[Callable, Callable], inputs, outputs):
         self.there, self.back, self.again = there, back, again
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+
+    def program_of(self, operands: Sequence[jax.ShapeDtypeStruct]) -> ClosedJaxpr:
+        """The traced map for operands of these shapes, residuals and x, which tells it from others."""
+        count = len(operands) - len(self.inputs)
+        return jax.make_jaxpr(lambda *own: _evaluate(*own, programs=self, known=count))(*operands)
 
     def transposed(self, known: tuple[bool, ...]) -> "_Programs":
         """The transpose, of the `known` ones of the cotangents."""

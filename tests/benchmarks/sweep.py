@@ -54,7 +54,8 @@ def timed(run):
 
 
 def batch_of(cases, **options):
-    return Batch(four_bar, declared(four_bar, {k: v[0] for k, v in cases.columns.items()}, max_steps=65536), **options)
+    outputs, _ = declared(four_bar, {k: v[0] for k, v in cases.columns.items()}, max_steps=65536)
+    return Batch(four_bar, outputs, **options)
 
 
 def overhead(chunks=4):
@@ -146,7 +147,7 @@ def cores():
             return {"q": motion.ys.q[-1], "result": motion}
 
         columns = {"x": np.linspace(0.9, 1.1, DEFAULT)}
-        run = Batch(of_mass, declared(of_mass, {"x": columns["x"][0]}), DEFAULT).compiled()
+        run = Batch(of_mass, declared(of_mass, {"x": columns["x"][0]})[0], DEFAULT).compiled()
         single = jax.jit(lambda x, own=of_mass: own(x)["q"])
         some = [single(x) for x in columns["x"][:1]] and columns["x"][:: DEFAULT // 32]
 

@@ -1,16 +1,16 @@
 """Outputs of a swept function: arrays by name, and how each member ended."""
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ..._arguments import whole_number
-from ..._compat import ClosedJaxpr, Jaxpr, Literal, canonical, codes_of, is_enumerated, messages_of
+from ..._compat import canonical, codes_of, is_enumerated, messages_of
+from ..._jaxpr_digest import Digest, digest_of_program
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 
@@ -109,8 +109,9 @@ def step_limit(function: Callable[..., Any], names: Any) -> int | None:
     return whole_number("The default of the function's argument max_steps", default)
 
 
-def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray], **fixed: Any) -> Outputs:
-    """Trace the function twice, with the parameters of one member: what it returns, which must be the same.
+def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray], **fixed: Any) -> tuple[Outputs, Digest]:
+    """Trace the function twice, with the parameters of one member: what it returns, which must be the same, and the
+    hash of its program.
 
     **Raises:** `ValueError` for what is no dictionary of arrays, and for a function that is not pure: one that gives
     other names, shapes or numbers when it is traced again.
@@ -121,12 +122,13 @@ def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray], **
     (program, found), (again, found_again) = trace(), trace()
     first, second = outputs_of(found), outputs_of(found_again)
     check_same(first, second)
-    if list(_numbers(program)) != list(_numbers(again)):
+    digest = digest_of_program(program, rules=False)
+    if digest.value != digest_of_program(again, rules=False).value:
         raise ValueError(
             "The function is not pure: traced twice, it has other numbers in it, as from numpy.random or from "
             "something that it changes. Make such numbers parameters of the cases."
         )
-    return first
+    return first, digest
 
 
 def outputs_of(found: Returned) -> Outputs:
@@ -166,21 +168,3 @@ def statuses(found: Returned) -> np.ndarray:
         by_event = code == (names.index("event_occurred") if "event_occurred" in names else -1)
         ended = np.where(code == 0, ended, np.where(by_event, OK, code + NOT_FINITE))
     return ended.astype(np.int16)
-
-
-def _numbers(program: Any) -> Iterator[Any]:
-    """The operations of a traced program by name, and the literals and constants in it, as bytes."""
-    if isinstance(program, ClosedJaxpr):
-        yield from (np.asarray(c).tobytes() for c in program.consts if _is_numeric(c))
-        program = program.jaxpr
-    is_program = lambda x: isinstance(x, ClosedJaxpr | Jaxpr)
-    for equation in program.eqns:
-        yield equation.primitive.name
-        yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, Literal))
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=is_program):
-            if is_program(inner):
-                yield from _numbers(inner)
-
-
-def _is_numeric(constant: Any) -> bool:
-    return isinstance(constant, np.ndarray | np.generic | jax.Array | int | float) and not isinstance(constant, Tracer)

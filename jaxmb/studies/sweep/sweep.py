@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -20,7 +19,7 @@ from . import dataset, store as stores
 from .batch import Batch, whole_chunk
 from .cases import Cases, table
 from .engine import Task, here, on_executor, on_processes
-from .identity import identity_of_cases, identity_of_function, identity_of_outputs
+from .identity import identity_of_cases, identity_of_outputs
 from .labels import described
 from .load import load_sweep
 from .outputs import OK, RESERVED, check_parameters, declared, step_limit
@@ -29,7 +28,7 @@ from .outputs import OK, RESERVED, check_parameters, declared, step_limit
 # its blocks, small enough that little is lost. A graphics processor computes thousands of members in the time of a few.
 _CHUNK, _OF_THREAD, _OF_ACCELERATOR = 512, 128, 8192
 # What a sweep is known by, where the name of the attribute does not say it.
-_WORDS = {"jaxmb_version": "version of jaxmb", "python": "version of Python", "version": "argument version"}
+_WORDS = {"jaxmb_version": "version of jaxmb", "jax_version": "version of JAX", "version": "argument version"}
 
 
 @names_arguments
@@ -103,12 +102,11 @@ def sweep(
         `devices=jax.local_devices()`; a sweep needs no communication.
     - `progress`: whether to show in one line that the function is being compiled, then what is done and the time that
         is left.
-    - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by its cases, its outputs, its
-        function and all that this one refers to: functions and classes by their code, systems and other objects by all
-        that they hold, names and choices as well as numbers. What an installed package defines counts by its name, and
-        by the file that defines it; what jaxmb itself rests on, such as JAX, by its name alone.
-    - `version`: a text or number of your own, by which the sweep is known besides. It stands for what cannot be told
-        apart otherwise, such as an open file or a function of a compiled language: change it when that changes.
+    - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by its cases, its outputs and
+        the program that JAX traces of its function, with all numbers in it, whatever the function reads them from; and
+        by the versions of jaxmb and of JAX. Names, comments and docstrings in the function make no difference.
+    - `version`: a text or number of your own, by which the sweep is known besides. It stands for functions that the
+        program calls from Python, as by `jax.pure_callback`: change it when what they compute changes.
 
     **Returns:** an `xarray.Dataset`, with a dimension for each parameter of a grid, or else with the dimension
     `member`; parameters are coordinates. With the outputs there are `status`: 0 pending, 1 ok, 2 an output is not
@@ -118,7 +116,8 @@ def sweep(
 
     **Raises:** `ValueError` for names that are unknown, missing, or there twice, for values that do not fit, for a
     function that returns no dictionary of arrays or is not pure or needs the number of a parameter, for a store of
-    another sweep, and for a function that holds something that no store can know again, without `version`;
+    another sweep, and for a function whose program calls Python, of which no store can know whether it has changed,
+    without `version`;
     `OSError` if the store cannot be written, as on a full disk: what is done is kept, and the same call again goes
     on; `RuntimeError` if processes die again and again, and if another process writes the store; `ImportError`
     without the packages of `jaxmb[studies]`. An interruption (Ctrl-C) keeps what is done as well.
@@ -135,19 +134,18 @@ def sweep(
     _check_engine(processes, executor, devices)
     found = _devices(devices)
     limit = step_limit(function, cases.columns)
-    outputs = declared(
+    outputs, program = declared(
         function, {n: c[0] for n, c in cases.columns.items()}, **({} if limit is None else {"max_steps": limit})
     )
     variables = described(cases, outputs, dims or {}, coords or {}, units or {})
     path = None if store is None else Path(store)
-    hashed, unknown = identity_of_function(function)
-    _check_version(version, {} if path is None else unknown)
+    _check_version(version, () if path is None else program.unknown)
     known = {
         "jaxmb_version": __version__,
-        "python": sys.implementation.cache_tag,
+        "jax_version": jax.__version__,
         "x64": str(jnp.result_type(float) == jnp.float64),
         "version": "" if version is None else str(version),
-        "function": hashed,
+        "function": program.value.hex(),
         "cases": identity_of_cases(cases),
         "outputs": identity_of_outputs(variables, cases),
     }
@@ -313,20 +311,26 @@ def _checked_budget(batch: Batch, budget: Any) -> int | Literal["auto"] | None:
     return min(budget, batch.max_steps or budget)
 
 
-def _check_version(version: Any, unknown: Mapping[str, str]) -> None:
+def _check_version(version: Any, unknown: Sequence[Any]) -> None:
     """Refuse what a store cannot know again, unless a version stands for it."""
     if isinstance(version, bool) or not isinstance(version, str | int | np.integer | None):
         raise ValueError(f"version must be a text or an integer, got {version!r}.")
     if unknown and version is None:
-        place, kind = next(iter(unknown.items()))
+        name = getattr(unknown[0], "__qualname__", repr(unknown[0]))
         more = f" (and {len(unknown) - 1} more like it)" if len(unknown) > 1 else ""
         raise ValueError(
-            f"The function of the sweep uses {place}, a {kind}{more}, and a store cannot tell whether that has "
+            f"The program of the sweep calls {name}{more} from Python, and a store cannot tell whether that has "
             "changed. Give version=, a text or number that you change when it changes, or leave out the store."
         )
 
 
 def _check_same_study(path: Any, before: Mapping[str, Any], known: Mapping[str, str], chunk: Any, budget: Any) -> None:
+    if "jax_version" not in before:
+        raise ValueError(
+            f"The store {path} holds another sweep: it was made by jaxmb {before.get('jaxmb_version', '')}, which knew "
+            "sweeps by other marks than this version. Read it with load_sweep; to compute, give another path, or "
+            "overwrite=True to replace it."
+        )
     differing = [_WORDS.get(name, name) for name in known if before.get(name) != known[name]]
     if differing:
         raise ValueError(
