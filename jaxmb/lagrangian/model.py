@@ -1,6 +1,7 @@
 """The equations of a Lagrangian system in any velocities, and the ways to write them, before its structure is known."""
 
 import abc
+import functools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -61,8 +62,8 @@ class AbstractLagrangian(AbstractSystem):
     **Fields:** those that `LagrangianSystem` takes; `lagrangian(t, q, v, parameters)`; `applied`, the forces without
     potential, or None; `constraints`, ordered by level; `sizes`, the number of rows of each.
 
-    `inputs` are the parameters that are functions of time; `known`: all kernels where classes of the user's have a
-    share in them, which tell the system from others. `diagonal` says whether the mass matrix is diagonal and constant.
+    `inputs` are the parameters that are functions of time; `known`: of classes of the user's what they compute, as
+    it was when the system was made. `diagonal` says whether the mass matrix is diagonal and constant.
     """
 
     lagrangian: Callable[..., Array] = eqx.field(static=True)
@@ -77,7 +78,7 @@ class AbstractLagrangian(AbstractSystem):
     coordinates: tuple[str, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
     inputs: tuple[DrivenParameters, ...]
-    known: Captured | None = eqx.field(static=True)
+    known: tuple[tuple[type, Captured], ...] = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = eqx.field(default=(), kw_only=True)
 
     diagonal: AbstractVar[bool]
@@ -150,27 +151,34 @@ class AbstractLagrangian(AbstractSystem):
         each = ((own, of_each(own.signal, len(own.names))) for own in self.inputs)
         return {name: (x, own.binds) for own, alone in each for name, x in zip(own.names, alone, strict=True)}
 
+    def kernel(self, own: Any, name: str) -> Callable[..., Array]:
+        """A method of a constraint, of a non-ideal force or of the kinematics."""
+        known = dict(self.known).get(type(own))
+        return getattr(own, name) if known is None else functools.partial(known, own)
+
+    def value(self, constraint: AbstractCoordinateConstraint, t: Scalar, *motion: Array) -> Array:
+        """The residual of a constraint, from coordinates, rates and accelerations."""
+        return self.kernel(constraint, "value")(t, *motion, self.parameters_at(t))
+
     # Kinematics
 
     def rates(self, t, q, u):
         t = jnp.asarray(t, q.dtype)
-        return self.kinematics.rates(t, q, u, self.parameters_at(t))
+        return self.kernel(self.kinematics, "rates")(t, q, u, self.parameters_at(t))
 
     # Constraints
 
     @eqx.filter_jit
     def position_residual(self, t, q):
         t = jnp.asarray(t, q.dtype)
-        return self._join(c.value(t, q, q, q, self.parameters_at(t)) for c in self.constraints if c.level == 0)
+        return self._join(self.value(c, t, q, q, q) for c in self.constraints if c.level == 0)
 
     @eqx.filter_jit
     def velocity_residual(self, t, q, u):
         t = jnp.asarray(t, q.dtype)
         v = self.rates(t, q, u)
         _, rate = jax.jvp(self.position_residual, (t, q), (jnp.ones_like(t), v))
-        return self._join(
-            [rate, *(c.value(t, q, v, v, self.parameters_at(t)) for c in self.constraints if c.level == 1)]
-        )
+        return self._join([rate, *(self.value(c, t, q, v, v) for c in self.constraints if c.level == 1)])
 
     @eqx.filter_jit
     def acceleration_residual(self, t, q, u, udot):
@@ -178,7 +186,7 @@ class AbstractLagrangian(AbstractSystem):
         v, one = self.rates(t, q, u), jnp.ones_like(t)
         _, rate = jax.jvp(self.velocity_residual, (t, q, u), (one, v, udot))
         _, a = jax.jvp(self.rates, (t, q, u), (one, v, udot))
-        others = [c.value(t, q, v, a, self.parameters_at(t)) for c in self.constraints if c.level == 2]
+        others = [self.value(c, t, q, v, a) for c in self.constraints if c.level == 2]
         return self._join([rate, *others])
 
     @eqx.filter_jit
@@ -191,7 +199,7 @@ class AbstractLagrangian(AbstractSystem):
             reaction = self._on_coordinates(t, q, v, jnp.where(mine, multipliers, 0.0))
             first = [name for name, _ in self.rows].index(law.constraint)
             own = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
-            total = total + law.force(t, q, v, reaction, own, self.parameters_at(t))
+            total = total + self.kernel(law, "force")(t, q, v, reaction, own, self.parameters_at(t))
         return pull(total)[0]
 
     def _on_coordinates(self, t, q, v, multipliers):
@@ -199,9 +207,7 @@ class AbstractLagrangian(AbstractSystem):
 
         def residual(a):
             return self._join(
-                jax.jacfwd(c.value, 1 + c.level)(t, q, v, v, self.parameters_at(t)) @ a
-                if c.level < 2
-                else c.value(t, q, v, a, self.parameters_at(t))
+                jax.jacfwd(self.value, 2 + c.level)(c, t, q, v, v) @ a if c.level < 2 else self.value(c, t, q, v, a)
                 for c in self.constraints
             )
 

@@ -84,28 +84,33 @@ def with_programs(system: Unanalysed) -> Unanalysed:
     """A system whose functions have been checked, with these as JAX traces them now."""
     system, functions = with_captured(system)
 
-    def kernels(own: Unanalysed, t: Any, q: Any, u: Any) -> Any:
-        v, p = own.kinematics.rates(t, q, u, own.parameters), own.parameters
-        sizes = {c.name: jnp.zeros(n, q.dtype) for c, n in zip(own.constraints, own.sizes, strict=True)}
-        # That of a constraint that is not there is refused later.
-        laws = [law for law in own.nonideal if law.constraint in sizes]
+    def evaluated(system: Unanalysed, t: Any, q: Any, u: Any) -> Any:
+        v, p = system.rates(t, q, u), system.parameters
+        sizes = {c.name: jnp.zeros(n, q.dtype) for c, n in zip(system.constraints, system.sizes, strict=True)}
+        # The law of a constraint that is not there is refused later.
+        laws = [law for law in system.nonideal if law.constraint in sizes]
         return (
-            own.lagrangian(t, q, v, p),
-            own.applied_force(t, q, v),
-            [c.value(t, q, v, v, p) for c in own.constraints],
-            [law.force(t, q, v, q, sizes[law.constraint], p) for law in laws],
+            system.lagrangian(t, q, v, p),
+            system.applied_force(t, q, v),
+            [system.value(c, t, q, v, v) for c in system.constraints],
+            [system.kernel(law, "force")(t, q, v, q, sizes[law.constraint], p) for law in laws],
         )
 
     given = jnp.zeros((), system.guess.q.dtype), system.guess.q, system.guess.u
-    eqx.filter_eval_shape(kernels, system, *given)
+    eqx.filter_eval_shape(evaluated, system, *given)
     for function in functions:
         function.keep()
-    if not is_of_user((system.constraints, system.nonideal, system.kinematics, system.equations)):
-        return system
-    known = Captured(kernels)
-    known.trace(system, *given)
-    known.keep()
-    return changed(system, known=known)
+    parts = [(own, "value") for own in system.constraints] + [(own, "force") for own in system.nonideal]
+    own = {
+        type(part): Captured(getattr(type(part), name))
+        for part, name in [*parts, (system.kinematics, "rates")]
+        if is_of_user(part)
+    }
+    system = changed(system, known=tuple(own.items()))
+    eqx.filter_eval_shape(evaluated, system, *given)
+    for function in own.values():
+        function.keep()
+    return system
 
 
 class Structure(NamedTuple):
@@ -208,7 +213,7 @@ def _evaluate(system: AbstractLagrangian, constant: bool) -> _Numbers:
     hessian = jax.hessian(system.lagrangian, 2)
     looks = jnp.arange(_LOOKS if constant else 0, dtype=q.dtype)
     masses = jax.vmap(lambda k: hessian(t, q, v, jax.tree.map(lambda x: _shaken(x, k), p)))(looks)
-    slopes = tuple(jax.jacfwd(c.value, 2)(t, q, v, v, p) for c in _between_velocities(system))
+    slopes = tuple(jax.jacfwd(system.value, 3)(c, t, q, v, v) for c in _between_velocities(system))
     residual, coordinate_rank = jnp.zeros((), q.dtype), jnp.array(0)
     mass, inertia = hessian(t, q, v, p), system.inertia(t, q, u).product(jnp.eye(u.size, dtype=q.dtype))
     if system.position_rows:

@@ -122,7 +122,7 @@ class LagrangianSystem(AbstractLagrangian):
             coordinates=names,
             sizes=constraint_sizes(energies, force, constraints, kinematics, guess, numbers),
             inputs=(),
-            known=None,
+            known=(),
         )
         model = with_programs(model)
         for field in dataclasses.fields(model):

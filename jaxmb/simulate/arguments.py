@@ -278,7 +278,9 @@ def with_end(saveat: diffrax.SaveAt, t: Any, state: State) -> diffrax.SaveAt:
     if saveat is _END:
         return _ENDS
     first = _AT_END if saveat.subs is None else saveat.subs
-    return changed(_ENDS, subs=(changed(first, fn=_captured_call(first.fn, t, state, None)), _AT_END), dense=saveat.dense)
+    return changed(
+        _ENDS, subs=(changed(first, fn=_captured_call(first.fn, t, state, None)), _AT_END), dense=saveat.dense
+    )
 
 
 def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
