@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._compat import ClosedJaxpr, canonical, jaxpr_as_function
+from ._compat import ClosedJaxpr, canonical, default_float, jaxpr_as_function
 from ._jaxpr_digest import digest_of_program
 from .linalg.arrays import ARRAYS
 from .solvers.closures import opened
@@ -41,10 +41,12 @@ class Captured:
         if self._key[0] == "open":
             self.trace(*args, **named)
         leaves, structure = jax.tree.flatten((args, named))
-        program = self._programs.get((structure, tuple(map(_kind, leaves))))
-        if program is None:
-            return self.function(*args, **named)
-        return program.computed([x for x in leaves if isinstance(x, _SHAPED)])
+        # A number of Python's may stand for an array, as a time.
+        for own in (leaves, [_as_array(x) for x in leaves]):
+            program = self._programs.get((structure, tuple(map(_kind, own))))
+            if program is not None:
+                return program.computed([x for x in own if isinstance(x, _SHAPED)])
+        return self.function(*args, **named)
 
     def trace(self, *args: Any, **named: Any) -> None:
         """Find the program for arguments of these shapes, for which arrays or `jax.ShapeDtypeStruct` stand."""
@@ -172,6 +174,10 @@ def _own(kind: Any, constant: Any) -> Any:
     if kind.weak_type or jnp.issubdtype(kind.dtype, jax.dtypes.extended):
         return constant
     return np.array(constant)
+
+
+def _as_array(leaf: Any) -> Any:
+    return np.asarray(leaf, default_float()) if type(leaf) in (int, float) else leaf
 
 
 def _kind(leaf: Any) -> Any:
