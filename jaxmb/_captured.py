@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._compat import ClosedJaxpr, canonical, default_float, jaxpr_as_function
+from ._compat import ClosedJaxpr, canonical, default_float, is_weakly_typed, jaxpr_as_function
 from ._jaxpr_digest import digest_of_program
 from .linalg.arrays import ARRAYS
 from .solvers.closures import opened
@@ -36,6 +36,8 @@ class Captured:
         self._examples: list[Any] = []
         # What tells it from others: until it is kept, that it is another object.
         self._key: tuple[Any, ...] = ("open", id(self))
+        # The hashes of its programs, the same in every process.
+        self.digests: tuple[bytes, ...] = ()
 
     def __call__(self, *args: Any, **named: Any) -> Any:
         if self._key[0] == "open":
@@ -61,11 +63,7 @@ class Captured:
         keys = tuple((kinds, program.key) for kinds, program in self._programs.items() if program is not None)
         known = 0 < len(keys) == len(self._programs)
         self._key = ("known", keys) if known else ("alone", self.function)
-
-    @property
-    def digests(self) -> tuple[bytes, ...]:
-        """The hashes of all programs, the same in every process."""
-        return tuple(program.key[0] for program in self._programs.values() if program is not None)
+        self.digests = tuple(key[0] for _, key in keys)
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Captured) and self._key == other._key)
@@ -96,9 +94,10 @@ class CapturedModule(eqx.Module):
     known: Captured = eqx.field(static=True)
 
     def __init__(self, function: Callable[..., Any]):
-        function = opened(function)
-        self.module = function if isinstance(function, eqx.Module) else None
-        self.known = Captured(function if self.module is None else _called)
+        own = opened(function)
+        is_module = isinstance(own, eqx.Module)
+        self.module = own if is_module else None
+        self.known = Captured(_called if is_module else function)
 
     def __call__(self, *args: Any, **named: Any) -> Any:
         return self.known(*self._held, *args, **named)
@@ -164,14 +163,14 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
         return None
     tree, rest = results
     digest = digest_of_program(closed, rules=True)
-    own = [_own(v.aval, constant) for v, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True)]
+    own = [_own(v, constant) for v, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True)]
     key = digest.value, tuple(map(id, digest.unknown)), tree, rest
     return _Program(jaxpr_as_function(ClosedJaxpr(closed.jaxpr, own)), tree, rest, key, digest.unknown)
 
 
-def _own(kind: Any, constant: Any) -> Any:
+def _own(variable: Any, constant: Any) -> Any:
     """A copy of a constant, which may share the memory of a NumPy array that the user changes."""
-    if kind.weak_type or jnp.issubdtype(kind.dtype, jax.dtypes.extended):
+    if is_weakly_typed(variable) or jnp.issubdtype(variable.aval.dtype, jax.dtypes.extended):
         return constant
     return np.array(constant)
 

@@ -84,8 +84,8 @@ class _Digest:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             fields = [(own.name, getattr(value, own.name, None)) for own in dataclasses.fields(value)]
             return _joined(name, [part for field in fields for part in map(self.of, field)])
-        if hasattr(value, "__wrapped__"):
-            return _joined(name, [self.of(value.__wrapped__)])
+        if (wrapped := getattr(value, "__wrapped__", None)) is not None:
+            return _joined(name, [self.of(wrapped)])
         return _joined(name, [self._shown(value)])
 
     def _program(self, program: Any) -> bytes:

@@ -109,7 +109,7 @@ class Group(eqx.Module):
         return jax.vmap(single)(members, self.part, *per_part)
 
     def kernel(self, name: str) -> Callable[..., Any]:
-        """A kernel as a function of one part and of what it takes after `space`; one that takes nothing is a property."""
+        """A kernel as a function of one part and of what it takes after `space`; without that it is a property."""
         space = self.layout.space
         plain = lambda part, *own: getattr(part, name)(space, *own) if own else getattr(part, name)
         return dict(self.kernels).get(name, plain)

@@ -30,7 +30,7 @@ from ..parts.base import (
     KnownParts,
     rows_of,
 )
-from ..parts.boundary import check_kernels
+from ..parts.boundary import captured, check_kernels
 from ..parts.dry_friction import AbstractDryFriction
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
 from ..parts.forces import Gravity
@@ -155,6 +155,9 @@ class Scene(eqx.Module):
 
     def compile(self) -> RigidBodySystem:
         """Check the scene, find its structure (ranks, implied rows), and stack its parts.
+
+        Functions of the scene count with the values that they read now: after a change of a global variable, of an
+        attribute or of an array that a function reads, compile the scene anew.
 
         **Returns:** the system, a pytree whose leaves are the parameters.
 
@@ -356,7 +359,8 @@ def _check_rotation(part, components, own, layout, poses):
     space = layout.space
     for component in components if points else ():
         with traced_by_jax(part.label, "an argument"):
-            turned = np.asarray(_turned(anonymous(_loaded(component)), space, poses))
+            now, kernels = captured(anonymous(_loaded(component)), space, len(own))
+            turned = np.asarray(_turned(now, space, poses, tuple(kernels.items())))
         if np.any(turned[points]):
             raise ValueError(
                 f"{part.label} acts on the rotation of a PointMass, which has none: put its point at the origin, "
@@ -380,8 +384,12 @@ def _loaded(part):
 
 
 @eqx.filter_jit
-def _turned(part, space, poses):
-    """Which bodies a part turns, at the given poses or at others, where springs are stretched and contacts closed."""
+def _turned(part, space, poses, kernels):
+    """Which bodies a part turns, at the given poses or at others, where springs are stretched and contacts closed.
+
+    **Arguments:** `kernels`: of a class of the user's, which tell it from what it was before.
+    """
+    del kernels
     d, k = space.dimension, poses.shape[0]
     varied = lambda size: jnp.asarray(1 + 0.4 * np.cos(np.arange(k * size)), poses.dtype).reshape(k, size)
 

@@ -18,7 +18,6 @@ from .._compat import with_values
 from .._traced_functions import NEED_NUMBERS, is_installed, note_of, traced_by_jax, with_note
 from .base import (
     AbstractBody,
-    AbstractConstraint,
     AbstractDynamicForce,
     AbstractForce,
     AbstractLink,

@@ -1,7 +1,7 @@
 """Values as functions of time: measured or planned series, and functions."""
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import equinox as eqx

@@ -6,13 +6,14 @@ transpose, and batches of either are the batched programs.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._compat import ClosedJaxpr, Primitive, ShapedArray, Zero, ad, batching, mlir, partial_eval
+from .._compat import Primitive, ShapedArray, Zero, ad, batching, mlir, partial_eval
 
 _SECOND_REVERSE = (
     "A derivative of a motion is differentiated in forward mode only: take jax.hessian, or jax.jacfwd of jax.grad, "
@@ -30,7 +31,7 @@ class _Programs:
         self.there, self.back, self.again = there, back, again
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
 
-    def program_of(self, operands: Sequence[jax.ShapeDtypeStruct]) -> ClosedJaxpr:
+    def program_of(self, operands: Sequence[jax.ShapeDtypeStruct]) -> Any:
         """The traced map for operands of these shapes, residuals and x, which tells it from others."""
         count = len(operands) - len(self.inputs)
         return jax.make_jaxpr(lambda *own: _evaluate(*own, programs=self, known=count))(*operands)

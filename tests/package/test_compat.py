@@ -153,6 +153,19 @@ def test_programs_can_be_read(compat):
     assert any(isinstance(x, kinds) for x in inner), "branches of `cond` are no programs in the parameters of `cond`"
 
 
+def test_rules_of_derivatives_in_programs(compat):
+    forward, reverse = jax.custom_jvp(jnp.sin), jax.custom_vjp(jnp.sin)
+    forward.defjvp(lambda primals, tangents: (jnp.sin(*primals), 2 * tangents[0]))
+    reverse.defvjp(lambda x: (jnp.sin(x), x), lambda x, ct: (2 * ct,))
+    program = jax.make_jaxpr(lambda x: forward(x) + reverse(x))(1.0)
+    held = [set(equation.params) & compat.RULES for equation in program.jaxpr.eqns[:2]]
+    about = "the equations of functions with rules for derivatives hold them under other names"
+    assert held == [{"jvp_jaxpr_fun"}, {"fwd_jaxpr_thunk", compat.REVERSE, "out_trees"}], about
+    (value,) = compat.jaxpr_as_function(program)(1.0)
+    np.testing.assert_allclose(value, 2 * np.sin(1.0))
+    assert compat.is_weakly_typed(program.jaxpr.invars[0]) is True
+
+
 def test_inputs_that_a_function_is_computed_from(compat):
     length = jax.jit(lambda x: jnp.sqrt(jnp.vdot(x, x)))
 

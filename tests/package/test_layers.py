@@ -13,7 +13,7 @@ ROOT = Path(jaxmb.__file__).parent
 LAYERS = [
     ["_compat", "_machine", "_programs", "_types", "_results", "_version"],
     ["linalg", "solvers"],
-    ["_arguments", "_traced_functions"],
+    ["_arguments", "_captured", "_jaxpr_digest", "_traced_functions"],
     ["parts"],
     ["planar", "spatial", "system"],
     ["formulations"],

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..._jaxpr_digest import Digest, digest_of_program
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 from ...system.quantities import component_names
@@ -73,6 +74,23 @@ def linearised(program: Program, z: Float[Array, "n"]):
 def rows_of_batch(program: Program, z: Float[Array, "starts n"]) -> Float[Array, "starts rows"]:
     """Rows of several vectors at once."""
     return batch(lambda z: program.rows(z)[0])(z)
+
+
+@dataclasses.dataclass(frozen=True)
+class Told:
+    """A function that is equal to others whose programs are the same: what it reads may change between two calls."""
+
+    function: Callable[..., Any] = dataclasses.field(compare=False)
+    digest: Digest
+
+    def __call__(self, values: Mapping[str, Array]) -> Any:
+        return self.function(values)
+
+
+def told_apart(function: Callable[..., Any], space: Space | FreeParameters) -> Told:
+    """A function of named parameters as one that is told apart by what it computes now."""
+    traced = jax.make_jaxpr(lambda z: function(space(z)))(jnp.zeros(space.size))
+    return Told(function, digest_of_program(traced, rules=False))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,6 +24,7 @@ from .evaluation import (
     limits,
     output_shapes,
     rows_of_batch,
+    told_apart,
     with_derivatives,
 )
 from .space import Space, space
@@ -231,6 +232,7 @@ def optimise(
     """
     where = space(start, bounds, system)
     shapes = output_shapes(Program(function, where, (), False))
+    function = told_apart(function, where)
     objective = chosen_objective(objective, shapes, constraints)
     limited = limits(constraints, shapes)
     _check(method, limited, starts, local, max_iterations, tol)

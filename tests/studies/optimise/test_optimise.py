@@ -491,3 +491,12 @@ def test_bad_starts_are_named():
             mb.optimise(valley, start, objective="f")
     with pytest.raises(ValueError, match="must return a number"):
         mb.optimise(lambda v: {"f": None}, START)
+
+
+def test_a_number_that_the_function_reads_may_change():
+    numbers = {"k": 1.0}
+    function = lambda values: (values["x"] - numbers["k"]) ** 2
+    best = lambda: mb.optimise(function, {"x": 0.0}).parameters["x"]
+    np.testing.assert_allclose(best(), 1.0, atol=1e-6)
+    numbers["k"] = 3.0
+    np.testing.assert_allclose(best(), 3.0, atol=1e-6)

@@ -1,4 +1,4 @@
-"""What a store of a sweep knows it by: every change of its program is another sweep, and the same program is the same."""
+"""What a store of a sweep knows it by: its program, in which every number counts, and words do not."""
 
 import functools
 import json
@@ -116,7 +116,7 @@ def test_a_store_of_an_older_version_is_read_and_not_continued(tmp_path):
     metadata = json.loads((store / "zarr.json").read_text())
     metadata["attributes"]["python"] = metadata["attributes"].pop("jax_version")
     (store / "zarr.json").write_text(json.dumps(metadata))
-    with pytest.raises(ValueError, match="another sweep: it was made by jaxmb .* by other marks .*load_sweep"):
+    with pytest.raises(ValueError, match=r"another sweep: it was made by jaxmb .* by other marks .*load_sweep"):
         mb.sweep(swept_functions.plain, CASES, store, progress=False)
     np.testing.assert_array_equal(mb.load_sweep(store)["x"], found["x"])
     assert mb.sweep(swept_functions.plain, CASES, store, overwrite=True, progress=False)["x"].identical(found["x"])
