@@ -347,11 +347,11 @@ class WrappedSolver(diffrax.AbstractWrappedSolver):
     # Of implicit solvers: where diffrax looks for their tolerances, and fills them in.
     @property
     def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportPrivateImportUsage]
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def root_find_max_steps(self) -> int:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportPrivateImportUsage]
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
     def order(self, terms):
         return self.solver.order(terms)

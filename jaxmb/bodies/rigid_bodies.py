@@ -364,8 +364,8 @@ class RigidBodySystem(AbstractSystem):
     def gaps_seen(self, t, q, u):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         seen = [g.gaps(t, poses, velocities) for g in self._closing]
-        *of_gaps, paces = (jnp.concatenate([x.ravel() for x in own]) for own in zip(*seen, strict=True))
-        return GapsSeen(*of_gaps, jnp.max(paces))
+        gaps, rates, widths, paces = (jnp.concatenate([x.ravel() for x in own]) for own in zip(*seen, strict=True))
+        return GapsSeen(gaps, rates, widths, jnp.max(paces))
 
     @eqx.filter_jit
     def friction_reactions(self, t, q, u, multipliers):

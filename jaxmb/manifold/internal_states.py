@@ -40,7 +40,7 @@ def _mechanical(y):
 class StatefulField(AbstractVectorField):
     """`(q, u, z) ↦ (q̇, u̇, ż)` from a vector field of (q, u)."""
 
-    field: AbstractVectorField
+    field: Any
 
     @property
     def gaps(self):

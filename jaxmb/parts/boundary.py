@@ -155,7 +155,9 @@ def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str
 def _check_gaps(part: AbstractForce, kernel: Callable[..., Any], given: list[Any]) -> None:
     """The same for gaps, of which there may be any number."""
     shape = getattr(_evaluated(part.label, "gaps", kernel, tuple(given)), "shape", ())
-    check_returns(part.label, "gaps", shape if len(shape) == 1 else ("n",), kernel, *given)
+    if len(shape) != 1:
+        raise ValueError(f"{part.label}: gaps must return a vector, got shape {shape}.")
+    check_returns(part.label, "gaps", shape, kernel, *given)
 
 
 def _arguments(space: AbstractSpace, bodies: int) -> tuple[Any, Any, Any]:

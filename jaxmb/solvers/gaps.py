@@ -191,6 +191,9 @@ class GapController(diffrax.AbstractAdaptiveStepSizeController):
 
     controller: Any
 
+    def __init__(self, controller: Any):
+        self.controller = controller
+
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.controller.rtol
