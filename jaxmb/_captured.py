@@ -66,7 +66,7 @@ class Captured:
         self.digests = tuple(key[0] for _, key in keys)
 
     def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Captured) and self._key == other._key)
+        return self is other or (type(other) is type(self) and self._key == other._key)
 
     def __hash__(self) -> int:
         return hash(self.digests if self._key[0] == "known" else self._key)

@@ -82,7 +82,10 @@ def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[..., 
 
 def with_programs(system: Unanalysed) -> Unanalysed:
     """A system whose functions have been checked, with these as JAX traces them now."""
-    system, functions = with_captured(system)
+    # Modules among the parameters are called by functions.
+    parameters = system.parameters
+    system, functions = with_captured(changed(system, parameters={}))
+    system = changed(system, parameters=parameters)
 
     def evaluated(system: Unanalysed, t: Any, q: Any, u: Any) -> Any:
         v, p = system.rates(t, q, u), system.parameters

@@ -25,8 +25,7 @@ from .base import (
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
-from .fields import entry, internal_states
-from .module_weights import ModuleWeights
+from .fields import declarations, entry, internal_states
 from .space import AbstractSpace
 
 T = TypeVar("T")
@@ -99,11 +98,11 @@ def is_of_user(value: Any) -> bool:
         return any(map(is_of_user, value.values()))
     if isinstance(value, tuple):
         return any(map(is_of_user, value))
-    if not isinstance(value, eqx.Module) or isinstance(value, ModuleWeights):
+    if not isinstance(value, eqx.Module):
         return False
     kinds = [kind for kind in type(value).__mro__ if kind is not object]
     of_packages = all(is_installed(getattr(sys.modules.get(kind.__module__), "__file__", None)) for kind in kinds)
-    return not of_packages or any(map(is_of_user, vars(value).values()))
+    return not of_packages or any(is_of_user(held) for held, _ in _held(value).values())
 
 
 def with_captured(module: T) -> tuple[T, list[Captured]]:
@@ -114,22 +113,26 @@ def with_captured(module: T) -> tuple[T, list[Captured]]:
     found: list[Captured] = []
 
     def own(value: Any, is_static: bool) -> Any:
-        if isinstance(value, ModuleWeights | type):
-            return value
         if isinstance(value, eqx.Module) and not is_static:
-            static = {field.name: field.metadata.get("static", False) for field in dataclasses.fields(value)}
-            return with_values(type(value), {name: own(x, static.get(name, False)) for name, x in vars(value).items()})
+            return with_values(type(value), vars(value) | {name: own(*held) for name, held in _held(value).items()})
         if isinstance(value, dict):
             return {name: own(x, is_static) for name, x in value.items()}
         if type(value) is tuple:
             return tuple(own(x, is_static) for x in value)
-        if callable(value):
+        if callable(value) and not isinstance(value, type):
             found.append(Captured(value))
             return found[-1]
         return value
 
     new = own(module, False)
     return (new if found else module), found
+
+
+def _held(module: eqx.Module) -> dict[str, tuple[Any, bool]]:
+    """The values of the fields of a module that are no numbers of its own, by name, and whether they are static."""
+    static = {field.name: field.metadata.get("static", False) for field in dataclasses.fields(module)}
+    numbers = {name for name, own in declarations(type(module)).items() if own.kind in ("numbers", "module")}
+    return {name: (value, static.get(name, False)) for name, value in vars(module).items() if name not in numbers}
 
 
 def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[int, ...] | None, list[Any]]]:
