@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -27,7 +27,11 @@ def sample_times(t0: Scalar, t1: Scalar) -> Float[Array, "n"]:
 
 
 class AbstractSignal(eqx.Module):
-    """A value as a function of time."""
+    """A value as a function of time; `of_arrays`: whether signals differ in their arrays alone where these have the same
+    shapes, and their static fields are equal.
+    """
+
+    of_arrays: ClassVar[bool] = False
 
     @abc.abstractmethod
     def __call__(self, t: Scalar) -> Array:
@@ -83,6 +87,7 @@ class Series(AbstractSignal):
     values: Float[Array, "n *shape"]
     slopes: Float[Array, "n *shape"] | None
     interpolation: str = eqx.field(static=True)
+    of_arrays: ClassVar[bool] = True
 
     def __init__(self, ts: VectorLike, values: VectorLike, interpolation: Interpolation = "linear"):
         if interpolation not in ("linear", "cubic", "held"):
@@ -214,8 +219,8 @@ def of_one_kind(signals: Sequence[AbstractSignal]) -> list[tuple[tuple[int, ...]
     kinds: dict[Any, list[int]] = {}
     for k, signal in enumerate(signals):
         leaves, structure = jax.tree.flatten(signal)
-        shapes = tuple((x.shape, x.dtype) for x in leaves) if isinstance(signal, Series) else k
-        kinds.setdefault((structure, shapes), []).append(k)
+        kind = (structure, *((x.shape, x.dtype) for x in leaves)) if signal.of_arrays else k
+        kinds.setdefault(kind, []).append(k)
     # Times that are numbers stay numbers.
     joined = lambda *leaves: jnp.stack(leaves) if is_traced(leaves) else np.stack(list(map(np.asarray, leaves)))
     together = lambda same: signals[same[0]] if len(same) == 1 else jax.tree.map(joined, *(signals[k] for k in same))
