@@ -27,9 +27,7 @@ def sample_times(t0: Scalar, t1: Scalar) -> Float[Array, "n"]:
 
 
 class AbstractSignal(eqx.Module):
-    """A value as a function of time; `of_arrays`: whether signals differ in their arrays alone where these have the same
-    shapes, and their static fields are equal.
-    """
+    """A value as a function of time; `of_arrays`: whether signals of one structure differ in their arrays alone."""
 
     of_arrays: ClassVar[bool] = False
 
