@@ -160,6 +160,19 @@ def test_stops_that_are_never_reached_change_no_step_of_a_derivative(solver, nam
     np.testing.assert_allclose(runs[0][0], runs[1][0], rtol=1e-6)
 
 
+@pytest.mark.long
+def test_stops_change_no_step_beside_internal_states():
+    drive = mb.Motor("drive", "pin.angle", command=0.5, lag=0.2)
+    bar = planar.Body("bar", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
+    steps = []
+    for own in ([], [mb.Stop(f"end{k}", "pin.angle", lower=-50.0 - k) for k in range(2)]):
+        system = mb.Scene([bar], joints=[pin, *own], forces=[mb.Gravity((0.0, -9.81)), drive]).compile()
+        start = mb.assemble(system, fix={"bar.angle": 0.5})
+        steps.append(int(mb.simulate(system, start, t1=4.0, rtol=1e-6).stats["num_steps"]))
+    assert steps[0] == steps[1]
+
+
 def test_modes_of_friction_do_not_count():
     """In space they are two, and its velocities as many."""
     top = spatial.Body("top", mass=1.0, inertia=np.diag([1.0, 2.0, 3.0]), position=(0.0, 0.0, 1.0))
