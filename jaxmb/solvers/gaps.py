@@ -191,9 +191,6 @@ class GapController(diffrax.AbstractAdaptiveStepSizeController):
 
     controller: Any
 
-    def __init__(self, controller: Any):
-        self.controller = controller
-
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.controller.rtol
@@ -205,6 +202,9 @@ class GapController(diffrax.AbstractAdaptiveStepSizeController):
     @property
     def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.controller.norm
+
+    def __init__(self, controller: Any):
+        self.controller = controller
 
     def wrap(self, direction):
         return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))

@@ -63,5 +63,5 @@ def test_a_gap_is_a_number_or_a_vector():
         seen = system.gaps_seen(jnp.array(0.0), system.guess.q, system.guess.u.at[0].set(2.0))
         assert system.has_gaps and seen.gaps.shape == (count,) and abs(seen.rates[0]) == 2
     assert not scene(None).compile().has_gaps
-    with pytest.raises(ValueError, match=r"'layer': gaps must return shape \('n',\), got \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"'layer': gaps must return a vector, got shape \(1, 3\)"):
         scene(lambda x, t, p: x).compile()

@@ -6,8 +6,8 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.contact import Linear
 
+Linear = mb.contact.Linear
 # Random cases of each kind, and the number of steps of a run that misses nothing.
 CASES, STEPS = 20, 4000
 
