@@ -1,5 +1,8 @@
 """Which laws of dry friction hold at the limit of stick."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +12,22 @@ from jaxmb.manifold.contact_laws import Laws
 from jaxmb.system.gaps import FREE, STICK
 
 NORMAL, COEFFICIENT = 10.0, 0.3
+
+
+@functools.cache
+def found():
+    """Which laws hold of friction in a joint, in a mode and under a load, relative to its limit."""
+
+    @jax.jit
+    def answers(mode, load):
+        one, none = jnp.ones(1), jnp.zeros(0)
+        joint = Dry((-1,), (), COEFFICIENT * one, 0 * one, 0 * one)
+        laws = Laws(jnp.eye(1), joint, 0, 1, COEFFICIENT * one, COEFFICIENT * one)
+        reactions = jnp.array([[[0.0, NORMAL]], [[0.0, 0.0]]])
+        opening = load * COEFFICIENT * NORMAL * one
+        return laws.answers(laws.of_forces(opening, reactions, none > 0, 0 * one, mode * one, 0 * one))
+
+    return answers
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -21,12 +40,6 @@ def test_friction_at_its_limit(mode, load, sticks, sign):
     """At its limit friction sticks: the guard of its force tells whether it slips. Friction that has stuck until then
     slips, in the direction of the load.
     """
-    one, none = jnp.ones(1), jnp.zeros(0)
-    joint = Dry((-1,), (), COEFFICIENT * one, 0 * one, 0 * one)
-    laws = Laws(jnp.eye(1), joint, 0, 1, COEFFICIENT * one, COEFFICIENT * one)
-    reactions = jnp.array([[[0.0, NORMAL]], [[0.0, 0.0]]])
-    opening = sign * load * COEFFICIENT * NORMAL * one
-    problem = laws.of_forces(opening, reactions, none > 0, 0 * one, mode * one, 0 * one)
-    answers = laws.answers(problem)
+    answers = found()(float(mode), sign * load)
     assert bool(answers.solvable) and bool(answers.sticks[0]) == sticks
     np.testing.assert_array_equal(answers.slips, [0.0 if sticks else sign])

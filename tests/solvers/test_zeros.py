@@ -1,5 +1,7 @@
 """How the zero of a guard is found in a step."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -91,13 +93,14 @@ class Slip(AbstractGuards):
         return y <= self.touch if self.is_new else None
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def found(is_new, middle, end, made_jump=False, before=0.0):
     """The search in a step from zero to one, whose interpolant passes through a point in its middle."""
     guards = Slip(jnp.asarray(1e-10), jnp.asarray(1e-8), is_new)
     at = lambda t: 4 * t * (1 - t) * jnp.array([middle]) + t * (2 * t - 1) * jnp.array([end])
     states = jnp.array([before]), jnp.zeros(1), jnp.array([end])
     times = jnp.zeros(()), jnp.ones(())
-    return events.crossing(guards, 1.0, None, times, states, at, jnp.array(made_jump))
+    return events.crossing(guards, 1.0, None, times, states, at, jnp.asarray(made_jump))
 
 
 def test_a_guard_that_begins_counts_at_the_end_of_a_step():
