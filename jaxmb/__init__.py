@@ -10,6 +10,7 @@ from . import (
     system as system,
     trajectory as trajectory,
 )
+from ._faulty_versions import warn_of_jaxlib as _warn_of_jaxlib
 from ._programs import (
     compile_quickly as compile_quickly,
     keep_compiled as keep_compiled,
@@ -73,6 +74,8 @@ from .trajectory import Trajectory as Trajectory, load as load
 
 # What not every motion needs is imported at its first use (PEP 562). Only a type checker, which has to see the names,
 # imports them here.
+_warn_of_jaxlib()
+
 if TYPE_CHECKING:
     from . import (
         importers as importers,

@@ -348,6 +348,7 @@ def _check_names(scene: Scene):
             for name in own:
                 if name not in known:
                     raise unknown("body", name, known, part.label)
+            own = part.distinct(own)
             twice = [name for name in own if own.count(name) > 1]
             if twice and (twice[0] != GROUND or set(own) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")

@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 
 from .. import mechanisms
+from .._faulty_versions import fault_of
 from .._machine import cores, limit_of_threads
 from .._programs import VARIABLE, kept_in
 from .._results import RESULTS
@@ -109,6 +110,9 @@ def _facts() -> Iterable[tuple[str, str]]:
         text = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
         yield f"for {extra}", text if all(found.values()) else f'{text}; pip install "jaxmb[{extra}]"'
     yield "machine", f"{platform.system()} {platform.machine()}, {_processor()}, {_cores()}"
+    faults = [fault for name in (*_NEEDED, *sum(_OPTIONAL.values(), ())) if (fault := fault_of(name))]
+    if faults:
+        yield "wrong numbers", "; ".join(faults)
     devices = Counter((device.platform, device.device_kind) for device in jax.devices())
     yield "devices", ", ".join(f"{count} {name} ({kind})" for (name, kind), count in devices.items())
     yield "double precision", "on in commands; in Python by jax.config.update('jax_enable_x64', True)"

@@ -28,6 +28,8 @@ from .notes import Notes
 STOP_TIME = 0.02
 # The share of a joint's range over which a stop sets in.
 _ROUNDING = 1e-3
+# A loop is open as drawn if its ends are farther apart than this share of the machine's size, or than this angle [rad].
+_OPEN = 1e-6
 
 
 class Scalar(NamedTuple):
@@ -269,6 +271,7 @@ class _Builder:
             if a == b:
                 self.notes.say("Loops between links that are fixed to each other anyway are left out: {}.", loop.name)
                 continue
+            self._say_if_open(loop)
             name = self._named(loop.name, "loop")
             if loop.rotation is None:
                 self.joints.append(Spherical(name, a, b, point_a=point_a, point_b=point_b))
@@ -276,6 +279,22 @@ class _Builder:
                 turn_a, turn_b = self.fused.rotation(loop.link_a), self.fused.rotation(loop.link_b)
                 attitude = from_matrix(turn_a @ loop.rotation @ turn_b.T)
                 self.joints.append(Fixed(name, a, b, point_a=point_a, point_b=point_b, orientation=attitude))
+
+    def _say_if_open(self, loop):
+        """Note a loop that does not close where the file has its links."""
+        a, b = self.fused.links[loop.link_a], self.fused.links[loop.link_b]
+        ends = [own.position + own.rotation @ at for own, at in ((a, loop.point_a), (b, loop.point_b))]
+        off = np.zeros((3, 3)) if loop.rotation is None else a.rotation @ loop.rotation - b.rotation
+        gap, angle = np.linalg.norm(ends[1] - ends[0]), 2 * np.arcsin(min(np.linalg.norm(off) / np.sqrt(8), 1.0))
+        size = max(float(np.linalg.norm(own.position)) for own in self.fused.links.values())
+        shown = [f"{gap:.3g} m"] * bool(gap > _OPEN * max(size, np.linalg.norm(ends))) + [f"{angle:.3g} rad"] * bool(
+            angle > _OPEN
+        )
+        if shown:
+            self.notes.say(
+                "Loops are open as drawn, and assemble moves the bodies to close them: {}.",
+                f"{loop.name} by {' and '.join(shown)}",
+            )
 
     def _couplings(self):
         for coupling in self.machine.couplings:

@@ -12,7 +12,7 @@ A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes th
 import abc
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import equinox as eqx
@@ -286,6 +286,8 @@ class AbstractLink(AbstractActor):
     bodies = _Bodies()
     path_kind: ClassVar[PathKind] = "rod"
 
+    # From which of its bodies on several may be one, on which the part has several places; None where all must differ.
+    several_from: ClassVar[int | None] = None
     # Whether it has a function of time, in which steps look for pulses, by `given_in_time`.
     of_time: ClassVar[bool] = False
     # Names of the coordinates that are angles.
@@ -321,6 +323,12 @@ class AbstractLink(AbstractActor):
             cls.check(part, space.dimension)
         return part
 
+    @classmethod
+    def distinct(cls, bodies: Sequence[Any]) -> list[Any]:
+        """The bodies that must be different ones: one that the part may have several places on counts once."""
+        first = len(bodies) if cls.several_from is None else cls.several_from
+        return [*bodies[:first], *dict.fromkeys(bodies[first:])]
+
     def complete(self, space: AbstractSpace, poses: Poses) -> Self:
         """Hook: a copy with omitted numbers computed from the given poses; see `filled`."""
         del space, poses
@@ -329,7 +337,7 @@ class AbstractLink(AbstractActor):
     def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
         cls, names = type(self), self.bodies
         own = tuple(known.numbers[name] for name in names)
-        moving = [k for k in own if k != known.numbers[GROUND]]
+        moving = [k for k in cls.distinct(own) if k != known.numbers[GROUND]]
         if len({*moving}) < len(moving):
             raise ValueError(f"{self.label} connects two frames of one body: {', '.join(names)}.")
         frames = {str(k): known.frames[name] for k, name in enumerate(names) if name in known.frames}

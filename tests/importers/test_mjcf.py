@@ -538,7 +538,6 @@ def test_keyframes_are_states():
 # Loops, angles and filters along a motion
 
 
-@pytest.mark.long
 def test_a_loop_that_cannot_be_closed():
     """Two sites that no position brings together, and two couplings that contradict each other."""
     apart = '<site name="far" pos="5 0 0"/>' + rod("a", HINGE, '<site name="tip" pos=".3 0 0"/>')

@@ -11,7 +11,7 @@ ROOT = Path(jaxmb.__file__).parent
 
 # Lowest first; a layer may import from those before it, and from itself.
 LAYERS = [
-    ["_compat", "_machine", "_programs", "_types", "_results", "_version"],
+    ["_compat", "_faulty_versions", "_kept_programs", "_machine", "_programs", "_types", "_results", "_version"],
     ["linalg", "solvers"],
     ["_arguments", "_captured", "_jaxpr_digest", "_traced_functions"],
     ["parts"],

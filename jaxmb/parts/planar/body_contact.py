@@ -61,6 +61,8 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     has_gaps: ClassVar[bool] = True
 
+    several_from = 1
+
     @abc.abstractmethod
     def surfaces(self) -> Surface:
         """Numbers that describe the surfaces, with a row for each of the other bodies."""
@@ -188,7 +190,8 @@ class PlateContact(AbstractBodyContact):
 
     **Arguments:**
 
-    - `bodies`: names, first that of the disc's body, then those of the plates' bodies.
+    - `bodies`: names, first that of the disc's body, then those of the plates' bodies; one of several plates is named
+        for each of them.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
     - `start`, `end` [m] of the plates, fixed in their bodies, shape (2,) or (plates, 2).
@@ -334,7 +337,8 @@ class DiscContact(AbstractBodyContact):
 
     **Arguments:**
 
-    - `bodies`: names, first that of the body of `radius` and `centre`, then those of the others.
+    - `bodies`: names, first that of the body of `radius` and `centre`, then those of the others, one of several discs
+        for each of them.
     - `normal`, `friction`, `radius`, `centre`, `damping`, `damping_depth`, `smoothing`: as in `PlateContact`.
     - `radii` [m] ≥ 0 of the other discs, shape () or (others,), 0 for points.
     - `centres` [m] of the other discs, fixed in their bodies, shape (2,) or (others, 2), default the

@@ -261,3 +261,48 @@ def test_what_is_no_chain_is_refused():
     backwards = planar.PlateContact("touch", ("disc", "a", "b", "c"), radius=0.2, chain=True, **corners, **SHARP)
     with pytest.raises(ValueError, match=r"'touch': .* that of 'c' begins 2 m from the end of that of 'b'; join them"):
         backwards.resolve(PLANE, jnp.zeros((4, 3)))
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("ball", "box", "box"),
+        pytest.param(("ball", "box", "lid"), marks=pytest.mark.long),
+        pytest.param(("ball", "box", "ground"), marks=pytest.mark.long),
+    ],
+)
+def test_several_plates_of_one_body_bear_as_one_contact_each(names):
+    """Named for each of them, or by its frames; and the ground beside it."""
+    ball = planar.Body("ball", mass=1.0, inertia=0.01, position=(0.91, 0.095), velocity=(0.1, -0.3))
+    box = planar.Body("box", mass=1.0, inertia=0.1, angular_velocity=-0.3)
+    plates = [{"start": (-1.0, 0.0), "end": (1.0, 0.0)}, {"start": (1.0, -0.2), "end": (1.0, 1.0)}]
+    both = {key: [own[key] for own in plates] for key in ("start", "end")}
+    laws = {"radius": 0.1, **LAWS}
+    single = [
+        planar.PlateContact(f"touch {k}", ("ball", name), **laws, **own)
+        for k, (name, own) in enumerate(zip(names[1:], plates, strict=True))
+    ]
+    lid = planar.Frame("lid", "box")
+    found, expected = (
+        jax.jit(lambda q, u, system=system: (udot(system, q, u), system.potential_energy(0.0, q)))(*start)
+        for forces in ([planar.PlateContact("touch", names, **laws, **both)], single)
+        for system in [mb.Scene([box, ball], forces=forces, frames=[lid]).compile()]
+        for start in [(system.guess.q, system.guess.u)]
+    )
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-12)
+    assert abs(float(found[0][-1])) > 1.0
+
+
+def udot(system, q, u):
+    return mb.formulations.accelerations(system, mb.formulations.Multipliers(), 0.0, q, u)[0]
+
+
+def test_a_disc_and_a_plate_of_one_body():
+    """Touch each other nowhere, whatever other bodies there are."""
+    bodies = [planar.Body(name, mass=1.0, inertia=0.1, position=(k, 0.0)) for k, name in enumerate(("ball", "box"))]
+    both = {"start": [(-1.0, 0.0)] * 2, "end": [(1.0, 0.0)] * 2}
+    for names in (("ball", "ball", "box"), ("ball", "box", "ball")):
+        part = planar.PlateContact("touch", names, radius=0.1, **SHARP, **both)
+        with pytest.raises(ValueError, match="PlateContact 'touch' connects 'ball' with itself"):
+            mb.Scene(bodies, forces=[part]).compile()
