@@ -538,6 +538,28 @@ def test_keyframes_are_states():
 # Loops, angles and filters along a motion
 
 
+@pytest.mark.parametrize(
+    "equality, pos, said",
+    [
+        ('<connect name="loop" site1="tip" site2="far"/>', "0.31 0.02 0", "loop by 0.0224 m"),
+        ('<connect name="loop" site1="tip" site2="far"/>', "0.3 0 1e-9", None),
+        ('<weld name="loop" site1="tip" site2="far"/>', "0.3 0 0", "loop by 0.2 rad"),
+        ('<weld name="loop" site1="tip" site2="far"/>', "0.3 0 0.1", "loop by 0.1 m and 0.2 rad"),
+        ('<connect name="loop" body1="a" anchor=".3 0 0"/>', "9 0 0", None),
+        ('<weld body1="a" relpose="0 0.05 0 1 0 0 0"/>', "9 0 0", "equality 0 by 0.05 m"),
+    ],
+)
+def test_a_loop_that_is_open_as_drawn(equality, pos, said):
+    """The gap and the angle, by their formulas: of sites at (0.3, 0, 0) and at `pos`, there turned by 0.2 rad."""
+    far = f'<site name="far" pos="{pos}" euler="0 0 0.2"/>'
+    arm = rod("a", HINGE, '<site name="tip" pos=".3 0 0"/>', pos="0 0 0")
+    found = importers.mjcf(file(far + arm, f"<equality>{equality}</equality>", '<compiler angle="radian"/>'))
+    notes = [note for note in found.notes if "open as drawn" in note]
+    expected = f"Loops are open as drawn, and assemble moves the bodies to close them: {said!r}."
+    assert notes == ([] if said is None else [expected])
+
+
+@pytest.mark.long
 def test_a_loop_that_cannot_be_closed():
     """Two sites that no position brings together, and two couplings that contradict each other."""
     apart = '<site name="far" pos="5 0 0"/>' + rod("a", HINGE, '<site name="tip" pos=".3 0 0"/>')
