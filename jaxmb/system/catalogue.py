@@ -290,9 +290,8 @@ class AbstractSystem(AbstractEquation):
         return (*forces, *dict.fromkeys(f"the residual of {name!r}" for name in wrong))
 
     def __repr__(self) -> str:
-        facts = dict(self.describe().facts)
-        free = f", degrees of freedom: {facts['degrees of freedom']}" if "degrees of freedom" in facts else ""
-        return f"{type(self).__name__}: {facts['system']}{free}"
+        (_, kind), *_ = self.describe().facts
+        return f"{type(self).__name__}: {kind}, {counted(self.nu - self.velocity_rank, 'degree')} of freedom"
 
     def __str__(self) -> str:
         return str(self.describe())

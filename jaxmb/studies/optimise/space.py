@@ -18,6 +18,9 @@ from ...system.design import Bounds, design_bounds
 from ...system.quantities import component_names
 from ..ranges import FreeParameters, range_between
 
+# A parameter is at a bound if it is closer than this, relative to its scale.
+_NEAR = 1e-6
+
 
 class Space(eqx.Module):
     """Parameters by name as an affine function of a vector z: `start + scale z`, component by component.
@@ -62,8 +65,8 @@ class Space(eqx.Module):
 
     def at_bounds(self, z: np.ndarray) -> list[str]:
         """The names of components that are at a bound."""
-        low, high = self.box
-        return [name for name, own, a, b in zip(self.components(), z, low, high, strict=True) if own in (a, b)]
+        near = np.min(np.abs(np.array(self.box) - z), axis=0) < _NEAR
+        return [name for name, own in zip(self.components(), near, strict=True) if own]
 
     def unbounded(self) -> FreeParameters:
         """The same parameters as a function of a vector that may take any value; zero at the start.
