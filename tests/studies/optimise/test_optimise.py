@@ -314,7 +314,7 @@ def test_an_objective_that_leaps_up_is_no_optimum():
 
 def test_a_design_that_bounds_forbid_names_them_after_a_few_trials():
     """The values scatter as those of a simulation, so that no line search ends by itself."""
-    scatter = lambda x: 1e-6 * jnp.sin(1e14 * x)
+    scatter = lambda x: 1e-6 * jax.lax.stop_gradient(jnp.sin(1e14 * x))
     wheel = lambda v: {"J": v["J"], "fluctuation": 1.88481475 / v["J"] * (1.0 + scatter(v["J"]))}
     limits = {"constraints": {"fluctuation": (None, 0.02)}, "bounds": {"J": (0.05, 50.0)}}
     best = mb.optimise(wheel, {"J": 5.0}, objective="J", **limits)
