@@ -47,15 +47,16 @@ class Event(NamedTuple):
     **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
     `"close"`, `"open"`, `"rest"`: the end of infinitely many bounces, or `"impulse"` of a contact that stays closed
     while others strike; of friction `"stick"`, `"slip"`, or `"impact"` for an impulse alone; the `impulse` [N s, N m
-    s]; `energy_lost` [J]: the kinetic energy that was lost at this time, by all parts together, so that each of them
-    has the same; `ContactEvents.energy_lost` has one for each time.
+    s]; `kinetic_energy_lost` [J]: how much less kinetic energy all bodies together have after this time than before, so
+    that each part has the same. It is negative where a driver, whose speed is given, does more work at the impact than
+    the impact takes. `ContactEvents.kinetic_energy_lost` has one for each time.
     """
 
     time: float
     part: str
     kind: str
     impulse: float
-    energy_lost: float
+    kinetic_energy_lost: float
 
 
 class ContactEvents(eqx.Module):
@@ -64,7 +65,7 @@ class ContactEvents(eqx.Module):
 
     ```python
     print(motion.events)  # A table, of a motion with contacts such as `RigidContact`.
-    motion.events.times, motion.events.impulses, motion.events.energy_lost
+    motion.events.times, motion.events.impulses, motion.events.kinetic_energy_lost
     ```
 
     Impacts at `t0`, and what happens at announced `jumps`, are part of the motion and are not listed.
@@ -73,9 +74,10 @@ class ContactEvents(eqx.Module):
 
     **Fields:** the `names` of the parts, twice that of friction in space, which has two directions, and how many of
     them, the first ones, are `contacts`; `times` [s], shape
-    (events,); `impulses` [N s, of angles N m s], shape (events, parts); `energy_lost` [J], shape (events,): that of the
-    impact; `before` and `after`: modes, of a contact 0 where it is open, 1 where it is closed, 2 where others imply it,
-    of friction 1 and -1 where it slips forwards and backwards, in space 1, 2 where it sticks, 0 where it does nothing;
+    (events,); `impulses` [N s, of angles N m s], shape (events, parts); `kinetic_energy_lost` [J], shape (events,): by
+    all bodies at the impact, negative where a driver gave more; `before` and `after`: modes, of a contact 0 where it is
+    open, 1 where it is closed, 2 where others imply it, of friction 1 and -1 where it slips forwards and backwards, in
+    space 1, 2 where it sticks, 0 where it does nothing;
     `rest` [s],
     shape (events, parts): the time from an event to the end of the infinitely many bounces that begin with it and are
     too low to be resolved, after which the contact is at rest; zero where there are none. Under `jit` or in a batch
@@ -86,7 +88,7 @@ class ContactEvents(eqx.Module):
     contacts: int = eqx.field(static=True)
     times: Float[Array, "events"]
     impulses: Float[Array, "events parts"]
-    energy_lost: Float[Array, "events"]
+    kinetic_energy_lost: Float[Array, "events"]
     before: Float[Array, "events parts"]
     after: Float[Array, "events parts"]
     rest: Float[Array, "events parts"]
@@ -115,10 +117,10 @@ class ContactEvents(eqx.Module):
         # The energy that parts lose together stands at the first of them.
         first = [k == 0 or event.time != events[k - 1].time for k, event in enumerate(events)]
         rows = [
-            (f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.energy_lost:.6g}" if shown else "")
+            (f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.kinetic_energy_lost:.6g}" if shown else "")
             for e, shown in zip(events, first, strict=True)
         ]
-        table = [("time [s]", "part", "kind", "impulse [N s]", "energy lost [J]"), *rows]
+        table = [("time [s]", "part", "kind", "impulse [N s]", "kinetic energy lost [J]"), *rows]
         widths = [max(len(row[k]) for row in table) for k in range(5)]
         return "\n".join(
             "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in table
@@ -138,7 +140,7 @@ class ContactEvents(eqx.Module):
                 "ContactEvents."
             )
         times, impulses, lost, before, after, rest = map(
-            np.asarray, (self.times, self.impulses, self.energy_lost, self.before, self.after, self.rest)
+            np.asarray, (self.times, self.impulses, self.kinetic_energy_lost, self.before, self.after, self.rest)
         )
         rows = []
         for k in np.flatnonzero(np.isfinite(times)):

@@ -34,7 +34,7 @@ def one_impact():
         1,
         times=jnp.array([1.0, jnp.inf]),
         impulses=jnp.array([[3.0], [0.0]]),
-        energy_lost=jnp.array([0.5, 0.0]),
+        kinetic_energy_lost=jnp.array([0.5, 0.0]),
         before=jnp.zeros((2, 1)),
         after=jnp.zeros((2, 1)),
         rest=jnp.zeros((2, 1)),

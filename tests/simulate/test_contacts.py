@@ -58,7 +58,7 @@ def test_bouncing_ball_comes_to_rest():
     np.testing.assert_allclose([event.impulse for event in impacts], 2 * size * G * FALL * 0.5**k, atol=1e-8)
     heights = [motion.at(t).q[1] for t in (times[1:] + times[:-1]) / 2]
     np.testing.assert_allclose(heights, 0.25 ** k[1:], atol=1e-12)
-    np.testing.assert_allclose(sum(event.energy_lost for event in impacts), 2 * G, rtol=1e-9)
+    np.testing.assert_allclose(sum(event.kinetic_energy_lost for event in impacts), 2 * G, rtol=1e-9)
     assert [event.kind for event in events[-2:]] == ["close", "rest"]
     np.testing.assert_allclose(events[-1].time, 3 * FALL, atol=2e-8)
     s = 1.0 - 2 * FALL
@@ -164,7 +164,7 @@ def test_events_have_derivatives():
     def events(at):
         system = mb.with_parameters(BALL, {"floor.restitution": at[0], "floor.lower": at[1]})
         found = mb.simulate(system, mb.assemble(BALL), t1=2.0, rtol=1e-9, max_steps=300, max_events=16).events
-        return found.times[:3], found.impulses[:3, 0], found.energy_lost[:3]
+        return found.times[:3], found.impulses[:3, 0], found.kinetic_energy_lost[:3]
 
     def exact(at):
         speed, time, out = jnp.sqrt(2 * G * (1 - at[1])), jnp.sqrt(2 * (1 - at[1]) / G), []
@@ -623,7 +623,7 @@ def test_a_block_comes_to_rest_on_its_corners():
     saveat = np.linspace(0.0, 1.0, 41)
     motion = mb.simulate(system, mb.assemble(system), t1=1.0, saveat=saveat, rtol=1e-8)
     np.testing.assert_allclose(motion["block"].position[-1], [0.0, 0.4], atol=1e-10)
-    assert np.all(np.diff(motion.energy) <= 1e-7) and np.all(np.asarray(motion.events.energy_lost) >= 0)
+    assert np.all(np.diff(motion.energy) <= 1e-7) and np.all(np.asarray(motion.events.kinetic_energy_lost) >= 0)
     gaps = np.stack([motion[name].gap for name in ("left", "right")])
     assert np.min(gaps) >= -1e-10
     forces = [motion.reactions[name].force[-1, 1] for name in ("left", "right")]

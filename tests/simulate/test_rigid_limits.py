@@ -141,6 +141,6 @@ def test_ten_thousand_impacts():
     events, start = motion.events, motion.energy[0]
     assert len(events.times) >= 10_000
     assert np.max(np.diff(motion.energy)) <= rtol * start
-    lost = np.cumsum(np.asarray(events.energy_lost))[np.searchsorted(np.asarray(events.times), times) - 1]
+    lost = np.cumsum(np.asarray(events.kinetic_energy_lost))[np.searchsorted(np.asarray(events.times), times) - 1]
     np.testing.assert_allclose(motion.energy[1:], start - lost[1:], atol=1e3 * rtol * start)
     assert np.max(np.abs(np.asarray(motion["mass"].position[:, 0]))) <= 0.1 + 1e-11

@@ -77,13 +77,13 @@ def test_events_are_a_table_in_which_losses_of_energy_add_up():
         contacts=1,
         times=times,
         impulses=np.array([[3.0, -0.5], [1.0, -0.25]]),
-        energy_lost=lost,
+        kinetic_energy_lost=lost,
         before=np.array([[0.0, 0.0], [0.0, 0.0]]),
         after=np.array([[0.0, 0.0], [0.0, 0.0]]),
         rest=np.zeros((2, 2)),
     )
     head, *rows = str(events).splitlines()
-    assert head.split("  ")[0] == "time [s]" and "impulse [N s]" in head and head.endswith("energy lost [J]")
+    assert head.split("  ")[0] == "time [s]" and "impulse [N s]" in head and head.endswith("kinetic energy lost [J]")
     assert [row.split() for row in rows] == [
         ["0.5", "floor", "impact", "3", "2"],
         ["0.5", "rub", "impact", "-0.5"],
@@ -92,6 +92,6 @@ def test_events_are_a_table_in_which_losses_of_energy_add_up():
     ]
     frame = events.to_pandas()
     assert list(frame.columns) == list(mb.Event._fields) and list(frame["part"]) == ["floor", "rub"] * 2
-    np.testing.assert_array_equal(frame.groupby("time")["energy_lost"].first(), lost)
+    np.testing.assert_array_equal(frame.groupby("time")["kinetic_energy_lost"].first(), lost)
     first = events[0]
-    assert isinstance(first, mb.Event) and first.energy_lost == 2.0
+    assert isinstance(first, mb.Event) and first.kinetic_energy_lost == 2.0
