@@ -763,3 +763,20 @@ def test_what_counts_as_closed_does_not_depend_on_the_size_of_a_scene(rtol):
     assert len(several[0]) == {1e-3: 3, 1e-6: 8}[rtol]
     for event, other in zip(runs[0].events, runs[1].events, strict=True):
         np.testing.assert_allclose(event.time, other.time, atol=10 * rtol)
+
+
+@pytest.mark.long
+def test_an_impact_of_a_driven_hammer_gives_energy():
+    """The driver keeps the hammer at its speed v, and the ball leaves at (1 + e) v: a loss below zero."""
+    bodies = [
+        planar.Body(name, mass=2.0, inertia=1.0, position=(x, 0.0)) for name, x in (("hammer", 0.0), ("ball", 0.3))
+    ]
+    joints = [
+        planar.Prismatic("slide", "ground", "hammer", point=(0.0, 0.0), axis=(1.0, 0.0)),
+        mb.JointDriver("drive", "slide.displacement", rate=2.0),
+        mb.RigidBallContact("meet", "hammer", "ball", radius_a=0.1, radius_b=0.1, restitution=0.5),
+    ]
+    system = mb.Scene(bodies, joints=joints).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=0.1)
+    (event,) = motion.events
+    np.testing.assert_allclose([event.time, event.impulse, event.kinetic_energy_lost], [0.05, 6.0, -9.0], rtol=1e-9)
