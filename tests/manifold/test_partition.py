@@ -1,0 +1,89 @@
+"""Charts near positions where constraints lose rank: linkages that lie flat go on as their momentum tells."""
+
+import flat_linkages
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+
+
+@pytest.fixture(scope="module")
+def folding():
+    """A slider-crank with a rod as long as its crank, which folds where the crank stands upright, beside a skate: with
+    its row of velocities, coordinates have a stored factor.
+    """
+    bars = [
+        planar.Body("crank", mass=1.0, inertia=0.02, position=(0.2, 0.0)),
+        planar.Body("rod", mass=1.0, inertia=0.02, position=(0.6, 0.0)),
+        planar.Body("skate", mass=1.0, inertia=0.02, position=(0.0, -1.0)),
+    ]
+    joints = [
+        planar.Revolute("pin", "ground", "crank", point=(0.0, 0.0)),
+        planar.Revolute("elbow", "crank", "rod", point=(0.4, 0.0)),
+        planar.PointOnLine("slider", "ground", "rod", axis_a=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.2, 0.0)),
+        planar.KnifeEdge("blade", "skate", axis=(1.0, 0.0)),
+    ]
+    return mb.Scene(bars, joints=joints).compile()
+
+
+def test_a_stored_position_factor_serves_no_other_side_of_a_flat_position(folding):
+    """Newton's method failed after it, however short the steps were."""
+
+    @jax.jit
+    def run(speed, rtol):
+        start = mb.State(
+            jnp.array([0.2, 0, 0, 0.6, 0, 0, 0, -1, 0]),
+            speed * jnp.array([0, 0.2, 1, 0, 0.2, -1, 0, 0, 0.3]),
+        )
+        motion = mb.simulate(
+            folding, start, t1=5.0, rtol=rtol, saveat=jnp.linspace(0, 5, 11), max_steps=2000, throw=False
+        )
+        return motion["crank"].angle, motion["rod"].angle, motion.energy
+
+    for speed in (2.0, 3.0, -5.0):
+        for rtol in (1e-6, 1e-9):
+            crank, rod, energy = run(speed, rtol)
+            np.testing.assert_allclose(rod + crank, 0.0, atol=100 * rtol)
+            np.testing.assert_allclose(energy, energy[0], rtol=100 * rtol)
+            assert np.abs(crank[-1]) > 6.0
+
+
+def _case(linkage, rng, in_space):
+    """Sizes, masses, coordinates and rates at the start."""
+    sizes = {name: size * rng.uniform(0.6, 1.6) for name, size in linkage.sizes.items()}
+    masses = {name: np.exp(rng.uniform(-1.5, 1.5)) for name in linkage.lengths(sizes)}
+    x = np.array(linkage.start) + rng.uniform(-0.3, 0.6, len(linkage.start))
+    return sizes, masses, x, rng.choice([-1.0, 1.0], x.size) * rng.uniform(1.0, 6.0, x.size)
+
+
+def _errors(name, in_space, count, **options):
+    """For each of some random cases the relative tolerance, the name of the result, and the error of the centres."""
+    linkage, rng, times = flat_linkages.LINKAGES[name], np.random.default_rng(7), jnp.linspace(0.0, 3.0, 13)
+    system = linkage.system(in_space)
+
+    @jax.jit
+    def run(sizes, masses, x, rates, rtol):
+        changed = mb.with_parameters(system, linkage.values(sizes, masses, in_space))
+        start = linkage.state(sizes, x, rates, in_space)
+        motion = mb.simulate(changed, start, t1=3.0, rtol=rtol, saveat=times, max_steps=3000, throw=False, **options)
+        centres = linkage.centres(sizes, linkage.path(sizes, masses, x, rates, times), in_space)
+        return motion.result, jnp.max(jnp.stack([jnp.abs(motion[k].position - at) for k, at in centres.items()]))
+
+    out = []
+    for k in range(count):
+        rtol = (1e-4, 1e-6, 1e-8, 1e-10)[k % 4]
+        result, error = run(*_case(linkage, rng, in_space), rtol)
+        out.append((rtol, mb.RESULTS[result], float(error)))
+    return out
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", flat_linkages.LINKAGES)
+@pytest.mark.parametrize("in_space", [False, True], ids=["plane", "space"])
+def test_random_linkages_go_on_after_flat_positions(name, in_space):
+    """Positions are those of Lagrange's equations for the freedoms of the linkage."""
+    for rtol, result, error in _errors(name, in_space, 40):
+        assert not result and error < 300 * rtol + 1e-8, (rtol, result, error)

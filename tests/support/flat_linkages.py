@@ -1,0 +1,216 @@
+"""Linkages of bars that lie flat in passing, in the plane or in space, with their motion in closed form.
+
+At such a position the constraints lose rank and other motions branch off; the bars go on as their momentum tells.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+
+# How the plane of the linkages lies in space.
+_PLANE = np.array([0.4, 0.3, -0.6, 0.5]) / np.linalg.norm([0.4, 0.3, -0.6, 0.5])
+
+
+def _product(a, b):
+    scalar = a[0] * b[0] - a[1:] @ b[1:]
+    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
+
+
+def _turned(v):
+    """A vector of the plane in space."""
+    conjugate = jnp.asarray(_PLANE) * jnp.array([1.0, -1.0, -1.0, -1.0])
+    return _product(_product(jnp.asarray(_PLANE), jnp.concatenate([jnp.zeros(1), v, jnp.zeros(1)])), conjugate)[1:]
+
+
+def along(angle):
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+@dataclasses.dataclass(frozen=True)
+class FlatLinkage:
+    """Uniform slender bars on hinges.
+
+    **Fields:** `hinges`: name, bodies, and where on them, in numbers along bars and points of the ground, as a function
+    of the `sizes`; `poses(sizes, x)`: centre and angle of each bar by name; `lengths(sizes)` of the bars; sizes and
+    coordinates of the scene; `line`: a bar whose lower end slides along x, or None; `kinds` of hinges in space other
+    than `spatial.Revolute`.
+    """
+
+    hinges: Callable
+    poses: Callable
+    lengths: Callable
+    sizes: dict[str, float]
+    start: tuple[float, ...]
+    line: str | None = None
+    kinds: dict[str, type] = dataclasses.field(default_factory=dict)
+
+    def system(self, in_space: bool):
+        """The compiled scene, all bars of 1 kg."""
+        poses, lengths = self.poses(self.sizes, jnp.array(self.start)), self.lengths(self.sizes)
+        bodies, joints = [], []
+        for name, (centre, angle) in poses.items():
+            inertia = lengths[name] ** 2 / 12
+            if in_space:
+                turn = _product(jnp.asarray(_PLANE), jnp.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]))
+                body = spatial.Body(
+                    name,
+                    mass=1.0,
+                    inertia=np.diag(inertia * np.array([0.1, 1.0, 1.0])),
+                    position=_turned(centre),
+                    orientation=turn,
+                )
+            else:
+                body = planar.Body(name, mass=1.0, inertia=inertia, position=centre, angle=float(angle))
+            bodies.append(body)
+        values = self.values(self.sizes, dict.fromkeys(poses, 1.0), in_space)
+        normal = _product(_product(_PLANE, np.array([0.0, 0, 0, 1])), _PLANE * np.array([1.0, -1, -1, -1]))[1:]
+        for name, a, b, *_ in self.hinges(self.sizes):
+            at = {key: values[f"{name}.{key}"] for key in ("point_a", "point_b")}
+            if not in_space:
+                joints.append(planar.Revolute(name, a, b, **at))
+                continue
+            axis = normal if a == "ground" else (0.0, 0.0, 1.0)
+            kind = self.kinds.get(name, spatial.Revolute)
+            axes = {spatial.Revolute: {"axis_a": axis, "axis_b": (0.0, 0.0, 1.0)}, spatial.Spherical: {}}
+            axes[spatial.Universal] = {"axis_a": axis, "axis_b": (0.0, 1.0, 0.0)}
+            joints.append(kind(name, a, b, **at, **axes[kind]))
+        if self.line is not None:
+            part, axis = (spatial, _turned(jnp.array([1.0, 0.0]))) if in_space else (planar, (1.0, 0.0))
+            at = {"point_a": np.zeros(3 if in_space else 2), "point_b": values["line.point_b"]}
+            joints.append(part.PointOnLine("line", "ground", self.line, axis_a=axis, **at))
+        return mb.Scene(bodies, joints=joints).compile()
+
+    def values(self, sizes, masses, in_space):
+        """The parameters of the system for sizes and masses."""
+        lengths, out = self.lengths(sizes), {}
+        point = lambda s: jnp.zeros(3 if in_space else 2).at[0].set(s)
+        for name, mass in masses.items():
+            inertia = mass * lengths[name] ** 2 / 12
+            out[f"{name}.mass"] = mass
+            out[f"{name}.inertia"] = inertia * jnp.diag(jnp.array([0.1, 1.0, 1.0])) if in_space else inertia
+        for name, a, _, at_a, at_b in self.hinges(sizes):
+            on_ground = jnp.stack([jnp.asarray(at_a, float), jnp.zeros(())])
+            ground = a == "ground"
+            out[f"{name}.point_a"] = (_turned(on_ground) if in_space else on_ground) if ground else point(at_a)
+            out[f"{name}.point_b"] = point(at_b)
+        if self.line is not None:
+            out["line.point_b"] = point(-lengths[self.line] / 2)
+        return out
+
+    def state(self, sizes, x, rates, in_space):
+        """The state at coordinates x and their rates."""
+        flat = lambda x: [jnp.concatenate([centre, angle[None]]) for centre, angle in self.poses(sizes, x).values()]
+        at, velocity = jax.jvp(flat, (x,), (rates,))
+        if not in_space:
+            return mb.State(jnp.concatenate(at), jnp.concatenate(velocity))
+        half = [
+            jnp.array([1.0, 0, 0, 0]) * jnp.cos(p[2] / 2) + jnp.array([0, 0, 0, 1.0]) * jnp.sin(p[2] / 2) for p in at
+        ]
+        q = [jnp.concatenate([_turned(p[:2]), _product(jnp.asarray(_PLANE), h)]) for p, h in zip(at, half, strict=True)]
+        u = [jnp.concatenate([_turned(v[:2]), jnp.zeros(2), v[2:]]) for v in velocity]
+        return mb.State(jnp.concatenate(q), jnp.concatenate(u))
+
+    def path(self, sizes, masses, x, rates, times, substeps=200):
+        """The coordinates at times, by Lagrange's equations and steps of Runge and Kutta, shape (times, freedoms)."""
+        lengths = self.lengths(sizes)
+
+        def energy(x, rates):
+            flat = lambda x: jnp.stack([jnp.append(c, a) for c, a in self.poses(sizes, x).values()])
+            _, v = jax.jvp(flat, (x,), (rates,))
+            mass = jnp.stack([masses[name] for name in self.poses(sizes, x)])
+            length = jnp.stack([jnp.asarray(lengths[name]) for name in self.poses(sizes, x)])
+            return 0.5 * jnp.sum(mass * (v[:, 0] ** 2 + v[:, 1] ** 2 + length**2 / 12 * v[:, 2] ** 2))
+
+        def field(y):
+            x, rates = jnp.split(y, 2)
+            _, rise = jax.jvp(lambda x: jax.grad(energy, 1)(x, rates), (x,), (rates,))
+            return jnp.append(
+                rates, jnp.linalg.solve(jax.hessian(energy, 1)(x, rates), jax.grad(energy)(x, rates) - rise)
+            )
+
+        def step(_, y, h):
+            a = field(y)
+            b = field(y + h / 2 * a)
+            c = field(y + h / 2 * b)
+            return y + h / 6 * (a + 2 * b + 2 * c + field(y + h * c))
+
+        def interval(y, span):
+            y = jax.lax.fori_loop(0, substeps, lambda k, y: step(k, y, span / substeps), y)
+            return y, y[: x.size]
+
+        _, out = jax.lax.scan(interval, jnp.append(x, rates), jnp.diff(times))
+        return jnp.concatenate([x[None], out])
+
+    def centres(self, sizes, path, in_space):
+        """The centres of the bars along a path, by name."""
+        place = _turned if in_space else lambda centre: centre
+        return jax.vmap(lambda x: {name: place(c) for name, (c, _) in self.poses(sizes, x).items()})(path)
+
+
+def _parallel(count, kinds=None):
+    """Parallel cranks that carry level bars in a row."""
+
+    def hinges(p):
+        out = [(f"A{k}", "ground", f"crank{k}", k * p["d"], -p["l"] / 2) for k in range(count)]
+        for k in range(1, count):
+            out.append((f"P{k}", f"crank{k - 1}", f"level{k}", p["l"] / 2, -p["d"] / 2))
+            out.append((f"Q{k}", f"level{k}", f"crank{k}", p["d"] / 2, p["l"] / 2))
+        return out
+
+    def poses(p, x):
+        right, tip = jnp.array([1.0, 0.0]) * p["d"], p["l"] * along(x[0])
+        out = {f"crank{k}": (tip / 2 + k * right, x[0]) for k in range(count)}
+        return out | {f"level{k}": (tip + (k - 0.5) * right, 0 * x[0]) for k in range(1, count)}
+
+    def lengths(p):
+        return {f"crank{k}": p["l"] for k in range(count)} | {f"level{k}": p["d"] for k in range(1, count)}
+
+    return FlatLinkage(hinges, poses, lengths, {"l": 0.4, "d": 1.0}, (0.6,), kinds=kinds or {})
+
+
+def _scissors():
+    """Two crossed bars, their lower ends on a hinge and on the line."""
+    hinges = lambda p: [("foot", "ground", "a", 0.0, -p["l"] / 2), ("middle", "a", "b", 0.0, 0.0)]
+    poses = lambda p, x: {"a": (p["l"] / 2 * along(x[0]), x[0]), "b": (p["l"] / 2 * along(x[0]), jnp.pi - x[0])}
+    return FlatLinkage(hinges, poses, lambda p: {"a": p["l"], "b": p["l"]}, {"l": 1.0}, (0.6,), "b")
+
+
+def _pantograph():
+    """An arm and a crank on one axis; a rod parallel to the arm keeps the forearm parallel to the crank."""
+
+    def hinges(p):
+        middle = (p["w"] - p["r"]) / 2
+        return [
+            ("A", "ground", "arm", 0.0, -p["l"] / 2),
+            ("C", "ground", "crank", 0.0, -p["r"] / 2),
+            ("R", "crank", "rod", p["r"] / 2, -p["l"] / 2),
+            ("E", "arm", "forearm", p["l"] / 2, -middle),
+            ("F", "rod", "forearm", p["l"] / 2, p["r"] - middle),
+        ]
+
+    def poses(p, x):
+        a, b = along(x[0]), along(x[1])
+        return {
+            "arm": (p["l"] / 2 * a, x[0]),
+            "crank": (p["r"] / 2 * b, x[1]),
+            "rod": (p["r"] * b + p["l"] / 2 * a, x[0]),
+            "forearm": (p["l"] * a + (p["w"] - p["r"]) / 2 * b, x[1]),
+        }
+
+    lengths = lambda p: {"arm": p["l"], "crank": p["r"], "rod": p["l"], "forearm": p["w"] + p["r"]}
+    return FlatLinkage(hinges, poses, lengths, {"l": 0.7, "r": 0.25, "w": 0.8}, (0.3, 1.5))
+
+
+LINKAGES = {
+    "parallelogram": _parallel(2),
+    "parallelogram without redundancy": _parallel(2, {"P1": spatial.Universal, "Q1": spatial.Spherical}),
+    "row of parallelograms": _parallel(3),
+    "scissors": _scissors(),
+    "pantograph": _pantograph(),
+}
