@@ -87,3 +87,20 @@ def test_random_linkages_go_on_after_flat_positions(name, in_space):
     """Positions are those of Lagrange's equations for the freedoms of the linkage."""
     for rtol, result, error in _errors(name, in_space, 40):
         assert not result and error < 300 * rtol + 1e-8, (rtol, result, error)
+
+
+@pytest.mark.long
+def test_derivatives_beyond_a_flat_position(folding):
+    """Forward, reverse, and central differences of a tighter solution."""
+
+    def end(speed, rtol):
+        rates = jnp.array([0, 0.2, 1, 0, 0.2, -1, 0, 0, 0.3])
+        start = mb.State(jnp.array([0.2, 0, 0, 0.6, 0, 0, 0, -1, 0]), speed * rates)
+        return mb.simulate(folding, start, t1=1.0, rtol=rtol, max_steps=400)["crank"].angle[-1]
+
+    forward = jax.jit(jax.jvp, static_argnums=0)(lambda s: end(s, 1e-9), (3.0,), (1.0,))[1]
+    reverse = jax.jit(jax.grad(lambda s: end(s, 1e-9)))(3.0)
+    value = jax.jit(lambda s: end(s, 1e-10))
+    assert value(3.0) > np.pi / 2 + 0.3
+    np.testing.assert_allclose(forward, (value(3.0 + 1e-3) - value(3.0 - 1e-3)) / 2e-3, rtol=1e-5)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
