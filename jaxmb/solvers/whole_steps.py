@@ -88,6 +88,7 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
     # Concrete classes, since nothing else tells that a controller knows no jumps.
     if isinstance(controller, diffrax.ClipStepSizeController) and controller.jump_ts is None:
         controller = controller.controller
+    # A concrete class, which hands on what the controller inside knows of jumps.
     if isinstance(controller, GapController):
         controller = controller.controller
     jumps = not isinstance(controller, still)
