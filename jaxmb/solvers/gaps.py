@@ -186,7 +186,13 @@ def _least(gaps, rates, piece):
     return jnp.where(turns, jnp.minimum(before + closing * way, least), least)
 
 
-class GapController(diffrax.AbstractAdaptiveStepSizeController):
+class AbstractWithoutJumps(diffrax.AbstractAdaptiveStepSizeController):
+    """A controller around another one, `controller`, that makes no jumps of its own."""
+
+    controller: eqx.AbstractVar[Any]
+
+
+class GapController(AbstractWithoutJumps):
     """A controller around another one, whose steps pass over no force that sets in and ends within them."""
 
     controller: Any

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from .._compat import with_loops
 from .controller import MultistepController
 from .evaluation import freeze, ravel, unravel_like
-from .gaps import GapController
+from .gaps import AbstractWithoutJumps
 from .multistep import AbstractMultistep
 from .one_step import OneStepController, WithTangents
 from .steps import AbstractSteps, LinearStep, refuse_moving_jumps
@@ -88,8 +88,7 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
     # Concrete classes, since nothing else tells that a controller knows no jumps.
     if isinstance(controller, diffrax.ClipStepSizeController) and controller.jump_ts is None:
         controller = controller.controller
-    # A concrete class, which hands on what the controller inside knows of jumps.
-    if isinstance(controller, GapController):
+    if isinstance(controller, AbstractWithoutJumps):
         controller = controller.controller
     jumps = not isinstance(controller, still)
     if isinstance(solver, AbstractMultistep):
