@@ -5,7 +5,7 @@ again between them would be missed. So the gaps in which forces act are followed
 a step that hides one of them is tried again up to where it is most closed. All other steps stay as they are.
 """
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -17,6 +17,11 @@ from .._compat import WrappedSolver, direction_of, loop_of_lanes
 from .evaluation import gaps_of
 from .events import AbstractErrorWithMore
 from .manifold_term import AbstractGaps
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 # A stretch of a step is looked at in so many pieces; stretches that hide nothing grow by a factor.
 _PIECES, _GROWTH = 8, 4.0
@@ -189,7 +194,7 @@ def _least(gaps, rates, piece):
 class AbstractWithoutJumps(diffrax.AbstractAdaptiveStepSizeController):
     """A controller around another one, `controller`, that makes no jumps of its own."""
 
-    controller: eqx.AbstractVar[Any]
+    controller: AbstractVar[Any]
 
 
 class GapController(AbstractWithoutJumps):
