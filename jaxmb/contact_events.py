@@ -179,7 +179,7 @@ def contact_events(system: AbstractSystem, formulation: AbstractFormulation, fou
     return ContactEvents(**_parts(system), **dict(zip(_NUMBERS, evaluated(system, formulation, found), strict=True)))
 
 
-_NUMBERS = ("times", "impulses", "energy_lost", "before", "after", "rest")
+_NUMBERS = ("times", "impulses", "kinetic_energy_lost", "before", "after", "rest")
 
 
 @of_structure

@@ -90,8 +90,8 @@ def with_programs(system: Unanalysed) -> Unanalysed:
     def evaluated(system: Unanalysed, t: Any, q: Any, u: Any) -> Any:
         v, p = system.rates(t, q, u), system.parameters
         sizes = {c.name: jnp.zeros(n, q.dtype) for c, n in zip(system.constraints, system.sizes, strict=True)}
-        # The law of a constraint that is not there is refused later.
-        laws = [law for law in system.nonideal if law.constraint in sizes]
+        # The law of a constraint or a coefficient that is not there is refused later.
+        laws = [law for law in system.nonideal if law.constraint in sizes and p.keys() >= set(law.coefficients)]
         return (
             system.lagrangian(t, q, v, p),
             system.applied_force(t, q, v),

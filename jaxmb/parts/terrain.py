@@ -8,6 +8,7 @@ waves = terrain.Sinusoid(amplitude=0.05, wavelength=3.0)
 measured = terrain.Spline(x=[0.0, 1.0, 2.0, 3.0], heights=[0.0, 0.1, 0.05, 0.0])
 bowl = terrain.Surface(lambda place, p: p["curvature"] * place @ place / 2, parameters={"curvature": 0.1})
 terrain.distance(hill, jnp.array([1.0, 0.5])), terrain.outward(hill, jnp.array([1.0, 0.5]))
+terrain.pace_over(bump, jnp.array([2.1, 0.5]), jnp.array([3.0, 0.0]))
 ```
 
 A place is the world position without the vertical: (x,) in a planar scene, where y is up, and (x, y) in a spatial one,

@@ -36,7 +36,6 @@ from ..parts.series import of_one_kind
 from ..solvers import (
     NO_STATE,
     AbstractMultistep,
-    GapSolver,
     MeshAdjoint,
     RunningScales,
     TangentControl,
@@ -45,6 +44,7 @@ from ..solvers import (
     with_counted,
     with_tangents,
 )
+from ..solvers.gaps import GapSolver
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.parameters import with_parameters

@@ -22,7 +22,6 @@ from .events import (
     crossing as crossing,
     events_found as events_found,
 )
-from .gaps import GapSolver as GapSolver
 from .hermite import Hermite as Hermite, HermiteState as HermiteState
 from .manifold_term import (
     AbstractFieldJacobian as AbstractFieldJacobian,

@@ -75,13 +75,13 @@ def with_counted(controller: Any, counted: tuple[int, ...] | None) -> Any:
     """
     if counted is None:
         return controller
-    # Concrete classes, since a controller may be wrapped in others that diffrax has.
     kinds = (diffrax.PIDController, OneStepController, MultistepController)
     is_known = lambda x: isinstance(x, kinds)
 
     def of_counted(x):
         if not is_known(x):
             return x
+        # A concrete class each, since a controller may be wrapped in others that diffrax has.
         if isinstance(x, MultistepController):
             where = lambda x: (x.norm.norm,)
         else:

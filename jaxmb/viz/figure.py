@@ -12,6 +12,8 @@ def new_figure(width: float, height: float) -> "Figure":
     **Raises:** `ImportError` naming the extra to install if matplotlib is not there.
     """
     try:
+        import matplotlib.figure  # noqa: F401
+
         from .shown import ShownFigure
     except ImportError as error:
         raise ImportError('Figures need matplotlib; install it with: pip install "jaxmb[plot]"') from error

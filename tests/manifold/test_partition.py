@@ -59,7 +59,7 @@ def _case(linkage, rng, in_space):
     return sizes, masses, x, rng.choice([-1.0, 1.0], x.size) * rng.uniform(1.0, 6.0, x.size)
 
 
-def _errors(name, in_space, count, **options):
+def _errors(name, in_space, count, finest, **options):
     """For each of some random cases the relative tolerance, the name of the result, and the error of the centres."""
     linkage, rng, times = flat_linkages.LINKAGES[name], np.random.default_rng(7), jnp.linspace(0.0, 3.0, 13)
     system = linkage.system(in_space)
@@ -74,7 +74,7 @@ def _errors(name, in_space, count, **options):
 
     out = []
     for k in range(count):
-        rtol = (1e-4, 1e-6, 1e-8, 1e-10)[k % 4]
+        rtol = (1e-4, 1e-6, 1e-8, finest)[k % 4]
         result, error = run(*_case(linkage, rng, in_space), rtol)
         out.append((rtol, mb.RESULTS[result], float(error)))
     return out
@@ -85,10 +85,10 @@ def _errors(name, in_space, count, **options):
 @pytest.mark.parametrize("in_space", [False, True], ids=["plane", "space"])
 def test_random_linkages_go_on_after_flat_positions(name, in_space):
     """Positions are those of Lagrange's equations for the freedoms of the linkage."""
-    if name == "row of parallelograms" and not in_space:
-        pytest.xfail("at rtol 1e-10 steps may creep up to a position where two linkages lie flat at once")
-    for rtol, result, error in _errors(name, in_space, 40):
-        assert not result and error < 300 * rtol + 1e-8, (rtol, result, error)
+    # Where two linkages lie flat at once, steps in the plane may creep up to that position at 1e-10.
+    finest = 1e-9 if name == "row of parallelograms" and not in_space else 1e-10
+    for rtol, result, error in _errors(name, in_space, 40, finest):
+        assert result == "successful" and error < 300 * rtol + 1e-8, (rtol, result, error)
 
 
 @pytest.mark.long

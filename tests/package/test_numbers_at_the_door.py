@@ -135,9 +135,9 @@ def in_coordinates(end):
 
 
 WRONG = {
-    "force": (pushed_until, 0.5, "at t = 0.5 the force of 'push' is not finite"),
-    "driver": (driven_until, 0.3, "at t = 0.3 the residual of 'drive' is not finite"),
-    "potential": (in_coordinates, 0.1, "at t = 0.0[0-9]* the force on the coordinates is not finite"),
+    "force": (pushed_until, 0.5, "At t = 0.5 the force of 'push' is not finite"),
+    "driver": (driven_until, 0.3, "At t = 0.3 the residual of 'drive' is not finite"),
+    "potential": (in_coordinates, 0.1, "At t = 0.0[0-9]* the force on the coordinates is not finite"),
 }
 
 

@@ -153,7 +153,7 @@ def test_reports_on_the_command_line(capsys, tmp_path, monkeypatch):
     data = json.loads((tmp_path / "out" / "work_precision.json").read_text())
     assert data["mechanism"] == "oscillator" and data["runs"][0]["error"] < 1e-3
     assert (tmp_path / "out" / "work_precision.png").read_bytes().startswith(b"\x89PNG")
-    for name, message in ((f"{where}s", "has no attribute"), ("no_such_module:scene", "No module named")):
+    for name, message in ((f"{where}s", "has no 'oscillators'"), ("no_such_module:scene", "No module named")):
         assert main(["report", "stress_test", name, "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
 

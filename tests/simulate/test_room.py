@@ -147,7 +147,7 @@ def test_too_few_steps_are_no_singularity(narrow, rooms):
 
 def test_room_counts_internal_states():
     """Of which a system may have many more than coordinates."""
-    saveat = arguments.with_end(diffrax.SaveAt(steps=True))
+    saveat = arguments.with_end(diffrax.SaveAt(steps=True), jnp.zeros(()), mb.State(jnp.zeros(8), jnp.zeros(8)))
     few, many = mb.State(jnp.zeros(8), jnp.zeros(8)), mb.State(jnp.zeros(8), jnp.zeros(8), jnp.zeros(4096))
     first = [arguments.rooms_for(2**30, saveat, state, False, False)[0] for state in (few, many)]
     assert first == [2**17, 2**8 * 4]

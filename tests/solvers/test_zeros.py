@@ -55,6 +55,9 @@ class Dip(AbstractGuards):
     def forces(self, y):
         return jnp.array([False])
 
+    def changed(self, before, after):
+        return jnp.array(True)
+
 
 @jax.jit
 def first_zero(first, last):
