@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -35,7 +34,7 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
     rows = _violated(*lax.stop_gradient((system, t, state)))
     if is_traced(rows):
         off = jnp.any(rows[0]) | jnp.any(rows[1]) | jnp.any(rows[2])
-        return jax.tree.map(lambda x: jnp.where(off, jnp.nan, x), state)
+        return nan_where(off, state, (system, t, state))
     if not any(np.any(own) for own in rows):
         return state
     if is_traced((system, t, state)):

@@ -260,7 +260,8 @@ def test_a_pin_that_rubs_begins_to_turn():
 
 @functools.cache
 def _in_space(on):
-    push = lambda x, v, t, p: jnp.zeros((1, x.shape[-1])).at[0, :2].set(p["rate"] * t * jnp.array([0.6, 0.8]))
+    force = lambda t, p: (p["start"] + p["rate"] * t) * jnp.array([0.6, 0.8])
+    push = lambda x, v, t, p: jnp.zeros_like(v).at[0, :2].set(force(t, p))
     if on == "face":
         joint = spatial.Planar(
             "face", "ground", "block", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), x_a=(1.0, 0.0, 0.0), x_b=(1.0, 0, 0)
@@ -271,7 +272,7 @@ def _in_space(on):
         block = spatial.PointMass("block", mass=2.0)
     rub = mb.DryFriction("rub", on, coefficient=0.2, speed=(0.3, 0.4))
     spring = spatial.SpringDamper("spring", "ground", "block", stiffness=50.0, free_length=0.0)
-    push = mb.Force("push", ["block"], push, parameters={"rate": 0.0})
+    push = mb.Force("push", ["block"], push, parameters={"start": 0.0, "rate": 0.0})
     return mb.Scene([block], joints=[joint], forces=[mb.Gravity((0.0, 0.0, -G)), rub, spring, push]).compile()
 
 
@@ -286,7 +287,8 @@ def test_a_block_in_a_plane_in_space(on):
         numbers = {"push.rate": belt.rate, "push.start": belt.push, "rub.speed": belt.speed * along}
         numbers["spring.stiffness"] = belt.stiffness
         changed = mb.with_parameters(system, jax.tree.map(jnp.asarray, numbers))
-        start = mb.assemble(changed, velocities={"block": jnp.asarray(np.append(v * along, 0.0))})
+        guess = mb.State(system.guess.q.at[:2].set(x * along), system.guess.u.at[:2].set(v * along))
+        start = mb.assemble(changed, guess, fix={"floor.mode": 1} if on == "floor" else None)
         out = mb.simulate(changed, start, t1=1.3, saveat=[1.3], rtol=1e-6, max_events=10)
         *known, events = moved(belt, x, v, 1.3)
         np.testing.assert_allclose(out["block"].position[0, :2], known[0] * along, atol=1e-5)
