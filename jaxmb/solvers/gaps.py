@@ -119,7 +119,10 @@ def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
     **Arguments:** of times `s` in the step the `gaps`, their `rates` in units of the step, and the `pace`.
     """
     ends, piece = walk.ends, walk.length / _PIECES
-    score = jnp.max(_score(ends, s, gaps, touch), axis=1)
+    # A step in which a gap changes by less than the width in which its force sets in hides nothing. What still differs
+    # there is a jump of the gap itself, as of an angle that wraps.
+    varies = (jnp.max(jnp.abs(rates), axis=0) > jnp.maximum(_NEAR * ends.widths, touch))[None]
+    score = jnp.max(_score(ends, s, gaps, varies, touch), axis=1)
     own = jnp.argmax(score)
     width = piece.astype(gaps.dtype)
     least = _least(gaps, rates, width)
@@ -128,7 +131,7 @@ def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
     passed = jnp.cumsum(divided) == 0
     unlike = jnp.where(passed[1::2, None], _unlike(gaps, rates, width), 0.0)
     uncertain = walk.uncertain + jnp.sum(unlike, axis=0)
-    doubtful = jnp.any(_deeper(ends, least - _UNCERTAIN * uncertain[None], touch), axis=1)
+    doubtful = jnp.any(_deeper(ends, least - _UNCERTAIN * uncertain[None], touch) & varies, axis=1)
     looks, start = walk.looks + 1, jnp.where(passed[-1], s[-1], s[jnp.argmax(divided)])
     length = jnp.minimum(jnp.where(passed[-1], _GROWTH * walk.length, piece), 1 - start)
     hides, wrong, tired = score[own] > 0, jnp.any(doubtful & passed), (looks >= _LOOKS) & (start < 1)
@@ -137,15 +140,17 @@ def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
     return _Walk(start, length, ends, uncertain, hides | wrong | tired, target, looks)
 
 
-def _score(ends: _Ends, s, gaps, touch):
-    """How much deeper contacts are than their ends show, at times of a step; zero where nothing is hidden."""
+def _score(ends: _Ends, s, gaps, varies, touch):
+    """How much deeper contacts are than their ends show, at times of a step; zero where nothing is hidden. Contacts
+    that do not vary are hidden only where they are deeper than at the ends.
+    """
     s, widths = s.astype(gaps.dtype)[:, None], ends.widths[None]
     depth, first, last = (_depth(gap, widths) for gap in (gaps, ends.first[None], ends.last[None]))
     most = jnp.maximum(first, last)
     shown = _depth(_cubic(ends, s), widths)
     beyond = jnp.maximum(depth - jnp.maximum(shown, most), jnp.minimum(shown, jnp.minimum(first, last)) - depth)
     size = jnp.maximum(depth, most)
-    off = (size > _NEAR * widths + touch) & (beyond > _OFF * size)
+    off = (size > _NEAR * widths + touch) & (beyond > _OFF * size) & varies
     return jnp.where(_deeper(ends, gaps, touch) | off, 1 + depth / (most + _FAINT * widths + touch), 0.0)
 
 
