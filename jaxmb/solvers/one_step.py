@@ -75,18 +75,17 @@ def with_counted(controller: Any, counted: tuple[int, ...] | None) -> Any:
     """
     if counted is None:
         return controller
-    kinds = (diffrax.PIDController, OneStepController, MultistepController)
-    is_known = lambda x: isinstance(x, kinds)
+    # A controller may be wrapped in others that diffrax has.
+    norms = {
+        MultistepController: lambda x: (x.norm.norm,),
+        OneStepController: lambda x: (x.norm, x.controller.norm),
+        diffrax.PIDController: lambda x: (x.norm,),
+    }
+    is_known = lambda x: isinstance(x, tuple(norms))
 
     def of_counted(x):
-        if not is_known(x):
-            return x
-        # A concrete class each, since a controller may be wrapped in others that diffrax has.
-        if isinstance(x, MultistepController):
-            where = lambda x: (x.norm.norm,)
-        else:
-            where = lambda x: (x.norm, x.controller.norm) if isinstance(x, OneStepController) else (x.norm,)
-        return eqx.tree_at(where, x, replace_fn=lambda norm: NormOfCounted(norm, counted))
+        where = next((own for kind, own in norms.items() if isinstance(x, kind)), None)
+        return x if where is None else eqx.tree_at(where, x, replace_fn=lambda norm: NormOfCounted(norm, counted))
 
     return jax.tree.map(of_counted, controller, is_leaf=is_known)
 
