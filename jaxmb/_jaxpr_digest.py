@@ -109,7 +109,7 @@ class _Digest:
                 if name in RULES:
                     self.rules.add(name)
                 elif hasattr(value, "program_of"):
-                    operands = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
+                    operands = [_like(v.aval) for v in equation.invars]
                     parts += [name.encode(), self.of(value.program_of(operands))]
                 else:
                     parts += [name.encode(), self.of(value)]
@@ -119,7 +119,7 @@ class _Digest:
     def of_derivative(self, program: Any) -> bytes:
         """The hash of the derivative of a program, in which the rules of its equations are used."""
         function = jaxpr_as_function(program)
-        likes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in program.in_avals]
+        likes = [_like(x) for x in program.in_avals]
         real = [k for k, like in enumerate(likes) if jnp.issubdtype(like.dtype, jnp.floating)]
 
         def derivative(values: list[Any]) -> Any:
@@ -163,6 +163,11 @@ class _Digest:
             self.unknown.append(value)
             return b""
         return shown.encode()
+
+
+def _like(aval: Any) -> jax.ShapeDtypeStruct:
+    """The shape and dtype of a value, and whether the dtype is that of a number of Python."""
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
 
 
 def _joined(tag: str, parts: list[bytes]) -> bytes:

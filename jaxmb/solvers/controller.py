@@ -60,6 +60,27 @@ def states_inside(controller_state: Any, kind: type) -> list[Any]:
     return [x for x in jax.tree.leaves(controller_state, is_leaf=is_one) if is_one(x)]
 
 
+class AbstractControllerAround(diffrax.AbstractAdaptiveStepSizeController):
+    """A controller around another one, `controller`, with the tolerances of that."""
+
+    controller: AbstractVar[Any]
+
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.norm
+
+    def wrap(self, direction):
+        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
+
+
 class ControllerState(AbstractControllerState):
     """The state of `MultistepController` between steps; `diffrax.SaveAt(controller_state=True)` returns it.
 

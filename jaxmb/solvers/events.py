@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import cond_of_any_lane, cond_of_lanes, loop_of_lanes
-from .controller import AbstractControllerState, intended_step, states_inside
+from .controller import AbstractControllerAround, AbstractControllerState, intended_step, states_inside
 from .evaluation import ravel
 from .manifold_term import AbstractGuards
 
@@ -396,7 +396,7 @@ class EventState(AbstractControllerState):
         return intended_step(self.inner)
 
 
-class EventController(diffrax.AbstractAdaptiveStepSizeController):
+class EventController(AbstractControllerAround):
     """A controller around another one, whose steps end at events; at most `most` of them.
 
     Too many events end the solve with `diffrax.RESULTS.dt_min_reached`, and one after which there is no state with
@@ -406,24 +406,9 @@ class EventController(diffrax.AbstractAdaptiveStepSizeController):
     controller: Any
     most: int = eqx.field(static=True)
 
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.norm
-
     def __init__(self, controller: Any, most: int):
         self.controller = controller
         self.most = most
-
-    def wrap(self, direction):
-        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
 
     def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)

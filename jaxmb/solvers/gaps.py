@@ -5,23 +5,18 @@ again between them would be missed. So the gaps in which forces act are followed
 a step that hides one of them is tried again up to where it is most closed. All other steps stay as they are.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import WrappedSolver, direction_of, loop_of_lanes
+from .controller import AbstractControllerAround
 from .evaluation import gaps_of
 from .events import AbstractErrorWithMore
 from .manifold_term import AbstractGaps
-
-if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
 
 # A stretch of a step is looked at in so many pieces; stretches that hide nothing grow by a factor.
 _PIECES, _GROWTH = 8, 4.0
@@ -196,10 +191,8 @@ def _least(gaps, rates, piece):
     return jnp.where(turns, jnp.minimum(before + closing * way, least), least)
 
 
-class AbstractWithoutJumps(diffrax.AbstractAdaptiveStepSizeController):
-    """A controller around another one, `controller`, that makes no jumps of its own."""
-
-    controller: AbstractVar[Any]
+class AbstractWithoutJumps(AbstractControllerAround):
+    """A controller around another one that makes no jumps of its own."""
 
 
 class GapController(AbstractWithoutJumps):
@@ -207,23 +200,8 @@ class GapController(AbstractWithoutJumps):
 
     controller: Any
 
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.norm
-
     def __init__(self, controller: Any):
         self.controller = controller
-
-    def wrap(self, direction):
-        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
 
     def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
