@@ -4,6 +4,7 @@ Each stands here once, with what it does and the versions that it was found in; 
 test of each, which says what is missing when an update takes it away.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, TypeVar
@@ -116,6 +117,31 @@ def define_bilinear(
     ad.defbilinear(own, lambda c, a, b, **static: of_a(c, b, **static), lambda c, a, b, **static: of_b(c, a, **static))
     batching.primitive_batchers[own] = batched
     return own.bind
+
+
+def define_linear(
+    name: str,
+    evaluate: Callable[..., Array],
+    shape: Callable[..., tuple[int, ...]],
+    transpose: Callable[..., Array],
+    parameters: tuple[str, ...] = (),
+) -> Callable[..., Array]:
+    """A new operation of JAX on one array, linear in it, with its derivatives, its transpose and a rule for batches.
+    All functions take the static number of leading axes of a batch, `lead`; see `jaxmb.linalg.sums`.
+
+    (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10.)
+    """
+
+    def batched(operands, axes, *, lead, **static):
+        return own.bind(jnp.moveaxis(operands[0], axes[0], 0), lead=lead + 1, **static), 0
+
+    own = Primitive(name)
+    own.def_impl(jax.jit(evaluate, static_argnames=("lead", *parameters)))
+    own.def_abstract_eval(lambda a, **static: ShapedArray(shape(a.shape, **static), a.dtype))
+    mlir.register_lowering(own, mlir.lower_fun(evaluate, multiple_results=False))
+    ad.deflinear2(own, lambda c, a, **static: [transpose(c, a.aval.shape, **static)])
+    batching.primitive_batchers[own] = batched
+    return functools.partial(own.bind, lead=0)
 
 
 def used_inputs(function: Callable[[Any], Any], x: Any) -> Any:

@@ -14,12 +14,12 @@ from jax import lax
 from jaxtyping import Array, Complex, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
-from ..linalg.arrays import unchecked_take
 from ..linalg.block_elimination import BlockFactor, eliminate_blocks
 from ..linalg.block_jacobian import BlockJacobian
 from ..linalg.blocks import transpose_vector_products, vector_products
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import MassProjector
+from ..linalg.sums import unchecked_take
 from ..solvers import AbstractFieldJacobian, AbstractResolvent
 from .layout import Layout
 from .motion_graph import MotionOrder, motion_order

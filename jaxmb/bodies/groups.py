@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .._captured import Captured
 from .._types import Scalar
-from ..linalg.arrays import unchecked_take
+from ..linalg.sums import unchecked_take
 from ..parts.base import AbstractPart
 from ..parts.boundary import captured
 from ..parts.fields import anonymous, entry, inner_parts

@@ -1,6 +1,7 @@
 """Rigid bodies joined by constraints and forces: the compiled form of a scene."""
 
 import dataclasses
+import functools
 import itertools
 from typing import NamedTuple, Self
 
@@ -12,12 +13,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
-from ..linalg.arrays import add_up, is_traced, unchecked_take
+from ..linalg.arrays import add_up, is_traced
 from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.rotations import cross, normalize, rotate
-from ..linalg.sums import placed_sums
+from ..linalg.sums import placed_sums, unchecked_take
 from ..parts.base import AbstractInertialConstraint
 from ..parts.forces import Gravity
 from ..parts.unilateral import AbstractUnilateralConstraint
@@ -27,7 +28,9 @@ from ..system.design_variables import DesignVariables, variables_in_range
 from ..system.equation import Contacts, Frictions, Ranks
 from ..system.quantities import Measure, view_of_motion
 from ..system.structures import of_structure
+from .constraint_set import ConstraintSet
 from .describe import describe_scene
+from .elementary import ElementaryRows, elementary_rows
 from .field_jacobian import motion_jacobian
 from .groups import (
     AbstractConstraintGroup,
@@ -42,7 +45,6 @@ from .groups import (
     VelocityConstraintGroup,
     joint_reactions,
     nonideal_wrenches,
-    reaction_wrenches,
 )
 from .internal_states import (
     StateField,
@@ -98,7 +100,8 @@ class RigidBodySystem(AbstractSystem):
 
     **Fields:** the groups of `bodies` and of other parts, `free_joints` those of joints without rows; `gravity`
     [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`; `ranks`;
-    `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`.
+    `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`; of a system that is
+    `prepared` for a motion, the rows of joints in space by `elements`.
     """
 
     bodies: tuple[BodyGroup, ...]
@@ -120,6 +123,7 @@ class RigidBodySystem(AbstractSystem):
     frames: tuple[FrameGroup, ...] = ()
     tendons: tuple[CoordinateGroup, ...] = ()
     free_joints: tuple[CoordinateGroup, ...] = ()
+    elements: ElementaryRows | None = None
 
     # Sizes and names
 
@@ -610,7 +614,7 @@ class RigidBodySystem(AbstractSystem):
     @eqx.filter_jit
     def position_residual(self, t, q):
         poses = self.prepared_poses(q)
-        return _join([g.residual(t, poses) for g in self.constraints], q.dtype)
+        return _join(self._set(self.constraints).residual(t, poses), q.dtype)
 
     def coordinate_residual(self, t, q):
         residual = self.position_residual(t, q)
@@ -626,11 +630,13 @@ class RigidBodySystem(AbstractSystem):
         if self.rates_are_velocities:
             return self._jacobian(t, q, jnp.zeros(self.nu, q.dtype), self.constraints)
         poses = self.prepared_poses(q)
-        unit = jnp.eye(self.layout.space.pose_size, dtype=q.dtype)
-        along = lambda x: jax.vmap(lambda dx: jax.jvp(self.layout.space.prepare, (x,), (dx,))[1])(unit)
-        moves = jax.vmap(along)(poses[:, : self.layout.space.pose_size])
+        size = self.layout.space.pose_size
+        along = lambda x: jax.vmap(lambda dx: jax.jvp(self.layout.space.prepare, (x,), (dx,))[1])(
+            jnp.eye(size, dtype=q.dtype)
+        )
+        moves = functools.cache(lambda: jax.vmap(along)(poses[:, :size]))
         groups = (*self.constraints, *self.turn_counts)
-        blocks = [g.along(t, poses, moves) for g in groups]
+        blocks = self._set(groups).jacobian_of_poses(t, poses, moves)
         jacobian = self._assemble(blocks, groups, q.dtype, of_poses=True)
         rotating = _rotating(self.layout)
         index = self.layout.pose_index[rotating, 3:]
@@ -641,7 +647,15 @@ class RigidBodySystem(AbstractSystem):
     def velocity_residual(self, t, q, u):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         groups = (*self.constraints, *self.velocity_constraints)
-        return _join([g.velocity(t, poses, velocities) for g in groups], q.dtype)
+        return _join(self._set(groups).velocity(t, poses, velocities), q.dtype)
+
+    def prepared(self):
+        if not self.spatial:
+            return self
+        return dataclasses.replace(self, elements=elementary_rows(self.constraints, self.layout.ground))
+
+    def _set(self, groups: tuple[AbstractConstraintGroup, ...]) -> ConstraintSet:
+        return ConstraintSet(groups, self.elements)
 
     @eqx.filter_jit
     def jacobian(self, t, q, u):
@@ -659,7 +673,7 @@ class RigidBodySystem(AbstractSystem):
 
     def _blocks(self, t, q, u, groups):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
-        return [g.jacobian(t, poses, velocities) for g in groups]
+        return self._set(groups).jacobian(t, poses, velocities)
 
     def _jacobian(self, t, q, u, groups):
         blocks = self._blocks(t, q, u, groups)
@@ -667,8 +681,8 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def constraint_force(self, t, q, u, multipliers):
-        wrenches = reaction_wrenches(self.joints, t, self.prepared_poses(q), self.all_velocities(u), multipliers)
-        return self._add_up(wrenches, [g.group.body_index for g in self.joints], u.dtype)
+        poses, velocities = self.prepared_poses(q), self.all_velocities(u)
+        return self._add_up(*self._set(self.joints).wrenches(t, poses, velocities, multipliers), u.dtype)
 
     @eqx.filter_jit
     def nonideal_force(self, t, q, u, multipliers):
@@ -681,7 +695,7 @@ class RigidBodySystem(AbstractSystem):
     def acceleration_residual(self, t, q, u, udot):
         t = jnp.asarray(t, q.dtype)
         poses, velocities, accelerations = self.prepared_poses(q), self.all_velocities(u), self.all_velocities(udot)
-        return _join([g.acceleration(t, poses, velocities, accelerations) for g in self.joints], q.dtype)
+        return _join(self._set(self.joints).acceleration(t, poses, velocities, accelerations), q.dtype)
 
     def _assemble(self, blocks, groups, dtype, *, of_poses):
         source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 # Types of arrays.
 ARRAYS = (jax.Array, np.ndarray, np.generic)
@@ -91,11 +91,6 @@ def replaced(array: Array, index: Any, value: Any) -> Array:
 @functools.partial(jax.jit, static_argnums=1)
 def _set(array, index, value):
     return array.at[np.array(index)].set(value)
-
-
-def unchecked_take(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:
-    """`values[index]` as a gather without checks: the indices are in bounds by construction."""
-    return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def add_up(terms: Iterable[Any]) -> Any:

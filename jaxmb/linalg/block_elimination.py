@@ -16,9 +16,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Inexact
 
-from .arrays import add_up, unchecked_take
+from .arrays import add_up
 from .elimination import gauss_jordan
 from .elimination_order import NodeOrder
+from .sums import unchecked_take
 
 
 class BlockFactor(eqx.Module):

@@ -20,14 +20,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .arrays import unchecked_take
 from .block_elimination import BlockFactor, eliminate_blocks
 from .blocks import matrix_products, transpose_vector_products, vector_products
 from .elimination_order import NodeOrder
 from .inertia import AbstractInertia
 from .jacobian import AbstractJacobian, DenseJacobian
 from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor
-from .sums import PlacedSums
+from .sums import PlacedSums, unchecked_take
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,14 +1,19 @@
-"""Sums of entries by static places, by gathers alone: scatters are slow on some devices."""
+"""Entries at static places, and sums of entries by static places, each the transpose of the other.
+
+Both are gathers alone. The transpose of JAX's own gather is a scatter, which XLA makes a loop on processors, and which
+is slow on other devices: they were a quarter of the kernels of a gradient in space.
+"""
 
 import dataclasses
 import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .arrays import unchecked_take
+from .._compat import define_linear
 from .digest import digest
 
 # Entries of one place that one pass adds up; more take another pass, so the work is proportional to the entries.
@@ -37,6 +42,8 @@ class PlacedSums:
 def placed_sums(place: Int[np.ndarray, "e"], places: int) -> PlacedSums:
     """From the place of each entry; entries with a place out of bounds are left out."""
     passes = []
+    if np.array_equal(place, np.arange(places)):
+        return PlacedSums(digest([]), ())
     kept = np.flatnonzero((place >= 0) & (place < places))
     order, entries = kept[np.argsort(place[kept], kind="stable")], place.size
     while True:
@@ -55,3 +62,42 @@ def placed_sums(place: Int[np.ndarray, "e"], places: int) -> PlacedSums:
         place = np.repeat(np.arange(places), groups)
         order, entries = np.arange(place.size), place.size
     return PlacedSums(digest(passes), tuple(passes))
+
+
+def unchecked_take(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:
+    """`values[index]` as a gather without checks: the indices are in bounds by construction. NumPy in, NumPy out."""
+    if isinstance(values, np.ndarray):
+        return values[index]
+    if isinstance(index, jax.Array) or not jnp.issubdtype(values.dtype, jnp.floating):
+        return _gather(values, index, 0)
+    index = np.asarray(index, np.int32)
+    return _take(values, of=_Index(digest([index]), index))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Index:
+    """A static index, compared by its `key`."""
+
+    key: bytes
+    index: np.ndarray = dataclasses.field(compare=False)
+
+
+def _gather(values, index, lead):
+    return values.at[(*(slice(None),) * lead, index)].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def _sums_of_entries(cotangent, shape, *, of, lead):
+    """The cotangent of the values, whose shape is given, from that of the entries at an index."""
+    end = lead + of.index.ndim
+    entries = cotangent.reshape(*cotangent.shape[:lead], of.index.size, *cotangent.shape[end:])
+    sums = placed_sums(of.index.ravel(), shape[lead])
+    return jnp.moveaxis(sums(jnp.moveaxis(entries, lead, 0)), 0, lead)
+
+
+_take = define_linear(
+    "static_take",
+    lambda values, *, of, lead: _gather(values, of.index, lead),
+    lambda shape, *, of, lead: (*shape[:lead], *of.index.shape, *shape[lead + 1 :]),
+    _sums_of_entries,
+    parameters=("of",),
+)

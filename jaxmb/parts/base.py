@@ -417,6 +417,20 @@ class AbstractConstraint(AbstractLink):
     def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
         """Φ(poses, t) of this part."""
 
+    @property
+    def elements(self) -> Any:
+        """Hook: the elementary constraints that a joint in space consists of, in the order of its rows; see
+        `jaxmb.parts.elements`. They vanish with the residual, and there have its derivatives. None where the joint is
+        known by its residual alone.
+        """
+        return None
+
+    @classmethod
+    def declares_elements(cls) -> bool:
+        """Whether the class declares `elements`, and has no `residual` of its own that is newer than these."""
+        where = lambda name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind))
+        return cls.elements is not AbstractConstraint.elements and where("elements") <= where("residual")
+
 
 class AbstractInertialConstraint(AbstractConstraint):
     """A position constraint that binds a scalar coordinate of its own, which has an `inertia` [kg m² of an angle, kg of

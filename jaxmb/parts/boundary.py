@@ -18,6 +18,7 @@ from .._compat import with_values
 from .._traced_functions import NEED_NUMBERS, is_installed, note_of, traced_by_jax, with_note
 from .base import (
     AbstractBody,
+    AbstractConstraint,
     AbstractDynamicForce,
     AbstractForce,
     AbstractLink,
@@ -27,6 +28,7 @@ from .base import (
 )
 from .fields import declarations, entry, internal_states
 from .space import AbstractSpace
+from .spatial.elements import ROWS
 
 T = TypeVar("T")
 
@@ -50,6 +52,10 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
             _check_state_rates(part, kernel, given)
         else:
             check_returns(part.label, name, shape, kernel, *given)
+    if isinstance(part, AbstractConstraint) and part.declares_elements():
+        rows = sum(ROWS[type(element)] for element in part.elements)
+        if rows != part.rows:
+            raise ValueError(f"{part.label}: its elements have {rows} rows, but rows = {part.rows}.")
     if isinstance(part, AbstractForce) and not isinstance(part, AbstractPotentialForce) and hasattr(part, "energy"):
         raise ValueError(f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce.")
 
@@ -81,6 +87,8 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         yield "inertia", (lambda part: part.inertia, [])
     for name, _, given in _kernels(part, space, bodies):
         yield name, (lambda part, *own, name=name: getattr(part, name)(space, *own), given)
+    if isinstance(part, AbstractConstraint) and part.declares_elements():
+        yield "elements", (lambda part: part.elements, [])
     if isinstance(part, AbstractLink):
         poses, velocities, t = _arguments(space, bodies)
         yield "coordinates", (lambda part, poses: part.coordinates(space, poses), [poses])

@@ -134,7 +134,7 @@ class Problem(NamedTuple):
 
     def assembled(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for it."""
-        term, prepared = self.policy.prepare(system, self.method, self.solver, self.rtol)
+        term, prepared = self.policy.prepare(system.prepared(), self.method, self.solver, self.rtol)
         if self.watches_gaps and not isinstance(prepared, AbstractMultistep):
             prepared = GapSolver(prepared)
         return with_internal_states(term), prepared
@@ -246,7 +246,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if saved_at is not None:
         ts = jnp.where(finite, ts, jnp.inf)
     if correction is not None:
-        saved, lost = _corrected(system, options, ts, saved, correction)
+        saved, lost = _corrected(system.prepared(), options, ts, saved, correction)
     if after is not saved_at:
         ts = _replaced(ts, after, saved_at)
     if any(problem.moving):
@@ -340,7 +340,7 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     """The result of a run that ended at a state, made precise where it got stuck, and the coupling of friction with its
     own reactions there, None without friction.
     """
-    system = problem.system
+    system = problem.system.prepared()
     result = problem.policy.diagnose(system, t, y, evidence, result, stuck)
     if not system.friction_parts:
         return result, None

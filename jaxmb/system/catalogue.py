@@ -54,6 +54,12 @@ class AbstractSystem(AbstractEquation):
     rows: ClassVar[tuple[tuple[str, int], ...]] = ()
     body_names: ClassVar[tuple[str, ...]] = ()
 
+    def prepared(self) -> Self:
+        """The system for the steps of a motion, whose states are close to the constraints, with what depends on its
+        parameters alone computed once; itself where there is no such thing.
+        """
+        return self
+
     @property
     def nz(self) -> int:
         return self.state_ends[-1] if self.state_ends else 0

@@ -36,7 +36,7 @@ class Frame(AbstractSpatialPart, AbstractFrame):
 
     def own_pose(self, space, pose):
         attitude = multiply(pose[3:7], self.orientation)
-        return namespace(pose).concatenate([space.point(pose, self.position), attitude])
+        return namespace(pose, attitude).concatenate([space.point(pose, self.position), attitude])
 
     def own_velocity(self, space, pose, velocity):
         turning = unrotate(self.orientation, velocity[3:])

@@ -34,12 +34,14 @@ from .axes import (
     half_sine,
     measured_from_given_poses,
     offset_in_a,
+    perpendiculars,
     relative_orientation,
     rotation_error,
     rotation_vector,
     turn_about,
     with_given_orientation,
 )
+from .elements import aligned, coincident, in_planes, parallel, perpendicular
 
 
 def _parallel(space, part, poses):
@@ -80,6 +82,10 @@ class Spherical(AbstractOriented):
     """
 
     rows: ClassVar[int] = 3
+
+    @property
+    def elements(self):
+        return (coincident(self),)
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
@@ -132,6 +138,10 @@ class Revolute(AbstractAxial):
     """
 
     rows: ClassVar[int] = 5
+
+    @property
+    def elements(self):
+        return coincident(self), *parallel(self)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), _parallel(space, self, poses)])
@@ -186,6 +196,10 @@ class Universal(AbstractSpatialPart, AbstractJoint):
                 raise ValueError(
                     f"{self.label}: axis_a_W and axis_b_W must be perpendicular, their product is {cosine:.6g}."
                 )
+
+    @property
+    def elements(self):
+        return coincident(self), perpendicular(self.axis_a, self.axis_b)
 
     def residual(self, space, poses, t):
         cosine = dot(self.axis_a, direction_in_a(space, poses, self.axis_b))
@@ -249,6 +263,10 @@ class Gimbal(AbstractOriented):
             raise ValueError(f"{self.label}: the three axes must be perpendicular to each other, got {triad.tolist()}.")
         return super().complete(space, poses)
 
+    @property
+    def elements(self):
+        return (coincident(self),)
+
     def residual(self, space, poses, t):
         return separation(space, self, poses)
 
@@ -311,6 +329,10 @@ class Cylindrical(AbstractSliding):
 
     rows: ClassVar[int] = 4
     slides: ClassVar[tuple[str, ...]] = ("angle", "displacement")
+
+    @property
+    def elements(self):
+        return *parallel(self), *in_planes(self, perpendiculars(self.axis_a))
 
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
@@ -402,6 +424,10 @@ class Prismatic(AbstractOriented):
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 5
 
+    @property
+    def elements(self):
+        return *in_planes(self, perpendiculars(self.axis_a)), *aligned(self)
+
     def residual(self, space, poses, t):
         return jnp.concatenate([across(self.axis_a, offset_in_a(space, self, poses)), rotation_error(self, poses)])
 
@@ -448,6 +474,10 @@ class Planar(AbstractAxial):
     rows: ClassVar[int] = 3
     slides: ClassVar[tuple[str, ...]] = ("displacement",)
 
+    @property
+    def elements(self):
+        return *parallel(self), *in_planes(self, [self.axis_a])
+
     def residual(self, space, poses, t):
         height = dot(self.axis_a, offset_in_a(space, self, poses))
         return jnp.concatenate([_parallel(space, self, poses), height[None]])
@@ -481,6 +511,10 @@ class Fixed(AbstractOriented):
     """
 
     rows: ClassVar[int] = 6
+
+    @property
+    def elements(self):
+        return coincident(self), *aligned(self)
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), rotation_error(self, poses)])

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...linalg import rotations as rot
-from ...linalg.arrays import namespace, unchecked_take
+from ...linalg.arrays import namespace
+from ...linalg.sums import unchecked_take
 from ..space import AbstractSpace
 
 

@@ -7,7 +7,8 @@ from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
 from ..shapes import ball
 from ..space import both_points, separation
-from .axes import across, displacement_along, offset_in_a
+from .axes import across, displacement_along, offset_in_a, perpendiculars
+from .elements import apart, in_planes
 
 
 class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
@@ -38,6 +39,10 @@ class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):
 
     def complete(self, space, poses):
         return self.filled(length=norm(separation(space, self, poses)))
+
+    @property
+    def elements(self):
+        return (apart(self),)
 
     def residual(self, space, poses, t):
         d = separation(space, self, poses)
@@ -73,6 +78,10 @@ class PointOnPlane(AbstractSpatialPart, AbstractJoint):
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
 
+    @property
+    def elements(self):
+        return in_planes(self, [self.axis_a])
+
     def residual(self, space, poses, t):
         return dot(self.axis_a, offset_in_a(space, self, poses))[None]
 
@@ -103,6 +112,10 @@ class PointOnLine(AbstractSpatialPart, AbstractJoint):
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 2
+
+    @property
+    def elements(self):
+        return in_planes(self, perpendiculars(self.axis_a))
 
     def residual(self, space, poses, t):
         return across(self.axis_a, offset_in_a(space, self, poses))

@@ -1,0 +1,352 @@
+"""Rows of joints in space that consist of elementary constraints, all of them together, whatever the joints' types.
+
+There are two kinds: points that coincide (three rows) and products X · Y of two vectors. Both need the world components
+of body-fixed vectors and of their rates, `R v`, `R (ω × v)` and `R (ω × (ω × v) + α × v)`, which is one product of
+matrices. The rows, their rates and second rates, Jacobians and wrenches then are a few sums and products.
+
+The rows vanish where the residuals of the joints do, and have the same derivatives there; elsewhere they may vanish
+where those do not, as the sine of an angle does half a turn away. So they serve motions, which stay close to their
+constraints, and not the assembly.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import State
+from ..linalg import rotations as rot
+from ..linalg.arrays import namespace
+from ..linalg.bilinear import BilinearMap
+from ..linalg.blocks import matrix_products
+from ..linalg.digest import digest_of_fields
+from ..linalg.sums import placed_sums, unchecked_take
+from ..parts.spatial.elements import ROWS, Coincident, Element, on_bodies
+from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities, ConstraintGroup
+
+_DOT = BilinearMap.of(np.eye(3)[None])
+# Rows of elements and of residuals may differ by this fraction of their sizes.
+_AGREE = 1e-9
+
+
+class Listed(NamedTuple):
+    """An element of each of some joints of one type.
+
+    **Fields:** the `element`, whose vectors have a leading axis for the joints; `bodies` of the joints, (joints, 2);
+    the first of its `rows` in each joint.
+    """
+
+    element: Element
+    bodies: np.ndarray
+    rows: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Places:
+    """Where bodies and rows of stacked elements stand; static, compared by its `key`.
+
+    **Fields:** the body of each vector, `of_vectors`; of points that coincide and of products, one after the other, the
+    bodies A and B (`pairs`); those between which a vector goes, the ground twice where there is none (`between`); where
+    products have an X of their own, `with_x`, and a vector between points, `with_points`; the places of the rows in the
+    joints' order, `order`; the number of all bodies but the ground.
+    """
+
+    key: Any
+    of_vectors: np.ndarray = dataclasses.field(compare=False)
+    pairs: np.ndarray = dataclasses.field(compare=False)
+    between: np.ndarray = dataclasses.field(compare=False)
+    with_x: np.ndarray = dataclasses.field(compare=False)
+    with_points: np.ndarray = dataclasses.field(compare=False)
+    order: np.ndarray = dataclasses.field(compare=False)
+    ground: int = dataclasses.field(compare=False)
+
+    @property
+    def points(self) -> int:
+        """The number of points that coincide."""
+        return len(self.pairs) - len(self.with_x)
+
+    @property
+    def products(self) -> int:
+        return len(self.with_x)
+
+    @property
+    def ends(self) -> list[int]:
+        """Where the vectors of points of B end, those of points of A, X, Y in B."""
+        s, d = self.points, self.products
+        return [s, 2 * s, 2 * s + d, 2 * s + 2 * d]
+
+
+class _Motion(NamedTuple):
+    """World vectors of elements, or their rates.
+
+    **Fields:** `of_b` and `of_a`, from the bodies' origins to points that coincide; `x`; `y_b` and `y_a`, the parts of
+    Y in B and in A; the `distances` of points that coincide, B from A, and `y`, the whole of Y.
+    """
+
+    of_b: Array
+    of_a: Array
+    x: Array
+    y_b: Array
+    y_a: Array
+    distances: Array
+    y: Array
+
+
+class ElementaryRows(eqx.Module):
+    """The rows of all joints that consist of elements.
+
+    **Fields:** body-fixed `vectors`: of points of B, of points of A, X, Y in B, Y in A; `turns`: the rates of points of
+    B and of A for unit angular velocities; `lengths` of products, and their inverses, zero where there are none, None
+    where no product has a length.
+    """
+
+    vectors: Float[Array, "n 3"]
+    turns: Float[Array, "p 3 3"]
+    lengths: Float[Array, "d 1"] | None
+    inverses: Float[Array, "d 1"] | None
+    places: Places = eqx.field(static=True)
+
+    def residual(self, poses: BodyPoses) -> Float[Array, "rows"]:
+        """The rows at prepared poses of the bodies and the ground."""
+        (now,) = self._moving(poses)
+        products = _DOT(self._x(now), now.y)
+        if self.lengths is not None:
+            half = np.where(self.places.with_x, 1.0, 0.5)[:, None].astype(products.dtype)
+            products = half * (products - self.lengths)
+        return self._ordered(now.distances, products)
+
+    def velocity(self, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "rows"]:
+        """Their rates."""
+        now, rate = self._moving(poses, velocities)
+        return self._ordered(rate.distances, _DOT(self._x(now), rate.y) + _DOT(rate.x, now.y))
+
+    def acceleration(
+        self, poses: BodyPoses, velocities: BodyVelocities, accelerations: BodyVelocities
+    ) -> Float[Array, "rows"]:
+        """Their second rates."""
+        now, rate, second = self._moving(poses, velocities, accelerations)
+        # Of a length X = Y / length only one of the two vectors counts.
+        x_rate = rate.x if self.inverses is None else rate.x + 0.5 * self.inverses * rate.y
+        products = _DOT(second.x, now.y) + 2.0 * _DOT(x_rate, rate.y) + _DOT(self._x(now), second.y)
+        return self._ordered(second.distances, products)
+
+    def jacobian(self, poses: BodyPoses) -> Float[Array, "rows 2 6"]:
+        """Derivatives with respect to the velocities of the two bodies of each row."""
+        (now,) = self._moving(poses)
+        return self._take_ordered(self._blocks(poses, now))
+
+    def jacobian_of_poses(self, poses: BodyPoses) -> Float[Array, "rows 2 7"]:
+        """Derivatives with respect to the poses, with Euler parameters whose length may change."""
+        (now,) = self._moving(poses)
+        blocks, x = self._blocks(poses, now), self._x(now)
+        # Matrices R are quadratic in Euler parameters: rows change by twice this along their direction.
+        of_points = jnp.stack([-now.of_a, now.of_b], axis=-1).reshape(-1, 2, 1)
+        of_products = _DOT(jnp.stack([x, x]), jnp.stack([self._with_x(now.y) - now.y_a, now.y_b]))
+        along = jnp.concatenate([of_points, of_products.swapaxes(0, 1)])
+        pairs = self._pairs_of_rows.reshape(-1)
+        p = unchecked_take(_cut(poses, [3, 7])[1], pairs).reshape(-1, 2, 4)
+        r, turn = _cut(blocks, [3])
+        return self._take_ordered(jnp.concatenate([r, 4.0 * rot.rates(p, turn) + 2.0 * along * p], axis=-1))
+
+    def wrenches(self, poses: BodyPoses, multipliers: Float[Array, "rows"]) -> Float[Array, "ground 6"]:
+        """The wrenches of all rows on each body, `Aᵀ λ`."""
+        places, s = self.places, self.places.points
+        (now,) = self._moving(poses)
+        of_points, of_products = _cut(unchecked_take(multipliers, np.argsort(places.order)), [3 * s], axis=0)
+        force = of_points.reshape(s, 3)
+        forces = jnp.stack([-force, force])
+        moments = rot.cross(jnp.stack([now.of_a, now.of_b]), forces)
+        along, turning = self._of_products(now)
+        own = of_products[None, :, None]
+        entries = jnp.concatenate(
+            [
+                jnp.concatenate([forces, moments], axis=-1).reshape(-1, 6),
+                jnp.concatenate([own * along, own * turning], axis=-1).reshape(-1, 6),
+            ]
+        )
+        bodies = np.concatenate([places.pairs[:s].T.ravel(), places.pairs[s:].T.ravel()])
+        force, moment = _cut(placed_sums(bodies, places.ground)(entries), [3])
+        matrices = _cut(poses, [3, 7])[2][: places.ground].reshape(-1, 3, 3)
+        return jnp.concatenate([force, matrix_products(moment[:, None], matrices)[:, 0]], axis=-1)
+
+    def _moving(self, poses, *rates) -> list[_Motion]:
+        """The world vectors at poses, and their first and second rates where velocities and accelerations are given."""
+        places, v, bodies = self.places, self.vectors, self.places.of_vectors
+        columns, spins = [v], [unchecked_take(_cut(own, [3])[1], bodies) for own in rates]
+        if spins:
+            columns.append(rot.cross(spins[0], v))
+        if len(spins) == 2:
+            columns.append(rot.cross(spins[0], columns[1]) + rot.cross(spins[1], v))
+        matrices = unchecked_take(_cut(poses, [3, 7])[2], bodies).reshape(-1, 3, 3)
+        of_world = matrix_products(matrices, namespace(poses).stack(columns, axis=-1))
+        origins = [_cut(poses, [3, 7])[0], *(_cut(own, [3])[0] for own in rates)]
+        found = []
+        for own, moved in zip(_cut(of_world, len(columns)), origins, strict=True):
+            of_b, of_a, x, y_b, y_a = _cut(own[..., 0], places.ends, axis=0)
+            apart = unchecked_take(moved, places.between[:, 1]) - unchecked_take(moved, places.between[:, 0])
+            of_points, of_products = _cut(apart, [places.points], axis=0)
+            found.append(_Motion(of_b, of_a, x, y_b, y_a, of_points + of_b - of_a, of_products + y_b - y_a))
+        return found
+
+    def _x(self, now: _Motion):
+        """X, also of products that have a length in place of it."""
+        return now.x if self.inverses is None else now.x + self.inverses * now.y
+
+    def _with_x(self, values):
+        """Those of products that have an X fixed in A; zero for others."""
+        return values if self.places.with_x.all() else self.places.with_x[:, None].astype(values.dtype) * values
+
+    def _of_products(self, now: _Motion):
+        """Forces, and moments in world axes, on A and on B, of products with unit multipliers, (2, d, 3) each."""
+        xp, x, with_points = namespace(now.x), self._x(now), self.places.with_points
+        force = x if with_points.all() else with_points[:, None].astype(x.dtype) * x
+        arms = xp.stack([self._with_x(now.y) + now.y_a, -now.y_b])
+        return xp.stack([-force, force]), rot.cross(xp.stack([x, x]), arms)
+
+    @property
+    def _pairs_of_rows(self):
+        s = self.places.points
+        return np.concatenate([np.repeat(self.places.pairs[:s], 3, axis=0), self.places.pairs[s:]])
+
+    def _blocks(self, poses, now: _Motion):
+        """The Jacobian, row after row of the elements."""
+        xp, places, s = namespace(poses), self.places, self.places.points
+        matrices = lambda bodies: unchecked_take(_cut(poses, [3, 7])[2], bodies).reshape(-1, 3, 3)
+        of_a, of_b = _cut(matrix_products(matrices(places.of_vectors[: 2 * s]), self.turns), [s], axis=0)[::-1]
+        unit = np.broadcast_to(np.stack([-np.eye(3), np.eye(3)], axis=1), (s, 3, 2, 3)).astype(poses.dtype)
+        of_points = xp.concatenate([unit, xp.stack([-of_a, of_b], axis=2)], axis=-1).reshape(-1, 2, 6)
+        along, turning = self._of_products(now)
+        turning = matrix_products(turning.reshape(-1, 1, 3), matrices(places.pairs[s:].T.reshape(-1)))
+        of_products = xp.concatenate([along, turning.reshape(along.shape)], axis=-1).swapaxes(0, 1)
+        return xp.concatenate([of_points, of_products])
+
+    def _ordered(self, of_points, of_products):
+        """Rows in the order of the joints."""
+        return self._take_ordered(
+            namespace(of_points).concatenate([of_points.reshape(-1), of_products.reshape(-1)]),
+        )
+
+    def _take_ordered(self, values):
+        order = self.places.order
+        return values if np.array_equal(order, np.arange(order.size)) else unchecked_take(values, order)
+
+
+def is_elementary(group: AbstractConstraintGroup) -> bool:
+    """Whether the rows of stacked joints are those of elements."""
+    if not isinstance(group, ConstraintGroup) or group.group.layout.space.dimension != 3:
+        return False
+    return group.damping is None and not group.group.inputs and group.group.part.declares_elements()
+
+
+def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> ElementaryRows | None:
+    """The rows of those groups that are elementary, in their order; None without any.
+
+    **Arguments:** `ground`: the number of the ground, which is that of all bodies and scalar coordinates.
+    """
+    listed, first = [], 0
+    for g in filter(is_elementary, groups):
+        own = g.group
+        of_part = lambda part, own=own: on_bodies(part, own.layout.space, own.kernel("elements")(part))
+        places = first + g.rows * np.arange(len(own.names))
+        for element in jax.vmap(of_part)(own.part):
+            listed.append(Listed(element, own.body_index, places))
+            places = places + ROWS[type(element)]
+        first += g.rows * len(own.names)
+    return stacked(listed, ground) if listed else None
+
+
+def stacked(listed: Sequence[Listed], ground: int) -> ElementaryRows:
+    """The rows of elements."""
+    points = [own for own in listed if isinstance(own.element, Coincident)]
+    products = [own for own in listed if not isinstance(own.element, Coincident)]
+    xp = namespace(*jax.tree.leaves([own.element for own in listed]))
+    dtype = xp.result_type(*jax.tree.leaves([own.element for own in listed]))
+
+    def numbers(of_element: Callable[[Any], Any], among: Sequence[Listed], shape: tuple[int, ...] = (3,)):
+        """The vectors of elements, zero where they have none."""
+        found = [(of_element(own.element), (len(own.bodies), *shape)) for own in among]
+        return xp.concatenate(
+            [xp.zeros((0, *shape), dtype), *(np.zeros(size) if x is None else x.reshape(size) for x, size in found)],
+            dtype=dtype,
+        )
+
+    def of_joints(of_element: Callable[[Any], Any], among: Sequence[Listed]):
+        """What is known of elements, once for each joint."""
+        found = [np.full(len(own.bodies), of_element(own.element)) for own in among]
+        return np.concatenate([np.zeros(0, bool), *found])
+
+    bodies = lambda among: np.concatenate([np.zeros((0, 2), int), *(own.bodies for own in among)])
+    s = sum(len(own.bodies) for own in points)
+    of_points = [numbers(lambda x: x.point_b, points), numbers(lambda x: x.point_a, points)]
+    of_products = [numbers(lambda x: x.x_a, products), numbers(lambda x: x.y_b, products)]
+    vectors = xp.concatenate([*of_points, *of_products, numbers(lambda x: x.y_a, products)])
+    unit: Any = np.broadcast_to(np.eye(3, dtype=dtype), (2 * s, 3, 3))
+    turns = rot.cross(unit, xp.broadcast_to(vectors[: 2 * s, None], unit.shape)).swapaxes(1, 2)
+    lengths = inverses = None
+    if any(own.element.length is not None for own in products):  # pyright: ignore[reportAttributeAccessIssue]
+        lengths = numbers(lambda x: x.length, products, (1,))
+        inverses = numbers(lambda x: None if x.length is None else 1 / x.length, products, (1,))
+    with_x = of_joints(lambda x: x.x_a is not None, products)
+    with_points = of_joints(lambda x: x.y_a is not None, products)
+    (a, b), (a2, b2) = bodies(points).T, bodies(products).T
+    between = np.where(with_points[:, None], bodies(products), ground)
+    rows = [np.add.outer(own.rows, np.arange(3)).ravel() for own in points] + [own.rows for own in products]
+    places = Places(
+        key=None,
+        of_vectors=np.concatenate([b, a, np.where(with_x, a2, ground), b2, np.where(with_points, a2, ground)]),
+        pairs=np.concatenate([bodies(points), bodies(products)]),
+        between=np.concatenate([bodies(points), between]),
+        with_x=with_x,
+        with_points=with_points,
+        order=np.argsort(np.concatenate(rows)),
+        ground=ground,
+    )
+    key = digest_of_fields(places), ground
+    return ElementaryRows(vectors, turns, lengths, inverses, dataclasses.replace(places, key=key))
+
+
+def check_elements(system: Any, state: State, t: float = 0.0) -> None:
+    """Raise a `ValueError` if joints that declare their `elements` have other rows than those of their residuals.
+
+    ```python
+    jaxmb.parts.check_elements(system, jaxmb.assemble(system))
+    ```
+
+    Give a state at which no row happens to vanish in its derivatives, and velocities that are not zero.
+
+    **Arguments:** `system`: a scene in space, compiled; a consistent `state`; the time `t` [s].
+    """
+    for what, (own, exact) in _compared(system, jnp.asarray(t, state.q.dtype), state).items():
+        own, exact = (np.asarray(x).reshape(x.shape[0], -1)[: system.position_rows] for x in (own, exact))
+        off = np.max(np.abs(own - exact), axis=1, initial=0.0)
+        row = int(np.argmax([*off, 0.0]))
+        if row < off.size and not off[row] <= _AGREE * (1 + np.max(np.abs(exact))):
+            name, number = system.rows[row]
+            raise ValueError(
+                f"Joint {name!r}: the {what} of row {number} of its elements and of its residual differ by "
+                f"{off[row]:.2g}. Where the residual vanishes, the elements must as well, with the same derivatives."
+            )
+
+
+@eqx.filter_jit
+def _compared(system, t, state):
+    """The rows of a system by elements and by residuals."""
+    near, (q, u) = system.prepared(), (state.q, state.u)
+    other = jnp.linspace(-1.0, 1.0, u.size, dtype=u.dtype)
+    both = lambda rows_of: (rows_of(near), rows_of(system))
+    return {
+        "values": both(lambda own: own.position_residual(t, q)),
+        "rates": both(lambda own: own.velocity_residual(t, q, other)),
+        "Jacobians": both(lambda own: own.jacobian(t, q, u)),
+        "second rates": both(lambda own: own.acceleration_residual(t, q, u, other)),
+    }
+
+
+def _cut(values, places, axis=-1):
+    """Parts of an array; derivatives of these are joined, where those of slices would be padded and added."""
+    return namespace(values).split(values, places, axis=axis)

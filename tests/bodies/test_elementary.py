@@ -1,0 +1,234 @@
+"""Rows of joints by their elements, against the rows by derivatives of each joint's residual."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import parts, spatial
+from jaxmb.bodies.elementary import check_elements, is_elementary
+from jaxmb.parts.spatial.elements import coincident, perpendicular
+
+POINTS = {"point_a": (0.3, -0.2, 0.5), "point_b": (-0.4, 0.1, 0.2)}
+PLACE = {"point": (0.2, 0.1, 0.4)}
+AXIS = {"axis": (0.6, 0.0, 0.8)}
+JOINTS = {
+    "Spherical": (spatial.Spherical, PLACE),
+    "Revolute": (spatial.Revolute, PLACE | AXIS),
+    "Universal": (spatial.Universal, PLACE | {"axis_a_W": (0.6, 0.0, 0.8), "axis_b_W": (0.8, 0.0, -0.6)}),
+    "Gimbal": (
+        spatial.Gimbal,
+        PLACE | {"axis_1_W": (1.0, 0.0, 0.0), "axis_2_W": (0.0, 1.0, 0.0), "axis_3_W": (0.0, 0.0, 1.0)},
+    ),
+    "Cylindrical": (spatial.Cylindrical, PLACE | AXIS),
+    "Prismatic": (spatial.Prismatic, PLACE | AXIS),
+    "Planar": (spatial.Planar, PLACE | AXIS),
+    "Fixed": (spatial.Fixed, PLACE),
+    "Distance": (spatial.Distance, POINTS),
+    "PointOnPlane": (spatial.PointOnPlane, PLACE | AXIS),
+    "PointOnLine": (spatial.PointOnLine, PLACE | AXIS),
+}
+
+
+TURNS = [
+    mb.rotations.from_axis_angle(np.array(axis), angle)
+    for axis, angle in (((0.6, 0.8, 0.0), 0.7), ((0.0, 0.28, 0.96), -1.1))
+]
+
+
+def bodies(number="", **of_b):
+    """Two turned bodies."""
+    inertia = spatial.box(2.0, 0.3, 0.8, 0.5)
+    places = (
+        {"position": (0.1, 0.2, 0.3), "orientation": TURNS[0]},
+        {"position": (-0.5, 0.4, 0.9), "orientation": TURNS[1]},
+    )
+    a, b = places[0], places[1] | of_b
+    return [
+        spatial.Body(f"a{number}", mass=1.0, inertia=inertia, **a),
+        spatial.Body(f"b{number}", mass=2.0, inertia=inertia, **b),
+    ]
+
+
+def states_of(system, many=3):
+    """Consistent states, far from that of the scene."""
+    keys = jax.random.split(jax.random.key(3), many)
+    size = lambda x: 0.2 * jax.random.normal(keys[0], x.shape)
+    for key in keys:
+        q = system.guess.q + 0.1 * jax.random.normal(key, (system.nq,))
+        u = jax.random.normal(jax.random.fold_in(key, 1), (system.nu,))
+        yield mb.assemble(system, mb.State(q, u)), size(u)
+
+
+def largest(x):
+    return float(jnp.max(jnp.abs(x), initial=0.0))
+
+
+@eqx.filter_jit
+def both(system, state, acceleration):
+    """All rows that a motion uses, by elements and by derivatives of the residuals."""
+    near, t, (q, u) = system.prepared(), jnp.zeros(()), (state.q, state.u)
+    assert near.elements is not None and system.elements is None
+    multipliers = jnp.linspace(-1.0, 2.0, system.acceleration_rows)
+    rates = system.rates(t, q, u)
+    # Along motions of bodies; the length of Euler parameters may count otherwise, since it does not change.
+    unit = jax.vmap(lambda v: system.rates(t, q, v))(jnp.eye(system.nu)).T
+
+    def rows(own):
+        accelerations = lambda q, u: own.acceleration_residual(t, q, u, acceleration)
+        return {
+            "values": own.position_residual(t, q),
+            "Jacobian": own.jacobian(t, q, u),
+            "rates": own.velocity_residual(t, q, acceleration),
+            "second rates": accelerations(q, u),
+            "their derivative": jax.jvp(accelerations, (q, u), (rates, jnp.zeros_like(u)))[1],
+            "forces": own.constraint_force(t, q, u, multipliers),
+            "Jacobian of coordinates": own.coordinate_jacobian(t, q) @ unit,
+        }
+
+    found, exact = rows(near), rows(system)
+    # All of the rows' own derivatives.
+    found["derivatives"] = near.coordinate_jacobian(t, q)
+    exact["derivatives"] = jax.jacfwd(lambda q: near.coordinate_residual(t, q))(q)
+    return found, exact
+
+
+def assert_agree(system, state, acceleration, tol=1e-13):
+    found, exact = both(system, state, acceleration)
+    for what, own in found.items():
+        assert largest(own - exact[what]) < tol * (1 + largest(exact[what])), what
+
+
+@pytest.mark.parametrize("where", ["bodies", "centre", "frame", "ground"])
+def test_rows_of_every_joint_are_those_of_its_residual(where):
+    pairs = [bodies(k, **({"centre": (0.1, 0.2, -0.1)} if where == "centre" else {})) for k in range(len(JOINTS))]
+    turned = {"position": (0.1, -0.3, 0.2), "orientation": (0.8, 0.0, 0.6, 0.0)}
+    frames = [spatial.Frame(f"tip{k}", f"b{k}", **turned) for k in range(len(pairs))] if where == "frame" else []
+    ends = ("ground" if where == "ground" else "a{}", "tip{}" if where == "frame" else "b{}")
+    joints = [
+        kind(name, *(end.format(k) for end in ends), **given) for k, (name, (kind, given)) in enumerate(JOINTS.items())
+    ]
+    system = mb.Scene([one for pair in pairs for one in pair], joints=joints, frames=frames).compile()
+    assert all(map(is_elementary, system.constraints))
+    assert {type(g.group.part) for g in system.constraints} == {kind for kind, _ in JOINTS.values()}
+    for state, acceleration in states_of(system):
+        assert_agree(system, state, acceleration)
+        check_elements(system, state)
+
+
+def many():
+    """Joints of all types, between bodies in a chain that closes, with two joints that have no elements."""
+    chain = [
+        spatial.Body(
+            f"b{k}",
+            mass=1.0 + k,
+            inertia=spatial.box(1.0 + k, 1.0, 0.4, 0.2),
+            position=(0.5 * k, 0.1 * k**2, 0.2 * k),
+            orientation=mb.rotations.from_axis_angle(np.array([0.6, 0.8, 0.0]), 0.4 * k),
+        )
+        for k in range(7)
+    ]
+    kinds = ["Revolute", "Universal", "Spherical", "Cylindrical", "PointOnLine", "Distance"]
+    joints = [JOINTS[kind][0](kind, f"b{k}", f"b{k + 1}", **JOINTS[kind][1]) for k, kind in enumerate(kinds)]
+    joints += [
+        spatial.Revolute("base", "ground", "b0", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)),
+        mb.JointDriver("drive", "base.angle", value=0.0),
+        spatial.Screw("screw", "ground", "b6", point=(3.0, 3.6, 1.2), axis=(0.0, 0.0, 1.0), pitch=0.1),
+    ]
+    return mb.Scene(chain, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))])
+
+
+def test_elementary_joints_stand_among_others():
+    system = many().compile()
+    assert not all(map(is_elementary, system.constraints))
+    for state, acceleration in states_of(system, 1):
+        assert_agree(system, state, acceleration, 1e-12)
+        check_elements(system, state)
+
+
+class Loose(spatial.Revolute):
+    """A hinge with a residual of its own, and the elements of a hinge."""
+
+    def residual(self, space, poses, t):
+        return 2.0 * super().residual(space, poses, t)
+
+
+class Hinge(parts.AbstractSpatialPart, parts.AbstractJoint):
+    """A hinge of a user's, whose elements are right or wrong."""
+
+    axis_a: parts.Number = parts.axis(body=0, optional=True)
+    axis_b: parts.Number = parts.axis(body=1, optional=True)
+    axis: parts.Number = parts.axis(body=None, gives=("axis_a", "axis_b"))
+    rows = 5
+    wrong = False
+
+    def residual(self, space, poses, t):
+        b = space.direction(poses[1], self.axis_b)
+        u, v = (space.direction(poses[0], x) for x in self._across)
+        return jnp.concatenate([parts.separation(space, self, poses), jnp.stack([u @ b, v @ b])])
+
+    @property
+    def _across(self):
+        u = jnp.cross(self.axis_a, jnp.array([0.0, 1.0, 0.0]))
+        return u, jnp.cross(self.axis_a, u)
+
+    @property
+    def elements(self):
+        u, v = self._across
+        return coincident(self), perpendicular(u, self.axis_b), perpendicular(u if self.wrong else v, self.axis_b)
+
+
+class WrongHinge(Hinge):
+    wrong = True
+
+
+class Short(Hinge):
+    @property
+    def elements(self):
+        return (coincident(self),)
+
+
+def system_with(kind):
+    return mb.Scene(bodies(), joints=[kind("joint", "a", "b", **PLACE, **AXIS)]).compile()
+
+
+def test_a_joint_of_the_users_may_have_elements():
+    system = system_with(Hinge)
+    assert all(map(is_elementary, system.constraints))
+    ((state, acceleration),) = states_of(system, 1)
+    assert_agree(system, state, acceleration)
+    check_elements(system, state)
+
+
+def test_elements_that_differ_from_the_residual_are_refused():
+    system = system_with(WrongHinge)
+    ((state, _),) = states_of(system, 1)
+    with pytest.raises(ValueError, match=r"Joint 'joint': the Jacobians of row 4 .* differ by"):
+        check_elements(system, state)
+    with pytest.raises(ValueError, match=r"Short 'joint': its elements have 3 rows, but rows = 5"):
+        system_with(Short)
+
+
+def test_a_newer_residual_counts_alone():
+    system = system_with(Loose)
+    assert not any(map(is_elementary, system.constraints)) and system.prepared().elements is None
+
+
+def test_motions_and_gradients_are_those_of_the_residuals(monkeypatch):
+    built = mb.mechanisms.spatial_slider_crank()
+    system, state = built.system, built.state
+
+    def end(length):
+        own = mb.with_parameters(system, {"crank.mass": length})
+        motion = mb.simulate(own, state, t1=0.3, rtol=1e-12, max_steps=1024)
+        return jnp.concatenate([motion.ys.q[-1], motion.ys.u[-1]])
+
+    mass = mb.parameters(system)["crank.mass"]
+    found = end(mass), jax.jacfwd(end)(mass)
+    monkeypatch.setattr(type(system), "prepared", lambda self: self)
+    jax.clear_caches()
+    expected = end(mass), jax.jacfwd(end)(mass)
+    for own, other in zip(found, expected, strict=True):
+        assert largest(own - other) < 1e-11 * (1 + largest(other))
