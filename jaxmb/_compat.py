@@ -50,6 +50,14 @@ RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
 jaxpr_as_function = core.jaxpr_as_fun
 
 
+def like_of(aval: Any) -> jax.ShapeDtypeStruct:
+    """Shape and dtype of a value in a traced program, and whether the dtype is that of a number of Python.
+
+    (jax.core.ShapedArray.weak_type, 0.7 to 0.10.)
+    """
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
+
+
 def default_float() -> np.dtype:
     """The type of floating-point numbers, at a fiftieth of the time of `jnp.result_type(float)`.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._compat import REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function
+from ._compat import REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function, like_of
 from ._traced_functions import is_installed
 
 _PLAIN = {bool, int, float, complex, str, bytes, type(None), type(Ellipsis)}
@@ -109,7 +109,7 @@ class _Digest:
                 if name in RULES:
                     self.rules.add(name)
                 elif hasattr(value, "program_of"):
-                    operands = [_like(v.aval) for v in equation.invars]
+                    operands = [like_of(v.aval) for v in equation.invars]
                     parts += [name.encode(), self.of(value.program_of(operands))]
                 else:
                     parts += [name.encode(), self.of(value)]
@@ -119,7 +119,7 @@ class _Digest:
     def of_derivative(self, program: Any) -> bytes:
         """The hash of the derivative of a program, in which the rules of its equations are used."""
         function = jaxpr_as_function(program)
-        likes = [_like(x) for x in program.in_avals]
+        likes = [like_of(x) for x in program.in_avals]
         real = [k for k, like in enumerate(likes) if jnp.issubdtype(like.dtype, jnp.floating)]
 
         def derivative(values: list[Any]) -> Any:
@@ -163,11 +163,6 @@ class _Digest:
             self.unknown.append(value)
             return b""
         return shown.encode()
-
-
-def _like(aval: Any) -> jax.ShapeDtypeStruct:
-    """The shape and dtype of a value, and whether the dtype is that of a number of Python."""
-    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
 
 
 def _joined(tag: str, parts: list[bytes]) -> bytes:

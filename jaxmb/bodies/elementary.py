@@ -1,8 +1,8 @@
-"""Rows of joints in space that consist of elementary constraints, all of them together, whatever the joints' types.
+"""Rows of joints that consist of elementary constraints, all of them together, whatever the joints' types.
 
-There are two kinds: points that coincide (three rows) and products X · Y of two vectors. Both need the world components
-of body-fixed vectors and of their rates, `R v`, `R (ω × v)` and `R (ω × (ω × v) + α × v)`, which is one product of
-matrices. The rows, their rates and second rates, Jacobians and wrenches then are a few sums and products.
+There are two kinds: points that coincide (two or three rows) and products X · Y of two vectors. Both need the world
+components of body-fixed vectors and of their rates, `R v`, `R (ω × v)` and `R (ω × (ω × v) + α × v)`, which is one
+product of matrices. The rows, their rates and second rates, Jacobians and wrenches then are a few sums and products.
 
 The rows vanish where the residuals of the joints do, and have the same derivatives there; elsewhere they may vanish
 where those do not, as the sine of an angle does half a turn away. So they serve motions, which stay close to their
@@ -26,10 +26,10 @@ from ..linalg.bilinear import BilinearMap
 from ..linalg.blocks import matrix_products
 from ..linalg.digest import digest_of_fields
 from ..linalg.sums import placed_sums, unchecked_take
-from ..parts.spatial.elements import ROWS, Coincident, Element, on_bodies
-from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities, ConstraintGroup
+from ..parts.elements import Element, on_bodies
+from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities
 
-_DOT = BilinearMap.of(np.eye(3)[None])
+_DOT = {d: BilinearMap.of(np.eye(d)[None]) for d in (2, 3)}
 # Rows of elements and of residuals may differ by this fraction of their sizes.
 _AGREE = 1e-9
 
@@ -97,6 +97,47 @@ class _Motion(NamedTuple):
     y: Array
 
 
+class _Turning(NamedTuple):
+    """What turning bodies do to vectors in the plane, or in space.
+
+    **Fields:** matrices R of prepared poses; the rate of body-fixed vectors, `rate(spin, v)`, in the body; the `moment`
+    of forces at arms, in the world; moments `in_bodies`, from matrices and world moments; `dimension`.
+    """
+
+    matrices: Callable[[Array], Array]
+    rate: Callable[[Array, Array], Array]
+    moment: Callable[[Array, Array], Array]
+    in_bodies: Callable[[Array, Array], Array]
+    dimension: int
+
+
+def _quarter_turn(v):
+    x, y = _cut(v, [1])
+    return namespace(v).concatenate([-y, x], axis=-1)
+
+
+def _planar_matrices(poses):
+    xp, (c, s) = namespace(poses), _cut(_cut(poses, [3])[1], [1])
+    return xp.stack([xp.concatenate([c, -s], axis=-1), xp.concatenate([s, c], axis=-1)], axis=-2)
+
+
+_PLANE = _Turning(
+    _planar_matrices,
+    lambda spin, v: spin * _quarter_turn(v),
+    lambda arm, force: _DOT[2](_quarter_turn(arm), force),
+    lambda matrices, moments: moments,
+    2,
+)
+_SPACE = _Turning(
+    lambda poses: _cut(poses, [7])[1].reshape(-1, 3, 3),
+    rot.cross,
+    rot.cross,
+    lambda matrices, moments: matrix_products(moments[:, None], matrices)[:, 0],
+    3,
+)
+_TURNING = {2: _PLANE, 3: _SPACE}
+
+
 class ElementaryRows(eqx.Module):
     """The rows of all joints that consist of elements.
 
@@ -105,16 +146,23 @@ class ElementaryRows(eqx.Module):
     where no product has a length.
     """
 
-    vectors: Float[Array, "n 3"]
-    turns: Float[Array, "p 3 3"]
+    vectors: Float[Array, "n d"]
+    turns: Float[Array, "p d turns"]
     lengths: Float[Array, "d 1"] | None
     inverses: Float[Array, "d 1"] | None
     places: Places = eqx.field(static=True)
 
+    @property
+    def _turning(self):
+        return _TURNING[self.vectors.shape[1]]
+
+    def _dot(self, a, b):
+        return _DOT[self.vectors.shape[1]](a, b)
+
     def residual(self, poses: BodyPoses) -> Float[Array, "rows"]:
         """The rows at prepared poses of the bodies and the ground."""
         (now,) = self._moving(poses)
-        products = _DOT(self._x(now), now.y)
+        products = self._dot(self._x(now), now.y)
         if self.lengths is not None:
             half = np.where(self.places.with_x, 1.0, 0.5)[:, None].astype(products.dtype)
             products = half * (products - self.lengths)
@@ -123,7 +171,7 @@ class ElementaryRows(eqx.Module):
     def velocity(self, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "rows"]:
         """Their rates."""
         now, rate = self._moving(poses, velocities)
-        return self._ordered(rate.distances, _DOT(self._x(now), rate.y) + _DOT(rate.x, now.y))
+        return self._ordered(rate.distances, self._dot(self._x(now), rate.y) + self._dot(rate.x, now.y))
 
     def acceleration(
         self, poses: BodyPoses, velocities: BodyVelocities, accelerations: BodyVelocities
@@ -132,59 +180,57 @@ class ElementaryRows(eqx.Module):
         now, rate, second = self._moving(poses, velocities, accelerations)
         # Of a length X = Y / length only one of the two vectors counts.
         x_rate = rate.x if self.inverses is None else rate.x + 0.5 * self.inverses * rate.y
-        products = _DOT(second.x, now.y) + 2.0 * _DOT(x_rate, rate.y) + _DOT(self._x(now), second.y)
+        products = self._dot(second.x, now.y) + 2.0 * self._dot(x_rate, rate.y) + self._dot(self._x(now), second.y)
         return self._ordered(second.distances, products)
 
-    def jacobian(self, poses: BodyPoses) -> Float[Array, "rows 2 6"]:
+    def jacobian(self, poses: BodyPoses) -> Float[Array, "rows 2 v"]:
         """Derivatives with respect to the velocities of the two bodies of each row."""
         (now,) = self._moving(poses)
         return self._take_ordered(self._blocks(poses, now))
 
     def jacobian_of_poses(self, poses: BodyPoses) -> Float[Array, "rows 2 7"]:
         """Derivatives with respect to the poses, with Euler parameters whose length may change."""
-        (now,) = self._moving(poses)
+        xp, (now,) = namespace(poses), self._moving(poses)
         blocks, x = self._blocks(poses, now), self._x(now)
         # Matrices R are quadratic in Euler parameters: rows change by twice this along their direction.
-        of_points = jnp.stack([-now.of_a, now.of_b], axis=-1).reshape(-1, 2, 1)
-        of_products = _DOT(jnp.stack([x, x]), jnp.stack([self._with_x(now.y) - now.y_a, now.y_b]))
-        along = jnp.concatenate([of_points, of_products.swapaxes(0, 1)])
-        pairs = self._pairs_of_rows.reshape(-1)
-        p = unchecked_take(_cut(poses, [3, 7])[1], pairs).reshape(-1, 2, 4)
+        of_points = xp.stack([-now.of_a, now.of_b], axis=-1).reshape(-1, 2, 1)
+        of_products = self._dot(xp.stack([x, x]), xp.stack([self._with_x(now.y) - now.y_a, now.y_b]))
+        along = xp.concatenate([of_points, of_products.swapaxes(0, 1)])
+        s = self.places.points
+        pairs = np.concatenate([np.repeat(self.places.pairs[:s], 3, axis=0), self.places.pairs[s:]])
+        p = unchecked_take(_cut(poses, [3, 7])[1], pairs.ravel()).reshape(-1, 2, 4)
         r, turn = _cut(blocks, [3])
-        return self._take_ordered(jnp.concatenate([r, 4.0 * rot.rates(p, turn) + 2.0 * along * p], axis=-1))
+        return self._take_ordered(xp.concatenate([r, 4.0 * rot.rates(p, turn) + 2.0 * along * p], axis=-1))
 
-    def wrenches(self, poses: BodyPoses, multipliers: Float[Array, "rows"]) -> Float[Array, "ground 6"]:
+    def wrenches(self, poses: BodyPoses, multipliers: Float[Array, "rows"]) -> Float[Array, "ground v"]:
         """The wrenches of all rows on each body, `Aᵀ λ`."""
-        places, s = self.places, self.places.points
+        places, s, turning, d = self.places, self.places.points, self._turning, self._turning.dimension
         (now,) = self._moving(poses)
-        of_points, of_products = _cut(unchecked_take(multipliers, np.argsort(places.order)), [3 * s], axis=0)
-        force = of_points.reshape(s, 3)
+        of_points, of_products = _cut(unchecked_take(multipliers, np.argsort(places.order)), [d * s], axis=0)
+        force = of_points.reshape(s, d)
         forces = jnp.stack([-force, force])
-        moments = rot.cross(jnp.stack([now.of_a, now.of_b]), forces)
-        along, turning = self._of_products(now)
+        moments = turning.moment(jnp.stack([now.of_a, now.of_b]), forces)
+        along, turn = self._of_products(now)
         own = of_products[None, :, None]
-        entries = jnp.concatenate(
-            [
-                jnp.concatenate([forces, moments], axis=-1).reshape(-1, 6),
-                jnp.concatenate([own * along, own * turning], axis=-1).reshape(-1, 6),
-            ]
-        )
+        wrenches = [jnp.concatenate(x, axis=-1) for x in ((forces, moments), (own * along, own * turn))]
+        entries = jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in wrenches])
         bodies = np.concatenate([places.pairs[:s].T.ravel(), places.pairs[s:].T.ravel()])
-        force, moment = _cut(placed_sums(bodies, places.ground)(entries), [3])
-        matrices = _cut(poses, [3, 7])[2][: places.ground].reshape(-1, 3, 3)
-        return jnp.concatenate([force, matrix_products(moment[:, None], matrices)[:, 0]], axis=-1)
+        force, moment = _cut(placed_sums(bodies, places.ground)(entries), [d])
+        matrices = turning.matrices(poses[: places.ground])
+        return jnp.concatenate([force, turning.in_bodies(matrices, moment)], axis=-1)
 
     def _moving(self, poses, *rates) -> list[_Motion]:
         """The world vectors at poses, and their first and second rates where velocities and accelerations are given."""
         places, v, bodies = self.places, self.vectors, self.places.of_vectors
-        columns, spins = [v], [unchecked_take(_cut(own, [3])[1], bodies) for own in rates]
+        rate, d = self._turning.rate, self._turning.dimension
+        columns, spins = [v], [unchecked_take(_cut(own, [d])[1], bodies) for own in rates]
         if spins:
-            columns.append(rot.cross(spins[0], v))
+            columns.append(rate(spins[0], v))
         if len(spins) == 2:
-            columns.append(rot.cross(spins[0], columns[1]) + rot.cross(spins[1], v))
-        matrices = unchecked_take(_cut(poses, [3, 7])[2], bodies).reshape(-1, 3, 3)
+            columns.append(rate(spins[0], columns[1]) + rate(spins[1], v))
+        matrices = unchecked_take(self._turning.matrices(poses), bodies)
         of_world = matrix_products(matrices, namespace(poses).stack(columns, axis=-1))
-        origins = [_cut(poses, [3, 7])[0], *(_cut(own, [3])[0] for own in rates)]
+        origins = [_cut(own, [d])[0] for own in (poses, *rates)]
         found = []
         for own, moved in zip(_cut(of_world, len(columns)), origins, strict=True):
             of_b, of_a, x, y_b, y_a = _cut(own[..., 0], places.ends, axis=0)
@@ -206,24 +252,21 @@ class ElementaryRows(eqx.Module):
         xp, x, with_points = namespace(now.x), self._x(now), self.places.with_points
         force = x if with_points.all() else with_points[:, None].astype(x.dtype) * x
         arms = xp.stack([self._with_x(now.y) + now.y_a, -now.y_b])
-        return xp.stack([-force, force]), rot.cross(xp.stack([x, x]), arms)
-
-    @property
-    def _pairs_of_rows(self):
-        s = self.places.points
-        return np.concatenate([np.repeat(self.places.pairs[:s], 3, axis=0), self.places.pairs[s:]])
+        return xp.stack([-force, force]), self._turning.moment(xp.stack([x, x]), arms)
 
     def _blocks(self, poses, now: _Motion):
         """The Jacobian, row after row of the elements."""
-        xp, places, s = namespace(poses), self.places, self.places.points
-        matrices = lambda bodies: unchecked_take(_cut(poses, [3, 7])[2], bodies).reshape(-1, 3, 3)
-        of_a, of_b = _cut(matrix_products(matrices(places.of_vectors[: 2 * s]), self.turns), [s], axis=0)[::-1]
-        unit = np.broadcast_to(np.stack([-np.eye(3), np.eye(3)], axis=1), (s, 3, 2, 3)).astype(poses.dtype)
-        of_points = xp.concatenate([unit, xp.stack([-of_a, of_b], axis=2)], axis=-1).reshape(-1, 2, 6)
-        along, turning = self._of_products(now)
-        turning = matrix_products(turning.reshape(-1, 1, 3), matrices(places.pairs[s:].T.reshape(-1)))
-        of_products = xp.concatenate([along, turning.reshape(along.shape)], axis=-1).swapaxes(0, 1)
-        return xp.concatenate([of_points, of_products])
+        xp, places, s, d = namespace(poses), self.places, self.places.points, self._turning.dimension
+        matrices = self._turning.matrices(poses)
+        points = matrix_products(unchecked_take(matrices, places.of_vectors[: 2 * s]), self.turns)
+        of_b, of_a = _cut(points, [s], axis=0)
+        unit = np.broadcast_to(np.stack([-np.eye(d), np.eye(d)], axis=1), (s, d, 2, d)).astype(poses.dtype)
+        of_points = xp.concatenate([unit, xp.stack([-of_a, of_b], axis=2)], axis=-1)
+        along, turn = self._of_products(now)
+        of_bodies = unchecked_take(matrices, places.pairs[s:].T.ravel())
+        own = self._turning.in_bodies(of_bodies, turn.reshape(-1, turn.shape[-1])).reshape(turn.shape)
+        of_products = xp.concatenate([along, own], axis=-1).swapaxes(0, 1)
+        return xp.concatenate([of_points.reshape(-1, *of_products.shape[1:]), of_products])
 
     def _ordered(self, of_points, of_products):
         """Rows in the order of the joints."""
@@ -238,9 +281,7 @@ class ElementaryRows(eqx.Module):
 
 def is_elementary(group: AbstractConstraintGroup) -> bool:
     """Whether the rows of stacked joints are those of elements."""
-    if not isinstance(group, ConstraintGroup) or group.group.layout.space.dimension != 3:
-        return False
-    return group.damping is None and not group.group.inputs and group.group.part.declares_elements()
+    return group.is_position and not group.group.inputs and group.group.part.declares_elements()
 
 
 def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> ElementaryRows | None:
@@ -255,19 +296,19 @@ def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> E
         places = first + g.rows * np.arange(len(own.names))
         for element in jax.vmap(of_part)(own.part):
             listed.append(Listed(element, own.body_index, places))
-            places = places + ROWS[type(element)]
+            places = places + element.rows(own.layout.space.dimension)
         first += g.rows * len(own.names)
-    return stacked(listed, ground) if listed else None
+    return stacked(listed, ground, groups[0].group.layout.space.dimension) if listed else None
 
 
-def stacked(listed: Sequence[Listed], ground: int) -> ElementaryRows:
-    """The rows of elements."""
-    points = [own for own in listed if isinstance(own.element, Coincident)]
-    products = [own for own in listed if not isinstance(own.element, Coincident)]
+def stacked(listed: Sequence[Listed], ground: int, d: int) -> ElementaryRows:
+    """The rows of elements in the plane or in space, of d dimensions."""
+    points = [own for own in listed if own.element.coincide]
+    products = [own for own in listed if not own.element.coincide]
     xp = namespace(*jax.tree.leaves([own.element for own in listed]))
     dtype = xp.result_type(*jax.tree.leaves([own.element for own in listed]))
 
-    def numbers(of_element: Callable[[Any], Any], among: Sequence[Listed], shape: tuple[int, ...] = (3,)):
+    def numbers(of_element: Callable[[Any], Any], among: Sequence[Listed], shape: tuple[int, ...] = (d,)):
         """The vectors of elements, zero where they have none."""
         found = [(of_element(own.element), (len(own.bodies), *shape)) for own in among]
         return xp.concatenate(
@@ -285,8 +326,9 @@ def stacked(listed: Sequence[Listed], ground: int) -> ElementaryRows:
     of_points = [numbers(lambda x: x.point_b, points), numbers(lambda x: x.point_a, points)]
     of_products = [numbers(lambda x: x.x_a, products), numbers(lambda x: x.y_b, products)]
     vectors = xp.concatenate([*of_points, *of_products, numbers(lambda x: x.y_a, products)])
-    unit: Any = np.broadcast_to(np.eye(3, dtype=dtype), (2 * s, 3, 3))
-    turns = rot.cross(unit, xp.broadcast_to(vectors[: 2 * s, None], unit.shape)).swapaxes(1, 2)
+    unit = np.eye(3, dtype=dtype) if d == 3 else np.ones((1, 1), dtype)
+    spins: Any = [xp.broadcast_to(own, (2 * s, *own.shape)) for own in unit]
+    turns = xp.stack([_TURNING[d].rate(spin, vectors[: 2 * s]) for spin in spins], axis=-1)
     lengths = inverses = None
     if any(own.element.length is not None for own in products):  # pyright: ignore[reportAttributeAccessIssue]
         lengths = numbers(lambda x: x.length, products, (1,))
@@ -295,7 +337,7 @@ def stacked(listed: Sequence[Listed], ground: int) -> ElementaryRows:
     with_points = of_joints(lambda x: x.y_a is not None, products)
     (a, b), (a2, b2) = bodies(points).T, bodies(products).T
     between = np.where(with_points[:, None], bodies(products), ground)
-    rows = [np.add.outer(own.rows, np.arange(3)).ravel() for own in points] + [own.rows for own in products]
+    rows = [np.add.outer(own.rows, np.arange(d)).ravel() for own in points] + [own.rows for own in products]
     places = Places(
         key=None,
         of_vectors=np.concatenate([b, a, np.where(with_x, a2, ground), b2, np.where(with_points, a2, ground)]),
@@ -314,7 +356,7 @@ def check_elements(system: Any, state: State, t: float = 0.0) -> None:
     """Raise a `ValueError` if joints that declare their `elements` have other rows than those of their residuals.
 
     ```python
-    jaxmb.parts.check_elements(system, jaxmb.assemble(system))
+    jaxmb.report.check_elements(system, jaxmb.assemble(system))
     ```
 
     Give a state at which no row happens to vanish in its derivatives, and velocities that are not zero.

@@ -205,6 +205,11 @@ class AbstractGroup(eqx.Module):
 
     group: Group
 
+    @property
+    def is_position(self) -> bool:
+        """Whether its rows are position constraints, and no more."""
+        return False
+
     def part(self, name: str = "") -> AbstractPart:
         """The part of a group of one without the leading axis; of others a part with that axis on every number."""
         return self.group.part.named(name)
@@ -315,6 +320,10 @@ class ConstraintGroup(AbstractConstraintGroup):
 
     damping: Float[Array, "parts"] | None = None
     stiffness: Float[Array, "parts"] | None = None
+
+    @property
+    def is_position(self):
+        return self.damping is None
 
     def part(self, name=""):
         part = super().part(name)

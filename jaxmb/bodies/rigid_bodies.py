@@ -46,6 +46,7 @@ from .groups import (
     joint_reactions,
     nonideal_wrenches,
 )
+from .host import host_scene
 from .internal_states import (
     StateField,
     initial_states,
@@ -650,9 +651,10 @@ class RigidBodySystem(AbstractSystem):
         return _join(self._set(groups).velocity(t, poses, velocities), q.dtype)
 
     def prepared(self):
-        if not self.spatial:
-            return self
         return dataclasses.replace(self, elements=elementary_rows(self.constraints, self.layout.ground))
+
+    def on_host(self):
+        return None if is_traced(self) else host_scene(self)
 
     def _set(self, groups: tuple[AbstractConstraintGroup, ...]) -> ConstraintSet:
         return ConstraintSet(groups, self.elements)
@@ -840,8 +842,18 @@ class RigidBodySystem(AbstractSystem):
     def velocity_scale(self):
         return self._scale(self.layout.velocity_index, self.nu)
 
+    def known_scales(self) -> tuple[Float[np.ndarray, "nq"], Float[np.ndarray, "nu"]]:
+        """The scales of coordinates and velocities of a system that is not traced: NumPy, also within a trace."""
+        index, length = self.layout, np.asarray(self.length)
+        sizes = (index.pose_index, self.nq), (index.velocity_index, self.nu)
+        of_coordinates, of_velocities = (np.where(self._lengths(*own), length, 1.0) for own in sizes)
+        return of_coordinates, of_velocities
+
     def _scale(self, index, size):
-        length = lax.stop_gradient(self.length)
+        return jnp.where(self._lengths(index, size), lax.stop_gradient(self.length), 1.0)
+
+    def _lengths(self, index, size):
+        """Which of the coordinates, or velocities, are lengths."""
         translation = [False] * size
         for body in index[: self.layout.bodies]:
             for k in body[: self.layout.space.dimension]:
@@ -849,7 +861,7 @@ class RigidBodySystem(AbstractSystem):
         for own, row in zip(self.layout.scalars, index[self.layout.bodies : -1], strict=True):
             if row[0] < size:
                 translation[row[0]] = own.is_length
-        return jnp.where(np.array(translation), length, 1.0)
+        return np.array(translation, bool)
 
 
 @view_of_motion

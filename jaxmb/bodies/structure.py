@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from ..linalg.graphs import connected
 from ..linalg.inertia import DiagonalInertia
-from ..linalg.rotations import cross, unrotate
+from ..linalg.rotations import unrotate
 from ..states.closest import largest_residual, meet_in_blocks, tolerance
 from ..states.redundancy import (
     ZERO,
@@ -55,7 +55,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
         return dataclasses.replace(system, ranks=Ranks(0, invariants, 0, 0))
     others = tuple(range(system.position_rows, system.acceleration_rows))
     of_positions = dataclasses.replace(system, elimination=joint_order(system, others))
-    q, residual, at = _analyse(of_positions)
+    q, residual, at = _analysed(of_positions)
     if not float(residual) <= tolerance(q.dtype):
         listed = violated_joints(system, 0.0, q, least=0.0)
         turn = "angle" if system.layout.space.dimension == 2 else "orientation"
@@ -64,11 +64,11 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
             f"remain in {listed}. The assembly starts at the position and the {turn} of each body: give poses that are "
             "nearer to an assembled mechanism. Else check lengths, points and axes: joints may contradict each other."
         )
-    joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, np.asarray(at.scale))
-    check_gradients(system, np.asarray(at.row_norms))
+    joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, system.known_scales()[1])
+    check_gradients(system, _row_norms(system, at.blocks))
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
-    absolute = joints.absolute_parts(np.asarray(at.as_one))
+    absolute = joints.absolute_parts(_motions_as_one(system.layout, np.asarray(q)))
     found = joints.subsets(level, absolute)
     dropped = tuple(sorted(r for own in found for r in own.dropped.tolist()))
     shares = [share for own in found for share in own.shares]
@@ -101,50 +101,70 @@ def _of_parts(groups):
 
 
 class _Evaluation(NamedTuple):
-    """Φ; the blocks of A group by group; the scale of its columns, and the norms of its rows with it; velocities of all
-    bodies, and zeros of the ground, in translations and rotations of all bodies as one.
-    """
+    """Φ, and the blocks of A group by group."""
 
     unmet: Array
     blocks: Any
-    scale: Array
-    row_norms: Array
-    as_one: Array
+
+
+def _analysed(system):
+    """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
+    on_host, guess = system.on_host(), np.asarray(system.guess.q)
+    met = None if on_host is None else on_host.met(on_host.normalize(guess))
+    if on_host is not None and on_host.holds(met):
+        q, at = met, _of_host(system, on_host, met)
+    else:
+        q, *at = map(_on_host, _met(system))
+        at = _Evaluation(*at)
+    norms: Any = _row_norms(system, at.blocks)
+    residual = largest_residual(at.unmet, norms[: system.position_rows])
+    return jax.device_put(q), residual, at
+
+
+def _on_host(tree):
+    return jax.tree.map(np.asarray, tree)
 
 
 @eqx.filter_jit
-def _analyse(system):
-    """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
+def _met(system):
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
     still = np.zeros(system.nu, bool)
     q = meet_in_blocks(system, t, q, still) if system.position_rows else system.normalize(q)
-    at = _evaluated(system, t, q)
-    residual = largest_residual(at.unmet, at.row_norms[: system.position_rows])
-    return q, residual, at
+    return q, *_evaluated(system, t, q)
 
 
 def _evaluated(system, t, q):
     """At coordinates on the constraints or near them, and the given velocities."""
     u = system.guess.u
     poses, velocities = system.prepared_poses(q), system.all_velocities(u)
-    blocks = [g.jacobian(t, poses, velocities) for g in system.joints]
-    scale = system.velocity_scale()
-    norms = _row_norms(system, blocks, scale)
-    return _Evaluation(system.position_residual(t, q), blocks, scale, norms, _motions_as_one(system, q))
+    return _Evaluation(system.position_residual(t, q), [g.jacobian(t, poses, velocities) for g in system.joints])
 
 
-def _row_norms(system, blocks, scale):
-    """The norm of each row of A, its columns multiplied by a scale."""
-    index = np.minimum(system.layout.velocity_index, system.nu)
-    of_bodies = jnp.append(scale, jnp.zeros((), scale.dtype))[index]
+def _of_host(system, on_host, q):
+    blocks, counts = on_host.blocks(q), [len(g.group.names) * g.rows for g in system.constraints]
+    own = np.split(blocks, np.cumsum(counts)[:-1])
+    pairs = zip(own, system.constraints, strict=True)
+    return _Evaluation(on_host.residual(q), [x.reshape(-1, g.rows, *x.shape[1:]) for x, g in pairs])
+
+
+def _row_norms(system, blocks):
+    """The norm of each row of A, its columns multiplied by the scales of velocities."""
+    of_bodies = np.append(system.known_scales()[1], 0.0)[system.layout.velocity_index]
     own = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.joints]
-    sizes = [jnp.sqrt(jnp.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, own, strict=True)]
-    return jnp.concatenate([size.reshape(-1) for size in sizes])
+    sizes = [np.sqrt(np.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, own, strict=True)]
+    return np.concatenate([size.reshape(-1) for size in sizes])
+
+
+def _displaced(system, t, q, moved):
+    """The same after displacements along velocities, in multiples of their scales."""
+    on_host = system.on_host()
+    if on_host is None:
+        return _Evaluation(*_on_host(_displaced_by_jax(system, t, q, moved)))
+    return _of_host(system, on_host, on_host.displaced(np.asarray(q), on_host.velocity_scale * moved))
 
 
 @eqx.filter_jit
-def _displaced(system, t, q, moved):
-    """The same after displacements along velocities, in multiples of their scales."""
+def _displaced_by_jax(system, t, q, moved):
     return _evaluated(system, t, displaced(system, t, q, system.velocity_scale() * moved))
 
 
@@ -159,17 +179,19 @@ def _asked(system, q):
     return asked, system.acceleration_residual(t, q, u, jnp.zeros_like(u))
 
 
-def _motions_as_one(system, q):
-    poses, d = system.poses(q), system.layout.space.dimension
-    moved = jnp.tile(jnp.eye(d, system.layout.space.velocity_size, dtype=q.dtype)[:, None], (1, len(poses), 1))
+def _motions_as_one(layout, q):
+    """Velocities of all bodies, and zeros of the ground, in translations and rotations of all bodies as one."""
+    poses: Any = np.append(q, layout.space.ground)[layout.pose_index[: layout.bodies]]
+    d = layout.space.dimension
+    moved = np.tile(np.eye(d, layout.space.velocity_size)[:, None], (1, len(poses), 1))
     if d == 2:
-        turned = jnp.stack([-poses[:, 1], poses[:, 0], jnp.ones_like(poses[:, 0])], axis=1)[None]
+        turned = np.stack([-poses[:, 1], poses[:, 0], np.ones(len(poses))], axis=1)[None]
     else:
-        turn = lambda axis: jax.vmap(lambda x: jnp.concatenate([cross(axis, x[:3]), unrotate(x[3:], axis)]))(poses)
-        turned = jax.vmap(turn)(jnp.eye(3, dtype=q.dtype))
+        axes: Any = np.eye(3)
+        turned = np.array([[[*np.cross(axis, x[:3]), *unrotate(x[3:], axis)] for x in poses] for axis in axes])
     # Scalar coordinates and the ground stay.
-    still = system.layout.ground + 1 - system.layout.bodies
-    return jnp.pad(jnp.concatenate([moved, turned]), ((0, 0), (0, still), (0, 0)))
+    still = layout.ground + 1 - layout.bodies
+    return np.pad(np.concatenate([moved, turned]), ((0, 0), (0, still), (0, 0)))
 
 
 @eqx.filter_jit

@@ -72,8 +72,9 @@ def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
 
 def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array, "2"]:
     """World components of the body vector `v` in a planar frame turned by `angle` [rad]."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+    xp = namespace(angle, v)
+    c, s = xp.cos(angle), xp.sin(angle)
+    return xp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
 
 
 def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:

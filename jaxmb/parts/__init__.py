@@ -56,6 +56,12 @@ from .contact import (
     AbstractNormalLaw as AbstractNormalLaw,
 )
 from .dry_friction import AbstractDryFriction as AbstractDryFriction
+from .elements import (
+    apart as apart,
+    coincident as coincident,
+    in_planes as in_planes,
+    perpendicular as perpendicular,
+)
 from .fields import (
     Module as Module,
     Names as Names,

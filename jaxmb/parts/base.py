@@ -419,9 +419,9 @@ class AbstractConstraint(AbstractLink):
 
     @property
     def elements(self) -> Any:
-        """Hook: the elementary constraints that a joint in space consists of, in the order of its rows; see
-        `jaxmb.parts.elements`. They vanish with the residual, and there have its derivatives. None where the joint is
-        known by its residual alone.
+        """Hook: the elementary constraints that a joint consists of, in the order of its rows, of `parts.coincident`,
+        `perpendicular`, `in_planes` and `apart`. They vanish with the residual and have its derivatives there, which
+        `jaxmb.report.check_elements` tells. None where the joint is known by its residual alone.
         """
         return None
 

@@ -28,7 +28,6 @@ from .base import (
 )
 from .fields import declarations, entry, internal_states
 from .space import AbstractSpace
-from .spatial.elements import ROWS
 
 T = TypeVar("T")
 
@@ -53,7 +52,7 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
         else:
             check_returns(part.label, name, shape, kernel, *given)
     if isinstance(part, AbstractConstraint) and part.declares_elements():
-        rows = sum(ROWS[type(element)] for element in part.elements)
+        rows = sum(element.rows(space.dimension) for element in part.elements)
         if rows != part.rows:
             raise ValueError(f"{part.label}: its elements have {rows} rows, but rows = {part.rows}.")
     if isinstance(part, AbstractForce) and not isinstance(part, AbstractPotentialForce) and hasattr(part, "energy"):

@@ -9,11 +9,13 @@
 - `formulation_costs(mechanism)`: run time and program size of every formulation, with derivatives.
 - `method_costs(mechanism)`: coordinate partitioning compared with integrating all coordinates: evaluations, linear
   algebra and time at equal error.
+- `check_elements(system, state)`: whether the elementary constraints that joints declare are those of their residuals.
 
 `jaxmb report KIND NAME` writes one of them from the command line; NAME is a mechanism or `file.py:function`, where the
 function returns a scene, or a system and a state.
 """
 
+from ..bodies.elementary import check_elements as check_elements
 from .formulations import (
     FormulationCost as FormulationCost,
     FormulationCosts as FormulationCosts,

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -103,7 +104,7 @@ def assemble(
     # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled.
     known = not is_traced((system, guess, fix, u, t))
     at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
-    u, ok_rates = (u, True) if at_rest else closest_velocities(system, t, q, u, tuple(fixed_rates.tolist()))
+    u, ok_rates = (u, True) if at_rest else _velocities(system, t, q, u, fixed_rates)
     # Under a derivative it is known whether a state was found, but its numbers are traced.
     traced = is_traced((system, q, u, t))
     # Under a trace, results of concrete numbers are traced as well.
@@ -161,8 +162,14 @@ def configuration(
     if not is_traced(q):
         _check_finite(q, "coordinates")
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
+    known = not is_traced((system, q, t))
+    on_host = system.on_host() if known else None
+    if on_host is not None:
+        found = on_host.closest_configuration(np.asarray(q), fixed, system.coordinate_rank - whole)
+        if found is not None:
+            return jax.device_put(found), fixed, jnp.array(True)
     # The poses that a system was compiled at are often their own closest configuration; then nothing is compiled.
-    if guess is system.guess.q and not fixed.any() and not is_traced((system, q, t)):
+    elif known and guess is system.guess.q and not fixed.any():
         met = _is_met(system, t, q)
         # Under a trace, results of concrete numbers are traced as well.
         if not is_traced(met) and met:
@@ -171,6 +178,16 @@ def configuration(
     if throw and not is_traced((system, t, q, ok)) and not ok:
         raise ValueError(cannot_assemble(system, t, q, fixed))
     return q, fixed, ok
+
+
+def _velocities(system, t, q, u, fixed):
+    """The second half of `assemble`: the velocities, and whether they satisfy the constraints."""
+    on_host = None if is_traced((system, t, q, u)) else system.on_host()
+    if on_host is not None:
+        found = on_host.closest_velocities(np.asarray(q), np.asarray(u), fixed, system.velocity_rank)
+        if found is not None:
+            return jax.device_put(found), jnp.array(True)
+    return closest_velocities(system, t, q, u, tuple(fixed.tolist()))
 
 
 def _check_modes(system, q, fixed):

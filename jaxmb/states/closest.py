@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._types import Coordinates, Scalar, Velocities
+from ..linalg.arrays import namespace
 from ..linalg.elimination import full_pivot
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
@@ -73,9 +74,9 @@ def tolerance(dtype) -> float:
 
 def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) -> Float[Array, ""]:
     """The largest residual, each row scaled to unit norm of its gradient times the system's size."""
-    largest = jnp.max(row_norms, initial=0.0)
-    floor = jnp.finfo(residual.dtype).eps ** 0.75 * largest + jnp.finfo(residual.dtype).tiny
-    return jnp.max(jnp.abs(residual) / jnp.maximum(row_norms, floor), initial=0.0)
+    xp, known = namespace(residual, row_norms), jnp.finfo(residual.dtype)
+    floor = known.eps**0.75 * xp.max(row_norms, initial=0.0) + known.tiny
+    return xp.max(xp.abs(residual) / xp.maximum(row_norms, floor), initial=0.0)
 
 
 def residual_size(

@@ -60,6 +60,12 @@ class AbstractSystem(AbstractEquation):
         """
         return self
 
+    def on_host(self) -> Any:
+        """The position constraints in NumPy, whose numbers are known, so that nothing is compiled to satisfy them once;
+        None where there is no such form.
+        """
+        return None
+
     @property
     def nz(self) -> int:
         return self.state_ends[-1] if self.state_ends else 0

@@ -8,8 +8,9 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import parts, spatial
-from jaxmb.bodies.elementary import check_elements, is_elementary
-from jaxmb.parts.spatial.elements import coincident, perpendicular
+from jaxmb.bodies.elementary import is_elementary
+from jaxmb.parts import coincident, perpendicular
+from jaxmb.report import check_elements
 
 POINTS = {"point_a": (0.3, -0.2, 0.5), "point_b": (-0.4, 0.1, 0.2)}
 PLACE = {"point": (0.2, 0.1, 0.4)}

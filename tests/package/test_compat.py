@@ -115,6 +115,9 @@ def test_weak_types(compat):
     assert compat.is_weakly_typed(jnp.asarray(1.0)) is True, about
     assert compat.is_weakly_typed(jnp.asarray(1.0, float)) is False, about
     jax.jit(lambda x, y: [x, compat.is_weakly_typed(x) and pytest.fail(about)])(jnp.zeros(1), 1.0)
+    program = jax.make_jaxpr(lambda x, y: (x, y))(jnp.zeros(2), 1.0)
+    strong, weak = map(compat.like_of, program.in_avals)
+    assert (strong.shape, strong.weak_type, weak.shape, weak.weak_type) == ((2,), False, (), True), about
 
 
 def test_whether_jax_has_started(compat):
@@ -200,6 +203,22 @@ def test_bilinear_operations(compat):
 
 
 # equinox
+
+
+def test_linear_operations(compat):
+    twice = compat.define_linear(
+        "twice",
+        lambda a, *, of, lead: of * a,
+        lambda shape, *, of, lead: shape,
+        lambda c, shape, *, of, lead: of * c,
+        parameters=("of",),
+    )
+    about = "operations of one's own no longer have derivatives, transposes and batches"
+    x = jnp.arange(6.0).reshape(2, 3)
+    value = lambda x: jnp.sum(jnp.sin(twice(x, of=2.0)))
+    assert jnp.allclose(jax.grad(value)(x), 2 * jnp.cos(2 * x)), about
+    assert jnp.allclose(jax.jacfwd(value)(x), 2 * jnp.cos(2 * x)), about
+    assert jnp.allclose(jax.jit(jax.vmap(lambda x: twice(x, of=2.0)))(x), 2 * x), about
 
 
 def test_conditions_of_a_batch(compat):

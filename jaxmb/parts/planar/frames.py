@@ -22,9 +22,6 @@ class Frame(AbstractPlanarPart, AbstractFrame):
     `acceleration` of its origin (world axes), `angle`, `angular_velocity`, `angular_acceleration`, and
     `specific_force`, what an accelerometer measures: acceleration less gravity, in the frame's axes [m/s²].
 
-    Joints on frames compile apart from those of their kind that join bodies: where a point and an axis in the bodies
-    serve as well, give the joint those, and its rows and their derivatives are compiled once for all.
-
     **Arguments:** `body`: the name of a body or frame; `position` [m], shape (2,), of its origin, and `angle` [rad], of
     its axes, in that body's frame.
     """

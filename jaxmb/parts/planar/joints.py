@@ -13,12 +13,15 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..._types import Scalar
+from ...linalg.arrays import namespace
 from ...linalg.rotations import norm, rotate_2d
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractPlanarPart
+from ..elements import apart, coincident, in_planes, perpendicular
 from ..shapes import pin, sleeve, wheel
 from ..space import both_points, nearest_to_origin, separation
 
@@ -49,6 +52,10 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
 
     rows: ClassVar[int] = 2
     angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+
+    @property
+    def elements(self):
+        return (coincident(self),)
 
     def residual(self, space, poses, t):
         return separation(space, self, poses)
@@ -87,6 +94,10 @@ class Fixed(AbstractPlanarPart, AbstractJoint):
     def complete(self, space, poses):
         return self.filled(angle=relative_angle(poses))
 
+    @property
+    def elements(self):
+        return coincident(self), _aligned(self.angle)
+
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), (relative_angle(poses) - self.angle)[None]])
 
@@ -119,6 +130,10 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
     angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+
+    @property
+    def elements(self):
+        return in_planes(self, [_normal(self.axis_a)])
 
     def residual(self, space, poses, t):
         return _offset(space, self, poses)[None]
@@ -167,6 +182,10 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
     def complete(self, space, poses):
         return self.filled(angle=relative_angle(poses))
 
+    @property
+    def elements(self):
+        return *in_planes(self, [_normal(self.axis_a)]), _aligned(self.angle)
+
     def residual(self, space, poses, t):
         return jnp.stack([_offset(space, self, poses), relative_angle(poses) - self.angle])
 
@@ -189,8 +208,19 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
 
 def _offset(space, part, poses):
     """`n·d`."""
-    along = space.direction(poses[0], part.axis_a)
-    return jnp.dot(jnp.stack([-along[1], along[0]]), separation(space, part, poses))
+    return jnp.dot(_normal(space.direction(poses[0], part.axis_a)), separation(space, part, poses))
+
+
+def _normal(axis):
+    return namespace(axis).stack([-axis[1], axis[0]])
+
+
+def _aligned(angle):
+    """The relative angle is this: the sine of the difference vanishes."""
+    x: Any = np.array([1.0, 0.0])
+    y = np.array([0.0, 1.0])
+    along = rotate_2d(-angle, x)
+    return perpendicular(y, along, (x, along))
 
 
 def _displacement(space, part, poses):
@@ -226,6 +256,10 @@ class Distance(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 
     def complete(self, space, poses):
         return self.filled(length=norm(separation(space, self, poses)))
+
+    @property
+    def elements(self):
+        return (apart(self),)
 
     def residual(self, space, poses, t):
         d = separation(space, self, poses)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from ...linalg import rotations as rot
 from ...linalg.arrays import add_up, namespace
 from ...linalg.roots import reciprocal_root
+from ..elements import Product, perpendicular
 
 Vector3 = Float[Array, "3"]
 
@@ -142,6 +143,19 @@ def _carried(x: Vector3, start: Vector3, end: Vector3) -> Vector3:
     # Between opposite directions any turn by half a turn is a shortest one.
     turned = x if half < 1e-12 else x - (end @ x) / half * (start + end)
     return turned / np.sqrt(turned @ turned)
+
+
+def parallel(part) -> tuple[Product, ...]:
+    """The axes of a part in A and in B are parallel."""
+    return tuple(perpendicular(x, part.axis_b, (part.axis_a, part.axis_b)) for x in perpendiculars(part.axis_a))
+
+
+def aligned(part) -> tuple[Product, ...]:
+    """The relative attitude is `part.orientation`."""
+    in_a = rot.rotation_matrix(part.orientation).T
+    unit = np.eye(3, dtype=in_a.dtype)
+    # Their rates are the components of the angular velocity of B in A along the axes of B.
+    return tuple(perpendicular(in_a[k], unit[j], (in_a[k], unit[k])) for k, j in ((2, 1), (0, 2), (1, 0)))
 
 
 def with_given_orientation(part, poses: Float[Array, "k p"]):

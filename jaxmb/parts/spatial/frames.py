@@ -24,9 +24,6 @@ class Frame(AbstractSpatialPart, AbstractFrame):
     `angular_velocity` (what a gyroscope measures), `angular_acceleration` and `specific_force`, what an accelerometer
     measures: acceleration less gravity [m/s²].
 
-    Joints on frames compile apart from those of their kind that join bodies: where a point and an axis in the bodies
-    serve as well, give the joint those, and its rows and their derivatives are compiled once for all.
-
     **Arguments:** `body`: the name of a body or frame; `position` [m], shape (3,), of its origin, and `orientation`,
     shape (4,), unit Euler parameters from its axes to those of the body, in that body's frame.
     """

@@ -23,10 +23,12 @@ import numpy as np
 from ...linalg.rotations import conjugate, cross, dot, multiply, rotate, unrotate
 from .. import fields
 from ..base import AbstractJoint, AbstractSpatialPart
+from ..elements import coincident, in_planes, perpendicular
 from ..shapes import ball, pin, sleeve
 from ..space import both_points, nearest_to_origin, separation
 from .axes import (
     across,
+    aligned,
     angle,
     cosine_sine,
     direction_in_a,
@@ -34,6 +36,7 @@ from .axes import (
     half_sine,
     measured_from_given_poses,
     offset_in_a,
+    parallel,
     perpendiculars,
     relative_orientation,
     rotation_error,
@@ -41,7 +44,6 @@ from .axes import (
     turn_about,
     with_given_orientation,
 )
-from .elements import aligned, coincident, in_planes, parallel, perpendicular
 
 
 def _parallel(space, part, poses):

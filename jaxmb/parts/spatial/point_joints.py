@@ -5,10 +5,10 @@ from typing import ClassVar
 from ...linalg.rotations import dot, norm
 from .. import fields
 from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
+from ..elements import apart, in_planes
 from ..shapes import ball
 from ..space import both_points, separation
 from .axes import across, displacement_along, offset_in_a, perpendiculars
-from .elements import apart, in_planes
 
 
 class Distance(AbstractSpatialPart, AbstractPair, AbstractConstraint):

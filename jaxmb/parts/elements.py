@@ -1,0 +1,110 @@
+"""The elementary constraints that joints consist of: points that coincide, and products of two vectors.
+
+A joint that declares them as its property `elements` has its rows computed together with those of all other such
+joints, whatever their types, in a few small kernels. The declared rows and the `residual` of the joint vanish together,
+and have the same derivatives where they do; `jaxmb.report.check_elements` compares them.
+
+```python
+class Pin(parts.AbstractPlanarPart, parts.AbstractJoint):
+    rows = 2
+
+    def residual(self, space, poses, t):
+        return parts.separation(space, self, poses)
+
+    @property
+    def elements(self):
+        return (parts.coincident(self),)
+
+pin = Pin("own_pin", "ground", "bar", point=(-0.5, 0.0))
+```
+
+Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", Allyn and Bacon 1989, chapter 9;
+P. E. Nikravesh, "Computer-Aided Analysis of Mechanical Systems", Prentice-Hall 1988, chapter 7.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, Self, TypeAlias
+
+import numpy as np
+
+
+class Coincident(NamedTuple):
+    """`d = 0`, a row for each dimension: the vector d from `point_a`, fixed in A, to `point_b`, fixed in B [m]."""
+
+    point_a: Any
+    point_b: Any
+    coincide = True
+
+    def rows(self, dimension: int) -> int:
+        return dimension
+
+    def moved(self, point: Callable[[int, Any], Any], direction: Callable[[int, Any], Any]) -> Self:
+        """The same for other axes of bodies 0 and 1: `point(k, s)` and `direction(k, v)` give those of the body k."""
+        del direction
+        return type(self)(point(0, self.point_a), point(1, self.point_b))
+
+
+class Product(NamedTuple):
+    """`X · Y = 0`, one row.
+
+    **Fields:** `x_a`: X, fixed in A; None for X = Y / length. `y_b`: Y, fixed in B; or, with `y_a`, the vector from the
+    point `y_a` of A to the point `y_b` of B [m]. `length` [m]: the row is `(Y · Y / length − length) / 2`. `along_a`
+    and `along_b`, fixed in A and in B: directions with a positive product, where the row alone does not tell a joint
+    from the same one half a turn away.
+    """
+
+    x_a: Any
+    y_b: Any
+    y_a: Any = None
+    length: Any = None
+    along_a: Any = None
+    along_b: Any = None
+    coincide = False
+
+    def rows(self, dimension: int) -> int:
+        del dimension
+        return 1
+
+    def moved(self, point: Callable[[int, Any], Any], direction: Callable[[int, Any], Any]) -> Self:
+        """As in `Coincident`."""
+        x_a, y_b, y_a, length, *along = self
+        if y_a is None:
+            return type(self)(direction(0, x_a), direction(1, y_b), None, None, *map(direction, (0, 1), along))
+        return type(self)(direction(0, x_a), point(1, y_b), point(0, y_a), length)
+
+
+Element: TypeAlias = Coincident | Product
+
+
+def coincident(part: Any) -> Coincident:
+    """Points A and B of a part coincide."""
+    return Coincident(part.point_a, part.point_b)
+
+
+def perpendicular(x_a: Any, y_b: Any, along: tuple[Any, Any] = (None, None)) -> Product:
+    """A direction fixed in A and one fixed in B are perpendicular, and those of `along` have a positive product."""
+    return Product(x_a, y_b, along_a=along[0], along_b=along[1])
+
+
+def in_planes(part: Any, normals: Iterable[Any]) -> tuple[Product, ...]:
+    """Point B of a part stays in planes, or on lines in the plane, that are fixed in A, go through point A and have
+    these normals.
+    """
+    return tuple(Product(x, part.point_b, part.point_a) for x in normals)
+
+
+def apart(part: Any) -> Product:
+    """Points A and B of a part keep the distance `part.length`."""
+    return Product(None, part.point_b, part.point_a, part.length)
+
+
+def on_bodies(part: Any, space: Any, elements: Iterable[Element]) -> tuple[Element, ...]:
+    """Elements in the axes of the bodies, from those in the frames that the part names in their place."""
+    frames = part.body_frames
+    if not frames:
+        return tuple(elements)
+    poses = [frames[k].pose(space, np.array(space.ground)) if k in frames else None for k in ("0", "1")]
+    point = lambda k, s: s if poses[k] is None else space.point(poses[k], s)
+    direction = lambda k, v: v if v is None or poses[k] is None else space.direction(poses[k], v)
+
+    return tuple(element.moved(point, direction) for element in elements)
