@@ -4,20 +4,6 @@ A joint that declares them as its property `elements` has its rows computed toge
 joints, whatever their types, in a few small kernels. The declared rows and the `residual` of the joint vanish together,
 and have the same derivatives where they do; `jaxmb.report.check_elements` compares them.
 
-```python
-class Pin(parts.AbstractPlanarPart, parts.AbstractJoint):
-    rows = 2
-
-    def residual(self, space, poses, t):
-        return parts.separation(space, self, poses)
-
-    @property
-    def elements(self):
-        return (parts.coincident(self),)
-
-pin = Pin("own_pin", "ground", "bar", point=(-0.5, 0.0))
-```
-
 Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", Allyn and Bacon 1989, chapter 9;
 P. E. Nikravesh, "Computer-Aided Analysis of Mechanical Systems", Prentice-Hall 1988, chapter 7.
 """
@@ -77,7 +63,28 @@ Element: TypeAlias = Coincident | Product
 
 
 def coincident(part: Any) -> Coincident:
-    """Points A and B of a part coincide."""
+    """Points A and B of a part coincide.
+
+    ```python
+    class Slide(jaxmb.parts.AbstractPlanarPart, jaxmb.parts.AbstractJoint):  # As planar.Prismatic, along x of both.
+        rows = 2
+
+        def residual(self, space, poses, t):
+            d = space.body_point(poses[0], space.point(poses[1], self.point_b)) - self.point_a
+            return jnp.array([d[1], poses[1, 2] - poses[0, 2]])
+
+        @property
+        def elements(self):
+            x, y = np.eye(2)
+            return *jaxmb.parts.in_planes(self, [y]), jaxmb.parts.perpendicular(y, x, (x, x))
+
+    slide = Slide("slide", "ground", "bar", point=(0.0, 0.0))
+    system = jaxmb.Scene([bar], joints=[slide]).compile()
+    jaxmb.report.check_elements(system, jaxmb.assemble(system, rates={"bar.x": 1.0}))
+    rod = planar.Distance("rod", "ground", "bar", point_b=(-0.1, 0.0))
+    jaxmb.parts.coincident(slide), jaxmb.parts.apart(rod)  # The elements of planar.Revolute and of the rod.
+    ```
+    """
     return Coincident(part.point_a, part.point_b)
 
 

@@ -374,7 +374,9 @@ def _solve_with_tangents(arguments, control, adjoint, limit, projects_steps):
         control = control.on_constraints(restore, *lax.stop_gradient((term, options["y0"])))
     solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
     options = options | {"stepsize_controller": controller}
-    solution = _solve_states(term, solver, options, adjoint, limit, MeshAdjoint(kept_steps(options["y0"])))
+    solution = _solve_states(
+        term, solver, options, adjoint, limit, MeshAdjoint(kept_steps(options["y0"]), "made_jump" in options)
+    )
     return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
 

@@ -6,7 +6,9 @@ known: nothing is solved, and little of a step is stored. This is the same metho
 the mesh of the motion; it differs from the derivative of the step by less than the local error of the tangent.
 """
 
+import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._compat import any_of_batch
@@ -32,6 +35,9 @@ from .evaluation import (
 )
 from .steps import AbstractSteps, LinearStep
 from .times import twice_differentiable
+
+# Of more numbers than this, states and fields among them, tangents after a jump are computed one at a time.
+_MOST_COLUMNS = 256
 
 
 class Coefficients(eqx.Module):
@@ -122,9 +128,13 @@ class AdamsRow(eqx.Module):
 
 
 class AdamsSteps(AbstractSteps):
-    """The steps of `Adams`; `jumps`: whether they may begin after a jump."""
+    """The steps of `Adams`; `jumps`: whether they may begin after a jump; whether the run itself `begins` with one."""
 
     jumps: bool = eqx.field(static=True)
+    begins: bool = eqx.field(static=True, default=False)
+
+    def after_first_jump(self):
+        return dataclasses.replace(self, begins=True)
 
     def row(self, terms, before, after):
         old, new = before.solver_state, after.solver_state
@@ -149,6 +159,8 @@ class AdamsSteps(AbstractSteps):
         return solver_state.memory
 
     def start(self, terms, before, after):
+        if self.begins:
+            return None
         differences = after.solver_state.history.differences
         # After one step from a start these are the derivative at its end, and how far it is from that at the start.
         f = differences[0] - differences[1]
@@ -159,6 +171,8 @@ class AdamsSteps(AbstractSteps):
 
     def memory_at_start(self, of, terms, like, row, along):
         *inward, given = along
+        if self.begins:
+            return given
 
         def field(terms, flat):
             own, args, _ = of(terms)
@@ -180,10 +194,11 @@ class AdamsSteps(AbstractSteps):
         _, field = jax.linearize(at, moved.terms, row.y)
         formulas = coefficients(row.mesh, row.order, row.end, row.y.dtype)
         used = (row.order >= INDEX)[:, None]
+        restart = None if row.jump is None else _restarts(of, moved, like, row.jump)
 
         def push(dmoved, w, memory):
-            if row.jump is not None:
-                w, memory = _restarted(of, moved, like, row.jump, dmoved, w, memory)
+            if restart is not None:
+                w, memory = restart(dmoved, w, memory)
             partial_sums, neighbours, mean = formulas.sums(memory)
             predicted = w + formulas.h * mean
             _, f = field(dmoved.terms, predicted)
@@ -214,25 +229,52 @@ class AdamsSteps(AbstractSteps):
         return eqx.tree_at(parts, out, (before[0], before[1][0]), is_leaf=lambda x: x is None)
 
 
-def _restarted(of, moved, like, jump: Jump, dmoved, w, memory):
-    """The tangents after a jump, where there was one."""
+def _restarts(of, moved, like, jump: Jump) -> Callable[..., tuple[Array, Array]]:
+    """The tangents after a jump, where there was one, from those of numbers, of the state and of the memory before it,
+    in which they are linear.
+    """
+    n, along_numbers = jump.y.size, sum(x.size for x in jax.tree.leaves(moved))
     guards = guards_of(of(moved.terms)[0])
 
-    def tangents(at_jump):
+    def tangents(at_jump, *along):
         restart = functools.partial(_restart, of, like, jump, at_jump)
-        return jax.jvp(restart, (moved, jump.y, jump.f), (dmoved, w, memory[0]))[1]
+        return jax.jvp(restart, (moved, jump.y, jump.f), along)[1]
 
-    def restarted():
+    def restarted(*along):
         if moved.jumps is None or guards is None:
-            new = tangents(moved.jumps is not None)
-        else:
-            # A run starts, and goes on after an impact, at a time that is none of the jumps, and at the start there is
-            # nothing before it.
-            is_jump = any_of_batch(_is_jump(moved.jumps, jump))
-            new = lax.cond(is_jump, lambda: tangents(True), lambda: tangents(False))
-        return jax.tree.map(lambda new, old: jnp.where(jump.made, new, old), new, (w, memory))
+            return tangents(moved.jumps is not None, *along)
+        # A run starts, and goes on after an impact, at a time that is none of the jumps, and at the start there is
+        # nothing before it.
+        is_jump = any_of_batch(_is_jump(moved.jumps, jump))
+        return lax.cond(is_jump, lambda: tangents(True, *along), lambda: tangents(False, *along))
 
-    return lax.cond(any_of_batch(jump.made), restarted, lambda: (w, memory))
+    def push(dmoved, w, memory):
+        def anew():
+            new = restarted(dmoved, w, memory[0])
+            return jax.tree.map(lambda new, old: jnp.where(jump.made, new, old), new, (w, memory))
+
+        return lax.cond(any_of_batch(jump.made), anew, lambda: (w, memory))
+
+    columns = along_numbers + 2 * n
+    if guards is None or columns > _MOST_COLUMNS:
+        return push
+    raveled = jax.numpy_dtype_promotion("standard")(ravel_pytree)
+    _, unraveled = raveled((moved, jump.y, jump.f))
+
+    def column(unit):
+        w, memory = restarted(*unraveled(unit))
+        return jnp.concatenate([w, memory[0]])
+
+    # The transpose of a program that finds an event would be a second one, and as long; a matrix is transposed at once.
+    every = lambda: jax.vmap(column)(jnp.eye(columns, dtype=jump.y.dtype))
+    matrix = lax.cond(any_of_batch(jump.made), every, lambda: jnp.zeros((columns, 2 * n), jump.y.dtype))
+
+    def push_by_matrix(dmoved, w, memory):
+        new = raveled((dmoved, w, memory[0]))[0].astype(matrix.dtype) @ matrix
+        restarted = jnp.concatenate([new[None, n:], jnp.zeros_like(memory[1:])])
+        return jnp.where(jump.made, new[:n], w), jnp.where(jump.made, restarted, memory)
+
+    return push_by_matrix
 
 
 def _restart(of, like, jump, at_jump, moved, flat, f):

@@ -317,10 +317,12 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
 class MeshAdjoint(diffrax.AbstractAdjoint):
     """Derivatives of a solve on its mesh, in every mode.
 
-    **Arguments:** `most`: the number of steps that are kept.
+    **Arguments:** `most`: the number of steps that are kept; whether the run `begins` with a jump, so that there is
+    nothing before its first step.
     """
 
     most: int = eqx.field(static=True)
+    begins: bool = eqx.field(static=True, default=False)
 
     def loop(self, *, terms, event, max_steps, **options):
         # What a function closes over is an argument of the rule below, or its derivative would be zero.
@@ -345,6 +347,7 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         """diffrax's loop with room for `max_steps` steps, of which `limit` are taken at most."""
         del throw, passed_solver_state, passed_controller_state
         steps, own = steps_of(solver, options["stepsize_controller"])
+        steps = steps.after_first_jump() if self.begins else steps
         jumps = jump_times(options["stepsize_controller"])
         given = {"solver": solver, "saveat": saveat, "max_steps": max_steps, **options}
         fixed = given, steps = freeze((given, steps))

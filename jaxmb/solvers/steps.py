@@ -60,6 +60,10 @@ class AbstractSteps(eqx.Module):
         """The same for runs of the solver itself."""
         return self
 
+    def after_first_jump(self) -> Self:
+        """The same for runs that begin with a jump."""
+        return self
+
     @abc.abstractmethod
     def memory(self, solver_state: Any) -> PyTree[Array]:
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
