@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import parts, spatial
+from jaxmb import parts, planar, spatial
 from jaxmb.bodies.elementary import is_elementary
 from jaxmb.parts import coincident, perpendicular
 from jaxmb.report import check_elements
@@ -102,6 +102,7 @@ def assert_agree(system, state, acceleration, tol=1e-13):
         assert largest(own - exact[what]) < tol * (1 + largest(exact[what])), what
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("where", ["bodies", "centre", "frame", "ground"])
 def test_rows_of_every_joint_are_those_of_its_residual(where):
     pairs = [bodies(k, **({"centre": (0.1, 0.2, -0.1)} if where == "centre" else {})) for k in range(len(JOINTS))]
@@ -114,6 +115,25 @@ def test_rows_of_every_joint_are_those_of_its_residual(where):
     system = mb.Scene([one for pair in pairs for one in pair], joints=joints, frames=frames).compile()
     assert all(map(is_elementary, system.constraints))
     assert {type(g.group.part) for g in system.constraints} == {kind for kind, _ in JOINTS.values()}
+    for state, acceleration in states_of(system):
+        assert_agree(system, state, acceleration)
+        check_elements(system, state)
+
+
+def test_rows_of_planar_joints_are_those_of_their_residuals():
+    point, axis = {"point": (0.5, 0.2)}, {"axis": (0.6, 0.8)}
+    places = [{"position": (0.3 * k, 0.1 * k * k), "angle": 0.4 * k - 1.0} for k in range(10)]
+    own = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, **place) for k, place in enumerate(places)]
+    frame = planar.Frame("tip", "b1", position=(0.1, -0.3), angle=0.4)
+    joints = [
+        planar.Revolute("pin", "b0", "tip", **point),
+        planar.Fixed("weld", "b2", "b3", **point),
+        planar.PointOnLine("slot", "b4", "b5", **point, **axis),
+        planar.Prismatic("slide", "b6", "ground", **point, **axis),
+        planar.Distance("rod", "b8", "b9", point_a=(0.1, 0.2), point_b=(-0.3, 0.4)),
+    ]
+    system = mb.Scene(own, joints=joints, frames=[frame]).compile()
+    assert all(map(is_elementary, system.constraints))
     for state, acceleration in states_of(system):
         assert_agree(system, state, acceleration)
         check_elements(system, state)
@@ -141,6 +161,7 @@ def many():
     return mb.Scene(chain, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))])
 
 
+@pytest.mark.long
 def test_elementary_joints_stand_among_others():
     system = many().compile()
     assert not all(map(is_elementary, system.constraints))
@@ -217,19 +238,26 @@ def test_a_newer_residual_counts_alone():
     assert not any(map(is_elementary, system.constraints)) and system.prepared().elements is None
 
 
-def test_motions_and_gradients_are_those_of_the_residuals(monkeypatch):
-    built = mb.mechanisms.spatial_slider_crank()
-    system, state = built.system, built.state
+@pytest.mark.long
+@pytest.mark.parametrize("name, t1", [("spatial_slider_crank", 0.2), ("double_wishbone", 0.2), ("slider_crank", 0.05)])
+def test_motions_and_gradients_are_those_of_the_residuals(name, t1, monkeypatch):
+    built = mb.mechanisms.get(name)
+    system, start = built.system, mb.parameters(built.system)
+    # Masses, lengths, points and axes of all joints.
+    names = [key for key in start if key.split(".")[-1] in ("mass", "length", "point_a", "point_b", "axis_b")]
+    along = {key: 1e-2 * jax.random.normal(jax.random.key(k), start[key].shape) for k, key in enumerate(names)}
 
-    def end(length):
-        own = mb.with_parameters(system, {"crank.mass": length})
-        motion = mb.simulate(own, state, t1=0.3, rtol=1e-12, max_steps=1024)
+    def end(step):
+        own = mb.with_parameters(system, {key: start[key] + step * along[key] for key in names})
+        state = mb.assemble(own, built.state)
+        motion = mb.simulate(own, state, t1=t1, rtol=1e-12, max_steps=1024)
         return jnp.concatenate([motion.ys.q[-1], motion.ys.u[-1]])
 
-    mass = mb.parameters(system)["crank.mass"]
-    found = end(mass), jax.jacfwd(end)(mass)
+    weights = jnp.linspace(-1.0, 1.0, system.nq + system.nu)
+    found = end(0.0), jax.jacfwd(end)(0.0), jax.grad(lambda step: weights @ end(step))(0.0)
     monkeypatch.setattr(type(system), "prepared", lambda self: self)
     jax.clear_caches()
-    expected = end(mass), jax.jacfwd(end)(mass)
+    expected = end(0.0), jax.jacfwd(end)(0.0), jax.grad(lambda step: weights @ end(step))(0.0)
     for own, other in zip(found, expected, strict=True):
-        assert largest(own - other) < 1e-11 * (1 + largest(other))
+        assert largest(own - other) < 1e-10 * (1 + largest(other))
+    assert largest(found[1]) > 1e-3 and abs(found[2] - weights @ found[1]) < 1e-9 * (1 + abs(found[2]))

@@ -30,7 +30,8 @@ class Frame(AbstractPlanarPart, AbstractFrame):
     angle: fields.Number = fields.parameter(unit="rad", default=0.0)
 
     def own_pose(self, space, pose):
-        return namespace(pose).concatenate([space.point(pose, self.position), (pose[2] + self.angle)[None]])
+        angle = (pose[2] + self.angle)[None]
+        return namespace(pose, angle).concatenate([space.point(pose, self.position), angle])
 
     def own_velocity(self, space, pose, velocity):
         return jnp.concatenate([space.point_velocity(pose, velocity, self.position), velocity[2:]])
