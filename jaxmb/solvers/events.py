@@ -118,8 +118,9 @@ class _Search(NamedTuple):
     """The search for the first zero in a step, whose times are fractions of it.
 
     **Fields:** the `phase`; `s`: where guards are evaluated next; the `bracket` of what changes its sign; which guards
-    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step, and guards at its
-    `middle`; whether one is negative within it, and how `coarse` it is; the number of evaluations in this `phase`.
+    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step, and guards and
+    their `slopes` at its `middle`; whether one is negative within it, and how `coarse` it is; the number of evaluations
+    in this `phase`.
     """
 
     phase: Any
@@ -130,6 +131,7 @@ class _Search(NamedTuple):
     end: Any
     rates: Any
     middle: Any
+    slopes: Any
     dips: Any
     coarse: Any
     count: Any
@@ -155,7 +157,7 @@ def crossing(
     sign = jnp.asarray(direction, t0.dtype)
     start = guards.rates(t0 * sign, y0) * sign.astype(ravel(y0).dtype)
     begins = guards.begins(t0 * sign, y0)
-    known = _Known(start, guards.forces(y0), begins, (t1 - t0).astype(start.dtype), guards.touch)
+    known = _Known(start, guards.forces(y0), begins, (t1 - t0).astype(start.dtype), guards.touch, guards.near)
 
     def advance(search):
         # One evaluation for all that is looked for, so that the guards are compiled once.
@@ -175,7 +177,7 @@ def crossing(
     none, one = jnp.zeros_like(start), jnp.ones((), t0.dtype)
     zero, no = jnp.zeros((), start.dtype), jnp.array(False)
     bracket = Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0))
-    first = _Search(jnp.array(_LOOK), one, bracket, none > 0, none > 0, none, none, none, no, zero, jnp.array(0))
+    first = _Search(jnp.array(_LOOK), one, bracket, none > 0, none > 0, none, none, none, none, no, zero, jnp.array(0))
     # Each lane evaluates its guards at a few points; few of them have a zero to find.
     looks, goes = lambda search: search.phase <= _LEAST, lambda search: search.phase != _DONE
     found = loop_of_lanes(looks, goes, advance, first)
@@ -190,7 +192,7 @@ def crossing(
 
 class _Known(NamedTuple):
     """What a search knows of a step: the rates of guards at its start, which of them are forces, and which begin there;
-    its length, and what counts as zero.
+    its length, what counts as zero, and what does at the end of a step that was made to end there.
     """
 
     start: Any
@@ -198,28 +200,20 @@ class _Known(NamedTuple):
     begins: Any
     length: Any
     touch: Any
+    near: Any
 
 
 def _looked(search: _Search, values, rates, known):
-    """At the end of a step: guards that are negative, and those whose rate has changed its sign."""
-    below = values < -known.touch
-    inside = (known.start < 0) & (rates > 0) & jnp.isfinite(known.start) & ~below
-    crosses = jnp.any(below)
+    """At the end of a step."""
+    del known
     return search._replace(
-        phase=jnp.where(crosses, _RISE, _HALF),
-        s=search.s / 2,
-        bracket=search.bracket._replace(of_b=jnp.min(jnp.where(below, values, jnp.inf))),
-        looked_at=below,
-        waiting=inside & ~crosses,
-        end=values,
-        rates=rates,
-        count=jnp.zeros_like(search.count),
+        phase=jnp.array(_HALF), s=search.s / 2, end=values, rates=rates, count=jnp.zeros_like(search.count)
     )
 
 
 def _halved(search: _Search, values, rates, known):
-    """At the middle: guards that are negative there, and those whose rate is another than that of a cubic polynomial
-    with what is known of them at both ends and their value here.
+    """At the middle: guards that are negative there, those that are least in one of the halves, and those whose rate is
+    another than that of a cubic polynomial with what is known of them at both ends and their value here.
     """
     dips, risen = _negative_within(search, values, known)
     watched = jnp.isfinite(known.start) & jnp.isfinite(search.rates)
@@ -227,9 +221,13 @@ def _halved(search: _Search, values, rates, known):
     cubic = 4 * (0.125 * at_start + 0.375 * at_end - (search.end - values))
     expected = at_start + 0.5 * (at_end - at_start - 3 * cubic) + 0.75 * cubic
     off = jnp.abs(expected - known.length * rates)
-    size = jnp.maximum(jnp.minimum(jnp.abs(values), jnp.abs(search.end)), known.touch)
+    # That of a guard that the step was made to end at is no size.
+    last = jnp.where(jnp.abs(search.end) <= known.near, jnp.inf, jnp.abs(search.end))
+    size = jnp.maximum(jnp.minimum(jnp.abs(values), last), known.touch)
     coarse = jnp.max(jnp.where(watched, off / (_COARSE * size), 0.0), initial=0.0)
-    search = search._replace(coarse=coarse, middle=values)
+    turns = jnp.where(rates > 0, known.start < 0, search.rates > 0)
+    waiting = turns & watched & jnp.isfinite(rates) & (search.end >= -known.touch)
+    search = search._replace(coarse=coarse, middle=values, slopes=rates, waiting=waiting)
     starts = search._replace(phase=jnp.array(_START), s=jnp.zeros_like(search.s))
     other = _chosen(jnp.any(known.forces), starts, _next_dip(search, known))
     return _chosen(dips, risen, other)._replace(count=jnp.zeros_like(search.count))
@@ -278,19 +276,30 @@ def _chosen(condition, one: _Search, other: _Search) -> _Search:
 
 def _next_dip(search: _Search, known):
     """Before the search for the zero of the rate of the next guard that waits for it, of several the one that is least
-    at the end of the step; the search is done where none does.
+    at the end of the step. Where none does, guards that are negative at the end are next; the search is done without.
     """
     least = jnp.argmin(jnp.where(search.waiting, search.end, jnp.inf))
-    own, one = jnp.arange(known.start.size) == least, jnp.ones_like(search.s)
-    bracket = Bracket(jnp.zeros_like(one), one, known.start[least], search.rates[least], jnp.array(0))
-    return search._replace(
-        phase=jnp.where(jnp.any(search.waiting), _DIP, _DONE),
-        s=0.5 * one,
-        bracket=bracket,
+    own, half = jnp.arange(known.start.size) == least, 0.5 * jnp.ones_like(search.s)
+    # In the first half where the guard rises at the middle.
+    middle, first = search.slopes[least], search.slopes[least] > 0
+    of_a, of_b = jnp.where(first, known.start[least], middle), jnp.where(first, middle, search.rates[least])
+    turn = Bracket(jnp.where(first, 0.0, half), jnp.where(first, half, 2 * half), of_a, of_b, jnp.array(0))
+    dip = search._replace(
+        phase=jnp.array(_DIP),
+        s=0.5 * (turn.a + turn.b),
+        bracket=turn,
         looked_at=own,
         waiting=search.waiting & ~own,
         count=jnp.array(0),
     )
+    below = search.end < -known.touch
+    of_end = Bracket(
+        0 * half, 2 * half, jnp.zeros_like(of_a), jnp.min(jnp.where(below, search.end, jnp.inf)), dip.count
+    )
+    back = search._replace(
+        phase=jnp.where(jnp.any(below), _RISE, _DONE), s=half, bracket=of_end, looked_at=below, count=jnp.array(0)
+    )
+    return _chosen(jnp.any(search.waiting), dip, back)
 
 
 def _dipped(search: _Search, values, rates, known):
@@ -432,8 +441,8 @@ class EventController(AbstractControllerAround):
         at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
         at_zero = at_zero | (close & (found.lowest < -found.touch))
         crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)
-        coarse = (found.coarse > 1) & (before.halved < _HALVED) & ~(crossed | at_zero)
-        again, ends = keep & (crossed | coarse), keep & at_zero & ~crossed
+        coarse = (found.coarse > 1) & (before.halved < _HALVED) & ~crossed
+        again, ends = keep & (crossed | coarse), keep & at_zero & ~(crossed | coarse)
         # The controller inside does not learn of a step that was good but too long, nor of one without a length, where
         # one event follows another at once.
         empty = t1 <= t0

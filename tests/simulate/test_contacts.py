@@ -413,6 +413,42 @@ def test_a_ball_among_pegs(solver):
         np.testing.assert_allclose(motion["ball"].position[-1], last, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    "solver", [None, pytest.param(diffrax.Dopri8(), marks=pytest.mark.long)], ids=["Adams", "Dopri8"]
+)
+def test_the_first_peg_that_random_flights_meet(solver):
+    """Steps are long, and gaps close and open again within them, also after they rose at the start."""
+    pegs = np.array([(0.3 * (k - row / 2), -0.3 * row) for row in range(4) for k in range(row + 1)])
+    contacts = [
+        mb.RigidBallContact(f"peg{k}", "ground", "ball", radius_a=0.05, radius_b=0.05, point_a=at, restitution=0.6)
+        for k, at in enumerate(pegs)
+    ]
+    ball = planar.PointMass("ball", mass=1.0, position=(0.0, 0.6))
+    system = mb.Scene([ball], joints=contacts, forces=[mb.Gravity((0.0, -G))]).compile()
+    start = mb.assemble(system)
+
+    @jax.jit
+    def first(x, v, rtol):
+        state = dataclasses.replace(start, q=start.q.at[0].set(x), u=start.u.at[0].set(v))
+        motion = mb.simulate(system, state, t1=0.9, rtol=rtol, solver=solver, max_events=16, throw=False)
+        return motion.events.times[0]
+
+    def meets(x, v):
+        """When it first comes to the distance of a peg, by the roots of a polynomial."""
+        found = []
+        for a, b in pegs:
+            across, down = np.poly1d([v, x - a]), np.poly1d([-G / 2, 0.0, 0.6 - b])
+            found += [t.real for t in (across**2 + down**2 - 0.01).roots if abs(t.imag) < 1e-6 and 0 < t.real < 0.9]
+        return min(found, default=np.inf)
+
+    rng = np.random.default_rng(0)
+    for x, v in zip(rng.uniform(-0.3, 0.3, 60), rng.uniform(-0.5, 0.5, 60), strict=True):
+        for rtol in (1e-3, 1e-6, 1e-10):
+            np.testing.assert_allclose(
+                first(x, v, rtol), meets(x, v), rtol=1e-6 + 10 * rtol, err_msg=f"{x}, {v}, {rtol}"
+            )
+
+
 def test_a_stop_that_vibrates():
     """Nothing of the motion towards it asks for short steps."""
     body = planar.Body("body", mass=2.0, inertia=0.1, velocity=(1.0, 0.0))
