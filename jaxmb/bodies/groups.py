@@ -547,63 +547,6 @@ class NonIdealGroup(AbstractGroup):
         return self.group.map(single, self.group.gather(poses), self.group.gather(velocities), reactions)
 
 
-def reaction_wrenches(
-    joints: Sequence[AbstractConstraintGroup],
-    t: Scalar,
-    poses: BodyPoses,
-    velocities: BodyVelocities,
-    multipliers: Float[Array, "rows"],
-) -> list[Float[Array, "parts k v"]]:
-    """Wrenches of the constraints on their bodies, group by group."""
-    out, row = [], 0
-    for g in joints:
-        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
-        out.append(g.wrenches(t, poses, velocities, own))
-        row += own.size
-    return out
-
-
-def nonideal_wrenches(
-    joints: Sequence[AbstractConstraintGroup],
-    laws: Sequence[NonIdealGroup],
-    t: Scalar,
-    poses: BodyPoses,
-    velocities: BodyVelocities,
-    multipliers: Float[Array, "rows"],
-) -> list[Float[Array, "parts k v"]]:
-    """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
-    reactions = joint_reactions(joints, laws, t, poses, velocities, multipliers)
-    return [g.wrenches(t, poses, velocities, own) for g, own in zip(laws, reactions, strict=True)]
-
-
-def joint_reactions(
-    joints: Sequence[AbstractConstraintGroup],
-    laws: Sequence[NonIdealGroup],
-    t: Scalar,
-    poses: BodyPoses,
-    velocities: BodyVelocities,
-    multipliers: Float[Array, "rows"],
-) -> list[Float[Array, "parts k v"]]:
-    """The wrenches of the joints of laws on the bodies of these, group by group."""
-    named, row, wrenches, bodies = {name for g in laws for name in g.joints}, 0, [], []
-    for g in joints:
-        names, own = g.group.names, multipliers[row : row + len(g.group.names) * g.rows]
-        row += own.size
-        if named.isdisjoint(names):
-            continue
-        # From the matrix A, which the equation needs as well.
-        rows = own.reshape(-1, g.rows, 1, 1) * g.jacobian(t, poses, velocities)
-        wrenches.append(jnp.sum(rows, axis=1).reshape(-1))
-        bodies.append((names, g.group.bodies))
-    reactions = jnp.concatenate([*wrenches, jnp.zeros(1, poses.dtype)])
-    # A joint may be made of several constraints, all between the same bodies.
-    take = lambda g: unchecked_take(reactions, g.group.layout.reaction_source(bodies, g.joints))
-    of_joints = [jnp.sum(take(g), axis=1) for g in laws]
-    # Scalar coordinates that a law has beyond those of its joint take no reaction.
-    more = [len(g.group.bodies[0]) - own.shape[1] for g, own in zip(laws, of_joints, strict=True)]
-    return [jnp.pad(own, ((0, 0), (0, k), (0, 0))) for own, k in zip(of_joints, more, strict=True)]
-
-
 def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:
     """Derivatives of a function of the poses of some bodies along their unit velocities, (…, k, v)."""
     moves = jax.vmap(space.moves)(x)

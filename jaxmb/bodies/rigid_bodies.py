@@ -43,8 +43,6 @@ from .groups import (
     FrameGroup,
     NonIdealGroup,
     VelocityConstraintGroup,
-    joint_reactions,
-    nonideal_wrenches,
 )
 from .host import host_scene
 from .internal_states import (
@@ -376,7 +374,7 @@ class RigidBodySystem(AbstractSystem):
     def friction_reactions(self, t, q, u, multipliers):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         groups = self.frictions
-        reactions = joint_reactions(self.joints, [g.law for g in groups], t, poses, velocities, multipliers)
+        reactions = self._set(self.joints).reactions([g.law for g in groups], t, poses, velocities, multipliers)
         d, both = self.layout.space.dimension, zip(groups, reactions, strict=True)
         return jnp.concatenate([_of_rows(own[:, g.group.part.last, :d], g.rows) for g, own in both])
 
@@ -690,7 +688,7 @@ class RigidBodySystem(AbstractSystem):
     def nonideal_force(self, t, q, u, multipliers):
         poses, velocities = self.prepared_poses(q), self.all_velocities(u)
         laws = self.laws
-        wrenches = nonideal_wrenches(self.joints, laws, t, poses, velocities, multipliers)
+        wrenches = self._set(self.joints).nonideal_wrenches(laws, t, poses, velocities, multipliers)
         return self._add_up(wrenches, [g.group.body_index for g in laws], u.dtype)
 
     @eqx.filter_jit
@@ -874,7 +872,7 @@ def _reactions(system, place, ts, ys, multipliers):
         slips = [system.frictions[at.group].law for at in of_friction]
         if not slips:
             return out
-        wrenches = nonideal_wrenches(system.joints, slips, t, poses, velocities, own)
+        wrenches = ConstraintSet(system.joints, None).nonideal_wrenches(slips, t, poses, velocities, own)
         return with_slip(out, slips, of_friction, poses, wrenches)
 
     return jax.vmap(single)(ts, ys, multipliers)
@@ -894,7 +892,7 @@ def _applied_wrenches(system, place, ts, ys, multipliers):
         poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
         if of_laws:
             laws = [system.nonideal[at.group] for at in of_laws]
-            wrenches = nonideal_wrenches(system.joints, laws, t, poses, velocities, own)
+            wrenches = ConstraintSet(system.joints, None).nonideal_wrenches(laws, t, poses, velocities, own)
             found = [values[at.member] for values, at in zip(wrenches, of_laws, strict=True)]
         else:
             alone = [system.at(y).forces[at.group].only(at.member) for at in of_forces]
