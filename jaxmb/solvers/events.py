@@ -221,10 +221,10 @@ def _halved(search: _Search, values, rates, known):
     cubic = 4 * (0.125 * at_start + 0.375 * at_end - (search.end - values))
     expected = at_start + 0.5 * (at_end - at_start - 3 * cubic) + 0.75 * cubic
     off = jnp.abs(expected - known.length * rates)
-    # That of a guard that the step was made to end at is no size.
-    last = jnp.where(jnp.abs(search.end) <= known.near, jnp.inf, jnp.abs(search.end))
-    size = jnp.maximum(jnp.minimum(jnp.abs(values), last), known.touch)
-    coarse = jnp.max(jnp.where(watched, off / (_COARSE * size), 0.0), initial=0.0)
+    size = jnp.maximum(jnp.minimum(jnp.abs(values), jnp.abs(search.end)), known.touch)
+    # A guard that the step was made to end at has no size there.
+    counts = watched & (jnp.abs(search.end) > known.near)
+    coarse = jnp.max(jnp.where(counts, off / (_COARSE * size), 0.0), initial=0.0)
     turns = jnp.where(rates > 0, known.start < 0, search.rates > 0)
     waiting = turns & watched & jnp.isfinite(rates) & (search.end >= -known.touch)
     search = search._replace(coarse=coarse, middle=values, slopes=rates, waiting=waiting)
@@ -245,7 +245,9 @@ def _started(search: _Search, values, rates, known):
     varies = jnp.maximum(jnp.abs(first - middle), jnp.abs(last - middle))
     size = jnp.maximum(jnp.max(jnp.abs(jnp.stack([first, middle, last])), axis=0), _FAINT)
     off = jnp.maximum(0.25 * jnp.abs(bent) / _BENT, _VARIES * varies) / size
-    search = search._replace(coarse=jnp.maximum(search.coarse, jnp.max(jnp.where(known.forces, off, 0.0), initial=0.0)))
+    # A step that was made to end at a zero may be as long as that one is away, whatever forces do.
+    counts = known.forces & jnp.all(jnp.abs(last) > known.near)
+    search = search._replace(coarse=jnp.maximum(search.coarse, jnp.max(jnp.where(counts, off, 0.0), initial=0.0)))
     looks = search._replace(
         phase=jnp.array(_LEAST), s=least_at[own].astype(search.s.dtype), looked_at=jnp.arange(least.size) == own
     )
