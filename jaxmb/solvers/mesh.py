@@ -38,7 +38,7 @@ class Saved(eqx.Module):
 
     **Fields:** whether it begins with the `start`; its `times`, or None; after how many `steps` each a state is saved,
     or 0; whether it is saved before each of the `events`; its `length`; how many states, and how many of the times,
-    were `passed`.
+    were `passed`; of events the second is one where the next step has found that the last event is none.
     """
 
     start: bool = eqx.field(static=True)
@@ -51,7 +51,7 @@ class Saved(eqx.Module):
     def takes(self, k: Any, row: Row) -> Any:
         """Whether the state at the end of the step k is saved; False of a series without such states."""
         if self.events:
-            return row.at_event
+            return row.at_event.here
         return (k + 1) % self.steps == 0 if self.steps else False
 
 
@@ -279,6 +279,9 @@ def _saved(series: Saved, table, place, k, row, w, dense, at):
         carry = table, place
         table, place = while_loop(more, save, carry, max_steps=None, buffers=lambda carry: carry[0], kind="lax")
     here = series.takes(k, row)
+    if series.events:
+        # The next event takes the place of one that is none.
+        place = place.at[0].add(-row.at_event.void.astype(place.dtype))
     if here is not False:
         table = buffer_set(table, place[0], w, here)
         place = place.at[0].add(here.astype(place.dtype))
@@ -291,9 +294,12 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
     """
     here = series.takes(k, row)
     if here is not False:
-        place = place.at[0].add(-here.astype(place.dtype))
+        place, counts = place.at[0].add(-here.astype(place.dtype)), here
+        if series.events:
+            void = row.at_event.void.astype(place.dtype)
+            counts, place = here & (place[1] == 0), jnp.stack([place[0] + void, void])
         if table is not None:
-            lw = lw + jnp.where(here, table[place[0]], 0.0)
+            lw = lw + jnp.where(counts, table[place[0]], 0.0)
     if series.times is not None:
         times = series.times
 

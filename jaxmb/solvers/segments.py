@@ -17,6 +17,13 @@ from .packing import Layout
 from .steps import AbstractSteps
 
 
+class AtEvent(NamedTuple):
+    """Whether a step ends at an event (`here`), and whether the one at which it starts is `void`: nothing changed."""
+
+    here: Any
+    void: Any
+
+
 class Row(NamedTuple):
     """What is stored of a step.
 
@@ -58,14 +65,14 @@ class Between(NamedTuple):
 
 def row_of(steps: AbstractSteps, terms: PyTree, since: Any, old: Any, new: Any) -> Row:
     """The row of the step between two states of diffrax's loop; `since`: the end of the last step before it."""
-    return Row(since, old.tnext, _ends_at_event(old, new), steps.row(terms, old, new))
+    return Row(since, old.tnext, _at_event(old, new), steps.row(terms, old, new))
 
 
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
     """What was chosen for the same step."""
     jump = (old.tprev, jnp.asarray(old.made_jump)) if steps.jumps else (None, None)
     chosen = steps.chosen(steps.alone(new.solver_state))
-    return Choice(old.tnext, *jump, _ends_at_event(old, new), chosen)
+    return Choice(old.tnext, *jump, _at_event(old, new), chosen)
 
 
 def start_of(steps: AbstractSteps, since: Any, state: Any) -> tuple[Any, Any, PyTree[Array], PyTree[Array]]:
@@ -73,9 +80,11 @@ def start_of(steps: AbstractSteps, since: Any, state: Any) -> tuple[Any, Any, Py
     return since, state.tprev, state.y, steps.alone(state.solver_state)
 
 
-def _ends_at_event(old, new):
+def _at_event(old, new):
     before, after = events_found(old.controller_state), events_found(new.controller_state)
-    return None if before is None or after is None else after.count > before.count
+    if before is None or after is None:
+        return None
+    return AtEvent(after.ended, before.count + after.ended.astype(before.count.dtype) > after.count)
 
 
 class Segments(eqx.Module):
