@@ -115,13 +115,13 @@ class HostScene:
         """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of those that are held."""
         scale = self.coordinate_scale if held is None else np.where(held, 0.0, self.coordinate_scale)
         before, small = self.coordinate_residual(q), np.finfo(float).eps ** _SMALL
-        for _ in range(_STEPS):
+        for _ in range(_STEPS if np.all(np.isfinite(before)) else 0):
             step = -scale * np.linalg.lstsq(self.coordinate_jacobian(q) * scale, before, rcond=1e-12)[0]
             longest = np.max(np.abs(step[scale > 0] / scale[scale > 0]), initial=0.0)
             step = step * min(1.0, 1.0 / longest if longest > 0 else 1.0)
             reached = [q + length * step for length in 0.5 ** np.arange(8)]
             sizes = [np.sum(self.coordinate_residual(there) ** 2) for there in reached]
-            best = int(np.nanargmin(sizes))
+            best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
             if not sizes[best] < before @ before:
                 break
             gained = sizes[best] < _PROGRESS * (before @ before)
@@ -141,7 +141,7 @@ class HostScene:
         if exact and not held.any() and self.holds(guess):
             return guess
         q = self.met(guess, held)
-        if not self.holds(q) or np.linalg.matrix_rank(self.coordinate_jacobian(q) * scale, rtol=_ZERO) != rank:
+        if not self.holds(q) or _rank(self.coordinate_jacobian(q) * scale) != rank:
             return None
         free, small = ~held, np.finfo(float).eps ** _SMALL
         weights = 1 / self.coordinate_scale[free] ** 2
@@ -175,13 +175,18 @@ class HostScene:
         """The velocities closest to the guess with some rates held; None where they are not found."""
         scale = np.where(held, 0.0, self.velocity_scale)
         jacobian = self.jacobian(q)
-        if not held.any() and np.linalg.matrix_rank(jacobian * scale, rtol=_ZERO) != rank:
+        if not held.any() and _rank(jacobian * scale) != rank:
             return None
         u = guess
         for _ in range(2):
             u = u - scale * np.linalg.lstsq(jacobian * scale, jacobian @ u, rcond=1e-10)[0]
         size = 1.0 + np.max(np.abs(jacobian) @ np.abs(u), initial=0.0)
         return u if np.max(np.abs(jacobian @ u), initial=0.0) <= 1e2 * tolerance(u.dtype) * size else None
+
+
+def _rank(matrix):
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    return int(np.sum(sizes > _ZERO * np.max(sizes, initial=0.0)))
 
 
 def host_scene(system: Any) -> HostScene | None:
