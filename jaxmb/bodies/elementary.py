@@ -361,7 +361,7 @@ def check_elements(system: Any, state: State, t: float = 0.0) -> None:
 
     Give a state at which no row happens to vanish in its derivatives, and velocities that are not zero.
 
-    **Arguments:** `system`: a scene in space, compiled; a consistent `state`; the time `t` [s].
+    **Arguments:** `system`: a compiled scene; a consistent `state`; the time `t` [s].
     """
     for what, (own, exact) in _compared(system, jnp.asarray(t, state.q.dtype), state).items():
         own, exact = (np.asarray(x).reshape(x.shape[0], -1)[: system.position_rows] for x in (own, exact))

@@ -100,7 +100,7 @@ class RigidBodySystem(AbstractSystem):
     **Fields:** the groups of `bodies` and of other parts, `free_joints` those of joints without rows; `gravity`
     [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`; `ranks`;
     `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`; of a system that is
-    `prepared` for a motion, the rows of joints in space by `elements`.
+    `prepared` for a motion, the rows of joints by their `elements`.
     """
 
     bodies: tuple[BodyGroup, ...]

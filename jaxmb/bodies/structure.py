@@ -114,14 +114,14 @@ def _analysed(system):
     if on_host is not None and on_host.holds(met):
         q, at = met, _of_host(system, on_host, met)
     else:
-        q, *at = map(_on_host, _met(system))
+        q, *at = map(_numbers, _met(system))
         at = _Evaluation(*at)
     norms: Any = _row_norms(system, at.blocks)
     residual = largest_residual(at.unmet, norms[: system.position_rows])
     return jax.device_put(q), residual, at
 
 
-def _on_host(tree):
+def _numbers(tree):
     return jax.tree.map(np.asarray, tree)
 
 
@@ -159,7 +159,7 @@ def _displaced(system, t, q, moved):
     """The same after displacements along velocities, in multiples of their scales."""
     on_host = system.on_host()
     if on_host is None:
-        return _Evaluation(*_on_host(_displaced_by_jax(system, t, q, moved)))
+        return _Evaluation(*_numbers(_displaced_by_jax(system, t, q, moved)))
     return _of_host(system, on_host, on_host.displaced(np.asarray(q), on_host.velocity_scale * moved))
 
 

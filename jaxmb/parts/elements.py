@@ -89,7 +89,10 @@ def coincident(part: Any) -> Coincident:
 
 
 def perpendicular(x_a: Any, y_b: Any, along: tuple[Any, Any] = (None, None)) -> Product:
-    """A direction fixed in A and one fixed in B are perpendicular, and those of `along` have a positive product."""
+    """A direction fixed in A and one fixed in B are perpendicular, and those of `along` have a positive product.
+
+    **Arguments:** `along`: give it where the residual of the joint does not vanish half a turn away, as this row does.
+    """
     return Product(x_a, y_b, along_a=along[0], along_b=along[1])
 
 
