@@ -28,8 +28,8 @@ class Row(NamedTuple):
     """What is stored of a step.
 
     **Fields:** the end of the last step, which is the start of this one unless there was a jump, and minus infinity
-    before the first; the `end` of this one; what is known of events (`AtEvent`, of `AbstractGuards`), None in a run that looks
-    for none; what its linearisation needs, its `own`.
+    before the first; the `end` of this one; what is known of events there, None in a run that
+    looks for none (`AbstractGuards`); what its linearisation needs, its `own`.
     """
 
     since: Any

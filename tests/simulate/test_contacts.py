@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 import jaxmb as mb
 from jaxmb import manifold, planar, spatial, terrain
 from jaxmb.manifold import Projection
+from jaxmb.solvers import adams_steps
 
 G = 9.81
 
@@ -447,6 +448,27 @@ def test_the_first_peg_that_random_flights_meet(solver):
             np.testing.assert_allclose(
                 first(x, v, rtol), meets(x, v), rtol=1e-6 + 10 * rtol, err_msg=f"{x}, {v}, {rtol}"
             )
+
+
+@pytest.mark.long
+def test_tangents_after_impacts_by_a_matrix_and_one_at_a_time(monkeypatch):
+    state = mb.assemble(BALL)
+
+    def end(gravity):
+        own = mb.with_parameters(BALL, {"gravity.acceleration": gravity})
+        motion = mb.simulate(own, state, t1=0.8, rtol=1e-9, max_steps=300, max_events=8)
+        return jnp.append(motion.ys.q[-1], motion.events.times[0])
+
+    at = mb.parameters(BALL)["gravity.acceleration"]
+    found = {}
+    for most in (256, 0):
+        monkeypatch.setattr(adams_steps, "_MOST_COLUMNS", most)
+        jax.clear_caches()
+        found[most] = jit_quickly(jax.jacfwd(end))(at), jit_quickly(jax.jacrev(end))(at)
+    (forward, reverse), others = found[256], found[0]
+    assert np.max(np.abs(forward)) > 0.01
+    for other in (reverse, *others):
+        np.testing.assert_allclose(other, forward, rtol=1e-10, atol=1e-13)
 
 
 def test_a_stop_that_vibrates():
