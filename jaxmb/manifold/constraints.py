@@ -10,10 +10,12 @@ theorem, not from the algorithm: they are independent of the formulation, and ca
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -51,6 +53,18 @@ class AbstractConstraints(eqx.Module):
     @abc.abstractmethod
     def cancel_velocities(self, residual: Float[Array, "m"]) -> Float[Array, "nu"]:
         """The change of velocities that changes the rows of ψ by `−residual`, to all digits."""
+
+    @abc.abstractmethod
+    def balance(
+        self,
+        system: AbstractEquation,
+        at: tuple[Scalar, Coordinates, Velocities],
+        rows: Float[Array, "m"],
+        forces: Float[Array, "nu"],
+    ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
+        """The changes of accelerations and of multipliers that change `A u̇ − γ` by `−rows` and `M u̇ − F − Aᵀ λ` by
+        `−forces`, at (t, q, u).
+        """
 
     @abc.abstractmethod
     def cancel_residuals(
@@ -127,11 +141,9 @@ def _restore_jvp(primals, tangents):
 
 def _push_solution(here, system, t, out, along):
     """The tangent of a restored state, from one of (system, t, q, u) before it was restored."""
-    dsystem, dt, dq, du = along
-    dq = here.push_positions((system, t, out.q), (dsystem, dt, dq))
-    along = push_velocities(here, (system, t, out.q, out.u), (dsystem, dt, dq, du))
+    along = _on_constraints(here, (system, t, out.q, out.u), along)
     dudot, dmultipliers = push_accelerations(here, (system, t, out.q, out.u), along, out)
-    return RestoredState(dq, along[3], dudot, dmultipliers)
+    return RestoredState(*along[2:], dudot, dmultipliers)
 
 
 @eqx.filter_custom_jvp
@@ -154,6 +166,84 @@ def _solved_jvp(primals, tangents):
     return out, _push_solution(at(system, t, out.q, out.u), system, t, out, along)
 
 
+def rates_along(
+    at: Callable[..., AbstractConstraints], system: AbstractEquation, t: Scalar, y: State, f: State, held: bool
+) -> tuple[State, State, State]:
+    """A state with its rate, both known, and the rate of that, as `AbstractManifoldTerm.along_solution` has them.
+
+    **Arguments:** `at(system, t, q, u)`: the constraints at a state, a pytree.
+    """
+    out, rates, jerk = _accelerated(at, system, t, RestoredState(y.q, y.u, f.u), held)
+    return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot), State(rates, jerk)
+
+
+@eqx.filter_custom_jvp
+def _accelerated(at, system, t, solution, held):
+    """A known state as `solved` has it, with the second derivatives of coordinates and the rates of accelerations.
+
+    Derivatives are those of the equations of motion, and of these differentiated in time, so that no factor is
+    differentiated. Friction must not depend on multipliers.
+    """
+    del held
+    here = at(system, t, solution.q, solution.u)
+    return solution, *_rates(here, system, t, solution)[:2]
+
+
+@_accelerated.def_jvp
+def _accelerated_jvp(primals, tangents):
+    at, system, t, solution, held = primals
+    _, dsystem, dt, dsolution, _ = tangents
+    out, here = solved(at, system, t, solution), at(system, t, solution.q, solution.u)
+    state, one = (t, out.q, out.u), jnp.ones_like(t)
+    qddot, jerk, multipliers, change = _rates(here, system, t, out)
+
+    moved = _on_constraints(here, (system, *state), (dsystem, dt, dense(dsolution.q, out.q), dense(dsolution.u, out.u)))
+    x = system, *state, out.udot, multipliers
+    residuals = push(_equations, x, (*moved, None, None))
+    dudot, dmultipliers = here.balance(system, state, *residuals)
+    dqdot = push(lambda system, *state: system.rates(*state), x[:4], moved)
+    along = system.rates(*state), out.udot
+    dalong = dqdot, dudot
+    if held:
+        # A rate that is held still satisfies the constraints where the state has moved to.
+        still = jax.tree.map(lambda _: None, system)
+        dalong = jax.tree.map(jnp.subtract, dalong, _on_constraints(here, x[:4], (still, None, *dalong))[2:])
+
+    def rate(x, along):
+        own = one, *along
+        by_state = push(lambda *state: x[0].rates(*state), x[1:4], own)
+        return by_state, push(functools.partial(_equations, x[0]), x[1:], (*own, jerk, change))
+
+    dqddot, residuals = eqx.filter_jvp(rate, (x, along), ((*moved, dudot, dmultipliers), dalong))[1]
+    djerk, _ = here.balance(system, state, *residuals)
+    return (out, qddot, jerk), (RestoredState(*moved[2:], dudot), dqddot, djerk)
+
+
+def _rates(here, system, t, solution):
+    """The second derivatives of coordinates, the rates of accelerations, the multipliers, and their rates."""
+    q, u, udot = solution.q, solution.u, solution.udot
+    multipliers = here.multipliers(system, t, solution)
+    along = jnp.ones_like(t), system.rates(t, q, u), udot
+    equations = lambda t, q, u: (system.rates(t, q, u), _equations(system, t, q, u, udot, multipliers))
+    qddot, residuals = jax.jvp(equations, (t, q, u), along)[1]
+    jerk, change = here.balance(system, (t, q, u), *residuals)
+    return qddot, jerk, multipliers, change
+
+
+def _on_constraints(here, at, along):
+    """The tangent of (system, t, q, u) with coordinates and velocities on the constraints."""
+    dq = here.push_positions(at[:3], along[:3])
+    return push_velocities(here, at, (*along[:2], dq, along[3]))
+
+
+def _equations(system, t, q, u, udot, multipliers):
+    """The residuals `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`."""
+    applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
+    if not system.ideal:
+        applied = applied + system.nonideal_force(t, q, u, multipliers)
+    return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
+
+
 def push_velocities(here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...]) -> tuple[Any, ...]:
     """The tangent of (system, t, q, u) with that of velocities on the constraints."""
     dsystem, dt, dq, du = along
@@ -165,17 +255,10 @@ def push_accelerations(
     here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...], out: RestoredState
 ) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
     """The tangents of the accelerations at (system, t, q, u), and of the multipliers that friction depends on."""
-    system, t, q, u = at
-    udot, multipliers = out.udot, here.multipliers(system, t, out)
-
-    def equations(system, t, q, u):
-        applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
-        if not system.ideal:
-            applied = applied + system.nonideal_force(t, q, u, multipliers)
-        return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
-
-    rows, forces = push(equations, at, along)
-    return here.cancel_residuals(system, (t, q, u), multipliers, forces, rows)
+    multipliers = here.multipliers(at[0], at[1], out)
+    forces_of = lambda *at: _equations(*at, out.udot, multipliers)
+    rows, forces = push(forces_of, at, along)
+    return here.cancel_residuals(at[0], at[1:], multipliers, forces, rows)
 
 
 def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:

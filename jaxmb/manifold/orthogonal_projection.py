@@ -124,8 +124,11 @@ class ProjectorConstraints(AbstractConstraints):
     def cancel_velocities(self, residual):
         return self.projector.displacement(-residual)
 
+    def balance(self, system, at, rows, forces):
+        return self.projector.solve(-forces, -rows)
+
     def cancel_residuals(self, system, at, multipliers, forces, rows):
-        return self.projector.solve(-forces, -rows)[0], None
+        return self.balance(system, at, rows, forces)[0], None
 
 
 def _largest(values, scale):

@@ -45,6 +45,7 @@ from .constraints import (
     push,
     push_accelerations,
     push_velocities,
+    rates_along,
     restore,
     solved,
 )
@@ -355,6 +356,11 @@ class ChartConstraints(AbstractConstraints):
 
         return cancel
 
+    def balance(self, system, at, rows, forces):
+        inertia = system.inertia(*at)
+        change = self._cancelling(inertia)(forces, rows)
+        return change, self._of_accelerations.right_inverse.T @ (inertia.product(change) + forces)
+
     def cancel_residuals(self, system, at, multipliers, forces, rows):
         inertia, own = system.inertia(*at), system.friction_rows
         cancel = self._cancelling(inertia)
@@ -608,6 +614,12 @@ class PartitionTerm(AbstractManifoldTerm):
         none = jnp.zeros(2 + drops_rows(system), y.q.dtype)
         out = self._project(t, y, Chart(split, none, none, jnp.zeros(5, int)), split)
         return out.y, out.f
+
+    def along_solution(self, t, y, f, held, kept, args):
+        system, (split, _) = self.system, kept
+        if system.acceleration_rows == 0 or system.friction_rows.size:
+            return super().along_solution(t, y, f, held, kept, args)
+        return rates_along(eqx.Partial(_chart_constraints, split), system, t, y, f, held)
 
     @property
     def guards(self):

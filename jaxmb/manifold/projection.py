@@ -27,7 +27,7 @@ from ..solvers import (
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .compliant_gaps import compliant_gaps
-from .constraints import RestoredState, SolvedState, restore, solved
+from .constraints import RestoredState, SolvedState, rates_along, restore, solved
 from .contact_guards import ContactGuards, after_jump, contact_guards
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
@@ -237,6 +237,12 @@ class ProjectionTerm(AbstractManifoldTerm):
             return super().at_solution(t, y, f, kept, args)
         out = solved(projector_constraints, system, t, RestoredState(y.q, y.u, f.u))
         return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
+
+    def along_solution(self, t, y, f, held, kept, args):
+        system = self.system
+        if system.velocity_rows == 0 or not system.ideal_on_velocities:
+            return super().along_solution(t, y, f, held, kept, args)
+        return rates_along(projector_constraints, system, t, y, f, held)
 
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)

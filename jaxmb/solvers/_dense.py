@@ -5,7 +5,6 @@ On a manifold the unknowns are the free components only; the others, and with th
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -13,7 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._compat import sequential_vmap
 from ._damping import eigenvalues
-from ._field import Field, filled, linearized, probed_derivatives
+from ._field import Field, probed_derivatives
 from ._newton import AbstractLinearization, StepEquation
 
 # The matrix is renewed after a step whose corrections shrank more slowly than by this factor.
@@ -59,13 +58,12 @@ class DenseLinearization(AbstractLinearization):
     def renewed(self, equation: StepEquation, y: Float[Array, " n"], rate: Float[Array, " n"]) -> "DenseLinearization":
         return linearize(equation.field, equation.t, y, rate, equation.h, equation.free)
 
-    def inverses(self, equation: StepEquation) -> "Inverses":
-        free = equation.free
-        return inverses_of(self.rate[free], self.acceleration[free], equation.a, equation.b)
+    def inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> "Inverses":
+        return inverses_of(self.rate[free], self.acceleration[free], a, b)
 
-    def no_inverses(self, equation: StepEquation) -> "Inverses":
-        size = equation.free.size
-        zeros = jnp.zeros((size, size), self.state.dtype)
+    def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> "Inverses":
+        del a, b
+        zeros = jnp.zeros((free.size, free.size), self.state.dtype)
         return Inverses(zeros, zeros, zeros[0, 0], zeros)
 
     def observed(self, inverses: "Inverses", anew: Bool[Array, ""]) -> "DenseLinearization":
@@ -91,9 +89,31 @@ class DenseLinearization(AbstractLinearization):
             errors = errors + (changes - changes[:, free] @ self.state.T)
         return errors
 
-    def differentiable(self, inverses: "Inverses", equation: StepEquation, end: tuple[Array, Array, Array]):
+    def tangents(self, inverses: "Inverses", a: Any, b: Any, free: Int[Array, " free"], push):
         del inverses
-        return differentiable(end, equation)
+        units = jnp.zeros((free.size, self.state.shape[0]), self.state.dtype).at[jnp.arange(free.size), free].set(1)
+        columns = jax.vmap(push, out_axes=-1)(units)
+        jacobian, held = columns[1][free], columns[2][free]
+        own_inverses = inverses_of(jacobian, held, a, b)
+
+        def solve(own, load):
+            moved = own[1][free]
+
+            def correction(change):
+                # Large terms are combined as in `correction` above, so the result does not depend on the last digits of
+                # an inverse.
+                rate = moved + jacobian @ change
+                mismatch = change - (load + b * own[2])[free] - b * held @ change
+                mismatch = mismatch - own_inverses.missing * jacobian @ rate
+                return own_inverses.c @ (own_inverses.p @ mismatch - own_inverses.p_rate @ rate), rate
+
+            change = -correction(jnp.zeros_like(moved))[0]
+            left, rate = correction(change)
+            rate = rate - jacobian @ left
+            dy, df, dg = (x + column @ change for x, column in zip(own, columns, strict=True))
+            return dy, df.at[free].set(rate, unique_indices=True), dg + columns[1] @ rate
+
+        return solve
 
 
 def linearize(
@@ -177,37 +197,3 @@ def inverse(matrix: Array) -> Array:
 def _inverse_jvp(primals, tangents):
     out = inverse(*primals)
     return out, -out @ tangents[0] @ out
-
-
-@eqx.filter_custom_jvp
-def differentiable(end: tuple[Array, Array, Array], equation: StepEquation) -> tuple[Array, Array, Array]:
-    """`(y, f, g)` at the `end` of a step, a solution of its equation, with its derivatives."""
-    del equation
-    return end
-
-
-@differentiable.def_jvp
-def _differentiable_jvp(primals, tangents):
-    (_, equation), (_, along) = primals, tangents
-    a, b, free = equation.a, equation.b, equation.free
-    y, f, g = differentiable(*primals)
-    still = jnp.zeros(free.shape[0], y.dtype)
-    moved, push = linearized(equation, along, lambda change: y.at[free].add(change), still, f)
-    columns = jax.vmap(push, out_axes=-1)(jnp.eye(still.size, dtype=still.dtype))
-    jacobian, held = columns[1][free], columns[2][free]
-    inverses = inverses_of(jacobian, held, a, b)
-    past = filled(along.past, equation.past)
-    load = (past + filled(along.a, a) * f + filled(along.b, b) * g + b * moved[2])[free]
-
-    def correction(change):
-        # Large terms are combined as in `solve`, so the result does not depend on the last digits of an inverse.
-        rate = moved[1][free] + jacobian @ change
-        mismatch = change - load - b * held @ change - inverses.missing * jacobian @ rate
-        return inverses.c @ (inverses.p @ mismatch - inverses.p_rate @ rate), rate
-
-    change = -correction(still)[0]
-    left, rate = correction(change)
-    rate = rate - jacobian @ left
-    dy, df, dg = (own + column @ change for own, column in zip(moved, columns, strict=True))
-    df = df.at[free].set(rate, unique_indices=True)
-    return (y, f, g), (dy, df, dg + columns[1] @ rate)

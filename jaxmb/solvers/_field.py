@@ -14,6 +14,9 @@ from .._compat import any_of_batch
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
+# `(t, y, f, held) -> (y, f, g)`: a known state, its f, and g, with the derivatives that the equations give them, and if
+# `held`, of g those for the rate f; a pytree as well.
+Solution = Callable[..., tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 
 
 class Derivatives(NamedTuple):
@@ -75,35 +78,34 @@ def filled(tangent: Array | None, primal: Array) -> Array:
     return jnp.zeros_like(primal) if tangent is None else tangent
 
 
+@eqx.filter_custom_jvp
+def at_start(
+    end: tuple[Array, Array, Array], solution: Solution, t: Any, y: Float[Array, " n"]
+) -> tuple[Array, Array, Array]:
+    """`(y, f, g)` at a state y, which are known, with the derivatives that the equations give them."""
+    del solution, t, y
+    return end
+
+
+@at_start.def_jvp
+def _at_start_jvp(primals, tangents):
+    _, f, _ = out = at_start(*primals)
+    tangents = eqx.filter_jvp(lambda solution, t, y: solution(t, y, f, False), primals[1:], tangents[1:])[1]
+    return out, tuple(map(filled, tangents, out))
+
+
 def linearized(
-    equation: Any,
-    along: Any,
-    place: Callable[[Float[Array, " free"]], Float[Array, " n"]],
-    still: Float[Array, " free"],
-    f: Float[Array, " n"],
-) -> tuple[Any, Callable[[Float[Array, " free"]], Any]]:
-    """The derivatives of `(y, f, g)` of the field of a step's equation at `y = place(still)`. Of g they are those for a
-    held rate `f`: the rest of its change is J times the change of the rate.
-
-    **Arguments:** `equation`, with a `field` and a time `t`; `along`: a tangent of it.
-
-    **Returns:** the changes by the tangents of the field and of time, and the change as a linear function of that of
-    `still`.
+    solution: Callable[[PyTree], Solution], numbers: PyTree, t: Any, y: Float[Array, " n"], f: Float[Array, " n"]
+) -> tuple[Callable[..., tuple[Array, Array, Array]], Callable[[Float[Array, " n"]], tuple[Array, Array, Array]]]:
+    """The tangents of `(y, f, g)` at a known state, of g for a held rate: linear functions of those of the `numbers`
+    that the solution depends on and of time, None without any, and of that of y.
     """
-    t, none = equation.t, lambda x: x is None
-    values, rest = eqx.partition(equation.field, jax.tree.map(lambda d: d is not None, along.field, is_leaf=none))
-
-    def at(values, t, change):
-        (state, rate), push, _ = jax.linearize(eqx.combine(values, rest), t, place(change), has_aux=True)
-        return state, rate, push(jnp.ones_like(t), f)[1]
-
-    out, push = jax.linearize(at, values, t, still)
-    zeros = jax.tree.map(jnp.zeros_like, (values, t, still))
+    out, push = jax.linearize(lambda x, t, y: solution(x)(t, y, f, True), numbers, t, y)
+    zeros, still = jax.tree.map(jnp.zeros_like, (numbers, t, y)), jax.tree.map(lambda _: None, numbers)
 
     def pushed(*tangents):
         # As a derivative of the linear function, which leaves out what has no tangent.
         moved = eqx.filter_jvp(push, zeros, tangents)[1]
-        return jax.tree.map(filled, moved, out, is_leaf=none)
+        return jax.tree.map(filled, moved, out, is_leaf=lambda x: x is None)
 
-    still_values = jax.tree.map(lambda _: None, values)
-    return pushed(along.field, along.t, None), lambda change: pushed(still_values, None, change)
+    return lambda along, dt: pushed(along, dt, None), lambda change: pushed(still, None, change)

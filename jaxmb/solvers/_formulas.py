@@ -80,9 +80,8 @@ class Formulas(NamedTuple):
     curvature: Float[Array, " length"]
 
 
-def formulas(family: Family, history: History, t: Any) -> Formulas:
-    """The coefficients of a step to `t`."""
-    mesh, dtype = history.mesh, history.differences.dtype
+def formulas(family: Family, mesh: Float[Array, " length"], t: Any, dtype: Any) -> Formulas:
+    """The coefficients of a step from the latest point of a mesh to `t`, for values of a type."""
     length = mesh.shape[0]
     constant = lambda x: jnp.asarray(x, mesh.dtype)
     h = t - mesh[0]

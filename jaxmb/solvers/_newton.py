@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._compat import cond_of_any_lane
-from ._field import Derivatives, Field, derivatives
+from ._field import Derivatives, Field, Solution, derivatives, filled, linearized
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -57,7 +57,7 @@ class AbstractLinearization(eqx.Module):
     **Fields:** `spectrum`: eigenvalues of the derivative J of the field; `renewals`: the number of next steps that must
     compute their own linearisation.
 
-    `inverses` is what `inverses(equation)` returns, the solved form of Newton's equation.
+    `inverses` is what the method of that name returns, the solved form of Newton's equation.
     """
 
     spectrum: AbstractVar[Complex[Array, " k"]]
@@ -82,11 +82,11 @@ class AbstractLinearization(eqx.Module):
         """The linearisation at another state, for a rate."""
 
     @abc.abstractmethod
-    def inverses(self, equation: StepEquation) -> Any:
-        """The solved form of Newton's equation."""
+    def inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> Any:
+        """The solved form of Newton's equation, of a step with these `a`, `b` and unknowns."""
 
     @abc.abstractmethod
-    def no_inverses(self, equation: StepEquation) -> Any:
+    def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> Any:
         """Zeros in its place."""
 
     @abc.abstractmethod
@@ -119,10 +119,58 @@ class AbstractLinearization(eqx.Module):
         """The changes of the solution with those of the past, also of what does not follow from the unknowns."""
 
     @abc.abstractmethod
-    def differentiable(
-        self, inverses: Any, equation: StepEquation, end: tuple[Array, Array, Array]
-    ) -> tuple[Array, Array, Array]:
-        """`(y, f, g)` at the `end` of a step, the solution of its equation, with its exact derivatives."""
+    def tangents(
+        self,
+        inverses: Any,
+        a: Any,
+        b: Any,
+        free: Int[Array, " free"],
+        push: Callable[[Float[Array, " n"]], tuple[Array, Array, Array]],
+    ) -> Callable[..., tuple[Array, Array, Array]]:
+        """The tangents of `(y, f, g)` at the end of a step, a linear function `(own, load)` of those at a held y, and
+        of that of `past + a f + b g` where f and g are held.
+
+        **Arguments:** `push`: the tangents of `(y, f, g)` by that of y, of g for a held f.
+        """
+
+
+class KnownStep(eqx.Module):
+    """A step whose end is known.
+
+    **Fields:** the `solution` of its equations, and the end `t`; `past`, `a`, `b` and `free` as in `StepEquation`.
+    """
+
+    solution: Solution
+    t: Any
+    past: Float[Array, " n"]
+    a: Any
+    b: Any
+    free: Int[Array, " free"]
+
+
+@eqx.filter_custom_jvp
+def at_end(
+    end: tuple[Array, Array, Array], step: KnownStep, matrix: AbstractLinearization, inverses: Any
+) -> tuple[Array, Array, Array]:
+    """`(y, f, g)` at the end of a step, the solution of `y = past + a f + b g`, with its exact derivatives.
+
+    **Arguments:** `end`: these numbers; `matrix`: the last of Newton's method.
+    """
+    del step, matrix, inverses
+    return end
+
+
+@at_end.def_jvp
+def _at_end_jvp(primals, tangents):
+    _, step, matrix, inverses = primals
+    along = tangents[1]
+    y, f, g = out = at_end(*primals)
+    has_one = jax.tree.map(lambda d: d is not None, along.solution, is_leaf=lambda x: x is None)
+    numbers, rest = eqx.partition(step.solution, has_one)
+    by_numbers, by_state = linearized(lambda x: eqx.combine(x, rest), numbers, step.t, y, f)
+    solve = matrix.tangents(inverses, step.a, step.b, step.free, by_state)
+    load = filled(along.past, step.past) + filled(along.a, step.a) * f + filled(along.b, step.b) * g
+    return out, solve(by_numbers(along.solution, along.t), load)
 
 
 class Solved(NamedTuple):
@@ -214,7 +262,7 @@ class Newton(eqx.Module):
             anew = (matrix.renewals > 0) | (k > 0)
             renewed = lambda old: eqx.tree_at(lambda m: m.renewals, old.renewed(equation, start, rate), old.renewals)
             matrix = cond_of_any_lane(anew, renewed, lambda old: old, matrix)
-            inverses = matrix.inverses(equation)
+            inverses = matrix.inverses(equation.a, equation.b, equation.free)
             matrix = matrix.observed(inverses, anew)
             first = _Iterate(
                 nothing._replace(y=start, f=rate), jnp.zeros(equation.free.size, one.dtype), one * jnp.inf, one, none
@@ -233,7 +281,7 @@ class Newton(eqx.Module):
             work = work + jnp.stack([last.iterations, anew.astype(jnp.int32)])
             return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
 
-        inverses = matrix.no_inverses(equation)
+        inverses = matrix.no_inverses(equation.a, equation.b, equation.free)
         carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
         k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
         return Solved(end, k == _DONE, matrix, inverses, work)

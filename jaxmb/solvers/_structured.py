@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._compat import cond_of_any_lane
 from ._damping import eigenvalues
-from ._field import Field, filled, linearized, probed_derivatives
+from ._field import Field, probed_derivatives
 from ._newton import AbstractLinearization, StepEquation
 from .evaluation import freeze
 from .manifold_term import AbstractFieldJacobian, AbstractResolvent
@@ -95,15 +95,15 @@ class StructuredLinearization(AbstractLinearization):
         del rate
         return structured(equation.jacobian, y)
 
-    def inverses(self, equation: StepEquation) -> StructuredInverses:
-        a, b = equation.a, equation.b
+    def inverses(self, a: Any, b: Any, free: Int[Array, " free"] | None = None) -> StructuredInverses:
+        del free
         # The roots are complex for all formulas with equal steps; real roots are replaced by the nearest complex ones.
         product, least = -b - a**2 / 4, a**2 / 1000
         r = lax.complex(a / 2, jnp.sqrt(jnp.maximum(product, least)))
         return StructuredInverses(self.jacobian.resolvent(r * self.direction.astype(r.dtype)), a, b, r)
 
-    def no_inverses(self, equation: StepEquation) -> StructuredInverses:
-        shapes = eqx.filter_eval_shape(self.inverses, equation)
+    def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> StructuredInverses:
+        shapes = eqx.filter_eval_shape(self.inverses, a, b)
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def observed(self, inverses: StructuredInverses, anew: Bool[Array, ""]) -> "StructuredLinearization":
@@ -133,8 +133,44 @@ class StructuredLinearization(AbstractLinearization):
 
         return lax.map(error, changes)
 
-    def differentiable(self, inverses: StructuredInverses, equation: StepEquation, end: tuple[Array, Array, Array]):
-        return _differentiable(end, equation, self, inverses)
+    def tangents(self, inverses: StructuredInverses, a: Any, b: Any, free: Int[Array, " free"], push):
+        del free
+        matrix, inverses = freeze((self, inverses))
+        project = matrix.jacobian.project
+
+        def twice(change):
+            """Changes of y, f and g by that of y; a loop, so that the linear function is compiled once."""
+
+            def body(x, _):
+                by_x = push(x)
+                return by_x[1], by_x
+
+            _, (states, rates, held) = lax.scan(body, change, None, length=2)
+            return states[0], rates[0], held[0] + rates[1]
+
+        def apply(change):
+            _, rate, acceleration = twice(change)
+            return change - a * rate - b * acceleration
+
+        def precondition(x):
+            tangent = project(x)
+            return inverses.solve(tangent)[0] + x - tangent
+
+        def precondition_transpose(x):
+            pull = jax.linear_transpose(project, x)
+            return x + pull(inverses.transpose_solve(x) - x)[0]
+
+        def solve(own, load):
+            acceleration = own[2] + push(own[1])[1]
+            change = lax.custom_linear_solve(
+                apply,
+                load + a * own[1] + b * acceleration,
+                lambda apply, x: _iterate(apply, precondition, x),
+                lambda apply, x: _iterate(apply, precondition_transpose, x),
+            )
+            return tuple(map(jnp.add, (own[0], own[1], acceleration), twice(change)))
+
+        return solve
 
 
 def structured(jacobian: Callable[[Float[Array, " n"]], Any], y: Float[Array, " n"]) -> StructuredLinearization | None:
@@ -193,64 +229,6 @@ def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -
     counts = magnitude > _SMALL * jnp.max(magnitude)
     safe = jnp.where(counts, found, jnp.ones_like(found))
     return jnp.where(counts & jnp.isfinite(magnitude), (1 - 1 / safe) / inverses.r, jnp.zeros_like(found))
-
-
-@eqx.filter_custom_jvp
-def _differentiable(
-    end: tuple[Array, Array, Array],
-    equation: StepEquation,
-    matrix: StructuredLinearization,
-    inverses: StructuredInverses,
-) -> tuple[Array, Array, Array]:
-    """`(y, f, g)` at the `end` of a step, a projection of `past + a f + b g`, with its derivatives."""
-    del equation, matrix, inverses
-    return end
-
-
-@_differentiable.def_jvp
-def _differentiable_jvp(primals, tangents):
-    _, equation, matrix, inverses = primals
-    of_equation, a, b = tangents[1], equation.a, equation.b
-    y, f, g = _differentiable(*primals)
-    matrix, inverses = freeze((matrix, inverses))
-    moved, along = linearized(equation, of_equation, lambda change: y + change, jnp.zeros_like(y), f)
-
-    def twice(change):
-        """Changes of y, f and g by that of y; a loop, so that the linear function is compiled once."""
-
-        def step(x, _):
-            by_x = along(x)
-            return by_x[1], by_x
-
-        _, (states, rates, held) = lax.scan(step, change, None, length=2)
-        return states[0], rates[0], held[0] + rates[1]
-
-    def apply(change):
-        _, rate, acceleration = twice(change)
-        return change - a * rate - b * acceleration
-
-    acceleration = moved[2] + along(moved[1])[1]
-    past = filled(of_equation.past, equation.past)
-    load = past + filled(of_equation.a, a) * f + filled(of_equation.b, b) * g + a * moved[1] + b * acceleration
-
-    project = matrix.jacobian.project
-
-    def precondition(x):
-        tangent = project(x)
-        return inverses.solve(tangent)[0] + x - tangent
-
-    def precondition_transpose(x):
-        pull = jax.linear_transpose(project, x)
-        return x + pull(inverses.transpose_solve(x) - x)[0]
-
-    change = lax.custom_linear_solve(
-        apply,
-        load,
-        lambda apply, x: _iterate(apply, precondition, x),
-        lambda apply, x: _iterate(apply, precondition_transpose, x),
-    )
-    by_change = twice(change)
-    return (y, f, g), tuple(map(jnp.add, (moved[0], moved[1], acceleration), by_change))
 
 
 def _iterate(

@@ -7,8 +7,6 @@ the mesh of the motion; it differs from the derivative of the step by less than 
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,28 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from .._compat import any_of_batch
 from ._history import INDEX, LENGTH, basis_means, known_differences, start, step_end
 from ._interpolation import RateInterpolation
-from .evaluation import (
-    after_jump,
-    at_solution,
-    chart_after_jump,
-    field_of,
-    guards_of,
-    kept_of_chart,
-    next_chart,
-    ravel,
-    unravel_like,
-)
+from .evaluation import at_solution, kept_of_chart, ravel, unravel_like
+from .restarts import Jump, restarts
 from .steps import AbstractSteps, LinearStep
-from .times import twice_differentiable
-
-# Of more numbers than this, states and fields among them, tangents after a jump are computed one at a time.
-_MOST_COLUMNS = 256
 
 
 class Coefficients(eqx.Module):
@@ -82,19 +66,6 @@ def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, 
     # Those of the terms k - 2 to k + 1, of which the term k is the new derivative's.
     integrals = lax.dynamic_slice_in_dim(padded, order - 1, 4)
     return Coefficients(h, end, products, integrals[2], jnp.diff(integrals))
-
-
-class Jump(eqx.Module):
-    """What is stored of a start: whether there was a jump, the times `before` and after it, and the state, the field
-    and the chart before it.
-    """
-
-    made: Any
-    before: Any
-    time: Any
-    y: Float[Array, " n"]
-    f: Float[Array, " n"]
-    chart: Any
 
 
 class StartRow(NamedTuple):
@@ -194,11 +165,14 @@ class AdamsSteps(AbstractSteps):
         _, field = jax.linearize(at, moved.terms, row.y)
         formulas = coefficients(row.mesh, row.order, row.end, row.y.dtype)
         used = (row.order >= INDEX)[:, None]
-        restart = None if row.jump is None else _restarts(of, moved, like, row.jump)
+        jump = row.jump
+        restart = None if jump is None else restarts(of, moved, like, jump, lambda field, t, y: field(t, y)[0])
 
         def push(dmoved, w, memory):
             if restart is not None:
-                w, memory = restart(dmoved, w, memory)
+                new, f = restart(dmoved, w, memory[0])
+                restarted = jnp.concatenate([f[None], jnp.zeros_like(memory[1:])])
+                w, memory = jnp.where(jump.made, new, w), jnp.where(jump.made, restarted, memory)
             partial_sums, neighbours, mean = formulas.sums(memory)
             predicted = w + formulas.h * mean
             _, f = field(dmoved.terms, predicted)
@@ -227,89 +201,3 @@ class AdamsSteps(AbstractSteps):
             return out
         parts = lambda row: (row.jump.y, row.jump.f)
         return eqx.tree_at(parts, out, (before[0], before[1][0]), is_leaf=lambda x: x is None)
-
-
-def _restarts(of, moved, like, jump: Jump) -> Callable[..., tuple[Array, Array]]:
-    """The tangents after a jump, where there was one, from those of numbers, of the state and of the memory before it,
-    in which they are linear.
-    """
-    n, along_numbers = jump.y.size, sum(x.size for x in jax.tree.leaves(moved))
-    guards = guards_of(of(moved.terms)[0])
-
-    def tangents(at_jump, *along):
-        restart = functools.partial(_restart, of, like, jump, at_jump)
-        return jax.jvp(restart, (moved, jump.y, jump.f), along)[1]
-
-    def restarted(*along):
-        if moved.jumps is None or guards is None:
-            return tangents(moved.jumps is not None, *along)
-        # A run starts, and goes on after an impact, at a time that is none of the jumps, and at the start there is
-        # nothing before it.
-        is_jump = any_of_batch(_is_jump(moved.jumps, jump))
-        return lax.cond(is_jump, lambda: tangents(True, *along), lambda: tangents(False, *along))
-
-    def push(dmoved, w, memory):
-        def anew():
-            new = restarted(dmoved, w, memory[0])
-            return jax.tree.map(lambda new, old: jnp.where(jump.made, new, old), new, (w, memory))
-
-        return lax.cond(any_of_batch(jump.made), anew, lambda: (w, memory))
-
-    columns = along_numbers + 2 * n
-    if guards is None or columns > _MOST_COLUMNS:
-        return push
-    raveled = jax.numpy_dtype_promotion("standard")(ravel_pytree)
-    _, unraveled = raveled((moved, jump.y, jump.f))
-
-    def column(unit):
-        w, memory = restarted(*unraveled(unit))
-        return jnp.concatenate([w, memory[0]])
-
-    # The transpose of a program that finds an event would be a second one, and as long; a matrix is transposed at once.
-    every = lambda: jax.vmap(column)(jnp.eye(columns, dtype=jump.y.dtype))
-    matrix = lax.cond(any_of_batch(jump.made), every, lambda: jnp.zeros((columns, 2 * n), jump.y.dtype))
-
-    def push_by_matrix(dmoved, w, memory):
-        new = raveled((dmoved, w, memory[0]))[0].astype(matrix.dtype) @ matrix
-        restarted = jnp.concatenate([new[None, n:], jnp.zeros_like(memory[1:])])
-        return jnp.where(jump.made, new[:n], w), jnp.where(jump.made, restarted, memory)
-
-    return push_by_matrix
-
-
-def _restart(of, like, jump, at_jump, moved, flat, f):
-    """The state after a restart and the memory there, from the state and the field before it; `at_jump`: whether it may
-    be at a jump whose time has derivatives.
-    """
-    terms, args, _ = of(moved.terms)
-    if not at_jump:
-        late = at = None
-    else:
-        # The jump comes later by this time, which is zero: the state moves on before it, and back after it.
-        time = moved.jumps[jnp.argmin(jnp.abs(moved.jumps - jump.time))]
-        late = twice_differentiable(time - lax.stop_gradient(time))
-        late = jnp.where(_is_jump(lax.stop_gradient(moved.jumps), jump), late, 0.0)
-        field = field_of(terms, jump.before, unravel_like(like, flat), jump.chart, args)
-        flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
-        at = jump.time + late
-    y = after_jump(terms, jump.time if at is None else at, unravel_like(like, flat), args)
-    chart = next_chart(terms, jump.time, y, chart_after_jump(terms, jump.chart), args)
-    field = field_of(terms, jump.time, y, chart, args)
-    if late is None:
-        (flat, f), _ = field(jump.time, ravel(y))
-    else:
-        (flat, f), _ = field(at, ravel(y))
-        flat = _moved_on(lambda t, y: field(t, y)[0][1], at, flat, f, -late)
-        (flat, f), _ = field(jump.time, flat)
-    return flat, jnp.concatenate([f[None], jnp.zeros((LENGTH - 1, f.size), f.dtype)])
-
-
-def _is_jump(jumps, jump):
-    """Whether a restart is at one of the times of jumps."""
-    return jnp.any((jump.before <= jumps) & (jumps <= jump.time)) & (jump.before < jump.time)
-
-
-def _moved_on(field, t, flat, f, time):
-    """A state after a time of zero, right to the second derivative by it; `f`: the field at the state."""
-    step = time.astype(flat.dtype)
-    return flat + step / 2 * (f + field(t + time, flat + step * f))

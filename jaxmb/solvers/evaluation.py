@@ -195,6 +195,30 @@ def at_solution(
     return ravel(y, flat.dtype), ravel(f, flat.dtype) * sign
 
 
+def solution_of(term: Any, t: Any, like: PyTree[Array], kept: PyTree[Array], args: Args) -> Any:
+    """`(t, y, f, held) -> (y, f, g)` for raveled states, a pytree: a known state, its field, and the rate of that along
+    the motion, with the derivatives that the equations give them; if `held`, of g those for the rate f.
+    """
+    if _manifold(term) is not None:
+        return eqx.Partial(_along_solution, term, like, kept, args)
+    flat = ravel(like)
+    field = lambda t, flat: ravel(derivative(term, t, unravel_like(like, flat), args), flat.dtype)
+    # What a vector field closes over has derivatives as well.
+    return eqx.Partial(_along_field, eqx.filter_closure_convert(field, t, flat))
+
+
+def _along_field(field, t, flat, f, held):
+    return flat, *jax.jvp(field, (t, flat), (jnp.ones_like(t), f if held else field(t, flat)))
+
+
+def _along_solution(term, like, kept, args, t, flat, f, held):
+    manifold, direction = _manifold(term), direction_of(term)
+    sign = jnp.asarray(direction).astype(flat.dtype)
+    y, f = unravel_like(like, flat), unravel_like(like, f * sign)
+    y, f, g = manifold.along_solution(t * direction, y, f, held, kept, args)
+    return ravel(y, flat.dtype), ravel(f, flat.dtype) * sign, ravel(g, flat.dtype)
+
+
 def free_components(term: Any, flat: Array, chart: Chart | None) -> Array:
     """Indices of the components that are integrated."""
     manifold = _manifold(term)

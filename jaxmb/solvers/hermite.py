@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -15,15 +16,25 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from .._arguments import whole_number
 from ._damping import is_resolved
 from ._dense import DenseLinearization
-from ._field import derivatives
+from ._field import at_start, derivatives, linearized
 from ._formulas import FAMILIES, Formulas, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._neighbours import a_stable, damped_growth, ladder, responses
-from ._newton import AbstractLinearization, Newton, Solved, StepEquation
-from ._structured import structured, unknown_structure
+from ._newton import AbstractLinearization, KnownStep, Newton, Solved, StepEquation, at_end
+from ._structured import unknown_structure
 from .controller import ControllerState, states_inside
-from .evaluation import field_of, free_components, freeze, jacobian_of, next_chart, ravel, unravel_like
+from .evaluation import (
+    field_of,
+    free_components,
+    freeze,
+    jacobian_of,
+    kept_of_chart,
+    next_chart,
+    ravel,
+    solution_of,
+    unravel_like,
+)
 from .hermite_steps import HermiteSteps
 from .manifold_term import Chart
 from .multistep import AbstractAttempt, AbstractMultistep, AbstractMultistepState, tolerances_of
@@ -74,38 +85,62 @@ class HermiteState(AbstractMultistepState):
         return self.order_index
 
 
-class _Step(AbstractAttempt):
-    """The numbers of a step: the state `after` it, the history there and its `slope`; the `ends` of the step by every
-    formula, for their errors; for interpolation the history with the last point doubled, and the `mismatch` of the
-    formula at the end; the chart there, whether the evaluation `broke` down, and the end of Newton's method.
+class StepEnd(eqx.Module):
+    """A step as its end determines it.
+
+    **Fields:** the state `after` it, the history there and its `slope`; for interpolation the history with the last
+    point `doubled`, and the `mismatch` of the formula at the end.
     """
 
     after: Float[Array, " n"]
     history: History
     slope: Float[Array, " m"]
-    ends: Float[Array, "formulas n"]
     doubled: History
     mismatch: Float[Array, " n"]
-    chart: Chart | None
-    broke: Bool[Array, ""]
-    newton: Solved
 
     @property
     def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
         return self.history.differences, self.slope
 
 
-class _Begun(NamedTuple):
-    """A step before its equation is solved: the `equation`, the `end` in time, the `unit` of the values that formulas
-    integrate, the `coefficients`, the `partial_sums` of the history at the end, and the `predicted` state and rate.
+class _Step(AbstractAttempt):
+    """The numbers of a step: its `end`; the state there by every formula, for their errors (`ends`); the chart there,
+    whether the evaluation `broke` down, and the end of Newton's method.
     """
 
-    equation: StepEquation
+    end: StepEnd
+    ends: Float[Array, "formulas n"]
+    chart: Chart | None
+    broke: Bool[Array, ""]
+    newton: Solved
+
+    @property
+    def after(self) -> Float[Array, " n"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.end.after
+
+    @property
+    def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
+        return self.end.memory
+
+
+class Formula(NamedTuple):
+    """The formula of a step, for a mesh.
+
+    **Fields:** the `end` of the step in time, and its length `h`; `unit`: of the values that it integrates; its
+    `coefficients` for all numbers of nodes, and how many `nodes` it has; `values` of the basis at the end.
+    """
+
     end: Any
-    unit: Any
+    h: Float[Array, ""]
+    unit: Float[Array, ""]
     coefficients: Formulas
-    partial_sums: Float[Array, "length m"]
-    predicted: tuple[Float[Array, " n"], Float[Array, " n"]]
+    nodes: Int[Array, ""]
+    values: Float[Array, " length"]
+
+    @property
+    def sums(self) -> Float[Array, "length length"]:
+        """The matrix that evaluates the polynomials of all orders at the end, from differences."""
+        return jnp.asarray(before_each(self.values.size), self.values.dtype) * self.values[None]
 
 
 class Hermite(AbstractMultistep):
@@ -224,125 +259,160 @@ class Hermite(AbstractMultistep):
 
     def initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
         family, flat = FAMILIES[self.family], ravel(y0)
-        chart = next_chart(terms, t0, y0, chart, args)
-        field, scales = field_of(terms, t0, y0, chart, args), self.tolerances.scales
+        chart, scales = next_chart(terms, t0, y0, chart, args), self.tolerances.scales
         free = free_components(terms, flat, chart)
-        known = unknown_structure(jacobian_of(terms, t0, y0, args), flat)
-        matrix = DenseLinearization.unknown(flat, free) if known is None else known
-        if before is None:
-            size = None if scales is None else scales.expected(flat)
-            first = matrix.probed(field, t0, flat, size)
-        else:
-            first = derivatives(field, t0, flat)
-        chart, failed = first.rest
-        # The NaN reaches the error estimate, so the step is rejected.
-        f = jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f)
         if free.size == 0:
             raise ValueError(
                 "`Hermite` has no equation to solve: constraints prescribe all components of the state. Use `Adams()`."
             )
-        z, slope = self._recorded(flat, f, first.g)
-        history = start(family, t0, z, slope, t1 - t0)
+        known = unknown_structure(jacobian_of(terms, t0, y0, args), flat)
+        matrix = DenseLinearization.unknown(flat, free) if known is None else known
+        field, at = freeze((field_of(terms, t0, y0, chart, args), flat))
         if before is None:
+            size = None if scales is None else scales.expected(at)
+            first = matrix.probed(field, t0, at, size)
             step_counts, work = jnp.zeros(family.highest + 1, np.int32), jnp.zeros(2, np.int32)
         else:
-            step_counts, work = before.step_counts, before.work
+            first, step_counts, work = derivatives(field, t0, at), before.step_counts, before.work
+        chart, failed = freeze(first.rest)
+        # The NaN reaches the error estimate, so the step is rejected.
+        end = at, jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f), first.g
 
         def numbers(terms, flat):
-            at = derivatives(field_of(terms, t0, unravel_like(y0, flat), chart, args), t0, flat)
-            z, slope = self._recorded(at.y, at.f, at.g)
-            return at.y, (start(family, t0, z, slope, t1 - t0).differences, slope)
+            return at_start(end, solution_of(terms, t0, y0, kept_of_chart(terms, chart), args), t0, flat)
 
-        tangents = self.first_tangents(numbers, terms, flat, before)
+        def memory(terms, flat):
+            y, f, g = numbers(terms, flat)
+            history, slope = self.begun(t0, t1 - t0, y, f, g)
+            return y, (history.differences, slope)
+
+        history, slope = self.begun(t0, t1 - t0, *numbers(terms, flat))
+        tangents = self.first_tangents(memory, terms, flat, before)
         index = jnp.asarray(1, np.int32)
-        sizes = self.first_sizes(flat, f, before)
+        sizes = self.first_sizes(flat, end[1], before)
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
 
     def attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
-        begun = self._begun(terms, t1, before, like, args, state)
-        scale = self._tolerated(t1, before, state)
-        latest = before, state.slope[-before.size :]
-        equation, scale, predicted, latest, matrix = freeze(
-            (begun.equation, scale, begun.predicted, latest, state.matrix)
-        )
-        size = lambda correction: self.weighted_norm(correction, scale, like)
-        return self._completed(begun, state, Newton(equation, size, _NEWTON).solve(predicted, latest, matrix))
-
-    def attempt_to(self, terms, t1, before, like, args, state: HermiteState, after: Float[Array, " n"]) -> _Step:
-        """The numbers of a step that ends in a known state, for which nothing is solved; of the solver's state the
-        `matrix` is not needed.
-        """
-        begun = self._begun(terms, t1, before, like, args, state)
-        equation, after = freeze((begun.equation, after))
-        known = structured(equation.jacobian, after)
-        matrix, inverses = DenseLinearization.unknown(after, equation.free), None
-        if known is not None:
-            matrix, inverses = known, known.inverses(equation)
-        end, none = derivatives(equation.field, t1, after), jnp.zeros(2, np.int32)
-        return self._completed(begun, state, Solved(end, jnp.array(True), matrix, inverses, none))
-
-    def _begun(self, terms, t1, before, like, args, state: HermiteState) -> _Begun:
-        """A step before its equation is solved."""
-        family, history, k = FAMILIES[self.family], state.history, state.order_index
-        n, dtype = before.size, before.dtype
-        nodes = family.multiplicity * k
-        index = np.arange(family.length, dtype=np.int32)
+        history, n = state.history, before.size
+        formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
+        past, a, b = self.equation(formula, before, history.differences)
+        field = field_of(terms, t1, like, state.chart, args)
+        free = free_components(terms, before, state.chart)
+        equation = StepEquation(field, jacobian_of(terms, t1, like, args), t1, formula.h, past, a, b, free)
 
         # The prediction extrapolates y, not f: the remaining error of stiff components is large in f. It has the order
         # of the formula, if there are enough points, since Newton's method converges only from nearby. Its slope
         # follows from the logarithmic derivatives of the basis.
-        end = step_end(history.mesh, t1)
-        h = (end - history.mesh[0]).astype(dtype)
-        values = basis(history.mesh, end[None])[:, 0].astype(dtype)
-        before_own = jnp.asarray(before_each(family.length), dtype)
-        partial_sums = (before_own * values[None]) @ history.differences
-        recent = jnp.where(index <= nodes + 2, values, jnp.zeros((), dtype))
-        slopes = recent * (before_own @ (1 / (end - history.mesh)).astype(dtype))
-        predicted = recent @ history.differences[:, -n:], slopes @ history.differences[:, -n:]
-
-        # y = past + a f + b g, by the formula with k points.
-        coefficients = formulas(family, history, end)
-        base, unit = (before, h) if family.integrated else (jnp.zeros_like(before), jnp.ones_like(h))
-        past = base + unit * (coefficients.past[nodes] @ history.differences[:, :n])
-        a, b = h * coefficients.slope[nodes], h**2 * coefficients.curvature[nodes]
-        field = field_of(terms, t1, like, state.chart, args)
-        free = free_components(terms, before, state.chart)
-        equation = StepEquation(field, jacobian_of(terms, t1, like, args), t1, h, past, a, b, free)
-        return _Begun(equation, end, unit, coefficients, partial_sums, predicted)
-
-    def _completed(self, begun: _Begun, state: HermiteState, newton: Solved) -> _Step:
-        """A step whose equation is solved."""
-        family, history, equation = FAMILIES[self.family], state.history, begun.equation
-        coefficients, h, n = begun.coefficients, equation.h, equation.past.size
-        y, f, g = newton.matrix.differentiable(newton.inverses, equation, newton.end[:3])
-        chart, broke = newton.end.rest
-
-        ends = coefficients.past @ history.differences[:, :n]
-        ends = (
-            begun.unit * ends
-            + (h * coefficients.slope)[:, None] * f[None]
-            + (h**2 * coefficients.curvature)[:, None] * g[None]
+        used = np.arange(FAMILIES[self.family].length, dtype=np.int32) <= formula.nodes + 2
+        recent = jnp.where(used, formula.values, jnp.zeros((), before.dtype))
+        rates = jnp.asarray(before_each(used.size), before.dtype) @ (1 / (formula.end - history.mesh)).astype(
+            before.dtype
         )
-        z, slope = self._recorded(y, f, g)
-        advanced = advance(history, begun.end, z, begun.partial_sums)
-        doubled = double(advanced, slope)
-        history = doubled if family.multiplicity == 2 else advanced
-        mismatch = equation.past + equation.a * f + equation.b * g - y
-        return _Step(y, history, slope, ends, doubled, mismatch, chart, broke, newton)
+        predicted = recent @ history.differences[:, -n:], (recent * rates) @ history.differences[:, -n:]
 
-    def dense_info(self, step: _Step, like: Any, order_index: Int[Array, ""]) -> dict[str, Any]:
+        latest, scale = (before, state.slope[-n:]), self._tolerated(t1, before, state)
+        size = lambda correction: self.weighted_norm(correction, freeze(scale), like)
+        newton = Newton(freeze(equation), size, _NEWTON).solve(*freeze((predicted, latest, state.matrix)))
+
+        chart, broke = newton.end.rest
+        solution = solution_of(terms, t1, like, kept_of_chart(terms, freeze(chart)), args)
+        known = KnownStep(solution, t1, past, a, b, free)
+        y, f, g = at_end(newton.end[:3], known, *freeze((newton.matrix, newton.inverses)))
+        end = self.ended(formula, history, (past, a, b), (y, f, g))
+        return _Step(end, self._ends(formula, history, f, g), chart, broke, newton)
+
+    def attempted(self, terms, t1, before, like, args, state: HermiteState):
+        step, control = self.attempt(terms, t1, before, like, args, state), self.tangent_control
+        if control is None:
+            return step, []
+        # Tangents that are carried along have no derivatives themselves.
+        terms, end, newton, tangents = freeze((terms, step.end, step.newton, state.tangents))
+        along = control.of_terms(terms)
+        used = jax.tree.map(lambda *own: any(x is not None for x in own), *along, is_leaf=lambda x: x is None)
+        numbers, rest = eqx.partition(terms, used)
+        kept, history = kept_of_chart(terms, newton.end.rest[0]), state.history
+        solution = lambda numbers: solution_of(eqx.combine(numbers, rest), t1, like, kept, args)
+        formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
+        free = free_components(terms, before, state.chart)
+        push = self.linearised(formula, (solution, numbers), (t1, end.after, newton.end.f), newton.matrix, free)
+        at = lambda differences: History(differences, history.mesh, history.known)
+        pushed = [push(of, x.w, at(x.memory[0])) for of, x in zip(along, tangents, strict=True)]
+        # A derivative that is no number is taken as zero.
+        return step, jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), pushed)
+
+    def linearised(self, formula: Formula, equations, end, matrix: AbstractLinearization, free):
+        """The end of a step, and the ends by all formulas, as a linear map of tangents: of numbers, of the state at its
+        start, and of the history there, whose mesh is that of the step.
+
+        **Arguments:** `equations`: the solution of the equations, a function of the numbers, and these; the `end`: its
+        time, and the state and the field there; `matrix` and unknowns of the step.
+        """
+        (solution, numbers), (t, y, f) = equations, end
+        by_numbers, by_state = linearized(solution, numbers, t, y, f)
+        _, a, b = self.equation(formula, y, jnp.zeros((formula.values.size, y.size), y.dtype))
+        solve = matrix.tangents(matrix.inverses(a, b, free), a, b, free, by_state)
+
+        def push(along, w, history):
+            past, _, _ = self.equation(formula, w, history.differences)
+            _, f, g = solved = solve(by_numbers(along, None), past)
+            return self.ended(formula, history, (past, a, b), solved), self._ends(formula, history, f, g)
+
+        return push
+
+    def begun(self, t, spacing, y, f, g) -> tuple[History, Float[Array, " m"]]:
+        """The history at a start, of one point, and its slope there."""
+        z, slope = self._recorded(y, f, g)
+        return start(FAMILIES[self.family], t, z, slope, spacing), slope
+
+    def formula(self, mesh: Float[Array, " length"], order_index: Int[Array, ""], t1: Any, dtype: Any) -> Formula:
+        """The formula of a step from the latest point of a mesh to `t1`."""
+        family, end = FAMILIES[self.family], step_end(mesh, t1)
+        h = (end - mesh[0]).astype(dtype)
+        unit = h if family.integrated else jnp.ones_like(h)
+        values = basis(mesh, end[None])[:, 0].astype(dtype)
+        return Formula(end, h, unit, formulas(family, mesh, end, dtype), family.multiplicity * order_index, values)
+
+    def equation(
+        self, formula: Formula, before: Float[Array, " n"], differences: Float[Array, "length m"]
+    ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, ""]]:
+        """`(past, a, b)` of the equation `y = past + a f + b g` of a step; `past` is linear in the state `before` and
+        in the differences.
+        """
+        base = before if FAMILIES[self.family].integrated else jnp.zeros_like(before)
+        of, nodes = formula.coefficients, formula.nodes
+        past = base + formula.unit * (of.past[nodes] @ differences[:, : before.size])
+        return past, formula.h * of.slope[nodes], formula.h**2 * of.curvature[nodes]
+
+    def ended(
+        self, formula: Formula, history: History, equation: tuple[Array, Any, Any], solved: tuple[Array, Array, Array]
+    ) -> StepEnd:
+        """A step from its end, linear in `(y, f, g)` there, in `past` and in the differences before it."""
+        (past, a, b), (y, f, g) = equation, solved
+        z, slope = self._recorded(y, f, g)
+        advanced = advance(history, formula.end, z, formula.sums @ history.differences)
+        doubled = double(advanced, slope)
+        after = doubled if FAMILIES[self.family].multiplicity == 2 else advanced
+        return StepEnd(y, after, slope, doubled, past + a * f + b * g - y)
+
+    def _ends(self, formula: Formula, history: History, f, g) -> Float[Array, "formulas n"]:
+        """The changes of the state in a step by all formulas."""
+        of = formula.coefficients
+        past = formula.unit * (of.past @ history.differences[:, : f.size])
+        return past + (formula.h * of.slope)[:, None] * f[None] + (formula.h**2 * of.curvature)[:, None] * g[None]
+
+    def dense_info(self, end: StepEnd, like: Any, order_index: Int[Array, ""]) -> dict[str, Any]:
         """The dense output of a step of an order."""
-        family, n = FAMILIES[self.family], step.after.size
+        family, n = FAMILIES[self.family], end.after.size
         used = (np.arange(family.length, dtype=np.int32) < family.multiplicity * order_index + 2)[:, None]
         return {
-            "y1": unravel_like(like, step.after),
-            "differences": jnp.where(used, step.doubled.differences[:, :n], jnp.zeros((), step.after.dtype)),
-            "mesh": step.doubled.mesh,
-            "mismatch": step.mismatch,
+            "y1": unravel_like(like, end.after),
+            "differences": jnp.where(used, end.doubled.differences[:, :n], jnp.zeros((), end.after.dtype)),
+            "mesh": end.doubled.mesh,
+            "mismatch": end.mismatch,
         }
 
     def linear_steps(self, jumps):
-        return HermiteSteps(jumps)
+        return HermiteSteps(jumps, self.family)
 
     def advance(self, terms, t1, y0, args, state: HermiteState):
         family, history, k = FAMILIES[self.family], state.history, state.order_index
@@ -359,9 +429,9 @@ class Hermite(AbstractMultistep):
         stable = a_stable(self.family, self.past_points)
         candidates = jnp.append(around, stable or 1)
         sizes = self._sizes(step.ends, candidates, family, newton, free, scale, y0)
-        tangents, scales = self.tangents_after(state.tangents, along)
-        for end, scale in zip(along, scales, strict=True):
-            sizes = jnp.maximum(sizes, self._sizes(end.ends, candidates, family, newton, free, scale, y0))
+        tangents, scales = self.tangents_after(state.tangents, [end for end, _ in along])
+        for (_, ends), scale in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(ends, candidates, family, newton, free, scale, y0))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         bounded = None
         if stable is not None:
@@ -394,8 +464,8 @@ class Hermite(AbstractMultistep):
             changed = jnp.any(free_components(terms, before, renewed) != free)
             matrix = eqx.tree_at(lambda m: m.renewals, matrix, jnp.maximum(matrix.renewals, changed.astype(jnp.int32)))
         new_state = HermiteState(
-            history=step.history,
-            slope=step.slope,
+            history=step.end.history,
+            slope=step.end.slope,
             order_index=order_index,
             matrix=matrix,
             step_counts=state.step_counts + (k == np.arange(family.highest + 1, dtype=np.int32)).astype(np.int32),
@@ -404,7 +474,7 @@ class Hermite(AbstractMultistep):
             sizes=self.grown_sizes(state.sizes, step.after),
             tangents=tangents,
         )
-        return y1, estimate, self.dense_info(step, y0, k), new_state, failed
+        return y1, estimate, self.dense_info(step.end, y0, k), new_state, failed
 
     def _tolerated(self, t1, before, state: HermiteState) -> Float[Array, " n"]:
         """The errors tolerated in the step, by the state that it starts from: those of its iterations as well."""

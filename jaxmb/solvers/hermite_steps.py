@@ -1,7 +1,8 @@
 """A step of `Hermite` as a linear map.
 
-Where a step ends is known, so that its equation need not be solved again: its derivative is that of the solution, by
-the implicit function theorem. It is the exact derivative of the step.
+A step solves `y = past + a f + b g` at its end, which is known when it is differentiated: its tangent is the solution
+of the linearised equation, and nothing else is solved. So little of a step is stored, and none of what Newton's method
+did.
 """
 
 from typing import Any
@@ -9,39 +10,55 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .evaluation import ravel, unravel_like
-from .steps import AbstractSteps, LinearStep, refuse_moving_jumps
+from ._dense import DenseLinearization
+from ._field import derivatives
+from ._formulas import FAMILIES, start
+from ._history import History
+from ._structured import structured
+from .evaluation import free_components, freeze, jacobian_of, kept_of_chart, ravel, solution_of
+from .restarts import Jump, restarts
+from .steps import AbstractSteps, LinearStep
 
 
 class HermiteRow(eqx.Module):
     """What is stored of a step.
 
-    **Fields:** its start `t0` and end `t1`; the state of the solver `before` it, without the matrix of Newton's
-    method, which the result does not depend on; the raveled states at both ends; whether it `made_jump` at its start,
-    None where steps have none.
+    **Fields:** its `end`; the `mesh`, the number of `known` points and the `order_index` at its start; state `y` and
+    field `f` at its end; what is `kept` of the chart there, and its `free` components; `jump` at its start, None where
+    steps have none.
     """
 
-    t0: Any
-    t1: Any
-    before: Any
-    start: Float[Array, " n"]
-    end: Float[Array, " n"]
-    made_jump: Any
+    end: Any
+    mesh: Float[Array, " length"]
+    known: Int[Array, ""]
+    order_index: Int[Array, ""]
+    y: Float[Array, " n"]
+    f: Float[Array, " n"]
+    kept: Any
+    free: Int[Array, " free"]
+    jump: Jump | None
 
 
 class HermiteSteps(AbstractSteps):
-    """The steps of `Hermite`; `jumps`: whether they may begin after a jump."""
+    """The steps of `Hermite`; `jumps`: whether they may begin after a jump; its `family` of formulas."""
 
     jumps: bool = eqx.field(static=True)
+    family: str = eqx.field(static=True)
 
     def row(self, terms, before, after):
-        del terms
-        made_jump = jnp.asarray(before.made_jump) if self.jumps else None
-        own = self.alone(before.solver_state)
-        own = own if self.jumps else eqx.tree_at(lambda state: state.matrix, own, None)
-        return HermiteRow(before.tprev, before.tnext, own, ravel(before.y), ravel(after.y), made_jump)
+        old, new, n = before.solver_state, after.solver_state, ravel(after.y).size
+        mesh, known, order_index, jump = old.history.mesh, old.history.known, old.order_index, None
+        if self.jumps:
+            made, f = jnp.asarray(before.made_jump), old.slope[-n:]
+            first = start(FAMILIES[self.family], before.tprev, f, f, before.tnext - before.tprev)
+            of_start = first.mesh, first.known, jnp.ones_like(order_index)
+            here = mesh, known, order_index
+            mesh, known, order_index = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, here)
+            jump = Jump(made, old.history.mesh[0], before.tprev, ravel(before.y), f, old.chart)
+        kept, free = kept_of_chart(terms, new.chart), free_components(terms, ravel(after.y), new.chart)
+        return HermiteRow(before.tnext, mesh, known, order_index, ravel(after.y), new.slope[-n:], kept, free, jump)
 
     def alone(self, solver_state):
         return solver_state.alone()
@@ -53,28 +70,47 @@ class HermiteSteps(AbstractSteps):
         return solver_state.memory
 
     def linearised(self, of, moved, like, row):
-        *_, solver = of(moved.terms)
-        refuse_moving_jumps(moved, solver)
+        terms, args, solver = of(moved.terms)
+        formula = solver.formula(row.mesh, row.order_index, row.end, row.y.dtype)
+        jump = row.jump
+        if jump is not None:
+            restart = restarts(of, moved, like, jump, lambda *at: derivatives(*at)[:3])
 
-        def step(moved, flat, memory):
-            terms, args, solver = of(moved.terms)
-            y, jumped = unravel_like(like, flat), row.made_jump
-            state = eqx.tree_at(lambda state: state.memory, row.before, memory)
-            y, state = solver.restarted(terms, row.t0, row.t1, y, args, state, False if jumped is None else jumped)
-            found = solver.attempt_to(terms, row.t1, ravel(y), like, args, state, row.end)
-            dense, still = eqx.partition(solver.dense_info(found, like, state.order_index), eqx.is_inexact_array)
-            return (found.after, found.memory, dense), still
+        def solution(numbers):
+            own, args, _ = of(numbers)
+            return solution_of(own, row.end, like, row.kept, args)
 
-        (_, _, dense), push, still = jax.linearize(step, moved, row.start, row.before.memory, has_aux=True)
+        matrix = structured(jacobian_of(*freeze((terms, row.end, like, args))), freeze(row.y))
+        if matrix is None:
+            matrix = DenseLinearization.unknown(row.y, row.free)
+        step = solver.linearised(formula, (solution, moved.terms), (row.end, row.y, row.f), matrix, row.free)
 
-        def at(ddense, t):
-            interpolation = lambda dense: solver.interpolation_cls(t0=row.t0, t1=row.t1, **eqx.combine(dense, still))
-            return jax.jvp(lambda dense: ravel(interpolation(dense).evaluate(t)), (dense,), (ddense,))[1]
+        def push(dmoved, w, memory):
+            differences, slope = memory
+            if jump is not None:
+                new, f, g = restart(dmoved, w, slope[-w.size :])
+                first, _ = solver.begun(row.mesh[0], formula.h, new, f, g)
+                w = jnp.where(jump.made, new, w)
+                differences = jnp.where(jump.made, first.differences, differences)
+            end, _ = step(dmoved.terms, w, History(differences, row.mesh, row.known))
+            return end.after, end.memory, solver.dense_info(end, like, row.order_index) | {"mesh": None}
 
-        return LinearStep(push, at)
+        none = jnp.zeros_like(row.y)
+        blank, _ = solver.begun(row.mesh[0], formula.h, none, none, none)
+        blank = History(blank.differences, row.mesh, row.known)
+        mesh = solver.ended(formula, blank, solver.equation(formula, none, blank.differences), (none,) * 3).doubled.mesh
+
+        def within(dense, t):
+            # Dense output is linear in everything but the mesh.
+            return ravel(solver.interpolation_cls(t0=row.mesh[0], t1=row.end, **dense | {"mesh": mesh}).evaluate(t))
+
+        return LinearStep(push, within)
 
     def row_tangent(self, row, like, before, after):
-        # The end follows from the rest.
-        del after
-        none, parts = jax.tree.map(lambda _: None, row), lambda row: (row.start, row.before.memory)
-        return eqx.tree_at(parts, none, before, is_leaf=lambda x: x is None)
+        w, (_, slope) = after
+        none = jax.tree.map(lambda _: None, row)
+        out = eqx.tree_at(lambda row: (row.y, row.f), none, (w, slope[-w.size :]), is_leaf=lambda x: x is None)
+        if row.jump is None:
+            return out
+        parts = lambda row: (row.jump.y, row.jump.f)
+        return eqx.tree_at(parts, out, (before[0], before[1][1][-w.size :]), is_leaf=lambda x: x is None)

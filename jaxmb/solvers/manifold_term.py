@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 if TYPE_CHECKING:
@@ -214,6 +215,17 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         del f
         out = self.project_cold(t, y, kept, args)
         return out.y, out.f
+
+    def along_solution(self, t: Any, y: Y, f: Y, held: bool, kept: PyTree[Array], args: Args) -> tuple[Y, Y, Y]:
+        """The same with the rate of the vector field along the motion; `held`: with derivatives for the rate f, from
+        which a chart returns to the constraints of other states, and not for that of other states.
+
+        A manifold that knows the rate of its equations overrides this method.
+        """
+        rate = f
+        y, f = self.at_solution(t, y, f, kept, args)
+        at = lambda t, y: self.at_solution(t, y, f, kept, args)[1]
+        return y, f, jax.jvp(at, (t, y), (jnp.ones_like(t), rate if held else f))[1]
 
     def after_jump(self, t: Any, y: Y, args: Args) -> Y:
         """The state just after a time at which the field or the manifold jumps; by default it has not changed.

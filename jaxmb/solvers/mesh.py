@@ -22,7 +22,7 @@ from .evaluation import freeze, ravel, unravel_like
 from .events import events_found
 from .linear_map import filled, linear_map
 from .packing import Layout
-from .segments import Row, Segments, choice_of, row_of, start_of
+from .segments import Row, Segments, choice_of, remainder, row_of, start_of
 from .stepping import ended, known_in_steps, stepped
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
@@ -98,7 +98,12 @@ class Mesh(eqx.Module):
 
     def row(self, rows: list[Array], k: Any) -> Row:
         """The row of a step, from those of its segment."""
-        return self.layout.unpacked([buffer[k % self.size] for buffer in rows])
+        place = self._place(k)
+        return self.layout.unpacked([buffer[place] for buffer in rows])
+
+    def _place(self, k: Any) -> Any:
+        """The index of the row of a step, among those of its segment."""
+        return k if self.segments is None else remainder(k, self.size)
 
     def linearised(self, row: Row) -> LinearStep:
         return self.steps.linearised(lambda terms: eqx.combine(terms, self.still), self.moved, self.like, row.own)
@@ -187,7 +192,7 @@ class Mesh(eqx.Module):
             if rows:
                 own = self.steps.row_tangent(row.own, self.like, before, after)
                 along = self.layout.packed_tangent(row, Row(None, None, None, own))
-                rows = [buffer_set(buffer, k % self.size, x) for buffer, x in zip(rows, along, strict=True)]
+                rows = [buffer_set(buffer, self._place(k), x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x), ddense, dense)
             each = zip(self.saved, saved, places, strict=True)
@@ -390,10 +395,15 @@ def _recorded(equations, init_state, fixed, known, limit, most):
             first = _written(first, 0, of_first.packed(steps.start(terms, old, new)), kept & (k == 0))
             if starts is not None:
                 # In the middle of a segment what is written comes to lie behind the last start.
-                place = jnp.where(k % size == 0, k // size, segments)
+                place = jnp.where(remainder(k, size) == 0, k // size, segments)
                 starts = _written(starts, place, of_starts.packed(start_of(steps, since, old)), True)
                 choices = _written(choices, k, of_choices.packed(choice_of(steps, old, new)), kept)
-            rows = _written(rows, k % size, layout.packed(row_of(steps, terms, since, old, new)), kept)
+            rows = _written(
+                rows,
+                k if starts is None else remainder(k, size),
+                layout.packed(row_of(steps, terms, since, old, new)),
+                kept,
+            )
             return new, jnp.where(kept, old.tnext, since), first, rows, starts, choices
 
         several = segments > 1

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._compat import buffer_set, while_loop
@@ -87,6 +88,13 @@ def _at_event(old, new):
     return AtEvent(after.ended, before.count + after.ended.astype(before.count.dtype) > after.count)
 
 
+def remainder(k: Any, size: int) -> Any:
+    """The remainder of a number of steps, which is not negative: for any number it is ten operations, and each kernel
+    repeats them that uses it as an index.
+    """
+    return lax.rem(k, jnp.asarray(size, k.dtype))
+
+
 class Segments(eqx.Module):
     """The segments of a run.
 
@@ -122,7 +130,8 @@ class Segments(eqx.Module):
                 after = eqx.tree_at(steps.chosen, after, choice.chosen)
             own = steps.row(terms, old, Between(old.tnext, old.tnext, y, made_jump, after))
             packed = self.layout.packed(Row(since, old.tnext, choice.at_event, own))
-            rows = [buffer_set(buffer, k % size, x) for buffer, x in zip(rows, packed, strict=True)]
+            place = remainder(k, size)
+            rows = [buffer_set(buffer, place, x) for buffer, x in zip(rows, packed, strict=True)]
             return k + 1, old.tnext, old.tnext, y, after, rows
 
         start = self.of_starts.unpacked([buffer[segment] for buffer in self.starts])

@@ -37,7 +37,7 @@ def _march(family, k, ts, first):
     def step(carry, n):
         history, y = carry
         t, h = ts[n], ts[n] - ts[n - 1]
-        rows = formulas(family, history, t)
+        rows = formulas(family, history.mesh, t, history.differences.dtype)
         m = family.multiplicity * k
         past = rows.past[m] @ history.differences[:, 0]
         past = y + h * past if family.integrated else past

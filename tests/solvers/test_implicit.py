@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.solvers._dense import differentiable
+from jaxmb.solvers._dense import DenseLinearization
 from jaxmb.solvers._field import derivatives
-from jaxmb.solvers._newton import StepEquation
+from jaxmb.solvers._newton import KnownStep, at_end
 
 
 class Field(eqx.Module):
@@ -17,6 +17,12 @@ class Field(eqx.Module):
     def __call__(self, t, y):
         f = jnp.stack([-self.parameter * jnp.sin(y[0]) + y[1] * t, -3.0 * y[1] + y[0] ** 2])
         return (y, f), None
+
+
+def along(field, t, y, f, held):
+    assert held
+    (y, f), (_, g) = jax.jvp(lambda t, y: field(t, y)[0], (t, y), (jnp.ones_like(t), f))
+    return y, f, g
 
 
 def solved(x, a, b):
@@ -36,12 +42,12 @@ def solved(x, a, b):
 @pytest.mark.parametrize("b", [-0.02, -0.002, 0.003], ids=["complex roots", "real roots", "of opposite signs"])
 def test_derivative_of_a_step(b):
     a, x = 0.15, jnp.array([4.0, 0.7, 0.3, -0.5])
-    end = jax.lax.stop_gradient(solved(x, a, b))
-    one = jnp.asarray(1.0)
+    end, one, free = jax.lax.stop_gradient(solved(x, a, b)), jnp.asarray(1.0), jnp.arange(2)
+    matrix = DenseLinearization.unknown(end[0], free)
 
     def stepped(x):
-        equation = StepEquation(Field(x[0]), lambda y: None, x[1], one, x[2:], a * one, b * one, jnp.arange(2))
-        return differentiable(end, equation)
+        solution = eqx.Partial(along, Field(x[0]))
+        return at_end(end, KnownStep(solution, x[1], x[2:], a * one, b * one, free), matrix, None)
 
     expected = jax.jacfwd(lambda x: solved(x, a, b))(x)
     for mode in (jax.jacfwd, jax.jacrev):

@@ -154,7 +154,7 @@ def test_coefficients_at_run_time(family, k):
     m, multiplicity, h = k * properties.multiplicity, properties.multiplicity, 0.25
     mesh = np.repeat(-h * np.arange(properties.length), multiplicity)[: properties.length]
     history = History(jnp.zeros((properties.length, 1)), jnp.asarray(mesh), jnp.asarray(properties.length))
-    run = formulas(properties, history, jnp.asarray(h))
+    run = formulas(properties, history.mesh, jnp.asarray(h), history.differences.dtype)
     np.testing.assert_allclose(run.slope[m], float(exact.b[0]), rtol=1e-13)
     np.testing.assert_allclose(run.curvature[m], float(exact.c[0]), rtol=1e-13)
 
