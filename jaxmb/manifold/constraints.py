@@ -167,73 +167,61 @@ def _solved_jvp(primals, tangents):
 
 
 def rates_along(
-    at: Callable[..., AbstractConstraints], system: AbstractEquation, t: Scalar, y: State, f: State, held: bool
+    at: Callable[..., AbstractConstraints], system: AbstractEquation, t: Scalar, y: State, f: State, along: State | None
 ) -> tuple[State, State, State]:
     """A state with its rate, both known, and the rate of that, as `AbstractManifoldTerm.along_solution` has them.
 
     **Arguments:** `at(system, t, q, u)`: the constraints at a state, a pytree.
     """
-    out, rates, jerk = _accelerated(at, system, t, RestoredState(y.q, y.u, f.u), held)
-    return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot), State(rates, jerk)
+    out = RestoredState(y.q, y.u, f.u)
+    if along is None:
+        out = solved(at, system, t, out)
+        along = State(system.rates(t, out.q, out.u), out.udot)
+    out, jerk = _accelerated(at, system, t, out, along)
+    rates = lambda t, q, u: system.rates(t, q, u)
+    qdot, qddot = jax.jvp(rates, (t, out.q, out.u), (jnp.ones_like(t), along.q, along.u))
+    return State(out.q, out.u), State(qdot, out.udot), State(qddot, jerk)
 
 
 @eqx.filter_custom_jvp
-def _accelerated(at, system, t, solution, held):
-    """A known state as `solved` has it, with the second derivatives of coordinates and the rates of accelerations.
+def _accelerated(at, system, t, solution, along):
+    """A known state as `solved` has it, and the rate of its accelerations along a rate of the state.
 
     Derivatives are those of the equations of motion, and of these differentiated in time, so that no factor is
     differentiated. Friction must not depend on multipliers.
     """
-    del held
-    here = at(system, t, solution.q, solution.u)
-    return solution, *_rates(here, system, t, solution)[:2]
+    return solution, _rates(at(system, t, solution.q, solution.u), system, t, solution, along)[1]
 
 
 @_accelerated.def_jvp
 def _accelerated_jvp(primals, tangents):
-    at, system, t, solution, held = primals
-    _, dsystem, dt, dsolution, _ = tangents
+    at, system, t, solution, along = primals
+    _, dsystem, dt, dsolution, dalong = tangents
     out, here = solved(at, system, t, solution), at(system, t, solution.q, solution.u)
-    state, one = (t, out.q, out.u), jnp.ones_like(t)
-    qddot, jerk, multipliers, change = _rates(here, system, t, out)
+    state = t, out.q, out.u
+    multipliers, jerk, change = _rates(here, system, t, out, along)
 
-    moved = _on_constraints(here, (system, *state), (dsystem, dt, dense(dsolution.q, out.q), dense(dsolution.u, out.u)))
+    moved = dsystem, dt, dense(dsolution.q, out.q), dense(dsolution.u, out.u)
+    moved = _on_constraints(here, (system, *state), moved)
     x = system, *state, out.udot, multipliers
-    residuals = push(_equations, x, (*moved, None, None))
-    dudot, dmultipliers = here.balance(system, state, *residuals)
-    dqdot = push(lambda system, *state: system.rates(*state), x[:4], moved)
-    along = system.rates(*state), out.udot
-    dalong = dqdot, dudot
-    if held:
-        # A rate that is held still satisfies the constraints where the state has moved to.
-        still = jax.tree.map(lambda _: None, system)
-        dalong = jax.tree.map(jnp.subtract, dalong, _on_constraints(here, x[:4], (still, None, *dalong))[2:])
+    dudot, dmultipliers = here.balance(system, state, *push(_equations, x, (*moved, None, None)))
 
     def rate(x, along):
-        own = one, *along
-        by_state = push(lambda *state: x[0].rates(*state), x[1:4], own)
-        return by_state, push(functools.partial(_equations, x[0]), x[1:], (*own, jerk, change))
+        equations = functools.partial(_equations, x[0])
+        return push(equations, x[1:], (jnp.ones_like(t), along.q, along.u, jerk, change))
 
-    dqddot, residuals = eqx.filter_jvp(rate, (x, along), ((*moved, dudot, dmultipliers), dalong))[1]
+    residuals = push(rate, (x, along), ((*moved, dudot, dmultipliers), dalong))
     djerk, _ = here.balance(system, state, *residuals)
-    return (out, qddot, jerk), (RestoredState(*moved[2:], dudot), dqddot, djerk)
+    return (out, jerk), (RestoredState(*moved[2:], dudot), djerk)
 
 
-def _rates(here, system, t, solution):
-    """The second derivatives of coordinates, the rates of accelerations, the multipliers, and their rates."""
+def _rates(here, system, t, solution, along):
+    """The multipliers, and the rates of accelerations and multipliers along a rate of the state."""
     q, u, udot = solution.q, solution.u, solution.udot
     multipliers = here.multipliers(system, t, solution)
-    along = jnp.ones_like(t), system.rates(t, q, u), udot
-    equations = lambda t, q, u: (system.rates(t, q, u), _equations(system, t, q, u, udot, multipliers))
-    qddot, residuals = jax.jvp(equations, (t, q, u), along)[1]
-    jerk, change = here.balance(system, (t, q, u), *residuals)
-    return qddot, jerk, multipliers, change
-
-
-def _on_constraints(here, at, along):
-    """The tangent of (system, t, q, u) with coordinates and velocities on the constraints."""
-    dq = here.push_positions(at[:3], along[:3])
-    return push_velocities(here, at, (*along[:2], dq, along[3]))
+    equations = lambda t, q, u: _equations(system, t, q, u, udot, multipliers)
+    residuals = push(equations, (t, q, u), (jnp.ones_like(t), along.q, along.u))
+    return multipliers, *here.balance(system, (t, q, u), *residuals)
 
 
 def _equations(system, t, q, u, udot, multipliers):
@@ -242,6 +230,12 @@ def _equations(system, t, q, u, udot, multipliers):
     if not system.ideal:
         applied = applied + system.nonideal_force(t, q, u, multipliers)
     return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
+
+
+def _on_constraints(here, at, along):
+    """The tangent of (system, t, q, u) with coordinates and velocities on the constraints."""
+    dq = here.push_positions(at[:3], along[:3])
+    return push_velocities(here, at, (*along[:2], dq, along[3]))
 
 
 def push_velocities(here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -615,11 +615,11 @@ class PartitionTerm(AbstractManifoldTerm):
         out = self._project(t, y, Chart(split, none, none, jnp.zeros(5, int)), split)
         return out.y, out.f
 
-    def along_solution(self, t, y, f, held, kept, args):
+    def along_solution(self, t, y, f, along, kept, args):
         system, (split, _) = self.system, kept
         if system.acceleration_rows == 0 or system.friction_rows.size:
-            return super().along_solution(t, y, f, held, kept, args)
-        return rates_along(eqx.Partial(_chart_constraints, split), system, t, y, f, held)
+            return super().along_solution(t, y, f, along, kept, args)
+        return rates_along(eqx.Partial(_chart_constraints, split), system, t, y, f, along)
 
     @property
     def guards(self):

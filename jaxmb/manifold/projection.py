@@ -238,11 +238,11 @@ class ProjectionTerm(AbstractManifoldTerm):
         out = solved(projector_constraints, system, t, RestoredState(y.q, y.u, f.u))
         return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
 
-    def along_solution(self, t, y, f, held, kept, args):
+    def along_solution(self, t, y, f, along, kept, args):
         system = self.system
         if system.velocity_rows == 0 or not system.ideal_on_velocities:
-            return super().along_solution(t, y, f, held, kept, args)
-        return rates_along(projector_constraints, system, t, y, f, held)
+            return super().along_solution(t, y, f, along, kept, args)
+        return rates_along(projector_constraints, system, t, y, f, along)
 
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)

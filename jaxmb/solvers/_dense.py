@@ -92,26 +92,31 @@ class DenseLinearization(AbstractLinearization):
     def tangents(self, inverses: "Inverses", a: Any, b: Any, free: Int[Array, " free"], push):
         del inverses
         units = jnp.zeros((free.size, self.state.shape[0]), self.state.dtype).at[jnp.arange(free.size), free].set(1)
-        columns = jax.vmap(push, out_axes=-1)(units)
-        jacobian, held = columns[1][free], columns[2][free]
-        own_inverses = inverses_of(jacobian, held, a, b)
+        state, rate, _ = jax.vmap(lambda x: push(x, None), out_axes=-1)(units)
+        jacobian = rate[free]
+        # A rate whose free components are held still satisfies the constraints where the state has moved to.
+        turned = (rate - state @ jacobian).T
+        _, _, acceleration = jax.vmap(push, out_axes=-1)(units, turned)
+        held, own_inverses = acceleration[free], inverses_of(jacobian, acceleration[free], a, b)
 
         def solve(own, load):
-            moved = own[1][free]
+            y, f, g = own
+            moved = f[free]
+            g = g + push(None, f - state @ moved)[2]
 
             def correction(change):
                 # Large terms are combined as in `correction` above, so the result does not depend on the last digits of
                 # an inverse.
-                rate = moved + jacobian @ change
-                mismatch = change - (load + b * own[2])[free] - b * held @ change
-                mismatch = mismatch - own_inverses.missing * jacobian @ rate
-                return own_inverses.c @ (own_inverses.p @ mismatch - own_inverses.p_rate @ rate), rate
+                slope = moved + jacobian @ change
+                mismatch = change - (load + b * g)[free] - b * held @ change
+                mismatch = mismatch - own_inverses.missing * jacobian @ slope
+                return own_inverses.c @ (own_inverses.p @ mismatch - own_inverses.p_rate @ slope), slope
 
             change = -correction(jnp.zeros_like(moved))[0]
-            left, rate = correction(change)
-            rate = rate - jacobian @ left
-            dy, df, dg = (x + column @ change for x, column in zip(own, columns, strict=True))
-            return dy, df.at[free].set(rate, unique_indices=True), dg + columns[1] @ rate
+            left, slope = correction(change)
+            slope = slope - jacobian @ left
+            f = (f + rate @ change).at[free].set(slope, unique_indices=True)
+            return y + state @ change, f, g + acceleration @ change + rate @ slope
 
         return solve
 

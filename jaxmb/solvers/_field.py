@@ -14,8 +14,8 @@ from .._compat import any_of_batch
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
-# `(t, y, f, held) -> (y, f, g)`: a known state, its f, and g, with the derivatives that the equations give them, and if
-# `held`, of g those for the rate f; a pytree as well.
+# `(t, y, f, along) -> (y, f, g)`: a known state, its f, and g along a rate of the state, f if that is None, with the
+# derivatives that the equations give them; a pytree as well.
 Solution = Callable[..., tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 
 
@@ -90,22 +90,23 @@ def at_start(
 @at_start.def_jvp
 def _at_start_jvp(primals, tangents):
     _, f, _ = out = at_start(*primals)
-    tangents = eqx.filter_jvp(lambda solution, t, y: solution(t, y, f, False), primals[1:], tangents[1:])[1]
+    tangents = eqx.filter_jvp(lambda solution, t, y: solution(t, y, f, None), primals[1:], tangents[1:])[1]
     return out, tuple(map(filled, tangents, out))
 
 
 def linearized(
     solution: Callable[[PyTree], Solution], numbers: PyTree, t: Any, y: Float[Array, " n"], f: Float[Array, " n"]
-) -> tuple[Callable[..., tuple[Array, Array, Array]], Callable[[Float[Array, " n"]], tuple[Array, Array, Array]]]:
-    """The tangents of `(y, f, g)` at a known state, of g for a held rate: linear functions of those of the `numbers`
-    that the solution depends on and of time, None without any, and of that of y.
+) -> tuple[Callable[..., tuple[Array, Array, Array]], Callable[..., tuple[Array, Array, Array]]]:
+    """The tangents of `(y, f, g)` at a known state as linear functions: of those of the `numbers` that the solution
+    depends on and of time, None without any, for a rate that is held; and of those of the state and of the rate that g
+    is along, None for held.
     """
-    out, push = jax.linearize(lambda x, t, y: solution(x)(t, y, f, True), numbers, t, y)
-    zeros, still = jax.tree.map(jnp.zeros_like, (numbers, t, y)), jax.tree.map(lambda _: None, numbers)
+    out, push = jax.linearize(lambda x, *at: solution(x)(*at[:2], f, at[2]), numbers, t, y, f)
+    zeros, still = jax.tree.map(jnp.zeros_like, (numbers, t, y, f)), jax.tree.map(lambda _: None, numbers)
 
     def pushed(*tangents):
         # As a derivative of the linear function, which leaves out what has no tangent.
         moved = eqx.filter_jvp(push, zeros, tangents)[1]
         return jax.tree.map(filled, moved, out, is_leaf=lambda x: x is None)
 
-    return lambda along, dt: pushed(along, dt, None), lambda change: pushed(still, None, change)
+    return lambda along, dt: pushed(along, dt, None, None), lambda y, rate: pushed(still, None, y, rate)

@@ -125,12 +125,12 @@ class AbstractLinearization(eqx.Module):
         a: Any,
         b: Any,
         free: Int[Array, " free"],
-        push: Callable[[Float[Array, " n"]], tuple[Array, Array, Array]],
+        push: Callable[..., tuple[Array, Array, Array]],
     ) -> Callable[..., tuple[Array, Array, Array]]:
-        """The tangents of `(y, f, g)` at the end of a step, a linear function `(own, load)` of those at a held y, and
-        of that of `past + a f + b g` where f and g are held.
+        """The tangents of `(y, f, g)` at the end of a step, a linear function `(own, load)` of those at a held y and
+        rate, and of that of `past + a f + b g` where f and g are held.
 
-        **Arguments:** `push`: the tangents of `(y, f, g)` by that of y, of g for a held f.
+        **Arguments:** `push`: the tangents of `(y, f, g)` by those of y and of the rate that g is along.
         """
 
 

@@ -140,13 +140,9 @@ class StructuredLinearization(AbstractLinearization):
 
         def twice(change):
             """Changes of y, f and g by that of y; a loop, so that the linear function is compiled once."""
-
-            def body(x, _):
-                by_x = push(x)
-                return by_x[1], by_x
-
-            _, (states, rates, held) = lax.scan(body, change, None, length=2)
-            return states[0], rates[0], held[0] + rates[1]
+            still = jnp.zeros_like(change)
+            _, found = lax.scan(lambda rate, _: (lambda out: (out[1], out))(push(change, rate)), still, None, length=2)
+            return tuple(x[1] for x in found)
 
         def apply(change):
             _, rate, acceleration = twice(change)
@@ -161,7 +157,7 @@ class StructuredLinearization(AbstractLinearization):
             return x + pull(inverses.transpose_solve(x) - x)[0]
 
         def solve(own, load):
-            acceleration = own[2] + push(own[1])[1]
+            acceleration = own[2] + push(None, own[1])[2]
             change = lax.custom_linear_solve(
                 apply,
                 load + a * own[1] + b * acceleration,

@@ -196,8 +196,8 @@ def at_solution(
 
 
 def solution_of(term: Any, t: Any, like: PyTree[Array], kept: PyTree[Array], args: Args) -> Any:
-    """`(t, y, f, held) -> (y, f, g)` for raveled states, a pytree: a known state, its field, and the rate of that along
-    the motion, with the derivatives that the equations give them; if `held`, of g those for the rate f.
+    """`(t, y, f, along) -> (y, f, g)` for raveled states, a pytree: a known state, its vector field, and the rate of
+    that along a rate of the state, by default the field, with the derivatives that the equations give them.
     """
     if _manifold(term) is not None:
         return eqx.Partial(_along_solution, term, like, kept, args)
@@ -207,15 +207,18 @@ def solution_of(term: Any, t: Any, like: PyTree[Array], kept: PyTree[Array], arg
     return eqx.Partial(_along_field, eqx.filter_closure_convert(field, t, flat))
 
 
-def _along_field(field, t, flat, f, held):
-    return flat, *jax.jvp(field, (t, flat), (jnp.ones_like(t), f if held else field(t, flat)))
+def _along_field(field, t, flat, f, along):
+    del f
+    along = field(t, flat) if along is None else along
+    return flat, *jax.jvp(field, (t, flat), (jnp.ones_like(t), along))
 
 
-def _along_solution(term, like, kept, args, t, flat, f, held):
+def _along_solution(term, like, kept, args, t, flat, f, along):
     manifold, direction = _manifold(term), direction_of(term)
     sign = jnp.asarray(direction).astype(flat.dtype)
-    y, f = unravel_like(like, flat), unravel_like(like, f * sign)
-    y, f, g = manifold.along_solution(t * direction, y, f, held, kept, args)
+    in_time = lambda rate: None if rate is None else unravel_like(like, rate * sign)
+    y = unravel_like(like, flat)
+    y, f, g = manifold.along_solution(t * direction, y, in_time(f), in_time(along), kept, args)
     return ravel(y, flat.dtype), ravel(f, flat.dtype) * sign, ravel(g, flat.dtype)
 
 

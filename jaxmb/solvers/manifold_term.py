@@ -216,16 +216,14 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         out = self.project_cold(t, y, kept, args)
         return out.y, out.f
 
-    def along_solution(self, t: Any, y: Y, f: Y, held: bool, kept: PyTree[Array], args: Args) -> tuple[Y, Y, Y]:
-        """The same with the rate of the vector field along the motion; `held`: with derivatives for the rate f, from
-        which a chart returns to the constraints of other states, and not for that of other states.
+    def along_solution(self, t: Any, y: Y, f: Y, along: Y | None, kept: PyTree[Array], args: Args) -> tuple[Y, Y, Y]:
+        """The same with the rate of the vector field, for a rate `along` of the state; None for the vector field.
 
         A manifold that knows the rate of its equations overrides this method.
         """
-        rate = f
         y, f = self.at_solution(t, y, f, kept, args)
         at = lambda t, y: self.at_solution(t, y, f, kept, args)[1]
-        return y, f, jax.jvp(at, (t, y), (jnp.ones_like(t), rate if held else f))[1]
+        return y, f, jax.jvp(at, (t, y), (jnp.ones_like(t), f if along is None else along))[1]
 
     def after_jump(self, t: Any, y: Y, args: Args) -> Y:
         """The state just after a time at which the field or the manifold jumps; by default it has not changed.
