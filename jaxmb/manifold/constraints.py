@@ -143,7 +143,7 @@ def _push_solution(here, system, t, out, along):
     """The tangent of a restored state, from one of (system, t, q, u) before it was restored."""
     along = _on_constraints(here, (system, t, out.q, out.u), along)
     dudot, dmultipliers = push_accelerations(here, (system, t, out.q, out.u), along, out)
-    return RestoredState(*along[2:], dudot, dmultipliers)
+    return RestoredState(along[2], along[3], dudot, dmultipliers)
 
 
 @eqx.filter_custom_jvp
@@ -212,7 +212,7 @@ def _accelerated_jvp(primals, tangents):
 
     residuals = push(rate, (x, along), ((*moved, dudot, dmultipliers), dalong))
     djerk, _ = here.balance(system, state, *residuals)
-    return (out, jerk), (RestoredState(*moved[2:], dudot), djerk)
+    return (out, jerk), (RestoredState(moved[2], moved[3], dudot), djerk)
 
 
 def _rates(here, system, t, solution, along):
@@ -234,8 +234,8 @@ def _equations(system, t, q, u, udot, multipliers):
 
 def _on_constraints(here, at, along):
     """The tangent of (system, t, q, u) with coordinates and velocities on the constraints."""
-    dq = here.push_positions(at[:3], along[:3])
-    return push_velocities(here, at, (*along[:2], dq, along[3]))
+    dsystem, dt, _, du = along
+    return push_velocities(here, at, (dsystem, dt, here.push_positions(at[:3], along[:3]), du))
 
 
 def push_velocities(here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -249,10 +249,11 @@ def push_accelerations(
     here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...], out: RestoredState
 ) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
     """The tangents of the accelerations at (system, t, q, u), and of the multipliers that friction depends on."""
-    multipliers = here.multipliers(at[0], at[1], out)
-    forces_of = lambda *at: _equations(*at, out.udot, multipliers)
-    rows, forces = push(forces_of, at, along)
-    return here.cancel_residuals(at[0], at[1:], multipliers, forces, rows)
+    system, t, q, u = at
+    multipliers = here.multipliers(system, t, out)
+    equations = lambda system, t, q, u: _equations(system, t, q, u, out.udot, multipliers)
+    rows, forces = push(equations, at, along)
+    return here.cancel_residuals(system, (t, q, u), multipliers, forces, rows)
 
 
 def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:

@@ -142,7 +142,8 @@ class StructuredLinearization(AbstractLinearization):
             """Changes of y, f and g by that of y; a loop, so that the linear function is compiled once."""
             still = jnp.zeros_like(change)
             _, found = lax.scan(lambda rate, _: (lambda out: (out[1], out))(push(change, rate)), still, None, length=2)
-            return tuple(x[1] for x in found)
+            y, rate, acceleration = (x[1] for x in found)
+            return y, rate, acceleration
 
         def apply(change):
             _, rate, acceleration = twice(change)
@@ -164,7 +165,8 @@ class StructuredLinearization(AbstractLinearization):
                 lambda apply, x: _iterate(apply, precondition, x),
                 lambda apply, x: _iterate(apply, precondition_transpose, x),
             )
-            return tuple(map(jnp.add, (own[0], own[1], acceleration), twice(change)))
+            y, rate, by_change = twice(change)
+            return own[0] + y, own[1] + rate, acceleration + by_change
 
         return solve
 

@@ -169,7 +169,7 @@ class AdamsSteps(AbstractSteps):
         restart = None if jump is None else restarts(of, moved, like, jump, lambda field, t, y: field(t, y)[0])
 
         def push(dmoved, w, memory):
-            if restart is not None:
+            if jump is not None and restart is not None:
                 new, f = restart(dmoved, w, memory[0])
                 restarted = jnp.concatenate([f[None], jnp.zeros_like(memory[1:])])
                 w, memory = jnp.where(jump.made, new, w), jnp.where(jump.made, restarted, memory)

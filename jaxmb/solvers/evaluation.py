@@ -199,8 +199,9 @@ def solution_of(term: Any, t: Any, like: PyTree[Array], kept: PyTree[Array], arg
     """`(t, y, f, along) -> (y, f, g)` for raveled states, a pytree: a known state, its vector field, and the rate of
     that along a rate of the state, by default the field, with the derivatives that the equations give them.
     """
-    if _manifold(term) is not None:
-        return eqx.Partial(_along_solution, term, like, kept, args)
+    manifold = _manifold(term)
+    if manifold is not None:
+        return eqx.Partial(_along_solution, manifold, jnp.asarray(direction_of(term)), like, kept, args)
     flat = ravel(like)
     field = lambda t, flat: ravel(derivative(term, t, unravel_like(like, flat), args), flat.dtype)
     # What a vector field closes over has derivatives as well.
@@ -213,9 +214,8 @@ def _along_field(field, t, flat, f, along):
     return flat, *jax.jvp(field, (t, flat), (jnp.ones_like(t), along))
 
 
-def _along_solution(term, like, kept, args, t, flat, f, along):
-    manifold, direction = _manifold(term), direction_of(term)
-    sign = jnp.asarray(direction).astype(flat.dtype)
+def _along_solution(manifold, direction, like, kept, args, t, flat, f, along):
+    sign = direction.astype(flat.dtype)
     in_time = lambda rate: None if rate is None else unravel_like(like, rate * sign)
     y = unravel_like(like, flat)
     y, f, g = manifold.along_solution(t * direction, y, in_time(f), in_time(along), kept, args)

@@ -73,8 +73,7 @@ class HermiteSteps(AbstractSteps):
         terms, args, solver = of(moved.terms)
         formula = solver.formula(row.mesh, row.order_index, row.end, row.y.dtype)
         jump = row.jump
-        if jump is not None:
-            restart = restarts(of, moved, like, jump, lambda *at: derivatives(*at)[:3])
+        restart = None if jump is None else restarts(of, moved, like, jump, lambda *at: derivatives(*at)[:3])
 
         def solution(numbers):
             own, args, _ = of(numbers)
@@ -87,7 +86,7 @@ class HermiteSteps(AbstractSteps):
 
         def push(dmoved, w, memory):
             differences, slope = memory
-            if jump is not None:
+            if jump is not None and restart is not None:
                 new, f, g = restart(dmoved, w, slope[-w.size :])
                 first, _ = solver.begun(row.mesh[0], formula.h, new, f, g)
                 w = jnp.where(jump.made, new, w)
