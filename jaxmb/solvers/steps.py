@@ -107,6 +107,6 @@ def refuse_moving_jumps(moved: Moving, solver: Any) -> None:
     """Raise a `ValueError` for derivatives by the times of jumps."""
     if moved.jumps is not None:
         raise ValueError(
-            "Derivatives by the times of jumps are known to jaxmb.solvers.Adams only, got "
-            f"{type(solver).__name__}: use that, or stop_gradient for the times."
+            "Derivatives by the times of jumps are known to jaxmb.solvers.Adams and Hermite only, got "
+            f"{type(solver).__name__}: use these, or stop_gradient for the times."
         )

@@ -460,7 +460,7 @@ FRONTS = {
         DOPRI8 | {"direction": {"spring.stiffness": 1.0}},
     ),
     "event": (event, DOPRI8),
-    # Derivatives by the times of jumps are known to Adams.
+    # Derivatives by the times of jumps are known to multistep methods.
     "jumps": (jumps, {}),
     "body of a user": (body_of_a_user, FIXED),
     "assembly in the plane": (functools.partial(assembled, "four_bar"), {}),
