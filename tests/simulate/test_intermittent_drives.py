@@ -13,7 +13,7 @@ TOLERANCES = {"coarse": {"rtol": 1e-4}, "medium": {"rtol": 1e-6}, "default": {},
 DEFAULT = 1e-8
 
 
-class Scene:
+class Drive:
     """A system with the state and the times of its motion."""
 
     def __init__(self, bodies, joints, forces, start, times):
@@ -65,7 +65,7 @@ def geneva():
     )
     brake = mb.JointSpring("brake", "axle.angle", stiffness=0.0, damping=2e-2)
     times = np.linspace(0.0, TURNS * 2 * np.pi / RATE, 200 * TURNS + 1)
-    return Scene(bodies, joints, [slots, brake], {"wheel.angle": 0.0}, times)
+    return Drive(bodies, joints, [slots, brake], {"wheel.angle": 0.0}, times)
 
 
 def indexed(times):
@@ -79,10 +79,10 @@ def indexed(times):
 @pytest.mark.long
 @pytest.mark.parametrize("name", TOLERANCES)
 def test_a_geneva_wheel_turns_by_a_quarter_at_each_turn(name):
-    scene, options = geneva(), TOLERANCES[name]
-    motion, rtol = scene.motion(**options), options.get("rtol", DEFAULT)
-    angle, radius = indexed(scene.times)
-    wheel, exact = motion["wheel"], scene.exact["wheel"]
+    drive, options = geneva(), TOLERANCES[name]
+    motion, rtol = drive.motion(**options), options.get("rtol", DEFAULT)
+    angle, radius = indexed(drive.times)
+    wheel, exact = motion["wheel"], drive.exact["wheel"]
     # The pin moves by its clearance and by what the contact yields.
     assert np.max(np.abs(wheel.angle - angle) * radius) < 2 * CLEARANCE
     np.testing.assert_allclose(wheel.angle[::200], -np.pi / 2 * np.arange(TURNS + 1), atol=CLEARANCE / ARM)
@@ -90,7 +90,7 @@ def test_a_geneva_wheel_turns_by_a_quarter_at_each_turn(name):
     np.testing.assert_allclose(wheel.angular_velocity, exact.angular_velocity, rtol=0, atol=300 * rtol)
 
 
-# A wheel that a weight turns, and an anchor whose two pins stop it in turn; the teeth push it to and fro.
+# A weight turns a wheel, whose teeth push an anchor to and fro; the anchor's two pins stop them by turns.
 TEETH, RADIUS, TIP, OVERLAP = 6, 0.03, 5e-4, 1.5e-4
 PITCH, REACH = 2 * np.pi / TEETH, RADIUS + 2 * TIP
 # The pins are one and a half pitches apart, and move towards the axle and away from it.
@@ -129,20 +129,20 @@ def escapement():
     oil = mb.JointSpring("oil", "pivot.angle", stiffness=0.0, damping=2e-3)
     forces = [weight, oil, pallet("entry", -1), pallet("exit", 1)]
     start = {"wheel.angle": 0.0, "anchor.angle": 0.0}
-    return Scene(bodies, joints, forces, start, np.linspace(0.0, 3.0, 1001))
+    return Drive(bodies, joints, forces, start, np.linspace(0.0, 3.0, 1001))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", TOLERANCES)
 def test_an_escapement_lets_one_tooth_pass_at_each_swing(name):
-    scene, options = escapement(), TOLERANCES[name]
-    motion, rtol = scene.motion(**options), options.get("rtol", DEFAULT)
+    drive, options = escapement(), TOLERANCES[name]
+    motion, rtol = drive.motion(**options), options.get("rtol", DEFAULT)
     wheel, anchor = (np.asarray(motion[body].angle) for body in ("wheel", "anchor"))
-    # From the first stop on, which is at the exit: half a pitch from each stop to the next, at the other pin.
+    # From one stop to the next, at the other pin, the wheel turns by half a pitch.
     moves = np.abs(anchor) > 1e-3
     changes = np.flatnonzero(np.diff(np.sign(anchor[moves])))
     way = (wheel[0] - wheel[moves][changes]) / (0.5 * PITCH)
     assert len(changes) == 17
     assert np.max(np.abs(way - way[0] - np.arange(17))) < 0.01
     for body in ("wheel", "anchor"):
-        np.testing.assert_allclose(motion[body].angle, scene.exact[body].angle, rtol=0, atol=100 * rtol)
+        np.testing.assert_allclose(motion[body].angle, drive.exact[body].angle, rtol=0, atol=100 * rtol)
