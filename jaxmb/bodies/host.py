@@ -1,84 +1,178 @@
-"""The constraints of a scene in NumPy: where all its joints consist of elements, nothing is compiled to find consistent
-positions and velocities.
-
-The equations are those of `states/closest.py`. Matrices are dense and small.
+"""The constraints of a scene in NumPy: joints that consist of elements without any program, and all others by a program
+of their rows alone.
 """
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Float
 
 from ..linalg import rotations as rot
+from ..linalg.jitted import jitted
 from ..parts.elements import on_bodies
-from ..states.closest import largest_residual, tolerance
+from ..states.on_host import MOST, AbstractHost
 from .elementary import ElementaryRows, Listed, is_elementary, stacked
-
-# The largest numbers of rows and coordinates whose dense matrices are cheap.
-_MOST = 150
-# Largest numbers of Gauss–Newton and of Newton steps; a share of the residuals that a Gauss–Newton step takes away; the
-# power of the precision at which a step is the last one.
-_STEPS, _REFINEMENTS, _PROGRESS, _SMALL = 60, 16, 0.999, 0.75
-# Coordinates satisfy constraints exactly up to so many units of rounding; singular values below this fraction are zero.
-_ROUNDING, _ZERO = 4.0, 1e-9
-# The change of a coordinate, imaginary, by which derivatives are found.
-_IMAGINARY = 1e-30
+from .groups import AbstractConstraintGroup, ConstraintGroup
 
 
-class HostScene:
-    """The position constraints of a system of rigid bodies; made by `host_scene`."""
+class _Rows(NamedTuple):
+    """Of a group: Φ, or ψ where it binds velocities; how this changes while nothing moves; and derivatives along the
+    poses of the parts' bodies, or along their velocities.
+    """
 
-    def __init__(self, system: Any, rows: ElementaryRows, along: list[tuple[np.ndarray, np.ndarray, np.ndarray]]):
-        self._rows, self._along, self._layout = rows, along, system.layout
-        groups = [(g.group.body_index, g.rows) for g in system.constraints]
-        self._sources = [self._layout.jacobian_source(groups, of_poses=own) for own in (False, True)]
+    values: Float[Array, "parts rows"]
+    drift: Float[Array, "parts rows"]
+    blocks: Float[Array, "parts rows k n"]
+
+
+@jitted
+def _rows(groups: tuple[AbstractConstraintGroup, ...], t: Any, poses: Any, velocities: Any, moves: Any) -> list[_Rows]:
+    out = []
+    for g in groups:
+        if not isinstance(g, ConstraintGroup):
+            values = g.velocity(t, poses, velocities)
+            out.append(_Rows(values, values, g.jacobian(t, poses, velocities)))
+            continue
+        values, drift = g.residual(t, poses), jnp.zeros(0, poses.dtype)
+        if g.rheonomic:
+            drift = jax.jvp(lambda t, g=g: g.residual(t, poses), (t,), (jnp.ones_like(t),))[1]
+        out.append(_Rows(values, drift, g.along(t, poses, moves)))
+    return out
+
+
+class HostScene(AbstractHost):
+    """The constraints of a system of rigid bodies; made by `host_scene`."""
+
+    def __init__(self, system: Any, t: Any):
+        self._layout, self._groups, self._given = system.layout, system.joints, np.asarray(system.guess.u)
+        self._t, self._positions = np.asarray(t, system.guess.q.dtype), len(system.constraints)
+        self._elements, self._along = _elements(system)
+        self._others, self._last = tuple(g for g in self._groups if not _is_known(g)), None
+        places = [(g.group.body_index, g.rows) for g in self._groups]
+        self._of_poses = self._layout.jacobian_source(places[: self._positions], of_poses=True)
+        self._of_velocities = self._layout.jacobian_source(places, of_poses=False)
         self._rotating = [k for k, rotates in enumerate(self._layout.rotates) if rotates and self._spatial]
+        self.linear, self.velocity_rows = system.linear, system.velocity_rows
         self.coordinate_scale, self.velocity_scale = system.known_scales()
 
     @property
     def _spatial(self):
         return self._layout.space.dimension == 3
 
-    def poses(self, q) -> Any:
-        """Prepared poses of the bodies and the ground."""
-        layout = self._layout
-        poses = np.append(q, layout.space.ground)[layout.pose_index]
+    def _poses(self, q) -> Any:
+        """Poses of the bodies, of scalar coordinates and the ground."""
+        return np.append(q, self._layout.space.ground)[self._layout.pose_index]
+
+    def _prepared(self, q) -> Any:
+        return self._prepare(self._poses(q))
+
+    def _prepare(self, poses):
         if not self._spatial:
             angle = poses[:, 2:]
             return np.concatenate([poses, np.cos(angle), np.sin(angle)], axis=1)
         turned: Any = poses[:, 3:]
         return np.concatenate([poses, [rot.rotation_matrix(p).ravel() for p in turned]], axis=1)
 
+    def _moves(self, q):
+        """Rates of prepared poses along unit rates of poses."""
+        poses = self._poses(q)
+        size = poses.shape[1]
+        if self._spatial:
+            # Matrices are quadratic in Euler parameters, so that these differences are exact.
+            return np.stack([0.5 * (self._prepare(poses + x) - self._prepare(poses - x)) for x in np.eye(size)], axis=1)
+        moves = np.tile(np.eye(size, size + 2), (len(poses), 1, 1))
+        moves[:, 2, size:] = np.stack([-np.sin(poses[:, 2]), np.cos(poses[:, 2])], axis=1)
+        return moves
+
+    def _rates(self, q, of_bodies):
+        """The rates of poses of all bodies at these velocities."""
+        if not self._spatial:
+            return of_bodies
+        poses = self._poses(q)
+        turned: Any = zip(poses[:, 3:], of_bodies[:, 3:], strict=True)
+        return np.concatenate([of_bodies[:, :3], [rot.rates(p, w) for p, w in turned]], axis=1)
+
+    def _of_others(self, q, u=None) -> list[_Rows]:
+        """Rows of constraints that are not known as elements, by default at the given velocities."""
+        if not self._others:
+            return []
+        u = self._given if u is None else u
+        key = q.tobytes(), u.tobytes()
+        if self._last is None or self._last[0] != key:
+            of_bodies = np.append(u, 0.0)[self._layout.velocity_index]
+            with jax.ensure_compile_time_eval():
+                found = _rows(self._others, self._t, self._prepared(q), of_bodies, self._moves(q))
+            self._last = key, jax.tree.map(np.asarray, found)
+        return self._last[1]
+
+    def _joined(self, groups, of_elements: Any, of_others: Iterable[Any]) -> list[Any]:
+        """What is known of elements and of other constraints, group by group."""
+        others, out, first = iter(of_others), [], 0
+        for g in groups:
+            if not _is_known(g):
+                out.append(next(others))
+                continue
+            count = len(g.group.names) * g.rows
+            out.append(of_elements[first : first + count])
+            first += count
+        return out
+
     def residual(self, q):
         """Φ."""
-        return self._rows.residual(self.poses(q))
+        known = None if self._elements is None else self._elements.residual(self._prepared(q))
+        return _flat(self._joined(self._groups[: self._positions], known, (x.values for x in self._of_others(q))))
 
     def coordinate_residual(self, q):
-        """Φ, and the lengths of Euler parameters."""
         p = self._euler(q)
         return np.concatenate([self.residual(q), 0.5 * (np.sum(p * p, axis=1) - 1.0)])
 
-    def blocks(self, q):
-        """A, row by row for two bodies each."""
-        return self._rows.jacobian(self.poses(q))
+    def blocks(self, q, u=None) -> list[Float[np.ndarray, "parts rows k v"]]:
+        """A, group by group, for the bodies of each part; by default at the given velocities."""
+        known = None if self._elements is None else self._elements.jacobian(self._prepared(q))
+        others = zip(self._others, self._of_others(q, u), strict=True)
+        found = self._joined(self._groups, known, (self._along_velocities(q, g, x.blocks) for g, x in others))
+        pairs = zip(self._groups, found, strict=True)
+        return [x.reshape(len(g.group.names), g.rows, *x.shape[-2:]) for g, x in pairs]
 
-    def jacobian(self, q):
-        """A."""
-        return np.append(self.blocks(q), 0.0)[self._sources[0]]
+    def _along_velocities(self, q, group, blocks):
+        """Derivatives along velocities, from those along poses."""
+        if not (self._spatial and isinstance(group, ConstraintGroup)):
+            return blocks
+        units = np.eye(self._layout.space.velocity_size)
+        moved = [self._rates(q, np.tile(unit, (self._layout.ground + 1, 1))) for unit in units]
+        turned: Any = np.stack(moved, axis=-1)[group.group.body_index]
+        return np.einsum("prkn,pknv->prkv", blocks, turned)
 
     def coordinate_jacobian(self, q):
-        """The derivative of `coordinate_residual`."""
-        if not self._spatial:
-            return self.jacobian(q)
-        rows = np.append(self._rows.jacobian_of_poses(self.poses(q)), 0.0)[self._sources[1]]
-        of_lengths = np.zeros((len(self._rotating), q.size), q.dtype)
+        known = None
+        if self._elements is not None:
+            prepared = self._prepared(q)
+            known = self._elements.jacobian_of_poses(prepared) if self._spatial else self._elements.jacobian(prepared)
+        own = self._joined(self._groups[: self._positions], known, (x.blocks for x in self._of_others(q)))
+        rows = np.append(_flat(own), 0.0)[self._of_poses]
+        of_lengths = np.zeros((len(self._rotating), q.size))
         places = self._layout.pose_index[self._rotating, 3:]
         of_lengths[np.arange(len(self._rotating))[:, None], places] = q[places]
         return np.concatenate([rows, of_lengths])
 
+    def velocity_rows_at(self, q, u):
+        blocks, of_bodies = self.blocks(q, u), np.append(u, 0.0)[self._layout.velocity_index]
+        others, unmet = dict(zip(map(id, self._others), self._of_others(q, u), strict=True)), []
+        for g, own in zip(self._groups, blocks, strict=True):
+            more = others.get(id(g))
+            if more is not None and not isinstance(g, ConstraintGroup):
+                unmet.append(more.values)
+                continue
+            rates = np.einsum("prkv,pkv->pr", own, of_bodies[g.group.body_index])
+            unmet.append(rates if more is None or not more.drift.size else rates + more.drift)
+        jacobian = np.append(_flat(blocks), 0.0)[self._of_velocities]
+        return _flat(unmet)[: self.velocity_rows], jacobian[: self.velocity_rows]
+
     def _euler(self, q):
-        return q[self._layout.pose_index[self._rotating, 3:]] if self._rotating else np.zeros((0, 4), q.dtype)
+        return q[self._layout.pose_index[self._rotating, 3:]] if self._rotating else np.zeros((0, 4))
 
     def normalize(self, q):
         """The coordinates with Euler parameters of length one."""
@@ -90,113 +184,41 @@ class HostScene:
 
     def displaced(self, q, step):
         """The coordinates after a displacement along velocities."""
-        layout = self._layout
-        moved = np.append(step, 0.0)[layout.velocity_index]
-        poses = np.append(q, layout.space.ground)[layout.pose_index]
-        if self._spatial:
-            turned: Any = zip(poses[:, 3:], moved[:, 3:], strict=True)
-            moved = np.concatenate([moved[:, :3], [rot.rates(p, w) for p, w in turned]], axis=1)
-        return self.normalize((poses + moved)[:-1].ravel()[layout.coordinate_place])
+        moved = self._rates(q, np.append(step, 0.0)[self._layout.velocity_index])
+        return self.normalize((self._poses(q) + moved)[:-1].ravel()[self._layout.coordinate_place])
 
-    def holds(self, q) -> bool:
+    def holds(self, q):
         """Whether the constraints hold, and no joint is turned by half a turn."""
-        norms: Any = np.linalg.norm(self.coordinate_jacobian(q) * self.coordinate_scale, axis=1)
-        residual: Any = self.coordinate_residual(q)
-        if not largest_residual(residual, norms) <= tolerance(q.dtype):
+        if not super().holds(q):
             return False
-        poses, turned = self.poses(q), self._layout.space.direction
+        poses, turned = self._prepared(q), self._layout.space.direction
         return all(
             turned(poses[a], u) @ turned(poses[b], v) > 0
             for bodies, of_a, of_b in self._along
             for (a, b), u, v in zip(bodies, of_a, of_b, strict=True)
         )
 
-    def met(self, q, held: Bool[np.ndarray, "nq"] | None = None):
-        """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of those that are held."""
-        scale = self.coordinate_scale if held is None else np.where(held, 0.0, self.coordinate_scale)
-        before, small = self.coordinate_residual(q), np.finfo(float).eps ** _SMALL
-        for _ in range(_STEPS if np.all(np.isfinite(before)) else 0):
-            step = -scale * np.linalg.lstsq(self.coordinate_jacobian(q) * scale, before, rcond=1e-12)[0]
-            longest = np.max(np.abs(step[scale > 0] / scale[scale > 0]), initial=0.0)
-            step = step * min(1.0, 1.0 / longest if longest > 0 else 1.0)
-            reached = [q + length * step for length in 0.5 ** np.arange(8)]
-            sizes = [np.sum(self.coordinate_residual(there) ** 2) for there in reached]
-            best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
-            if not sizes[best] < before @ before:
-                break
-            gained = sizes[best] < _PROGRESS * (before @ before)
-            q, before = reached[best], self.coordinate_residual(reached[best])
-            if longest <= small or not gained:
-                break
-        return q
 
-    def closest_configuration(self, guess, held: Bool[np.ndarray, "nq"], rank: int):
-        """The configuration closest to the guess with some coordinates held; None where it is not found.
-
-        **Arguments:** `rank`: of the rows in the columns that are not held.
-        """
-        scale = np.where(held, 0.0, self.coordinate_scale)
-        size = np.max(np.abs(guess), initial=0.0) + np.max(self.coordinate_scale, initial=0.0)
-        exact = np.max(np.abs(self.coordinate_residual(guess))) <= _ROUNDING * np.finfo(guess.dtype).eps * size
-        if exact and not held.any() and self.holds(guess):
-            return guess
-        q = self.met(guess, held)
-        if not self.holds(q) or _rank(self.coordinate_jacobian(q) * scale) != rank:
-            return None
-        free, small = ~held, np.finfo(float).eps ** _SMALL
-        weights = 1 / self.coordinate_scale[free] ** 2
-        multipliers = np.zeros(self.coordinate_residual(q).size)
-        for _ in range(_REFINEMENTS):
-            jacobian = self.coordinate_jacobian(q)[:, free]
-            gradient = weights * (q - guess)[free]
-            if not np.any(multipliers):
-                multipliers = np.linalg.lstsq(jacobian.T, -gradient, rcond=1e-12)[0]
-            curvature = np.diag(weights) + self._curvature(q, multipliers, free)
-            matrix = np.block([[curvature, jacobian.T], [jacobian, np.zeros((jacobian.shape[0],) * 2)]])
-            right = -np.concatenate([gradient + jacobian.T @ multipliers, self.coordinate_residual(q)])
-            step = np.linalg.lstsq(matrix, right, rcond=1e-13)[0]
-            q = q.copy()
-            q[free] += step[: free.sum()]
-            multipliers = multipliers + step[free.sum() :]
-            if np.max(np.abs(step[: free.sum()]) / scale[free], initial=0.0) <= small:
-                return q if self.holds(q) else None
-        return None
-
-    def _curvature(self, q, multipliers, free):
-        """The second derivatives of rows along multipliers, by imaginary changes of coordinates."""
-        rows = []
-        for k in np.flatnonzero(free):
-            there = q.astype(complex)
-            there[k] += 1j * _IMAGINARY
-            rows.append((multipliers @ self.coordinate_jacobian(there)).imag[free] / _IMAGINARY)
-        return np.array(rows).reshape(free.sum(), free.sum())
-
-    def closest_velocities(self, q, guess, held: Bool[np.ndarray, "nu"], rank: int):
-        """The velocities closest to the guess with some rates held; None where they are not found."""
-        scale = np.where(held, 0.0, self.velocity_scale)
-        jacobian = self.jacobian(q)
-        if not held.any() and _rank(jacobian * scale) != rank:
-            return None
-        u = guess
-        for _ in range(2):
-            u = u - scale * np.linalg.lstsq(jacobian * scale, jacobian @ u, rcond=1e-10)[0]
-        size = 1.0 + np.max(np.abs(jacobian) @ np.abs(u), initial=0.0)
-        return u if np.max(np.abs(jacobian @ u), initial=0.0) <= 1e2 * tolerance(u.dtype) * size else None
+def _flat(pieces):
+    return np.concatenate([np.zeros(0), *(x.ravel() for x in pieces)])
 
 
-def _rank(matrix):
-    sizes = np.linalg.svd(matrix, compute_uv=False)
-    return int(np.sum(sizes > _ZERO * np.max(sizes, initial=0.0)))
+def host_scene(system: Any, t: Any) -> HostScene | None:
+    """The constraints of a system in NumPy; None where there are none, or many."""
+    small = 0 < system.acceleration_rows <= MOST and system.nq <= MOST and system.guess.q.dtype == np.float64
+    return HostScene(system, t) if small and not system.turn_counts else None
 
 
-def host_scene(system: Any) -> HostScene | None:
-    """The constraints of a system in NumPy; None where some are no elements, or there are many."""
-    plain = not (system.velocity_constraints or system.servos or system.layout.scalars)
-    small = 0 < system.position_rows <= _MOST and system.nq <= _MOST and system.guess.q.dtype == np.float64
-    if not (plain and small and all(is_elementary(g) and not g.group.kernels for g in system.constraints)):
-        return None
+def _is_known(group):
+    return is_elementary(group) and not group.group.kernels
+
+
+def _elements(system) -> tuple[ElementaryRows | None, list[tuple[np.ndarray, Any, Any]]]:
+    """The rows of joints that consist of elements; and where these have directions with a positive product, the bodies
+    of joints and the directions.
+    """
     space, listed, along, first = system.layout.space, [], [], 0
-    for g in system.constraints:
+    for g in filter(_is_known, system.constraints):
         own = g.group
         numbers, structure = jax.tree.flatten(own.part)
         numbers = [np.asarray(x) for x in numbers]
@@ -210,4 +232,4 @@ def host_scene(system: Any) -> HostScene | None:
                 along.append((own.body_index, element.along_a, element.along_b))
             places = places + element.rows(space.dimension)
         first += g.rows * len(own.names)
-    return HostScene(system, stacked(listed, system.layout.ground, space.dimension), along)
+    return stacked(listed, system.layout.ground, space.dimension) if listed else None, along

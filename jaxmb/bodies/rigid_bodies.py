@@ -651,8 +651,8 @@ class RigidBodySystem(AbstractSystem):
     def prepared(self):
         return dataclasses.replace(self, elements=elementary_rows(self.constraints, self.layout.ground))
 
-    def on_host(self):
-        return None if is_traced(self) else host_scene(self)
+    def on_host(self, t):
+        return None if is_traced((self, t)) else host_scene(self, t)
 
     def _set(self, groups: tuple[AbstractConstraintGroup, ...]) -> ConstraintSet:
         return ConstraintSet(groups, self.elements)

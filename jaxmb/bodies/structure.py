@@ -109,10 +109,10 @@ class _Evaluation(NamedTuple):
 
 def _analysed(system):
     """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
-    on_host, guess = system.on_host(), np.asarray(system.guess.q)
+    on_host, guess = system.on_host(0.0), np.asarray(system.guess.q)
     met = None if on_host is None else on_host.met(on_host.normalize(guess))
     if on_host is not None and on_host.holds(met):
-        q, at = met, _of_host(system, on_host, met)
+        q, at = met, _of_host(on_host, met)
     else:
         q, *at = map(_numbers, _met(system))
         at = _Evaluation(*at)
@@ -140,11 +140,8 @@ def _evaluated(system, t, q):
     return _Evaluation(system.position_residual(t, q), [g.jacobian(t, poses, velocities) for g in system.joints])
 
 
-def _of_host(system, on_host, q):
-    blocks, counts = on_host.blocks(q), [len(g.group.names) * g.rows for g in system.constraints]
-    own = np.split(blocks, np.cumsum(counts)[:-1])
-    pairs = zip(own, system.constraints, strict=True)
-    return _Evaluation(on_host.residual(q), [x.reshape(-1, g.rows, *x.shape[1:]) for x, g in pairs])
+def _of_host(on_host, q):
+    return _Evaluation(on_host.residual(q), on_host.blocks(q))
 
 
 def _row_norms(system, blocks):
@@ -157,10 +154,10 @@ def _row_norms(system, blocks):
 
 def _displaced(system, t, q, moved):
     """The same after displacements along velocities, in multiples of their scales."""
-    on_host = system.on_host()
+    on_host = system.on_host(t)
     if on_host is None:
         return _Evaluation(*_numbers(_displaced_by_jax(system, t, q, moved)))
-    return _of_host(system, on_host, on_host.displaced(np.asarray(q), on_host.velocity_scale * moved))
+    return _of_host(on_host, on_host.displaced(np.asarray(q), on_host.velocity_scale * moved))
 
 
 @eqx.filter_jit

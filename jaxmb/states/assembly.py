@@ -163,7 +163,7 @@ def configuration(
         _check_finite(q, "coordinates")
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
     known = not is_traced((system, q, t))
-    on_host = system.on_host() if known else None
+    on_host = system.on_host(t) if known else None
     if on_host is not None:
         found = on_host.closest_configuration(np.asarray(q), fixed, system.coordinate_rank - whole)
         if found is not None:
@@ -182,7 +182,7 @@ def configuration(
 
 def _velocities(system, t, q, u, fixed):
     """The second half of `assemble`: the velocities, and whether they satisfy the constraints."""
-    on_host = None if is_traced((system, t, q, u)) else system.on_host()
+    on_host = None if is_traced((system, t, q, u)) else system.on_host(t)
     if on_host is not None:
         found = on_host.closest_velocities(np.asarray(q), np.asarray(u), fixed, system.velocity_rank)
         if found is not None:

@@ -60,9 +60,9 @@ class AbstractSystem(AbstractEquation):
         """
         return self
 
-    def on_host(self) -> Any:
-        """The position constraints in NumPy, whose numbers are known, so that nothing is compiled to satisfy them once;
-        None where there is no such form.
+    def on_host(self, t: Scalar) -> Any:
+        """The constraints at a time in NumPy, whose numbers are known, so that little or nothing is compiled to satisfy
+        them once; None where there is no such form.
         """
         return None
 

@@ -1,0 +1,148 @@
+"""Consistent positions and velocities of a system found in NumPy, so that of its equations only the rows of the
+constraints and their derivatives are ever compiled.
+
+The equations are those of `states/closest.py`. Matrices are dense and small.
+"""
+
+import abc
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .closest import largest_residual, tolerance
+
+# The largest numbers of rows and coordinates whose dense matrices are cheap.
+MOST = 150
+# Largest numbers of Gauss–Newton and of Newton steps, and of steps to velocities that constraints are not linear in; a
+# share of the residuals that a Gauss–Newton step takes away; the power of the precision at which a step is the last.
+_STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.999, 0.75
+# Coordinates satisfy constraints exactly up to so many units of rounding; singular values below this fraction are zero.
+_ROUNDING, _ZERO = 4.0, 1e-9
+
+
+class AbstractHost(abc.ABC):
+    """The constraints of a system at a time, in NumPy.
+
+    **Fields:** scales as those of the system; whether ψ is `linear` in velocities; the number of `velocity_rows`.
+    """
+
+    coordinate_scale: Float[np.ndarray, "nq"]
+    velocity_scale: Float[np.ndarray, "nu"]
+    linear: bool
+    velocity_rows: int
+
+    @abc.abstractmethod
+    def coordinate_residual(self, q: Float[np.ndarray, "nq"]) -> Float[np.ndarray, "m"]:
+        """Φ, and the invariants of coordinates."""
+
+    @abc.abstractmethod
+    def coordinate_jacobian(self, q: Float[np.ndarray, "nq"]) -> Float[np.ndarray, "m nq"]:
+        """Its derivative."""
+
+    @abc.abstractmethod
+    def velocity_rows_at(
+        self, q: Float[np.ndarray, "nq"], u: Float[np.ndarray, "nu"]
+    ) -> tuple[Float[np.ndarray, "velocity_rows"], Float[np.ndarray, "velocity_rows nu"]]:
+        """ψ and its derivative."""
+
+    def holds(self, q: Float[np.ndarray, "nq"]) -> bool:
+        """Whether the constraints hold."""
+        norms = np.linalg.norm(self.coordinate_jacobian(q) * self.coordinate_scale, axis=1)
+        return bool(largest_residual(self.coordinate_residual(q), norms) <= tolerance(q.dtype))
+
+    def met(
+        self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None
+    ) -> Float[np.ndarray, "nq"]:
+        """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of those that are held."""
+        scale = self.coordinate_scale if held is None else np.where(held, 0.0, self.coordinate_scale)
+        before, small = self.coordinate_residual(q), np.finfo(float).eps ** _SMALL
+        for _ in range(_STEPS if before.size and np.all(np.isfinite(before)) else 0):
+            jacobian = self.coordinate_jacobian(q) * scale
+            if not np.all(np.isfinite(jacobian)):
+                break
+            step = -scale * np.linalg.lstsq(jacobian, before, rcond=1e-12)[0]
+            longest = np.max(np.abs(step[scale > 0] / scale[scale > 0]), initial=0.0)
+            step = step * min(1.0, 1.0 / longest if longest > 0 else 1.0)
+            reached = [q + length * step for length in 0.5 ** np.arange(8)]
+            sizes = [np.sum(self.coordinate_residual(there) ** 2) for there in reached]
+            best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
+            if not sizes[best] < before @ before:
+                break
+            gained = sizes[best] < _PROGRESS * (before @ before)
+            q, before = reached[best], self.coordinate_residual(reached[best])
+            if longest <= small or not gained:
+                break
+        return q
+
+    def closest_configuration(
+        self, guess: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"], rank: int
+    ) -> Float[np.ndarray, "nq"] | None:
+        """The configuration closest to the guess with some coordinates held; None where it is not found.
+
+        **Arguments:** `rank`: of the rows in the columns that are not held.
+        """
+        scale = np.where(held, 0.0, self.coordinate_scale)
+        size = np.max(np.abs(guess), initial=0.0) + np.max(self.coordinate_scale, initial=0.0)
+        unmet = np.max(np.abs(self.coordinate_residual(guess)), initial=0.0)
+        if unmet <= _ROUNDING * np.finfo(guess.dtype).eps * size and not held.any() and self.holds(guess):
+            return guess
+        q = self.met(guess, held)
+        if not self.holds(q) or _rank(self.coordinate_jacobian(q) * scale) != rank:
+            return None
+        free, small = ~held, np.finfo(float).eps ** _SMALL
+        weights = 1 / self.coordinate_scale[free] ** 2
+        multipliers = np.zeros(self.coordinate_residual(q).size)
+        for _ in range(_REFINEMENTS):
+            jacobian = self.coordinate_jacobian(q)[:, free]
+            gradient = weights * (q - guess)[free]
+            if not np.any(multipliers):
+                multipliers = np.linalg.lstsq(jacobian.T, -gradient, rcond=1e-12)[0]
+            curvature = np.diag(weights) + self._curvature(q, multipliers, free)
+            matrix = np.block([[curvature, jacobian.T], [jacobian, np.zeros((jacobian.shape[0],) * 2)]])
+            right = -np.concatenate([gradient + jacobian.T @ multipliers, self.coordinate_residual(q)])
+            if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(right))):
+                return None
+            step = np.linalg.lstsq(matrix, right, rcond=1e-13)[0]
+            q = q.copy()
+            q[free] += step[: free.sum()]
+            multipliers = multipliers + step[free.sum() :]
+            if np.max(np.abs(step[: free.sum()]) / scale[free], initial=0.0) <= small:
+                return q if self.holds(q) else None
+        return None
+
+    def _curvature(self, q, multipliers, free):
+        """The second derivatives of rows along multipliers, by differences; errors slow the last steps only."""
+        rows = []
+        for k in np.flatnonzero(free):
+            step = np.zeros_like(q)
+            step[k] = np.finfo(float).eps ** (1 / 3) * self.coordinate_scale[k]
+            ahead, behind = (multipliers @ self.coordinate_jacobian(there) for there in (q + step, q - step))
+            rows.append((ahead - behind)[free] / (2 * step[k]))
+        out = np.array(rows).reshape(free.sum(), free.sum())
+        return 0.5 * (out + out.T)
+
+    def closest_velocities(
+        self, q: Float[np.ndarray, "nq"], guess: Float[np.ndarray, "nu"], held: Bool[np.ndarray, "nu"], rank: int
+    ) -> Float[np.ndarray, "nu"] | None:
+        """The velocities closest to the guess with some rates held; None where they are not found."""
+        if not self.velocity_rows:
+            return guess
+        # Of rows that are implied, and not linear, some must be chosen.
+        if not self.linear and rank < self.velocity_rows:
+            return None
+        scale, u = np.where(held, 0.0, self.velocity_scale), guess
+        for _ in range(2 if self.linear else _VELOCITIES):
+            unmet, jacobian = self.velocity_rows_at(q, u)
+            if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(unmet))):
+                return None
+            if not held.any() and _rank(jacobian * scale) != rank:
+                return None
+            u = u - scale * np.linalg.lstsq(jacobian * scale, unmet, rcond=1e-10)[0]
+        unmet, jacobian = self.velocity_rows_at(q, u)
+        size = 1.0 + np.max(np.abs(jacobian) @ np.abs(u), initial=0.0)
+        return u if np.max(np.abs(unmet), initial=0.0) <= 1e2 * tolerance(u.dtype) * size else None
+
+
+def _rank(matrix):
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    return int(np.sum(sizes > _ZERO * np.max(sizes, initial=0.0)))
