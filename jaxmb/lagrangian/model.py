@@ -1,9 +1,10 @@
 """The equations of a Lagrangian system in any velocities, and the ways to write them, before its structure is known."""
 
 import abc
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ from ..system import AbstractSystem, DenseInertia, DiagonalInertia
 from ..system.catalogue import ParameterPath
 from ..system.description import Description, count_independent, count_rows, counted, remarks, shorten
 from ..system.design_variables import DesignVariables, description_rows
+from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
 from .kinematics import AbstractKinematics, Parameters
 from .nonideal import AbstractNonIdealForce
@@ -292,6 +294,21 @@ class AbstractLagrangian(AbstractSystem):
         if self.applied is None:
             left_out.append("forces besides those of the Lagrangian: there are none")
         return Description(tuple(facts), tables, remarks(self, left_out))
+
+
+class Unanalysed(AbstractLagrangian):
+    """A Lagrangian system without its structure, whose programs serve before that is known and afterwards."""
+
+    diagonal: ClassVar[bool] = False
+    positive_definite_mass: ClassVar[bool] = False
+    linear: ClassVar[bool] = False
+    drift_free: ClassVar[bool] = False
+    ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
+
+    @classmethod
+    def of(cls, system: AbstractLagrangian) -> Self:
+        """The functions and numbers of a system."""
+        return cls(**{field.name: getattr(system, field.name) for field in dataclasses.fields(cls)})
 
 
 class Projected(AbstractEquations):

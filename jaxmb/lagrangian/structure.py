@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from .._captured import Captured
 from .._compat import changed
 from .._traced_functions import note_of, traced_by_jax, with_note
 from .._types import State
-from ..linalg.elimination import full_pivot
+from ..linalg.independent_rows import dense_pivots
 from ..parts.boundary import is_of_user, with_captured
 from ..parts.names import unknown
 from ..states.closest import meet_constraints, residual_size, tolerance
@@ -22,21 +22,14 @@ from ..states.redundancy import check_gradients, check_implied_as_one
 from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
 from .dataflow import depends
+from .host import HostLagrangian
 from .kinematics import AbstractKinematics, Parameters
-from .model import AbstractLagrangian
+from .model import AbstractLagrangian, Unanalysed
 
 # Number of sets of parameters at which the entries of the mass matrix are compared with zero.
 _LOOKS = 3
-
-
-class Unanalysed(AbstractLagrangian):
-    """A Lagrangian system whose structure is not known yet; only `find_structure` evaluates it."""
-
-    diagonal: ClassVar[bool] = False
-    positive_definite_mass: ClassVar[bool] = False
-    linear: ClassVar[bool] = False
-    drift_free: ClassVar[bool] = False
-    ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
+# An equilibrated pivot below this power of eps is zero.
+_ZERO = 0.5
 
 
 def constraint_sizes(
@@ -137,124 +130,126 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     **Raises:** `ValueError` for an L without second derivatives in the rates, constraints that cannot be satisfied near
     the guess, and laws of constraints that are not there, or whose own force is not determined.
     """
-    q, p = system.guess.q, system.parameters
-    t = jnp.zeros((), q.dtype)
+    q, p = np.asarray(system.guess.q), system.parameters
+    t, host = np.zeros((), q.dtype), HostLagrangian(system, 0.0)
     # A matrix that depends on where the system is might have other entries elsewhere.
     constant = system.kinematics.identity and not depends(jax.hessian(system.lagrangian, 2), (t, q, q, p), 0, 1, 2)
-    found = jax.tree.map(np.asarray, _evaluate(system, constant))
-    if not np.all(np.isfinite(found.rates)):
-        raise ValueError(
-            f"The velocities u = {system.guess.u.tolist()} are not invertible for the rates at q = {q.tolist()}: no "
-            "rates were found that belong to them."
-        )
-    if not np.all(np.isfinite(found.mass)) or not np.any(found.mass):
-        raise ValueError(
-            f"The Lagrangian needs finite second derivatives with respect to the rates, and not all of them zero; at "
-            f"the guess they are {found.mass.tolist()}."
-        )
-    for c, slope in zip(_between_velocities(system), found.slopes, strict=True):
-        if not np.all(np.isfinite(slope)):
-            raise ValueError(f"{c.name}: its derivative with respect to the rates is not finite at the guess.")
-    if not found.residual <= tolerance(q.dtype):
-        names = ", ".join(c.name for c in system.constraints if c.level == 0)
-        raise ValueError(
-            f"The constraints {names} cannot be satisfied near q = {q.tolist()}: a scaled residual of "
-            f"{float(found.residual):.2g} remains."
-        )
-    if not np.all(np.isfinite(found.jacobian)):
+    rates, columns, masses = map(np.asarray, _evaluate(system, constant))
+    _check_finite(system, rates, masses[0])
+    jacobian = np.zeros((0, rates.size), q.dtype)
+    if system.acceleration_rows:
+        jacobian = host.jacobian(q)
+        for c in _between_velocities(system):
+            if not np.all(np.isfinite(jacobian[_rows_of(system, c.name)])):
+                raise ValueError(f"{c.name}: its derivative with respect to the rates is not finite at the guess.")
+        q = _met(system, host, q)
+        jacobian = host.jacobian(q)
+    if not np.all(np.isfinite(jacobian)):
         raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
-    position, velocity, acceleration, *others = map(int, found.row_ranks)
-    check_gradients(system, np.linalg.norm(found.jacobian, axis=1))
+    position, velocity, acceleration = (_independent(jacobian[:rows]) for rows in _row_counts(system))
+    check_gradients(system, np.linalg.norm(jacobian, axis=1))
     linear = system.kinematics.linear and all(c.is_linear(q, p) for c in system.constraints)
     drift_free = linear and system.kinematics.drift_free and all(c.is_drift_free(q, p) for c in system.constraints)
-    if linear:
+    if linear and system.velocity_rows:
         rows = slice(0, system.velocity_rows)
-        _check_consistent(system, "velocities", found.jacobian[rows], -found.unmet, rows)
+        _check_consistent(system, "velocities", jacobian[rows], -host.velocity_rows_at(q, system.guess.u)[0], rows)
     # Only rows that bind accelerations: the guess need not satisfy those that bind velocities.
-    rows = slice(system.velocity_rows, system.acceleration_rows)
-    _check_consistent(system, "accelerations", found.jacobian, found.right, rows)
-    check_implied_as_one(system, found.q, found.row_orders[0, :position], found.row_orders[2, :acceleration])
-    _check_nonideal(system, acceleration, others)
-    diagonal = constant and not np.any(found.masses * (1 - np.eye(q.size, dtype=q.dtype)))
-    sizes = np.linalg.eigvalsh(found.inertia)
+    if system.acceleration_rows > system.velocity_rows:
+        rows = slice(system.velocity_rows, system.acceleration_rows)
+        _check_consistent(system, "accelerations", jacobian, np.asarray(_asked(system, q)), rows)
+    check_implied_as_one(system, q, position, acceleration)
+    _check_nonideal(system, jacobian, acceleration.size)
+    diagonal = constant and not np.any(masses[1:] * (1 - np.eye(q.size, dtype=q.dtype)))
+    sizes = np.linalg.eigvalsh(columns.T @ masses[0] @ columns)
+    rank = _independent(host.coordinate_jacobian(q)).size if system.position_rows else 0
     return Structure(
         diagonal=bool(diagonal),
         positive_definite_mass=bool(sizes[0] > np.finfo(q.dtype).eps ** 0.75 * sizes[-1]),
         linear=linear,
         drift_free=drift_free,
-        ranks=Ranks(position, int(found.coordinate_rank), velocity, acceleration),
+        ranks=Ranks(position.size, rank, velocity.size, acceleration.size),
     )
 
 
-class _Numbers(NamedTuple):
-    """A configuration on the constraints; rates, second derivatives of L and mass matrix at the guess, second
-    derivatives with other parameters; slopes of the constraints between velocities; the residual that remains of the
-    constraints between positions; A, γ, ψ, and of some sets of rows of A the ranks and the orders of elimination.
-    """
+def _check_finite(system, rates, mass):
+    if not np.all(np.isfinite(rates)):
+        raise ValueError(
+            f"The velocities u = {system.guess.u.tolist()} are not invertible for the rates at "
+            f"q = {system.guess.q.tolist()}: no rates were found that belong to them."
+        )
+    if not np.all(np.isfinite(mass)) or not np.any(mass):
+        raise ValueError(
+            f"The Lagrangian needs finite second derivatives with respect to the rates, and not all of them zero; at "
+            f"the guess they are {mass.tolist()}."
+        )
 
-    q: Any
-    rates: Any
-    mass: Any
-    inertia: Any
-    masses: Any
-    slopes: tuple[Any, ...]
-    residual: Any
-    coordinate_rank: Any
-    jacobian: Any
-    right: Any
-    unmet: Any
-    row_ranks: Any
-    row_orders: Any
+
+def _met(system, host, start):
+    """The configuration where the constraints are met, without any program if NumPy finds it."""
+    if not system.position_rows:
+        return start
+    q = host.met(start)
+    if not host.holds(q):
+        q, residual = map(np.asarray, _met_by_jax(system))
+        if not residual <= tolerance(q.dtype):
+            names = ", ".join(c.name for c in system.constraints if c.level == 0)
+            raise ValueError(
+                f"The constraints {names} cannot be satisfied near q = {start.tolist()}: a scaled residual of "
+                f"{float(residual):.2g} remains."
+            )
+    return q
 
 
 @eqx.filter_jit
-def _evaluate(system: AbstractLagrangian, constant: bool) -> _Numbers:
-    """All that needs the user's functions, in one compiled function."""
+def _met_by_jax(system):
+    t = jnp.zeros((), system.guess.q.dtype)
+    q, jacobian = meet_constraints(system, t, system.guess.q, system.coordinate_scale())
+    return q, residual_size(system, t, q, jacobian)
+
+
+@eqx.filter_jit
+def _evaluate(system, constant):
+    """The rates, their derivatives with respect to the velocities, and second derivatives of L, also with other
+    parameters if these are `constant`.
+    """
     q, u, p = system.guess.q, system.guess.u, system.parameters
     t = jnp.zeros((), q.dtype)
     v = system.rates(t, q, u)
-    hessian = jax.hessian(system.lagrangian, 2)
-    looks = jnp.arange(_LOOKS if constant else 0, dtype=q.dtype)
-    masses = jax.vmap(lambda k: hessian(t, q, v, jax.tree.map(lambda x: _shaken(x, k), p)))(looks)
-    slopes = tuple(jax.jacfwd(system.value, 3)(c, t, q, v, v) for c in _between_velocities(system))
-    residual, coordinate_rank = jnp.zeros((), q.dtype), jnp.array(0)
-    mass, inertia = hessian(t, q, v, p), system.inertia(t, q, u).product(jnp.eye(u.size, dtype=q.dtype))
-    if system.position_rows:
-        q, linearized = meet_constraints(system, t, q, system.coordinate_scale())
-        residual = residual_size(system, t, q, linearized)
-        coordinate_rank = full_pivot(system.coordinate_jacobian(t, q)).rank
-    jacobian = system.jacobian(t, q, u)
-    pivots = jax.vmap(lambda own: full_pivot(jnp.where(own[:, None], jacobian, 0.0)))(_row_sets(system))
-    return _Numbers(
-        q=q,
-        rates=v,
-        mass=mass,
-        inertia=inertia,
-        masses=masses,
-        slopes=slopes,
-        residual=residual,
-        coordinate_rank=coordinate_rank,
-        jacobian=jacobian,
-        right=-system.acceleration_residual(t, q, u, jnp.zeros_like(u)),
-        unmet=system.velocity_residual(t, q, u),
-        row_ranks=pivots.rank,
-        row_orders=pivots.order.packed,
+    columns = jnp.eye(q.size, dtype=q.dtype)
+    if not system.kinematics.identity:
+        columns = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
+    shares = jnp.asarray([0.0, *[0.1] * (_LOOKS if constant else 0)], q.dtype)
+    looks = jnp.arange(shares.size, dtype=q.dtype)
+    hessian = lambda share, k: jax.hessian(system.lagrangian, 2)(
+        t, q, v, jax.tree.map(lambda x: _shaken(x, share, k), p)
     )
+    return v, columns, jax.vmap(hessian)(shares, looks)
 
 
-def _shaken(x: Array, k: Array) -> Array:
-    """A parameter with each of its numbers changed by a different factor."""
-    return x * (1 + 0.1 * jnp.cos(k + jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape))
+@eqx.filter_jit
+def _asked(system, q):
+    """What rows ask of accelerations at the given velocities."""
+    u = system.guess.u
+    return -system.acceleration_residual(jnp.zeros((), q.dtype), q, u, jnp.zeros_like(u))
 
 
-def _row_sets(system: AbstractLagrangian) -> np.ndarray:
-    """Masks of the rows whose ranks are asked for: between positions, between velocities, all, and for each law that
-    is not ideal those of the other constraints.
-    """
-    names = np.array([name for name, _ in system.rows], dtype=str)
-    rows = np.arange(names.size)
-    others = [names != law.constraint for law in system.nonideal]
-    return np.stack([rows < system.position_rows, rows < system.velocity_rows, rows >= 0, *others])
+def _shaken(x: Array, share: Array, k: Array) -> Array:
+    """A parameter with each of its numbers changed by a different factor, about this share of it."""
+    return x * (1 + share * jnp.cos(k + jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape))
+
+
+def _row_counts(system):
+    return system.position_rows, system.velocity_rows, system.acceleration_rows
+
+
+def _rows_of(system, name):
+    return np.array([own == name for own, _ in system.rows], bool)
+
+
+def _independent(jacobian):
+    """Independent rows of a matrix."""
+    order, rank = dense_pivots(jacobian, np.zeros(len(jacobian), int), _ZERO)
+    return order[:rank]
 
 
 def _between_velocities(system: AbstractLagrangian) -> list[AbstractCoordinateConstraint]:
@@ -276,13 +271,13 @@ def _check_consistent(
         )
 
 
-def _check_nonideal(system: AbstractLagrangian, rank: int, others: list[int]) -> None:
+def _check_nonideal(system: AbstractLagrangian, jacobian: np.ndarray, rank: int) -> None:
     """Raise a `ValueError` unless every law is of a constraint whose force is determined.
 
-    `rank` of all rows; `others`: for each law that of the rows of the other constraints.
+    `rank` of all rows of A.
     """
     names = [name for name, _ in system.rows]
-    for law, rest in zip(system.nonideal, others, strict=True):
+    for law in system.nonideal:
         if law.constraint not in names:
             raise ValueError(
                 f"{type(law).__name__} is of a constraint {law.constraint!r}, but there are {sorted(set(names))}."
@@ -290,7 +285,8 @@ def _check_nonideal(system: AbstractLagrangian, rank: int, others: list[int]) ->
         for coefficient in law.coefficients:
             if coefficient not in system.parameters:
                 raise unknown("parameter", coefficient, system.parameters)
-        if rest + names.count(law.constraint) > rank:
+        others = jacobian[~_rows_of(system, law.constraint)]
+        if _independent(others).size + names.count(law.constraint) > rank:
             raise ValueError(
                 f"{type(law).__name__} of {law.constraint!r}: the force of this constraint is not determined, because "
                 "other constraints imply some of its rows. Leave the redundant ones out."

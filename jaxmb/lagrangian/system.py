@@ -11,16 +11,19 @@ from jaxtyping import Array
 
 from .._compat import with_values
 from .._types import State, VectorLike
+from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
 from ..parts.module_weights import ModuleWeights, as_weights
 from ..parts.series import AbstractSignal, of_one_kind
+from ..states.on_host import MOST
 from ..system.equation import Ranks
 from .constraints import check_names
 from .dataflow import depends
+from .host import HostLagrangian
 from .kinematics import AbstractKinematics, Rates
-from .model import AbstractEquations, AbstractLagrangian, DrivenParameters, Projected
+from .model import AbstractEquations, AbstractLagrangian, DrivenParameters, Projected, Unanalysed
 from .nonideal import AbstractNonIdealForce
-from .structure import Unanalysed, constraint_sizes, find_structure, with_programs
+from .structure import constraint_sizes, find_structure, with_programs
 
 # Names that a saved motion holds besides the coordinates, and the argument of `numpy.savez` that no array can have.
 _TAKEN = ("t", "q", "u", "energy", "file")
@@ -130,6 +133,11 @@ class LagrangianSystem(AbstractLagrangian):
         for name, value in find_structure(model)._asdict().items():
             setattr(self, name, value)
         self.equations.check(self)
+
+    def on_host(self, t):
+        known = not is_traced((self, t)) and self.guess.q.dtype == np.float64
+        small = 0 < self.acceleration_rows <= MOST and self.nq <= MOST
+        return HostLagrangian(self, t) if known and small else None
 
     def with_signals(self, signals):
         inputs = _together(self.signals | _inputs_of(self, signals))

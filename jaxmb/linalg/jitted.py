@@ -1,12 +1,14 @@
 """Compiled functions of any pytree, called from Python at little cost."""
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import numpy as np
 
-from .arrays import ARRAYS
+from .arrays import ARRAYS, is_traced
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -40,3 +42,11 @@ def jitted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
         return compiled(arrays, (structure, rest))
 
     return called
+
+
+def on_host(function: Callable[_Arguments, Any], *arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:
+    """The result of a compiled function of numbers in NumPy, also while JAX traces something else."""
+    # Within a trace JAX would trace these numbers as well. The context makes constants of the function cost programs.
+    tracing = is_traced(jax.device_put(0.0))
+    with jax.ensure_compile_time_eval() if tracing else contextlib.nullcontext():
+        return jax.tree.map(np.asarray, function(*arguments, **named))

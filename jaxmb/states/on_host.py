@@ -50,9 +50,7 @@ class AbstractHost(abc.ABC):
         norms = np.linalg.norm(self.coordinate_jacobian(q) * self.coordinate_scale, axis=1)
         return bool(largest_residual(self.coordinate_residual(q), norms) <= tolerance(q.dtype))
 
-    def met(
-        self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None
-    ) -> Float[np.ndarray, "nq"]:
+    def met(self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None) -> Float[np.ndarray, "nq"]:
         """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of those that are held."""
         scale = self.coordinate_scale if held is None else np.where(held, 0.0, self.coordinate_scale)
         before, small = self.coordinate_residual(q), np.finfo(float).eps ** _SMALL
