@@ -7,8 +7,9 @@ forces lead away, because there are none at the guess, it starts again beside th
 balance, by the implicit function theorem.
 """
 
-from collections.abc import Mapping
-from typing import NamedTuple
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -18,8 +19,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._types import Coordinates, Scalar, State, VectorLike
-from ..linalg.arrays import is_traced
+from ..linalg.arrays import is_traced, namespace
 from ..linalg.failure import nan_where
+from ..linalg.jitted import jitted, on_host
 from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
@@ -112,15 +114,18 @@ def equilibrium(
     start, fixed, assembled = configuration(system, guess.q, fix, time, raises)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
-    still = _still(system, time, start, u)
+    still = jnp.array(True) if system.drift_free else _still(system, time, start, u)
     # Under a derivative the outcome is known, but the numbers that a message needs are traced.
     errors = raises and not is_traced((system, time, start, z, still))
     if errors and not bool(still):
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
-    q, unbalanced, falling, ok, overlaps, pulls = _balanced(system, time, start, held, bool(stable))
+    found = None if is_traced((system, time, start)) else _on_host(system, time, start, held, bool(stable))
+    found = _balanced(system, time, start, held, bool(stable)) if found is None else found
+    q, unbalanced, falling, ok, overlaps, pulls = found
     if errors and not bool(ok):
+        unbalanced = np.asarray(unbalanced) / np.asarray(system.velocity_scale())
         raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, start, unbalanced))
     if errors and np.any(overlaps | pulls):
         against, change = about_contacts("The forces balance", system, overlaps, pulls)
@@ -181,19 +186,23 @@ class _Balance(eqx.Module):
 
     @property
     def rest(self) -> Float[Array, "nu"]:
-        return jnp.zeros_like(self.system.velocity_scale())
+        return jnp.zeros(self.system.nu, self.system.guess.q.dtype)
 
     def moved(self, q, z):
         """The configuration after a small displacement."""
         return self.system.normalize(q + self.system.rates(self.t, q, self.system.velocity_scale() * z))
 
-    def force(self, q, multipliers):
-        """The sum of applied forces and forces of the rows."""
+    def applied(self, q):
+        """The applied forces."""
+        return self.system.velocity_scale() * self.system.force(self.t, q, self.rest)
+
+    def of_rows(self, q, multipliers):
+        """The forces of the rows."""
         rows = self.system.velocity_rows
-        force = self.system.force(self.t, q, self.rest)
-        force += self.system.constraint_force(self.t, q, self.rest, multipliers[:rows])
-        _, pull = jax.vjp(lambda u: self._held_rates(q, u), self.rest)
-        return self.system.velocity_scale() * (force + pull(multipliers[rows:])[0])
+        force = self.system.constraint_force(self.t, q, self.rest, multipliers[:rows])
+        if self.held:
+            force += jax.vjp(lambda u: self._held_rates(q, u), self.rest)[1](multipliers[rows:])[0]
+        return self.system.velocity_scale() * force
 
     def jacobian(self, q):
         held = jax.jacfwd(lambda u: self._held_rates(q, u))(self.rest)
@@ -232,6 +241,10 @@ class _Linearised(NamedTuple):
     implied: Float[Array, "m m"]
 
 
+# The configuration after a small displacement from another, and the balance there.
+_At: TypeAlias = Callable[[Coordinates, Float[Array, "n"]], tuple[Float[Array, "nq"], _Linearised]]
+
+
 def _linearise(balance: _Balance, q: Coordinates) -> _Linearised:
     jacobian = balance.jacobian(q)
     m, n = jacobian.shape
@@ -244,10 +257,12 @@ def _linearise(balance: _Balance, q: Coordinates) -> _Linearised:
     inverse = right.T @ (left / jnp.where(kept, values, 1.0)[None, :]).T
     allowed = jnp.eye(n, dtype=q.dtype) - right.T @ right
 
-    multipliers = -(inverse.T @ balance.force(q, jnp.zeros(m, q.dtype))) / sizes
     still = jnp.zeros(n, q.dtype)
-    forces = lambda z: (balance.force(balance.moved(q, z), multipliers),) * 2
-    softness, force = jax.jacfwd(forces, has_aux=True)(still)
+    along = lambda force: jax.jacfwd(lambda z: (force(balance.moved(q, z)),) * 2, has_aux=True)(still)
+    softness, applied = along(balance.applied)
+    multipliers = -(inverse.T @ applied) / sizes
+    of_rows, force = along(lambda q: balance.of_rows(q, multipliers))
+    softness, force = softness + of_rows, applied + force
     stiffness = -allowed @ softness @ allowed
     largest, overall = jnp.max(jnp.abs(stiffness)), jnp.max(jnp.abs(softness))
     # Where the rows allow no displacement, or none that is resisted, what is left is rounding errors.
@@ -267,18 +282,25 @@ def _linearise(balance: _Balance, q: Coordinates) -> _Linearised:
     )
 
 
+def _linearised(balance: _Balance, q: Coordinates, z: Float[Array, "nu"]) -> tuple[Float[Array, "nq"], _Linearised]:
+    """The configuration after a small displacement, and the balance there."""
+    there = balance.moved(q, z)
+    return there, _linearise(balance, there)
+
+
 def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
     """Newton's step, with curvatures made positive if it leads downhill; none along loose directions without force."""
+    xp = namespace(local.force)
     along = local.directions.T @ local.force
-    largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)
+    largest = lambda x: xp.max(xp.abs(x), initial=0.0)
     noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(local.curvatures) + largest(local.sizes * local.multipliers))
-    quiet = local.loose & (jnp.abs(along) <= noise)
-    size = jnp.abs(local.curvatures)
+    quiet = local.loose & (xp.abs(along) <= noise)
+    size = xp.abs(local.curvatures)
     # Directions without force count as stiff, so that rounding errors cause no motion along them.
-    size = jnp.where(quiet, jnp.max(size), jnp.maximum(size, _NEGLIGIBLE * jnp.max(size)))
-    size = size if downhill else jnp.where(~quiet & (local.curvatures < 0), -size, size)
+    size = xp.where(quiet, xp.max(size), xp.maximum(size, _NEGLIGIBLE * xp.max(size)))
+    size = size if downhill else xp.where(~quiet & (local.curvatures < 0), -size, size)
     stiffness = local.stiffness + (local.directions * (size - local.curvatures)[None, :]) @ local.directions.T
-    return jnp.linalg.solve(stiffness, local.directions @ jnp.where(quiet, 0.0, along))
+    return xp.linalg.solve(stiffness, local.directions @ xp.where(quiet, 0.0, along))
 
 
 @eqx.filter_jit
@@ -292,12 +314,14 @@ def _balanced(
     Bool[Array, "contacts"],
     Bool[Array, "contacts"],
 ]:
-    """The equilibrium, the residual forces there, the displacement along which one that was left falls, zero if none
-    was, and whether the equilibrium was found; which open contacts are overlapped there, and which closed ones pull.
+    """The equilibrium, the residual forces there in the scales of velocities, the displacement along which one that was
+    left falls, zero if none was, and whether the equilibrium was found; which open contacts are overlapped there, and
+    which closed ones pull.
     """
     balance = _Balance(system, t, start[np.array(held, int)], held)
     found = _settled if stable else _nearest
-    q, local, falling, ok = found(lax.stop_gradient(balance), lax.stop_gradient(start))
+    fixed = lax.stop_gradient(balance)
+    q, local, falling, ok = found(functools.partial(_linearised, fixed), lax.stop_gradient(start), _unknown(balance))
 
     # The equations of the equilibrium, for its derivatives. Loose directions and implied rows are made definite: the
     # configuration does not move along loose directions, and multipliers are the smallest ones.
@@ -308,7 +332,7 @@ def _balanced(
     def equations(x):
         z, multipliers = x[:n], x[n:]
         there = balance.moved(q, z)
-        force = balance.force(there, multipliers) - stiff * (loose @ z)
+        force = balance.applied(there) + balance.of_rows(there, multipliers) - stiff * (loose @ z)
         rows = balance.residual(there, jacobian, z) / local.sizes
         rows += local.implied @ (local.sizes * multipliers) / stiff
         # Without an equilibrium the equations are replaced by ones with a solution, so that derivatives stay finite.
@@ -317,65 +341,103 @@ def _balanced(
     known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
     solved = root(equations, known, lambda _, x: x)
     q = balance.moved(q, solved[:n])
-    alone = jnp.zeros(0, bool)
-    if system.contacts is not None:
-        alone = jnp.diag(local.implied)[np.array(system.contacts.rows, int)] <= tolerance(q.dtype) ** 0.5
-    rest = jnp.zeros(system.nu, q.dtype)
-    overlaps, pulls = contacts_against(*lax.stop_gradient((system, t, q, rest, solved[n:], alone)))
-    return q, local.force / system.velocity_scale(), falling, ok, overlaps, pulls
+    overlaps, pulls = lax.stop_gradient(_against(system, t, q, solved[n:], local.implied))
+    return q, local.force, falling, ok, overlaps, pulls
 
 
-def _nearest(balance: _Balance, start: Coordinates):
+def _against(system, t, q, multipliers, implied):
+    """Which open contacts are overlapped, and which closed ones pull."""
+    if system.contacts is None:
+        return (jnp.zeros(0, bool),) * 2
+    alone = jnp.diag(implied)[np.array(system.contacts.rows, int)] <= tolerance(q.dtype) ** 0.5
+    return contacts_against(system, t, q, jnp.zeros(system.nu, q.dtype), multipliers, alone)
+
+
+_linearised_alone, _against_alone = jitted(_linearised), jitted(_against)
+
+
+def _on_host(system, t, start, held, stable):
+    """`_balanced` with the search in NumPy, of concrete numbers; None where a matrix is singular or not finite."""
+    start = np.asarray(start)
+    balance = _Balance(system, np.asarray(t), start[np.array(held, int)], held)
+    at = functools.partial(on_host, _linearised_alone, balance)
+    try:
+        q, local, falling, ok = (_settled if stable else _nearest)(at, start, _unknown(balance))
+    except np.linalg.LinAlgError:
+        return None
+    against = (np.zeros(0, bool),) * 2
+    if ok and system.contacts is not None:
+        against = on_host(_against_alone, system, np.asarray(t), q, local.multipliers, local.implied)
+    return jax.device_put(q), local.force, falling, jax.device_put(np.asarray(ok)), *against
+
+
+def _nearest(at: _At, start: Coordinates, unknown: _Linearised):
     """The equilibrium to which Newton's method leads from a guess."""
-    q, local, found = _search(balance, start, downhill=False)
-    return q, local, balance.rest, found
+    q, local, found = _search(at, start, unknown, downhill=False)
+    return q, local, namespace(start).zeros_like(local.force), found
 
 
-def _settled(balance: _Balance, start: Coordinates):
+def _settled(at: _At, start: Coordinates, unknown: _Linearised):
     """The equilibrium to which the forces lead from a guess, or from beside an equilibrium that is not stable."""
+    xp = namespace(start)
 
     def proceed(carry):
         *_, done, k = carry
         return ~done & (k < _STARTS)
 
     def start_again(carry):
-        begin, _, origin, falling, side, *_, k = carry
-        q, local, found = _search(balance, begin, downhill=True)
+        begin, beside, _, _, origin, falling, side, *_, k = carry
+        q, local, found = _search(at, begin, unknown, downhill=True, first=beside)
         stable, softest = _softest(local.stiffness)
         ok = found & stable
         leave, turn_round = found & ~ok, ~found & (side > 0)
-        origin, falling = jnp.where(leave, q, origin), jnp.where(leave, softest, falling)
-        side = jnp.where(leave, 1.0, jnp.where(turn_round, -1.0, side))
-        begin = jnp.where(ok, q, balance.moved(origin, side * _BESIDE * falling))
-        return begin, local, origin, falling, side, ok, ok | ~(leave | turn_round), k + 1
+        origin, falling = xp.where(leave, q, origin), xp.where(leave, softest, falling)
+        side = xp.where(leave, 1.0, xp.where(turn_round, -1.0, side))
+        begin, beside = xp.where(ok, q, origin), xp.where(ok, 0.0, side * _BESIDE * falling)
+        return begin, beside, q, local, origin, falling, side, ok, ok | ~(leave | turn_round), k + 1
 
-    none = jnp.zeros((), start.dtype)
-    at = start, _unknown(balance, start), start, balance.rest, none, jnp.array(False), jnp.array(False), 0
-    q, local, _, falling, _, ok, _, _ = lax.while_loop(proceed, start_again, at)
+    none, no, still = xp.zeros((), start.dtype), xp.asarray(False), xp.zeros_like(unknown.force)
+    begun = start, still, start, unknown, start, still, none, no, no, 0
+    _, _, q, local, _, falling, _, ok, _, _ = _repeated(proceed, start_again, begun)
     return q, local, falling, ok
+
+
+def _repeated(proceed: Callable[[Any], Any], advance: Callable[[Any], Any], carry: Any) -> Any:
+    """A loop of Python for arrays of NumPy, else of XLA."""
+    if namespace(carry[0]) is not np:
+        return lax.while_loop(proceed, advance, carry)
+    while proceed(carry):
+        carry = advance(carry)
+    return carry
 
 
 def _softest(stiffness: Float[Array, "n n"]) -> tuple[Bool[Array, ""], Float[Array, "n"]]:
     """Whether no eigenvalue has a negative real part, and the direction of the least, its largest entry about one."""
-    values, vectors = jnp.linalg.eig(stiffness)
-    direction = vectors[:, jnp.argmin(values.real)].real
-    size = jnp.abs(direction)
+    xp = namespace(stiffness)
+    values, vectors = xp.linalg.eig(stiffness)
+    direction = vectors[:, xp.argmin(values.real)].real
+    size = xp.abs(direction)
     # Of entries of about the same size the first one has the sign, so that rounding errors do not decide.
-    first = direction[jnp.argmax(size > 0.5 * jnp.max(size))]
-    stable = jnp.min(values.real) >= -_FALLS * jnp.max(jnp.abs(values))
-    return stable, direction / jnp.where(first != 0, first, 1.0)
+    first = direction[xp.argmax(size > 0.5 * xp.max(size))]
+    stable = xp.min(values.real) >= -_FALLS * xp.max(xp.abs(values))
+    return stable, direction / xp.where(first != 0, first, 1.0)
 
 
-def _unknown(balance, q):
+def _unknown(balance: _Balance) -> _Linearised:
     """A linearisation of zeros."""
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(_linearise, balance, q))
+    n, m, dtype = balance.system.nu, balance.system.velocity_rows + len(balance.held), balance.system.guess.q.dtype
+    of = lambda *shape: np.zeros(shape, dtype)
+    return _Linearised(of(n), of(n, n), of(n), of(n, n), np.zeros(n, bool), of(m), of(n), of(m), of(m, m))
 
 
 def _search(
-    balance: _Balance, start: Coordinates, *, downhill: bool
+    at: _At, start: Coordinates, unknown: _Linearised, *, downhill: bool, first: Float[Array, "n"] | None = None
 ) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
-    """Follow the forces until they vanish, or the steps of Newton's method; also returns whether they do."""
-    close = jnp.finfo(start.dtype).eps ** 0.5
+    """Follow the forces until they vanish, or the steps of Newton's method; also returns whether they do.
+
+    **Arguments:** `first`: a displacement from the start, default none.
+    """
+    xp, close = namespace(start), float(np.finfo(start.dtype).eps) ** 0.5
 
     def proceed(carry):
         *_, radius, found, k = carry
@@ -383,28 +445,28 @@ def _search(
 
     def advance(carry):
         q, local, step, radius, _, k = carry
-        size, off = jnp.max(jnp.abs(step)), jnp.max(jnp.abs(local.correction))
-        trial = balance.moved(q, step + local.correction)
-        there = _linearise(balance, trial)
+        size, off = xp.max(xp.abs(step)), xp.max(xp.abs(local.correction))
+        trial, there = at(q, step + local.correction)
         # A step is too long if the forces at its end push back at least half as hard as they pushed at its beginning.
         # The effect of the rows' correction on the forces is not counted.
-        other = jnp.max(jnp.abs(local.curvatures)) * norm(local.correction) * norm(step)
-        back = jnp.dot(there.force, step) < -0.5 * jnp.abs(jnp.dot(local.force, step)) - other
+        other = xp.max(xp.abs(local.curvatures)) * norm(local.correction) * norm(step)
+        back = xp.dot(there.force, step) < -0.5 * xp.abs(xp.dot(local.force, step)) - other
         weaker = norm(there.force) < norm(local.force)
         better = ~back | weaker if downhill else (size <= close) | weaker
-        good = (k == 0) | (better & jnp.all(jnp.isfinite(there.force)))
-        q, local = jax.tree.map(lambda new, old: jnp.where(good, new, old), (trial, there), (q, local))
-        radius = jnp.where(good, jnp.minimum(2 * radius, _LONGEST), 0.25 * radius)
+        good = (k == 0) | (better & xp.all(xp.isfinite(there.force)))
+        q, local = jax.tree.map(lambda new, old: xp.where(good, new, old), (trial, there), (q, local))
+        radius = xp.where(good, xp.minimum(2 * radius, _LONGEST), 0.25 * radius)
         step = _step(local, downhill=downhill)
-        longest = jnp.max(jnp.abs(step))
-        step = step * jnp.minimum(1.0, radius / jnp.where(longest > 0, longest, 1.0))
+        longest = xp.max(xp.abs(step))
+        step = step * xp.minimum(1.0, radius / xp.where(longest > 0, longest, 1.0))
         # The error after a small step of Newton's method is of the size of its square, and of that of the correction,
         # whose effect on the forces is not counted.
         return q, local, step, radius, good & (size <= close) & (off <= close**1.5) & (k > 0), k + 1
 
-    # Before the first linearisation nothing is known, and the step is zero.
-    at = (start, _unknown(balance, start), balance.rest, jnp.asarray(_FIRST, start.dtype), jnp.array(False), 0)
-    q, local, _, _, found, _ = lax.while_loop(proceed, advance, at)
+    # Before the first linearisation nothing is known, and only a step that is given is not zero.
+    step = xp.zeros_like(unknown.force) if first is None else first
+    begun = (start, unknown, step, xp.asarray(_FIRST, start.dtype), xp.asarray(False), 0)
+    q, local, _, _, found, _ = _repeated(proceed, advance, begun)
     return q, local, found
 
 
