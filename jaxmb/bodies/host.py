@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg import rotations as rot
-from ..linalg.jitted import jitted, on_host
+from ..linalg.jitted import on_host
 from ..parts.elements import on_bodies
 from ..states.on_host import MOST, AbstractHost
 from .elementary import ElementaryRows, Listed, is_elementary, stacked
@@ -28,7 +28,7 @@ class _Rows(NamedTuple):
     blocks: Float[Array, "parts rows k n"]
 
 
-@jitted
+@on_host
 def _rows(groups: tuple[AbstractConstraintGroup, ...], t: Any, poses: Any, velocities: Any, moves: Any) -> list[_Rows]:
     out = []
     for g in groups:
@@ -103,7 +103,7 @@ class HostScene(AbstractHost):
         key = q.tobytes(), u.tobytes()
         if self._last is None or self._last[0] != key:
             of_bodies = np.append(u, 0.0)[self._layout.velocity_index]
-            self._last = key, on_host(_rows, self._others, self._t, self._prepared(q), of_bodies, self._moves(q))
+            self._last = key, _rows(self._others, self._t, self._prepared(q), of_bodies, self._moves(q))
         return self._last[1]
 
     def _joined(self, groups, of_elements: Any, of_others: Iterable[Any]) -> list[Any]:

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..linalg.jitted import jitted, on_host
+from ..linalg.jitted import on_host
 from ..states.on_host import AbstractHost
 from .model import AbstractLagrangian, Unanalysed
 
 
-@jitted
+@on_host
 def _rows(system: AbstractLagrangian, t: Any, q: Any, u: Any) -> tuple[Array, Array, Array, Array]:
     """Φ and its derivative, ψ, and A."""
     v = system.rates(t, q, u)
@@ -43,7 +43,7 @@ class HostLagrangian(AbstractHost):
         u = self._given if u is None else u
         key = q.tobytes(), u.tobytes()
         if self._last is None or self._last[0] != key:
-            self._last = key, on_host(_rows, self._system, self._t, q, u)
+            self._last = key, _rows(self._system, self._t, q, u)
         return self._last[1]
 
     def coordinate_residual(self, q):

@@ -15,6 +15,7 @@ from .._compat import changed
 from .._traced_functions import note_of, traced_by_jax, with_note
 from .._types import State
 from ..linalg.independent_rows import dense_pivots
+from ..linalg.jitted import on_host
 from ..parts.boundary import is_of_user, with_captured
 from ..parts.names import unknown
 from ..states.closest import meet_constraints, residual_size, tolerance
@@ -134,7 +135,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     t, host = np.zeros((), q.dtype), HostLagrangian(system, 0.0)
     # A matrix that depends on where the system is might have other entries elsewhere.
     constant = system.kinematics.identity and not depends(jax.hessian(system.lagrangian, 2), (t, q, q, p), 0, 1, 2)
-    rates, columns, masses = map(np.asarray, _evaluate(system, constant))
+    rates, columns, masses = _evaluate(system, constant)
     _check_finite(system, rates, masses[0])
     jacobian = np.zeros((0, rates.size), q.dtype)
     if system.acceleration_rows:
@@ -207,7 +208,7 @@ def _met_by_jax(system):
     return q, residual_size(system, t, q, jacobian)
 
 
-@eqx.filter_jit
+@on_host
 def _evaluate(system, constant):
     """The rates, their derivatives with respect to the velocities, and second derivatives of L, also with other
     parameters if these are `constant`.

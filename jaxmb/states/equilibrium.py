@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.arrays import is_traced, namespace
 from ..linalg.failure import nan_where
-from ..linalg.jitted import jitted, on_host
+from ..linalg.jitted import on_host
 from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
@@ -353,21 +353,21 @@ def _against(system, t, q, multipliers, implied):
     return contacts_against(system, t, q, jnp.zeros(system.nu, q.dtype), multipliers, alone)
 
 
-_linearised_alone, _against_alone = jitted(_linearised), jitted(_against)
+_linearised_alone, _against_alone = on_host(_linearised), on_host(_against)
 
 
 def _on_host(system, t, start, held, stable):
     """`_balanced` with the search in NumPy, of concrete numbers; None where a matrix is singular or not finite."""
     start = np.asarray(start)
     balance = _Balance(system, np.asarray(t), start[np.array(held, int)], held)
-    at = functools.partial(on_host, _linearised_alone, balance)
+    at = functools.partial(_linearised_alone, balance)
     try:
         q, local, falling, ok = (_settled if stable else _nearest)(at, start, _unknown(balance))
     except np.linalg.LinAlgError:
         return None
     against = (np.zeros(0, bool),) * 2
     if ok and system.contacts is not None:
-        against = on_host(_against_alone, system, np.asarray(t), q, local.multipliers, local.implied)
+        against = _against_alone(system, np.asarray(t), q, local.multipliers, local.implied)
     return jax.device_put(q), local.force, falling, jax.device_put(np.asarray(ok)), *against
 
 

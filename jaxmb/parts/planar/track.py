@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._types import VectorLike
+from ...linalg.arrays import namespace
 from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce, PathKind
@@ -84,45 +85,51 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
 
     def complete(self, space, poses):
         if self.radii is not None:
-            distance, more = norm(self._lines(space, poses)), jnp.roll(self.radii, -1) - self.radii
-            if jnp.any(distance <= jnp.abs(more)):
+            xp = namespace(poses, self.radii)
+            distance, more = norm(self._lines(space, poses)), xp.roll(self.radii, -1) - self.radii
+            if xp.any(distance <= xp.abs(more)):
                 raise ValueError(f"{self.label}: a circle lies in its neighbour; remove it or make it smaller.")
             _, _, turn = self._tangents(self._lines(space, poses))
             # Where a turn is next to the ends of its range, rounding decides whether all add up to one.
-            if jnp.abs(jnp.sum(turn) - 2 * np.pi) > 1.0 or jnp.any(jnp.abs(turn - 0.5 * np.pi) > np.pi - 1e-6):
+            if xp.abs(xp.sum(turn) - 2 * np.pi) > 1.0 or xp.any(xp.abs(turn - 0.5 * np.pi) > np.pi - 1e-6):
                 raise ValueError(f"{self.label}: a path with radii must be counter-clockwise; reverse its order.")
         return self.filled(free_length=self.length(space, poses))
 
     def _lines(self, space, poses):
         """From each point to the next."""
         points = self._centres(space, poses)
-        return jnp.roll(points, -1, axis=0) - points
+        return namespace(points).roll(points, -1, axis=0) - points
 
     def _centres(self, space, poses):
-        return jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
+        own = poses[np.array(self.owners)], self.points
+        if namespace(*own) is np:
+            return np.stack([space.point(*pair) for pair in zip(*own, strict=True)])
+        return jax.vmap(space.point)(*own)
 
     def length(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
         """Length of the track [m]."""
         d = self._lines(space, poses)
+        xp = namespace(d)
         if self.radii is None:
-            return jnp.sum(norm(d))
+            return xp.sum(norm(d))
         straight, _, turn = self._tangents(d)
-        return jnp.sum(straight) + jnp.dot(self.radii, turn)
+        return xp.sum(straight) + xp.dot(self.radii, turn)
 
     def _tangents(self, d):
         """Of the straight parts along the lines of centres `d`: lengths, unit vectors, and the angles by which the
         track turns before each, on a circle.
         """
-        square = jnp.sum(d * d, axis=1)
-        more = jnp.roll(self.radii, -1) - self.radii
-        straight = jnp.sqrt(square - more**2)
+        xp = namespace(d, self.radii)
+        square = xp.sum(d * d, axis=1)
+        more = xp.roll(self.radii, -1) - self.radii
+        straight = xp.sqrt(square - more**2)
         # The unit vector along a tangent, turned from the line of centres towards the smaller circle.
-        across = jnp.stack([-d[:, 1], d[:, 0]], axis=1)
+        across = xp.stack([-d[:, 1], d[:, 0]], axis=1)
         along = (straight[:, None] * d - more[:, None] * across) / square[:, None]
-        into = jnp.roll(along, 1, axis=0)
-        turn = jnp.arctan2(into[:, 0] * along[:, 1] - into[:, 1] * along[:, 0], jnp.sum(into * along, axis=1))
+        into = xp.roll(along, 1, axis=0)
+        turn = xp.arctan2(into[:, 0] * along[:, 1] - into[:, 1] * along[:, 0], xp.sum(into * along, axis=1))
         # At its ends a track turns by half a turn or more; elsewhere it turns back by less than a quarter.
-        return straight, along, jnp.where(turn < -0.5 * jnp.pi, turn + 2 * jnp.pi, turn)
+        return straight, along, xp.where(turn < -0.5 * xp.pi, turn + 2 * xp.pi, turn)
 
     def path(self, space, poses):
         centres = self._centres(space, poses)
