@@ -15,6 +15,7 @@ from .._printed import preformatted
 from .._traced_functions import traced_by_jax
 from .._types import State
 from ..linalg.arrays import ARRAYS, is_traced
+from ..linalg.jitted import on_host
 from ..parts.base import (
     GROUND,
     AbstractActor,
@@ -361,7 +362,7 @@ def _check_rotation(part, components, own, layout, poses):
     for component in components if points else ():
         with traced_by_jax(part.label, "an argument"):
             now, kernels = captured(anonymous(_loaded(component)), space, len(own))
-            turned = np.asarray(_turned(now, space, poses, tuple(kernels.items())))
+            turned = _turned(now, space, poses, tuple(kernels.items()))
         if np.any(turned[points]):
             raise ValueError(
                 f"{part.label} acts on the rotation of a PointMass, which has none: put its point at the origin, "
@@ -384,7 +385,7 @@ def _loaded(part):
     return _call(part, "with_fields", **ones) if ones else part
 
 
-@eqx.filter_jit
+@on_host
 def _turned(part, space, poses, kernels):
     """Which bodies a part turns, at the given poses or at others, where springs are stretched and contacts closed.
 

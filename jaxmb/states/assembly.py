@@ -162,6 +162,8 @@ def configuration(
     if not is_traced(q):
         _check_finite(q, "coordinates")
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
+    if not system.coordinate_rows:
+        return q, fixed, jnp.array(True)
     known = not is_traced((system, q, t))
     on_host = system.on_host(t) if known else None
     if on_host is not None:
@@ -182,6 +184,8 @@ def configuration(
 
 def _velocities(system, t, q, u, fixed):
     """The second half of `assemble`: the velocities, and whether they satisfy the constraints."""
+    if not system.velocity_rows:
+        return u, jnp.array(True)
     on_host = None if is_traced((system, t, q, u)) else system.on_host(t)
     if on_host is not None:
         found = on_host.closest_velocities(np.asarray(q), np.asarray(u), fixed, system.velocity_rank)
