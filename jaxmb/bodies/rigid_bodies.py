@@ -17,6 +17,7 @@ from ..linalg.arrays import add_up, is_traced
 from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.jacobian import DenseJacobian
+from ..linalg.jitted import on_host
 from ..linalg.rotations import cross, normalize, rotate
 from ..linalg.sums import placed_sums, unchecked_take
 from ..parts.base import AbstractInertialConstraint
@@ -394,7 +395,8 @@ class RigidBodySystem(AbstractSystem):
         """The system with the scalar coordinates and their rates in its guess that satisfy their constraints there."""
         if not self.layout.scalars:
             return self
-        return dataclasses.replace(self, guess=_with_scalars(self, self.guess))
+        q, u = jax.device_put(_with_scalars(self, self.guess))
+        return dataclasses.replace(self, guess=dataclasses.replace(self.guess, q=q, u=u))
 
     # Internal states
 
@@ -938,7 +940,7 @@ def _rotating(layout: Layout):
     return [k for k, rotates in enumerate(layout.rotates) if rotates]
 
 
-@eqx.filter_jit
+@on_host
 def _with_scalars(system, guess):
     t, q, u = jnp.zeros((), guess.q.dtype), system.normalize(guess.q), guess.u
     layout = system.layout
@@ -948,7 +950,7 @@ def _with_scalars(system, guess):
         q = q.at[layout.pose_index[scalars, 0]].add(-unmet)
         unmet = g.velocity(t, system.prepared_poses(q), system.all_velocities(u))[:, 0]
         u = u.at[layout.velocity_index[scalars, 0]].add(-unmet)
-    return dataclasses.replace(guess, q=q, u=u)
+    return q, u
 
 
 def _of_rows(values: Array, count: int) -> Array:

@@ -99,7 +99,7 @@ def assemble(
     q, _, ok = configuration(holding(system, of_joints, {}, t), guess.q, fix, t, raises)
     if rates_of_joints:
         known = system.joint_coordinates()
-        here = {name: system.joint_coordinate(known[name], t, q) for name in rates_of_joints}
+        here = {name: _joint_coordinate(system, known[name], t, q) for name in rates_of_joints}
         system = holding(system, here, rates_of_joints, t)
     # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled.
     known = not is_traced((system, guess, fix, u, t))
@@ -198,6 +198,11 @@ def _check_modes(system, q, fixed):
     for name, k in zip(system.contacts.names, system.contacts.modes, strict=True):
         if fixed[k] and q[k] not in (OPEN, CLOSED):
             raise ValueError(f"Coordinate '{name}.mode' is 1 to close the contact, or 0 to open it; got {q[k]:g}.")
+
+
+@jitted
+def _joint_coordinate(system, coordinate, t, q):
+    return system.joint_coordinate(coordinate, t, q)
 
 
 @jitted
