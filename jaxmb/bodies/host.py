@@ -55,6 +55,7 @@ class HostScene(AbstractHost):
         self._of_poses = self._layout.jacobian_source(places[: self._positions], of_poses=True)
         self._of_velocities = self._layout.jacobian_source(places, of_poses=False)
         self._rotating = [k for k, rotates in enumerate(self._layout.rotates) if rotates and self._spatial]
+        self.analytic = not self._others
         self.linear, self.velocity_rows = system.linear, system.velocity_rows
         self.coordinate_scale, self.velocity_scale = system.known_scales()
 
@@ -135,6 +136,10 @@ class HostScene(AbstractHost):
         pairs = zip(self._groups, found, strict=True)
         return [x.reshape(len(g.group.names), g.rows, *x.shape[-2:]) for g, x in pairs]
 
+    def jacobian(self, q):
+        """A at the given velocities."""
+        return np.append(_flat(self.blocks(q)), 0.0)[self._of_velocities]
+
     def _along_velocities(self, q, group, blocks):
         """Derivatives along velocities, from those along poses."""
         if not (self._spatial and isinstance(group, ConstraintGroup)):
@@ -180,10 +185,14 @@ class HostScene(AbstractHost):
             q[self._layout.pose_index[self._rotating, 3:]] = p / np.linalg.norm(p, axis=1, keepdims=True)
         return q
 
+    def along(self, q, step):
+        """The rates of coordinates at these velocities."""
+        moved = self._rates(q, np.append(step, 0.0)[self._layout.velocity_index])
+        return moved[:-1].ravel()[self._layout.coordinate_place]
+
     def displaced(self, q, step):
         """The coordinates after a displacement along velocities."""
-        moved = self._rates(q, np.append(step, 0.0)[self._layout.velocity_index])
-        return self.normalize((self._poses(q) + moved)[:-1].ravel()[self._layout.coordinate_place])
+        return self.normalize(q + self.along(q, step))
 
     def holds(self, q):
         """Whether the constraints hold, and no joint is turned by half a turn."""

@@ -30,6 +30,7 @@ from ..system.gaps import are_open, contacts_of
 from ..system.quantities import directions
 from .arguments import check_system, checked_guess, checked_time, holding, split_coordinates, split_internal_states
 from .assembly import configuration
+from .balance import Balance, HostBalance, balance_on_host
 from .closest import tolerance
 from .held import about_contacts, contacts_against
 
@@ -171,56 +172,6 @@ def _changing(system, t, q, u, steady):
     )
 
 
-class _Balance(eqx.Module):
-    """The equilibrium equations in scaled velocities; rows are those of the constraints and of held coordinates."""
-
-    system: AbstractSystem
-    t: Array
-    values: Float[Array, "held"]
-    held: tuple[int, ...] = eqx.field(static=True)
-
-    @property
-    def rank(self) -> int:
-        """The largest possible rank of the rows, without implied ones."""
-        return self.system.velocity_rank + len(self.held)
-
-    @property
-    def rest(self) -> Float[Array, "nu"]:
-        return jnp.zeros(self.system.nu, self.system.guess.q.dtype)
-
-    def moved(self, q, z):
-        """The configuration after a small displacement."""
-        return self.system.normalize(q + self.system.rates(self.t, q, self.system.velocity_scale() * z))
-
-    def applied(self, q):
-        """The applied forces."""
-        return self.system.velocity_scale() * self.system.force(self.t, q, self.rest)
-
-    def of_rows(self, q, multipliers):
-        """The forces of the rows."""
-        rows = self.system.velocity_rows
-        force = self.system.constraint_force(self.t, q, self.rest, multipliers[:rows])
-        if self.held:
-            force += jax.vjp(lambda u: self._held_rates(q, u), self.rest)[1](multipliers[rows:])[0]
-        return self.system.velocity_scale() * force
-
-    def jacobian(self, q):
-        held = jax.jacfwd(lambda u: self._held_rates(q, u))(self.rest)
-        rows = jnp.concatenate([self.system.velocity_jacobian(self.t, q, self.rest), held])
-        return rows * self.system.velocity_scale()[None, :]
-
-    def residual(self, q, jacobian, z):
-        """Residuals of the rows; those of velocity constraints depend on the displacement alone."""
-        constraints = slice(self.system.position_rows, self.system.velocity_rows)
-        rolled = jacobian[constraints] @ z
-        return jnp.concatenate(
-            [self.system.position_residual(self.t, q), rolled, q[np.array(self.held, int)] - self.values]
-        )
-
-    def _held_rates(self, q, u):
-        return self.system.rates(self.t, q, u)[np.array(self.held, int)]
-
-
 class _Linearised(NamedTuple):
     """The balance for small displacements z from a configuration, `force − stiffness z` along those that the rows
     allow.
@@ -245,44 +196,44 @@ class _Linearised(NamedTuple):
 _At: TypeAlias = Callable[[Coordinates, Float[Array, "n"]], tuple[Float[Array, "nq"], _Linearised]]
 
 
-def _linearise(balance: _Balance, q: Coordinates) -> _Linearised:
-    jacobian = balance.jacobian(q)
+def _linearise(balance: Balance | HostBalance, q: Coordinates) -> _Linearised:
+    xp, jacobian = namespace(q), balance.jacobian(q)
     m, n = jacobian.shape
     sizes = norm(jacobian)
-    sizes = jnp.where(sizes > 0, sizes, 1.0)
-    left, values, right = jnp.linalg.svd(jacobian / sizes[:, None], full_matrices=False)
+    sizes = xp.where(sizes > 0, sizes, 1.0)
+    left, values, right = xp.linalg.svd(jacobian / sizes[:, None], full_matrices=False)
     # Rows that are implied on the constraints are only nearly implied off them: the rank tells how many to drop.
-    kept = (jnp.arange(values.size) < balance.rank) & (values > _NEGLIGIBLE * jnp.max(values, initial=0.0))
-    left, right = jnp.where(kept[None, :], left, 0.0), jnp.where(kept[:, None], right, 0.0)
-    inverse = right.T @ (left / jnp.where(kept, values, 1.0)[None, :]).T
-    allowed = jnp.eye(n, dtype=q.dtype) - right.T @ right
+    kept = (xp.arange(values.size) < balance.rank) & (values > _NEGLIGIBLE * xp.max(values, initial=0.0))
+    left, right = xp.where(kept[None, :], left, 0.0), xp.where(kept[:, None], right, 0.0)
+    inverse = right.T @ (left / xp.where(kept, values, 1.0)[None, :]).T
+    allowed = xp.eye(n, dtype=q.dtype) - right.T @ right
 
-    still = jnp.zeros(n, q.dtype)
-    along = lambda force: jax.jacfwd(lambda z: (force(balance.moved(q, z)),) * 2, has_aux=True)(still)
-    softness, applied = along(balance.applied)
+    softness, applied = balance.applied_along(q)
     multipliers = -(inverse.T @ applied) / sizes
-    of_rows, force = along(lambda q: balance.of_rows(q, multipliers))
-    softness, force = softness + of_rows, applied + force
+    more, force = balance.of_rows_along(q, multipliers)
+    softness, force = softness + more, applied + force
     stiffness = -allowed @ softness @ allowed
-    largest, overall = jnp.max(jnp.abs(stiffness)), jnp.max(jnp.abs(softness))
+    largest, overall = xp.max(xp.abs(stiffness)), xp.max(xp.abs(softness))
     # Where the rows allow no displacement, or none that is resisted, what is left is rounding errors.
-    largest = jnp.where(largest > _NEGLIGIBLE * overall, largest, overall)
-    stiffness += jnp.where(largest > 0, largest, 1.0) * (right.T @ right)
-    curvatures, directions = jnp.linalg.eigh(0.5 * (stiffness + stiffness.T))
+    largest = xp.where(largest > _NEGLIGIBLE * overall, largest, overall)
+    stiffness = stiffness + xp.where(largest > 0, largest, 1.0) * (right.T @ right)
+    curvatures, directions = xp.linalg.eigh(0.5 * (stiffness + stiffness.T))
     return _Linearised(
         allowed @ force,
         stiffness,
         curvatures,
         directions,
-        jnp.abs(curvatures) <= _NEGLIGIBLE * jnp.max(jnp.abs(curvatures)),
+        xp.abs(curvatures) <= _NEGLIGIBLE * xp.max(xp.abs(curvatures)),
         multipliers,
-        -inverse @ (balance.residual(q, jacobian, still) / sizes),
+        -inverse @ (balance.residual(q, jacobian, xp.zeros(n, q.dtype)) / sizes),
         sizes,
-        jnp.eye(m, dtype=q.dtype) - left @ left.T,
+        xp.eye(m, dtype=q.dtype) - left @ left.T,
     )
 
 
-def _linearised(balance: _Balance, q: Coordinates, z: Float[Array, "nu"]) -> tuple[Float[Array, "nq"], _Linearised]:
+def _linearised(
+    balance: Balance | HostBalance, q: Coordinates, z: Float[Array, "nu"]
+) -> tuple[Float[Array, "nq"], _Linearised]:
     """The configuration after a small displacement, and the balance there."""
     there = balance.moved(q, z)
     return there, _linearise(balance, there)
@@ -318,7 +269,7 @@ def _balanced(
     left falls, zero if none was, and whether the equilibrium was found; which open contacts are overlapped there, and
     which closed ones pull.
     """
-    balance = _Balance(system, t, start[np.array(held, int)], held)
+    balance = Balance(system, t, start[np.array(held, int)], held)
     found = _settled if stable else _nearest
     fixed = lax.stop_gradient(balance)
     q, local, falling, ok = found(functools.partial(_linearised, fixed), lax.stop_gradient(start), _unknown(balance))
@@ -332,7 +283,7 @@ def _balanced(
     def equations(x):
         z, multipliers = x[:n], x[n:]
         there = balance.moved(q, z)
-        force = balance.applied(there) + balance.of_rows(there, multipliers) - stiff * (loose @ z)
+        force = balance.forces(there, multipliers) - stiff * (loose @ z)
         rows = balance.residual(there, jacobian, z) / local.sizes
         rows += local.implied @ (local.sizes * multipliers) / stiff
         # Without an equilibrium the equations are replaced by ones with a solution, so that derivatives stay finite.
@@ -359,8 +310,9 @@ _linearised_alone, _against_alone = on_host(_linearised), on_host(_against)
 def _on_host(system, t, start, held, stable):
     """`_balanced` with the search in NumPy, of concrete numbers; None where a matrix is singular or not finite."""
     start = np.asarray(start)
-    balance = _Balance(system, np.asarray(t), start[np.array(held, int)], held)
-    at = functools.partial(_linearised_alone, balance)
+    balance = Balance(system, np.asarray(t), start[np.array(held, int)], held)
+    known = balance_on_host(balance)
+    at = functools.partial(_linearised_alone, balance) if known is None else functools.partial(_linearised, known)
     try:
         q, local, falling, ok = (_settled if stable else _nearest)(at, start, _unknown(balance))
     except np.linalg.LinAlgError:
@@ -423,7 +375,7 @@ def _softest(stiffness: Float[Array, "n n"]) -> tuple[Bool[Array, ""], Float[Arr
     return stable, direction / xp.where(first != 0, first, 1.0)
 
 
-def _unknown(balance: _Balance) -> _Linearised:
+def _unknown(balance: Balance) -> _Linearised:
     """A linearisation of zeros."""
     n, m, dtype = balance.system.nu, balance.system.velocity_rows + len(balance.held), balance.system.guess.q.dtype
     of = lambda *shape: np.zeros(shape, dtype)

@@ -23,8 +23,11 @@ _ROUNDING, _ZERO = 4.0, 1e-9
 class AbstractHost(abc.ABC):
     """The constraints of a system at a time, in NumPy.
 
-    **Fields:** scales as those of the system; whether ψ is `linear` in velocities; the number of `velocity_rows`.
+    **Fields:** scales as those of the system; whether ψ is `linear` in velocities; the number of `velocity_rows`;
+    whether residuals and Jacobians are `analytic`: positions alone, also for coordinates that are complex.
     """
+
+    analytic: bool = False
 
     coordinate_scale: Float[np.ndarray, "nq"]
     velocity_scale: Float[np.ndarray, "nu"]

@@ -1,0 +1,134 @@
+"""The equilibrium equations of a system, in scaled velocities.
+
+Rows are those of the constraints and of held coordinates.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..linalg.jitted import on_host
+from ..system import AbstractSystem
+
+# The change of a coordinate, imaginary, by which derivatives are found.
+_IMAGINARY = 1e-30
+
+
+class Balance(eqx.Module):
+    """The equations in programs of JAX.
+
+    **Fields:** the `system`, the time `t` [s], and the `values` of the `held` coordinates.
+    """
+
+    system: AbstractSystem
+    t: Array
+    values: Float[Array, "held"]
+    held: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def rank(self) -> int:
+        """The largest possible rank of the rows, without implied ones."""
+        return self.system.velocity_rank + len(self.held)
+
+    @property
+    def rest(self) -> Float[Array, "nu"]:
+        return jnp.zeros(self.system.nu, self.system.guess.q.dtype)
+
+    def moved(self, q, z):
+        """The configuration after a small displacement."""
+        return self.system.normalize(q + self.system.rates(self.t, q, self.system.velocity_scale() * z))
+
+    def applied(self, q):
+        """The applied forces."""
+        return self.system.velocity_scale() * self.system.force(self.t, q, self.rest)
+
+    def of_rows(self, q, multipliers):
+        """The forces of the rows."""
+        rows = self.system.velocity_rows
+        force = self.system.constraint_force(self.t, q, self.rest, multipliers[:rows])
+        if self.held:
+            force += jax.vjp(lambda u: self._held_rates(q, u), self.rest)[1](multipliers[rows:])[0]
+        return self.system.velocity_scale() * force
+
+    def forces(self, q, multipliers):
+        """All forces, those of the rows with these multipliers."""
+        return self.applied(q) + self.of_rows(q, multipliers)
+
+    def applied_along(self, q: Array) -> tuple[Array, Array]:
+        """How the applied forces change with displacements, and these forces."""
+        return self._along(q, self.applied)
+
+    def of_rows_along(self, q: Array, multipliers: Array) -> tuple[Array, Array]:
+        """The same of the forces of the rows."""
+        return self._along(q, lambda q: self.of_rows(q, multipliers))
+
+    def _along(self, q, force: Callable[[Array], Array]):
+        return jax.jacfwd(lambda z: (force(self.moved(q, z)),) * 2, has_aux=True)(jnp.zeros(self.system.nu, q.dtype))
+
+    def jacobian(self, q):
+        """Derivatives of the rows with respect to displacements."""
+        held = jax.jacfwd(lambda u: self._held_rates(q, u))(self.rest)
+        rows = jnp.concatenate([self.system.velocity_jacobian(self.t, q, self.rest), held])
+        return rows * self.system.velocity_scale()[None, :]
+
+    def residual(self, q, jacobian, z):
+        """Residuals of the rows; those of velocity constraints depend on the displacement alone."""
+        constraints = slice(self.system.position_rows, self.system.velocity_rows)
+        rolled = jacobian[constraints] @ z
+        return jnp.concatenate(
+            [self.system.position_residual(self.t, q), rolled, q[np.array(self.held, int)] - self.values]
+        )
+
+    def _held_rates(self, q, u):
+        return self.system.rates(self.t, q, u)[np.array(self.held, int)]
+
+
+@on_host
+def _applied_along(balance: Balance, q: Any) -> Any:
+    return balance.applied_along(q)
+
+
+class HostBalance:
+    """The same of a system all of whose constraints NumPy computes: only its applied forces are a program."""
+
+    def __init__(self, balance: Balance, host: Any):
+        self._balance, self._host, self.rank = balance, host, balance.rank
+        self._scale, self._held = host.velocity_scale, np.array(balance.held, int)
+
+    def moved(self, q, z):
+        """As of `Balance`."""
+        return self._host.displaced(q, self._scale * z)
+
+    def applied_along(self, q):
+        """As of `Balance`."""
+        return _applied_along(self._balance, q)
+
+    def of_rows_along(self, q, multipliers):
+        """As of `Balance`."""
+        pull = lambda q: (self.jacobian(q)).T @ multipliers
+        ways = [self._host.along(q, x) for x in np.diag(self._scale)]
+        return np.stack([pull(q + 1j * _IMAGINARY * x).imag / _IMAGINARY for x in ways], axis=1), pull(q)
+
+    def jacobian(self, q):
+        """As of `Balance`."""
+        # Held coordinates are velocities.
+        held = np.eye(self._scale.size)[self._held]
+        return np.concatenate([self._host.jacobian(q), held]) * self._scale
+
+    def residual(self, q, jacobian, z):
+        """As of `Balance`."""
+        del jacobian, z
+        return np.concatenate([self._host.residual(q), q[self._held] - self._balance.values])
+
+
+def balance_on_host(balance: Balance) -> HostBalance | None:
+    """The equations in NumPy, where these serve."""
+    system = balance.system
+    host = system.on_host(balance.t)
+    suits = host is not None and host.analytic and (system.rates_are_velocities or not balance.held)
+    return HostBalance(balance, host) if suits else None
