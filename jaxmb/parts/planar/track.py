@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from ..._types import VectorLike
 from ...linalg.arrays import namespace
 from ...linalg.rotations import norm
+from ...linalg.sums import placed_sums
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce, PathKind
-from ..forces import generalized_force
 from ..shapes import wheel
 
 
@@ -108,12 +108,16 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
 
     def length(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
         """Length of the track [m]."""
-        d = self._lines(space, poses)
+        return self._measured(self._lines(space, poses))[0]
+
+    def _measured(self, d):
+        """Along the lines of centres `d`: the length, and unit vectors of the straight parts."""
         xp = namespace(d)
         if self.radii is None:
-            return xp.sum(norm(d))
-        straight, _, turn = self._tangents(d)
-        return xp.sum(straight) + xp.dot(self.radii, turn)
+            sizes = norm(d)
+            return xp.sum(sizes), d / xp.where(sizes > 0, sizes, 1.0)[:, None]
+        straight, along, turn = self._tangents(d)
+        return xp.sum(straight) + xp.dot(self.radii, turn), along
 
     def _tangents(self, d):
         """Of the straight parts along the lines of centres `d`: lengths, unit vectors, and the angles by which the
@@ -159,8 +163,12 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         return self.pretension + self.stiffness * (self.length(space, poses) - self.free_length)
 
     def wrenches(self, space, poses, velocities, t):
-        law = lambda length, rate: -(self.pretension + self.stiffness * (length - self.free_length))
-        return generalized_force(space, self, lambda part, p: part.length(space, p), poses, velocities, law)
+        length, along = self._measured(self._lines(space, poses))
+        tension = self.pretension + self.stiffness * (length - self.free_length)
+        # The length of a taut line changes with the ends of its straight parts alone, also where it wraps circles.
+        pull = tension * (along - jnp.roll(along, 1, axis=0))
+        own = jax.vmap(space.point_force)(poses[np.array(self.owners)], self.points, pull)
+        return placed_sums(np.array(self.owners), len(self.bodies))(own)
 
     def energy(self, space, poses, t):
         stretch = self.length(space, poses) - self.free_length
