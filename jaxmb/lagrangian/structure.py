@@ -131,7 +131,8 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     **Raises:** `ValueError` for an L without second derivatives in the rates, constraints that cannot be satisfied near
     the guess, and laws of constraints that are not there, or whose own force is not determined.
     """
-    q, p = np.asarray(system.guess.q), system.parameters
+    q: Any = np.asarray(system.guess.q)
+    u, p = np.asarray(system.guess.u), system.parameters
     t, host = np.zeros((), q.dtype), HostLagrangian(system, 0.0)
     # A matrix that depends on where the system is might have other entries elsewhere.
     constant = system.kinematics.identity and not depends(jax.hessian(system.lagrangian, 2), (t, q, q, p), 0, 1, 2)
@@ -153,7 +154,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     drift_free = linear and system.kinematics.drift_free and all(c.is_drift_free(q, p) for c in system.constraints)
     if linear and system.velocity_rows:
         rows = slice(0, system.velocity_rows)
-        _check_consistent(system, "velocities", jacobian[rows], -host.velocity_rows_at(q, system.guess.u)[0], rows)
+        _check_consistent(system, "velocities", jacobian[rows], -host.velocity_rows_at(q, u)[0], rows)
     # Only rows that bind accelerations: the guess need not satisfy those that bind velocities.
     if system.acceleration_rows > system.velocity_rows:
         rows = slice(system.velocity_rows, system.acceleration_rows)

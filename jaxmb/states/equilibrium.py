@@ -122,7 +122,7 @@ def equilibrium(
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
-    found = None if is_traced((system, time, start)) else _on_host(system, time, start, held, bool(stable))
+    found: Any = None if is_traced((system, time, start)) else _on_host(system, time, start, held, bool(stable))
     found = _balanced(system, time, start, held, bool(stable)) if found is None else found
     q, unbalanced, falling, ok, overlaps, pulls = found
     if errors and not bool(ok):
@@ -309,8 +309,8 @@ _linearised_alone, _against_alone = on_host(_linearised), on_host(_against)
 
 def _on_host(system, t, start, held, stable):
     """`_balanced` with the search in NumPy, of concrete numbers; None where a matrix is singular or not finite."""
-    start = np.asarray(start)
-    balance = Balance(system, np.asarray(t), start[np.array(held, int)], held)
+    start, time = jax.tree.map(np.asarray, (start, t))
+    balance = Balance(system, time, start[np.array(held, int)], held)
     known = balance_on_host(balance)
     at = functools.partial(_linearised_alone, balance) if known is None else functools.partial(_linearised, known)
     try:
@@ -319,7 +319,7 @@ def _on_host(system, t, start, held, stable):
         return None
     against = (np.zeros(0, bool),) * 2
     if ok and system.contacts is not None:
-        against = _against_alone(system, np.asarray(t), q, local.multipliers, local.implied)
+        against = _against_alone(system, time, q, local.multipliers, local.implied)
     return jax.device_put(q), local.force, falling, jax.device_put(np.asarray(ok)), *against
 
 
@@ -378,8 +378,9 @@ def _softest(stiffness: Float[Array, "n n"]) -> tuple[Bool[Array, ""], Float[Arr
 def _unknown(balance: Balance) -> _Linearised:
     """A linearisation of zeros."""
     n, m, dtype = balance.system.nu, balance.system.velocity_rows + len(balance.held), balance.system.guess.q.dtype
-    of = lambda *shape: np.zeros(shape, dtype)
-    return _Linearised(of(n), of(n, n), of(n), of(n, n), np.zeros(n, bool), of(m), of(n), of(m), of(m, m))
+    vector, rows, matrix = np.zeros(n, dtype), np.zeros(m, dtype), np.zeros((n, n), dtype)
+    zeros: Any = vector, matrix, vector, matrix, np.zeros(n, bool), rows, vector, rows, np.zeros((m, m), dtype)
+    return _Linearised(*zeros)
 
 
 def _search(

@@ -5,6 +5,7 @@ The equations are those of `states/closest.py`. Matrices are dense and small.
 """
 
 import abc
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -50,8 +51,9 @@ class AbstractHost(abc.ABC):
 
     def holds(self, q: Float[np.ndarray, "nq"]) -> bool:
         """Whether the constraints hold."""
-        norms = np.linalg.norm(self.coordinate_jacobian(q) * self.coordinate_scale, axis=1)
-        return bool(largest_residual(self.coordinate_residual(q), norms) <= tolerance(q.dtype))
+        norms: Any = np.linalg.norm(self.coordinate_jacobian(q) * self.coordinate_scale, axis=1)
+        residual: Any = self.coordinate_residual(q)
+        return bool(largest_residual(residual, norms) <= tolerance(q.dtype))
 
     def met(self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None) -> Float[np.ndarray, "nq"]:
         """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of those that are held."""

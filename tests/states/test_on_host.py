@@ -52,6 +52,67 @@ def test_closest_states_are_those_of_programs(name, holds):
         np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-11)
 
 
+def pinned_bar(**more):
+    bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    return [bar], [pin, *more.pop("joints", ())], [mb.Gravity((0.0, -9.81)), *more.pop("forces", ())]
+
+
+def driven():
+    drive = planar.Driver("drive", "ground", "bar", quantity="angle", motion=lambda t, p: 0.4 * t**2)
+    bodies, joints, forces = pinned_bar(joints=[drive])
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+def stopped():
+    bodies, joints, forces = pinned_bar(joints=[mb.Stop("stop", "pin.angle", lower=-0.5)])
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+def screwed():
+    nut = spatial.Body("nut", mass=1.0, inertia=spatial.box(1.0, 0.1, 0.2, 0.3), position=(0.0, 0.0, 0.3))
+    axis = (0.0, 0.0, 1.0)
+    screw = spatial.Screw("screw", "ground", "nut", point=(0.0, 0.0, 0.0), axis=axis, pitch=0.1)
+    return mb.Scene([nut], joints=[screw]).compile()
+
+
+def rolling():
+    disc = spatial.Body("disc", mass=1.0, inertia=spatial.box(1.0, 0.2, 0.1, 0.2), position=(0.0, 0.0, 0.3))
+    plane = spatial.RollingDisc("plane", "disc", radius=0.3, axis=(0.0, 1.0, 0.0))
+    return mb.Scene([disc], joints=[plane]).compile()
+
+
+def of_a_lagrangian():
+    ring = mb.lagrangian.Holonomic("ring", lambda t, q, p: jnp.array([q @ q - (1.0 + 0.1 * t) ** 2]))
+    blade = mb.lagrangian.Pfaffian("blade", lambda t, q, p: jnp.array([[0.0, -jnp.sin(q[2]), jnp.cos(q[2])]]))
+    kinetic = lambda t, q, v, p: 0.5 * v @ v
+    return mb.lagrangian.LagrangianSystem(kinetic=kinetic, constraints=[ring, blade], q=[0.6, 0.7, 0.2])
+
+
+LONG = [pytest.param(make, marks=pytest.mark.long) for make in (screwed, rolling, of_a_lagrangian)]
+
+
+@pytest.mark.parametrize("make", [driven, stopped, *LONG])
+def test_states_of_any_constraints_are_those_of_programs(make):
+    system, t, key = make(), jnp.asarray(0.3), jax.random.key(7)
+    none, still = np.zeros(system.nq, bool), np.zeros(system.nu, bool)
+    if system.contacts is None:
+        guess = np.array(system.guess.q + 0.03 * jax.random.normal(key, (system.nq,)))
+    else:
+        guess = np.array(system.guess.q)
+        guess[:3] += 0.03
+    u = np.array(jax.random.normal(key, (system.nu,)))
+    on_host = system.on_host(t)
+    expected, ok = closest_configuration(system, t, guess, tuple(none.tolist()), system.coordinate_rank)
+    found = on_host.closest_configuration(guess, none, system.coordinate_rank)
+    assert ok and found is not None
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    expected, ok = closest_velocities(system, t, found, u, tuple(still.tolist()))
+    rates = on_host.closest_velocities(found, u, still, system.velocity_rank)
+    assert ok and rates is not None
+    np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-11)
+
+
 def test_coordinates_that_cannot_be_held_together_are_left_to_programs():
     system = mb.mechanisms.get("four_bar").system
     held = held_coordinates(system, ["crank.angle", "rocker.angle"])
@@ -93,6 +154,51 @@ def test_within_a_program_of_the_users():
     inside = jax.jit(lambda x: (x, mb.assemble(system, fix={"crank.angle": 1.2}, rates={"crank.angle": 2.0})))(1.0)[1]
     np.testing.assert_allclose(inside.q, outside.q, atol=1e-12)
     np.testing.assert_allclose(inside.u, outside.u, atol=1e-12)
+
+
+def test_other_constraints_within_a_program_of_the_users():
+    system = driven()
+    outside = mb.assemble(system, t=0.5)
+    inside = jax.jit(lambda x: (x, mb.assemble(system, t=0.5)))(1.0)[1]
+    np.testing.assert_allclose(inside.q, outside.q, atol=1e-12)
+    np.testing.assert_allclose(inside.u, outside.u, atol=1e-12)
+    np.testing.assert_allclose(outside.u[2], 0.4, atol=1e-12)
+
+
+def hanging(spring):
+    bodies, joints, forces = pinned_bar(forces=spring)
+    rope = planar.Body("rope", mass=0.5, inertia=0.05, position=(1.5, 0.0))
+    joints.append(planar.Revolute("knee", "bar", "rope", point=(1.0, 0.0)))
+    return mb.Scene([*bodies, rope], joints=joints, forces=forces).compile()
+
+
+def hanging_in_space():
+    names, inertia = {"bar": 0.5, "rope": 1.5}, spatial.box(1.0, 1.0, 0.1, 0.1)
+    bodies = [spatial.Body(name, mass=1.0, inertia=inertia, position=(x, 0.0, 0.0)) for name, x in names.items()]
+    joints = [spatial.Revolute("pin", "ground", "bar", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))]
+    joints.append(spatial.Revolute("knee", "bar", "rope", point=(1.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)))
+    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+@pytest.mark.long
+def test_an_equilibrium_is_that_of_a_program():
+    spring = planar.SpringDamper("spring", "ground", "bar", stiffness=20.0, point_a=(1.0, 1.0), point_b=(0.4, 0.0))
+    system = hanging([spring])
+    for fix in ({}, {"bar.angle": 0.2}):
+        outside = mb.equilibrium(system, fix=fix)
+        inside = jax.jit(lambda q, fix=fix: mb.equilibrium(system, mb.State(q, system.guess.u), fix=fix))(
+            system.guess.q
+        )
+        np.testing.assert_allclose(outside.q, inside.q, rtol=0, atol=1e-10)
+
+
+@pytest.mark.long
+def test_an_equilibrium_in_space_is_that_of_a_program():
+    system = hanging_in_space()
+    outside = mb.equilibrium(system)
+    inside = jax.jit(lambda q: mb.equilibrium(system, mb.State(q, system.guess.u)))(system.guess.q)
+    np.testing.assert_allclose(outside.q, inside.q, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(outside.q[9], -1.5, atol=1e-9)
 
 
 def test_scenes_without_constraints_have_no_such_form():

@@ -100,7 +100,7 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         points = self._centres(space, poses)
         return namespace(points).roll(points, -1, axis=0) - points
 
-    def _centres(self, space, poses):
+    def _centres(self, space, poses) -> Any:
         own = poses[np.array(self.owners)], self.points
         if namespace(*own) is np:
             return np.stack([space.point(*pair) for pair in zip(*own, strict=True)])
