@@ -301,6 +301,11 @@ class AbstractConstraintGroup(AbstractGroup):
         """The time derivative of `velocity`."""
 
     @property
+    def of_poses(self) -> bool:
+        """Whether its rows are derivatives of residuals of poses."""
+        return False
+
+    @property
     def rows(self) -> int:
         return self.group.rows
 
@@ -320,6 +325,10 @@ class ConstraintGroup(AbstractConstraintGroup):
 
     damping: Float[Array, "parts"] | None = None
     stiffness: Float[Array, "parts"] | None = None
+
+    @property
+    def of_poses(self):
+        return True
 
     @property
     def is_position(self):

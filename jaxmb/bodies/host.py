@@ -15,7 +15,6 @@ from ..linalg.jitted import on_host
 from ..parts.elements import on_bodies
 from ..states.on_host import MOST, AbstractHost
 from .elementary import ElementaryRows, Listed, is_elementary, stacked
-from .groups import AbstractConstraintGroup, ConstraintGroup
 
 
 class _Rows(NamedTuple):
@@ -29,10 +28,10 @@ class _Rows(NamedTuple):
 
 
 @on_host
-def _rows(groups: tuple[AbstractConstraintGroup, ...], t: Any, poses: Any, velocities: Any, moves: Any) -> list[_Rows]:
+def _rows(groups: tuple[Any, ...], t: Any, poses: Any, velocities: Any, moves: Any) -> list[_Rows]:
     out = []
     for g in groups:
-        if not isinstance(g, ConstraintGroup):
+        if not g.of_poses:
             values = g.velocity(t, poses, velocities)
             out.append(_Rows(values, values, g.jacobian(t, poses, velocities)))
             continue
@@ -142,7 +141,7 @@ class HostScene(AbstractHost):
 
     def _along_velocities(self, q, group, blocks):
         """Derivatives along velocities, from those along poses."""
-        if not (self._spatial and isinstance(group, ConstraintGroup)):
+        if not (self._spatial and group.of_poses):
             return blocks
         units = np.eye(self._layout.space.velocity_size)
         moved = [self._rates(q, np.tile(unit, (self._layout.ground + 1, 1))) for unit in units]
@@ -166,7 +165,7 @@ class HostScene(AbstractHost):
         others, unmet = dict(zip(map(id, self._others), self._of_others(q, u), strict=True)), []
         for g, own in zip(self._groups, blocks, strict=True):
             more = others.get(id(g))
-            if more is not None and not isinstance(g, ConstraintGroup):
+            if more is not None and not g.of_poses:
                 unmet.append(more.values)
                 continue
             rates = np.einsum("prkv,pkv->pr", own, of_bodies[g.group.body_index])

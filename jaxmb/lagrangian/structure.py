@@ -150,8 +150,9 @@ def find_structure(system: AbstractLagrangian) -> Structure:
         raise ValueError("The constraints have no finite derivatives at the guess; begin at another state.")
     position, velocity, acceleration = (_independent(jacobian[:rows]) for rows in _row_counts(system))
     check_gradients(system, np.linalg.norm(jacobian, axis=1))
-    linear = system.kinematics.linear and all(c.is_linear(q, p) for c in system.constraints)
-    drift_free = linear and system.kinematics.drift_free and all(c.is_drift_free(q, p) for c in system.constraints)
+    linear = system.kinematics.linear and all(c.is_linear(system.guess.q, p) for c in system.constraints)
+    drift_free = linear and system.kinematics.drift_free
+    drift_free = drift_free and all(c.is_drift_free(system.guess.q, p) for c in system.constraints)
     if linear and system.velocity_rows:
         rows = slice(0, system.velocity_rows)
         _check_consistent(system, "velocities", jacobian[rows], -host.velocity_rows_at(q, u)[0], rows)

@@ -58,15 +58,15 @@ class AbstractHost(abc.ABC):
     def met(self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None) -> Float[np.ndarray, "nq"]:
         """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of those that are held."""
         scale = self.coordinate_scale if held is None else np.where(held, 0.0, self.coordinate_scale)
-        before, small = self.coordinate_residual(q), np.finfo(float).eps ** _SMALL
+        before, small = self.coordinate_residual(q), float(np.finfo(q.dtype).eps) ** _SMALL
         for _ in range(_STEPS if before.size and np.all(np.isfinite(before)) else 0):
             jacobian = self.coordinate_jacobian(q) * scale
             if not np.all(np.isfinite(jacobian)):
                 break
-            step = -scale * np.linalg.lstsq(jacobian, before, rcond=1e-12)[0]
+            step = -scale * np.linalg.lstsq(jacobian, before, rcond=small)[0]
             longest = np.max(np.abs(step[scale > 0] / scale[scale > 0]), initial=0.0)
             step = step * min(1.0, 1.0 / longest if longest > 0 else 1.0)
-            reached = [q + length * step for length in 0.5 ** np.arange(8)]
+            reached = [q + 0.5**k * step for k in range(8)]
             sizes = [np.sum(self.coordinate_residual(there) ** 2) for there in reached]
             best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
             if not sizes[best] < before @ before:

@@ -195,7 +195,7 @@ def test_building_a_scene_compiles_nothing_but_its_analysis():
         stiffness = mb.parameters(mb.with_parameters(system, {"coil.stiffness": 4.0}))["coil.stiffness"]
     assert float(stiffness) == 4.0
     # Whether its joint and its spring turn the point mass is asked of themselves.
-    assert set(names) == {"_turned"}
+    assert set(names) == {"turned"}
 
 
 def test_forces_that_no_reaction_changes_are_not_solved_for(monkeypatch):
