@@ -17,6 +17,8 @@ MOST = 150
 # Largest numbers of Gauss–Newton and of Newton steps, and of steps to velocities that constraints are not linear in; a
 # share of the residuals that a Gauss–Newton step takes away; the power of the precision at which a step is the last.
 _STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.999, 0.75
+# A full step is not shortened where it reduces the squares of the residuals to less than this share.
+_WHOLE = 0.01
 # Coordinates satisfy constraints exactly up to so many units of rounding; singular values below this fraction are zero.
 _ROUNDING, _ZERO = 4.0, 1e-9
 
@@ -66,13 +68,19 @@ class AbstractHost(abc.ABC):
             step = -scale * np.linalg.lstsq(jacobian, before, rcond=small)[0]
             longest = np.max(np.abs(step[scale > 0] / scale[scale > 0]), initial=0.0)
             step = step * min(1.0, 1.0 / longest if longest > 0 else 1.0)
-            reached = [q + 0.5**k * step for k in range(8)]
-            sizes = [np.sum(self.coordinate_residual(there) ** 2) for there in reached]
+            size = before @ before
+            reached = [(q + step, self.coordinate_residual(q + step))]
+            # Shorter steps are no better than one that takes nearly all of the residuals away.
+            if not np.sum(reached[0][1] ** 2) < _WHOLE * size:
+                reached += [
+                    (there, self.coordinate_residual(there)) for there in (q + 0.5**k * step for k in range(1, 8))
+                ]
+            sizes = [np.sum(residual**2) for _, residual in reached]
             best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
-            if not sizes[best] < before @ before:
+            if not sizes[best] < size:
                 break
-            gained = sizes[best] < _PROGRESS * (before @ before)
-            q, before = reached[best], self.coordinate_residual(reached[best])
+            gained = sizes[best] < _PROGRESS * size
+            q, before = reached[best]
             if longest <= small or not gained:
                 break
         return q
