@@ -291,11 +291,20 @@ def independent_components(W: Float[Array, "k k"], among: Bool[Array, "k"]) -> B
     positive semidefinite W; without derivative.
     """
     W, among = lax.stop_gradient((W, among))
-    both = among[:, None] & among[None, :]
-    # What must be cancelled in a random direction is nearly always cancelled by a basis.
-    asked = -jnp.where(both, W, 0.0) @ (1 + jnp.arange(among.size, dtype=W.dtype))
-    matrix = jnp.where(both, W, jnp.eye(among.size, dtype=W.dtype))
-    return positive_components(matrix, jnp.where(among, asked, 1.0))[0]
+    scale = _scale(W)
+
+    def advance(_, carry):
+        # The Cholesky factorisation with pivots: the next one is furthest from the span of those before it.
+        left, found, others = carry
+        rest = jnp.where(others, jnp.diag(left), 0.0)
+        own = jnp.argmax(rest)
+        is_own, pivot = np.arange(among.size) == own, rest[own]
+        is_pivot = pivot > _PIVOT
+        left = left - left[:, own, None] * (left[own] / jnp.where(is_pivot, pivot, jnp.inf))[None, :]
+        return left, found | (is_own & is_pivot), others & ~is_own
+
+    first = W / scale[:, None] / scale[None, :], jnp.zeros_like(among), among
+    return lax.fori_loop(0, among.size, advance, first)[1]
 
 
 def _in_lines(W, b, dry, among):

@@ -34,7 +34,7 @@ from ..system.gaps import (
 from .contact_forces import contact_forces, largest_force, slow_slip, stick_reserve
 from .contact_laws import REST
 from .impact import Impact, impact
-from .impact_event import NEAR
+from .impact_event import NEAR, Event, find_event
 from .impulse import after_impulse
 
 # Slip in two directions that begins has the direction of its modes up to this multiple of what is slow.
@@ -103,9 +103,13 @@ class ContactGuards(AbstractGuards):
         n, pairs = counts(self.system)[0], frictions_of(self.system).pairs
         return jnp.concatenate([free[:n], placed_pairs(pairs, jnp.stack([turned, fast], axis=1), free[n:])])
 
-    def impact(self, t: Scalar, y: State, dated: bool = False) -> Impact:
+    def event(self, t: Scalar, y: State) -> Event:
+        """The numbers of the event at a state, without derivatives."""
+        return find_event(self.system.at(y), self.formulation, self.touch, t, y)
+
+    def impact(self, t: Scalar, y: State, dated: bool = False, found: Event | None = None) -> Impact:
         """The event at a state; see `impact`."""
-        return impact(self.system.at(y), self.formulation, self.touch, t, y, dated)
+        return impact(self.system.at(y), self.formulation, self.touch, t, y, dated, found)
 
     def changed(self, before, after):
         system, before, after = lax.stop_gradient((self.system, before, after))
@@ -153,10 +157,15 @@ def contact_guards(
     return None if system.contacts is None or touch is None else ContactGuards(system, formulation, touch)
 
 
-def after_jump(term: Any, t: Scalar, y: State) -> State:
+def found_at_jump(term: Any, t: Scalar, y: State) -> Event | None:
+    """The event of contacts that close or open at a jump, of a term with `guards`; None without them."""
+    return None if term.guards is None else term.guards.event(t, y)
+
+
+def after_jump(term: Any, t: Scalar, y: State, found: Event | None) -> State:
     """The state after prescribed rates have jumped, or contacts closed or opened, of a term with `system`,
     `formulation` and `guards`.
     """
     if term.guards is None:
         return after_impulse(term.system, t, y)
-    return term.guards.impact(t, y).after
+    return term.guards.impact(t, y, found=found).after

@@ -87,6 +87,7 @@ def impact(
     t: Scalar,
     y: State,
     dated: bool = False,
+    found: Event | None = None,
 ) -> Impact:
     """The event of contacts that are about to close, or to open, at a state.
 
@@ -97,18 +98,18 @@ def impact(
 
     **Arguments:** `system`: with the internal states of `y`; `touch`: gaps down to minus this, in units of the system's
     size, count as zero; `dated`: whether `late` has its derivative also where the state after the event does not depend
-    on it, as where a contact opens.
+    on it, as where a contact opens; `found`: the event, where it is known.
     """
     t = jnp.asarray(t, y.q.dtype)
-    after, event = _impact(system, t, y, formulation, jnp.asarray(touch, y.q.dtype), dated)
+    found = find_event(system, formulation, touch, t, y) if found is None else found
+    after, event = _impact(system, t, y, found, formulation, jnp.asarray(touch, y.q.dtype), dated)
     modes = kinds_of(system, event.modes[0]), kinds_of(system, event.modes[1])
     return Impact(after, event.late, event.impulses, modes, event.rest, event.energy, event.solvable)
 
 
 @eqx.filter_custom_jvp
-def _impact(system, t, y, formulation, touch, dated):
-    del dated
-    event = find_event(system, formulation, touch * system.length, t, y)
+def _impact(system, t, y, event, formulation, touch, dated):
+    del formulation, touch, dated
     q = with_modes(system, y.q, event.modes[1])
     # The state moves on before the event, and back after it, each at the mean velocity.
     before = system.rates(t, y.q, event.at - 0.5 * event.late * event.before)
@@ -124,7 +125,7 @@ def _impact(system, t, y, formulation, touch, dated):
 
 @_impact.def_jvp
 def _impact_jvp(primals, tangents):
-    system, t, y, formulation, touch, dated = primals
+    system, t, y, _, formulation, touch, dated = primals
     dsystem, dt, dy, *_ = tangents
     after, event = _impact(*primals)
     system, t, y, event = _without_second_derivative((system, t, y, event))

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,8 +90,12 @@ class Phase(NamedTuple):
     impulses: Float[Array, "laws"]
 
 
+# Compiled inside the whole program, so that it is traced once.
+@eqx.filter_jit
 def find_event(system, formulation, touch, t, y) -> Event:
-    """An event at a state; `touch` [m, rad]."""
+    """An event at a state, without derivatives; `touch` in units of the system's size."""
+    system, touch, t, y = lax.stop_gradient((system, jnp.asarray(touch, y.q.dtype), jnp.asarray(t, y.q.dtype), y))
+    touch = touch * system.length
     contacts, q, u = contacts_of(system), y.q, y.u
     frictions, (n, m) = contacts.frictions, counts(system)
     modes, free_q = modes_of(system, q), with_modes(system, q, 0.0)

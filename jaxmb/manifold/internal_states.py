@@ -17,6 +17,7 @@ from ..solvers import AbstractManifoldTerm, Block
 from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractSystem
 from ..system.gaps import mode_places
+from .contact_guards import after_jump, found_at_jump
 
 
 def with_internal_states(term: Any) -> Any:
@@ -105,10 +106,13 @@ class StatefulTerm(AbstractManifoldTerm):
     def gaps(self):
         return self.term.gaps
 
-    def after_jump(self, t, y, args):
+    def found_at_jump(self, t, y, args):
+        return found_at_jump(self, t, y)
+
+    def after_jump(self, t, y, found, args):
         if self.guards is not None:
-            return self.guards.impact(t, y).after
-        after = self.term.after_jump(t, _mechanical(y), args)
+            return after_jump(self, t, y, found)
+        after = self.term.after_jump(t, _mechanical(y), found, args)
         return State(after.q, after.u, y.z)
 
     def chart_after_jump(self, chart):

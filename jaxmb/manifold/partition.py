@@ -49,7 +49,7 @@ from .constraints import (
     restore,
     solved,
 )
-from .contact_guards import after_jump, contact_guards
+from .contact_guards import after_jump, contact_guards, found_at_jump
 from .diagnosis import diagnose
 from .manifold import AbstractManifold, VectorField, contact_tolerance, newton_tolerance
 from .orthogonal_projection import project_normalized
@@ -629,8 +629,11 @@ class PartitionTerm(AbstractManifoldTerm):
     def gaps(self):
         return compliant_gaps(self.system)
 
-    def after_jump(self, t, y, args):
-        return after_jump(self, t, y)
+    def found_at_jump(self, t, y, args):
+        return found_at_jump(self, t, y)
+
+    def after_jump(self, t, y, found, args):
+        return after_jump(self, t, y, found)
 
     def chart_after_jump(self, chart):
         if self.system.contacts is None:

@@ -28,7 +28,7 @@ from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .compliant_gaps import compliant_gaps
 from .constraints import RestoredState, SolvedState, rates_along, restore, solved
-from .contact_guards import ContactGuards, after_jump, contact_guards
+from .contact_guards import ContactGuards, after_jump, contact_guards, found_at_jump
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
 from .manifold import AbstractManifold, VectorField, contact_tolerance, newton_tolerance, normalize_state
@@ -255,8 +255,11 @@ class ProjectionTerm(AbstractManifoldTerm):
     def gaps(self):
         return compliant_gaps(self.system)
 
-    def after_jump(self, t, y, args):
-        return after_jump(self, t, y)
+    def found_at_jump(self, t, y, args):
+        return found_at_jump(self, t, y)
+
+    def after_jump(self, t, y, found, args):
+        return after_jump(self, t, y, found)
 
     def controlled(self, chart):
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))

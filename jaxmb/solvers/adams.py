@@ -21,6 +21,7 @@ from .evaluation import (
     Evaluation,
     controlled_components,
     evaluate,
+    found_at_jump,
     next_chart,
     project_near,
     ravel,
@@ -56,6 +57,7 @@ class AdamsState(AbstractMultistepState):
     - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
     - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
+    - `found`: what an `AbstractManifoldTerm` has found at the last jump, for its derivatives, otherwise `None`.
     """
 
     history: History
@@ -65,6 +67,10 @@ class AdamsState(AbstractMultistepState):
     stiffness: Stiffness | None
     sizes: Float[Array, " sizes"] | None
     tangents: tuple[Tangent, ...] | None
+    found: PyTree[Array]
+
+    def with_found(self, found):
+        return eqx.tree_at(lambda state: state.found, self, found, is_leaf=lambda x: x is None)
 
     @property
     def memory(self) -> Float[Array, "length n"]:
@@ -186,7 +192,7 @@ class Adams(AbstractMultistep):
         return self.max_order + 1
 
     def linear_steps(self, jumps):
-        return AdamsSteps(jumps)
+        return AdamsSteps(jumps, evaluates=not self.tolerances.fixed)
 
     def statistics(self, solver_state: AdamsState, controller_state, stats):
         out = {
@@ -209,15 +215,18 @@ class Adams(AbstractMultistep):
         if before is None:
             step_counts, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
             sizes = None if self.tolerances.scales is None else self.tolerances.scales.none(flat.dtype)
+            found = eqx.filter_eval_shape(found_at_jump, terms, t0, y0, args)
+            found = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), found)
         else:
             step_counts, stiffness, sizes = before.step_counts, before.stiffness, before.sizes
+            found = before.found
         tangents = None
         if self.tangent_control is not None:
             control = self.tangent_control
             ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
             tangents = tuple(Tangent(w, jnp.zeros_like(history.differences), control.largest(w)) for w in ws)
         order = jnp.asarray(1, np.int32)
-        return AdamsState(history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents)
+        return AdamsState(history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents, found)
 
     def attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
         history, order, chart = state.history, state.order, state.chart
@@ -286,6 +295,7 @@ class Adams(AbstractMultistep):
             stiffness=self._observed(state, h, before, step.predicted, after, step.first.f, step.second.f, y0),
             sizes=self.grown_sizes(state.sizes, after),
             tangents=tangents,
+            found=state.found,
         )
         used = (order >= INDEX)[:, None]
         dense_info = {

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float, Int
 from .._compat import any_of_batch
 from ._history import INDEX, LENGTH, basis_means, known_differences, start, step_end
 from ._interpolation import RateInterpolation
-from .evaluation import at_solution, kept_of_chart, ravel, unravel_like
-from .restarts import Jump, restarts
+from .evaluation import at_solution, guards_of, kept_of_chart, ravel, unravel_like
+from .restarts import AtRestart, Jump, restarts
 from .steps import AbstractSteps, LinearStep
 
 
@@ -99,9 +99,12 @@ class AdamsRow(eqx.Module):
 
 
 class AdamsSteps(AbstractSteps):
-    """The steps of `Adams`; `jumps`: whether they may begin after a jump; whether the run itself `begins` with one."""
+    """The steps of `Adams`; `jumps`: whether they may begin after a jump; whether the run itself `begins` with one;
+    whether the first step after a jump `evaluates` at its start, and at its end, only.
+    """
 
     jumps: bool = eqx.field(static=True)
+    evaluates: bool = eqx.field(static=True, default=True)
     begins: bool = eqx.field(static=True, default=False)
 
     def after_first_jump(self):
@@ -116,9 +119,18 @@ class AdamsSteps(AbstractSteps):
             of_start = first.mesh, jnp.ones_like(order), first.known
             mesh, order, known = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, (mesh, order, known))
             last = jnp.where(old.history.known > 0, old.history.mesh[0], before.tprev)
-            jump = Jump(made, last, before.tprev, ravel(before.y), old.history.differences[0], old.chart)
+            restart = self._restart(terms, new)
+            jump = Jump(made, last, before.tprev, ravel(before.y), old.history.differences[0], old.chart, restart)
         kept = kept_of_chart(terms, new.chart)
         return AdamsRow(before.tnext, mesh, order, known, ravel(after.y), new.history.differences[0], kept, jump)
+
+    def _restart(self, terms, after):
+        """What is known after one step from a restart. Second derivatives, which there are none of through events,
+        would need the tangent of the field.
+        """
+        if guards_of(terms) is None or not self.evaluates:
+            return None
+        return AtRestart(after.found, *_at_start(terms, after))
 
     def alone(self, solver_state):
         return solver_state.alone()
@@ -132,13 +144,9 @@ class AdamsSteps(AbstractSteps):
     def start(self, terms, before, after):
         if self.begins:
             return None
-        differences = after.solver_state.history.differences
-        # After one step from a start these are the derivative at its end, and how far it is from that at the start.
-        f = differences[0] - differences[1]
         # A run that begins with a jump has no field before it.
         asked = (before.solver_state.history.known == 0) & ~jnp.asarray(before.made_jump)
-        kept = kept_of_chart(terms, after.solver_state.chart, at_start=True)
-        return StartRow(asked, before.tprev, f, kept)
+        return StartRow(asked, before.tprev, *_at_start(terms, after.solver_state))
 
     def memory_at_start(self, of, terms, like, row, along):
         *inward, given = along
@@ -201,3 +209,10 @@ class AdamsSteps(AbstractSteps):
             return out
         parts = lambda row: (row.jump.y, row.jump.f)
         return eqx.tree_at(parts, out, (before[0], before[1][0]), is_leaf=lambda x: x is None)
+
+
+def _at_start(terms, after):
+    """The field at a start, and what is kept of the chart there, from the state of the solver after one step."""
+    # These are the derivative at its end, and how far it is from that at the start.
+    last, change, *_ = after.history.differences
+    return last - change, kept_of_chart(terms, after.chart, at_start=True)

@@ -98,10 +98,16 @@ def refused(term: Any, chart: Chart | None, before: Chart | None) -> Any:
     return False if manifold is None else manifold.refuses(chart, before)
 
 
-def after_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
+def found_at_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
+    """The numbers of a jump by which `after_jump` knows the state after it; None for a plain vector field."""
+    manifold = _manifold(term)
+    return None if manifold is None else manifold.found_at_jump(t * direction_of(term), y, args)
+
+
+def after_jump(term: Any, t: Any, y: PyTree[Array], found: PyTree[Array], args: Args) -> PyTree[Array]:
     """The state just after a jump; `y` for a plain vector field."""
     manifold = _manifold(term)
-    return y if manifold is None else manifold.after_jump(t * direction_of(term), y, args)
+    return y if manifold is None else manifold.after_jump(t * direction_of(term), y, found, args)
 
 
 def chart_after_jump(term: Any, chart: Chart | None) -> Chart | None:

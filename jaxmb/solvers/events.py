@@ -437,50 +437,131 @@ class EventController(AbstractControllerAround):
         keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, found.error, error_order, before.inner
         )
-        # Compilers round what is computed in two places twice.
-        meant = jnp.abs(t1 - before.target) <= 4 * jnp.finfo(before.target.dtype).eps * jnp.abs(t1)
-        close = (t1 - found.target) <= _END * (t1 - t0)
-        at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
-        at_zero = at_zero | (close & (found.lowest < -found.touch))
-        crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)
-        coarse = (found.coarse > 1) & (before.halved < _HALVED) & ~crossed
-        again, ends = keep & (crossed | coarse), keep & at_zero & ~(crossed | coarse)
-        # The controller inside does not learn of a step that was good but too long, nor of one without a length, where
-        # one event follows another at once.
-        empty = t1 <= t0
-        inner = jax.tree.map(lambda new, old: jnp.where(again | empty, old, new), inner, before.inner)
-        shorter = jnp.where(crossed, found.target, t0 + 0.5 * (t1 - t0))
-        next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, shorter, next_t1)
-        growing = jnp.where(keep & ~again & (found.coarse > _NOT_SMOOTH), t1 + _GROWTH * (t1 - t0), jnp.inf)
-        next_t1 = jnp.minimum(next_t1, growing)
-        length = jnp.where(jnp.isinf(before.target), t1 - t0, before.length)
-        next_t1 = jnp.where(empty & ~again, t1 + _SHORTER * length, next_t1)
-        # A method that starts anew, at order one, takes the longest step that it could take when it last did.
-        accepted, allowed = keep & ~again, (t1 - t0) * _START_SAFETY * found.retry.astype(before.start.dtype)
-        start = jnp.where(before.starts & accepted & ~empty, allowed, before.start)
-        next_t1 = jnp.where(ends, jnp.minimum(next_t1, t1 + start), next_t1)
-        target = jnp.where(keep & crossed, found.target, jnp.inf)
+        starts = jnp.asarray(made_jump), before.starts
+        step = _Tried(t0, t1, found.target, found.coarse, found.retry, before.halved, before.inner, starts)
+        plan = _Plan(
+            jnp.array(False),
+            jnp.array(False),
+            next_t0,
+            next_t1,
+            # The controller inside does not learn of a step without a length, where one event follows another at once.
+            jax.tree.map(lambda new, old: jnp.where(t1 <= t0, old, new), inner, before.inner),
+            jnp.full_like(before.target, jnp.inf),
+            jnp.where(jnp.isinf(before.target), t1 - t0, before.length),
+            jnp.zeros_like(before.halved),
+            before.starts,
+            before.start,
+            before.ended,
+        )
+        # A branch, so that the compiler does not repeat the verdict wherever it matters.
+        verdict = _verdict(keep, (t0, t1), found, before)
+        plan = lax.switch(verdict, [_refused, _crossed, _too_coarse, _passed, _ended], step, plan)
         # A place at which nothing changed is that of the next event.
-        count = before.count - (accepted & before.ended & (found.idle > 0)).astype(before.count.dtype)
-        place = jnp.where(ends, jnp.minimum(count, self.most), self.most)
+        idle = plan.accepted & before.ended & (found.idle > 0)
+        count = before.count - idle.astype(before.count.dtype)
+        place = jnp.where(plan.ends, jnp.minimum(count, self.most), self.most)
         state = EventState(
-            inner,
-            target,
-            length,
-            count + ends.astype(count.dtype),
+            plan.inner,
+            plan.target,
+            plan.length,
+            count + plan.ends.astype(count.dtype),
             before.times.at[place].set(t1),
             before.states.at[place].set(ravel(y1_candidate)),
             found.touch,
-            jnp.where(keep & coarse, before.halved + 1, 0),
-            jnp.where(accepted, made_jump | ends, before.starts),
-            start,
-            jnp.where(accepted, ends, before.ended),
+            plan.halved,
+            plan.starts,
+            plan.start,
+            plan.ended,
         )
-        full = ends & (count >= self.most)
+        full = plan.ends & (count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)
         lost = found.lost > 0
         result = diffrax.RESULTS.where(lost, NO_STATE, result)
-        return keep & ~crossed & ~coarse & ~lost, next_t0, next_t1, made_jump | ends, state, result
+        return plan.accepted & ~lost, plan.next_t0, plan.next_t1, made_jump | plan.ends, state, result
+
+
+class _Tried(NamedTuple):
+    """A step that was tried from `t0` to `t1`, with what was found in it, see `Crossing`; of the state before it how
+    often a step was `halved`, and `inner`; whether the method `starts` anew after it, and did with it.
+    """
+
+    t0: Any
+    t1: Any
+    target: Any
+    coarse: Any
+    retry: Any
+    halved: Any
+    inner: Any
+    starts: tuple[Any, Any]
+
+
+class _Plan(NamedTuple):
+    """What follows a step: whether it is `accepted`, and `ends` at an event; the next one; for the other fields see
+    `EventState`.
+    """
+
+    accepted: Any
+    ends: Any
+    next_t0: Any
+    next_t1: Any
+    inner: Any
+    target: Any
+    length: Any
+    halved: Any
+    starts: Any
+    start: Any
+    ended: Any
+
+
+# Steps that the controller inside refuses; that pass a zero; that are too coarse; that have no event, and that end at
+# one.
+_REFUSED, _CROSSED, _TOO_COARSE, _PASSED, _ENDED = range(5)
+
+
+def _verdict(keep, step: tuple[Any, Any], found: Crossing, before: EventState):
+    """What a step is, if the controller inside would `keep` it."""
+    t0, t1 = step
+    # Compilers round what is computed in two places twice.
+    meant = jnp.abs(t1 - before.target) <= 4 * jnp.finfo(before.target.dtype).eps * jnp.abs(t1)
+    close = (t1 - found.target) <= _END * (t1 - t0)
+    at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
+    at_zero = at_zero | (close & (found.lowest < -found.touch))
+    crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)
+    coarse = (found.coarse > 1) & (before.halved < _HALVED)
+    verdict = jnp.where(coarse, _TOO_COARSE, jnp.where(at_zero, _ENDED, _PASSED))
+    return jnp.where(keep, jnp.where(crossed, _CROSSED, verdict), _REFUSED)
+
+
+def _refused(step: _Tried, plan: _Plan) -> _Plan:
+    return plan._replace(next_t1=jnp.where(step.t1 <= step.t0, step.t1 + _SHORTER * plan.length, plan.next_t1))
+
+
+def _crossed(step: _Tried, plan: _Plan) -> _Plan:
+    # The controller inside does not learn of a step that was good but too long.
+    return plan._replace(next_t0=step.t0, next_t1=step.target, inner=step.inner, target=step.target)
+
+
+def _too_coarse(step: _Tried, plan: _Plan) -> _Plan:
+    middle = step.t0 + 0.5 * (step.t1 - step.t0)
+    return plan._replace(next_t0=step.t0, next_t1=middle, inner=step.inner, halved=step.halved + 1)
+
+
+def _passed(step: _Tried, plan: _Plan) -> _Plan:
+    t0, t1, (starts, started) = step.t0, step.t1, step.starts
+    growing = jnp.where(step.coarse > _NOT_SMOOTH, t1 + _GROWTH * (t1 - t0), jnp.inf)
+    empty = t1 <= t0
+    next_t1 = jnp.where(empty, t1 + _SHORTER * plan.length, jnp.minimum(plan.next_t1, growing))
+    # A method that starts anew, at order one, takes the longest step that it could take when it last did.
+    allowed = (t1 - t0) * _START_SAFETY * step.retry.astype(plan.start.dtype)
+    start = jnp.where(started & ~empty, allowed, plan.start)
+    yes, no = jnp.array(True), jnp.array(False)
+    return plan._replace(accepted=yes, next_t1=next_t1, starts=starts, start=start, ended=no)
+
+
+def _ended(step: _Tried, plan: _Plan) -> _Plan:
+    plan, yes = _passed(step, plan), jnp.array(True)
+    next_t1 = jnp.minimum(plan.next_t1, step.t1 + plan.start)
+    return plan._replace(ends=yes, next_t1=next_t1, starts=yes, ended=yes)
 
 
 def events_found(controller_state: Any) -> EventState | None:

@@ -56,7 +56,7 @@ class HermiteSteps(AbstractSteps):
             of_start = first.mesh, first.known, jnp.ones_like(order_index)
             here = mesh, known, order_index
             mesh, known, order_index = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, here)
-            jump = Jump(made, old.history.mesh[0], before.tprev, ravel(before.y), f, old.chart)
+            jump = Jump(made, old.history.mesh[0], before.tprev, ravel(before.y), f, old.chart, None)
         kept, free = kept_of_chart(terms, new.chart), free_components(terms, ravel(after.y), new.chart)
         return HermiteRow(before.tnext, mesh, known, order_index, ravel(after.y), new.slope[-n:], kept, free, jump)
 

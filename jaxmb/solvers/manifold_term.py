@@ -225,12 +225,22 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         at = lambda t, y: self.at_solution(t, y, f, kept, args)[1]
         return y, f, jax.jvp(at, (t, y), (jnp.ones_like(t), f if along is None else along))[1]
 
-    def after_jump(self, t: Any, y: Y, args: Args) -> Y:
+    def found_at_jump(self, t: Any, y: Y, args: Args) -> PyTree[Array]:
+        """The numbers of a jump that take long to find, without derivatives; by default None.
+
+        They are found once, and stored for the derivatives of `after_jump`.
+        """
+        del t, y, args
+        return None
+
+    def after_jump(self, t: Any, y: Y, found: PyTree[Array], args: Args) -> Y:
         """The state just after a time at which the field or the manifold jumps; by default it has not changed.
 
         A manifold whose states jump with it overrides this method.
+
+        **Arguments:** `found`: the numbers of `found_at_jump`.
         """
-        del t, args
+        del t, found, args
         return y
 
     def chart_after_jump(self, chart: Chart) -> Chart:

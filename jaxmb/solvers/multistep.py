@@ -19,6 +19,7 @@ from .evaluation import (
     check_term,
     derivative,
     first_chart,
+    found_at_jump,
     gaps_of,
     guards_of,
     refused,
@@ -66,6 +67,13 @@ class AbstractMultistepState(eqx.Module):
         """What the error estimate of the last step chose for the next one, such as its order: fields, or parts of them;
         None without any.
         """
+
+    def with_found(self, found: PyTree[Array]) -> Self:
+        """The same after a jump, with what was found there if the method keeps it; see
+        `AbstractManifoldTerm.found_at_jump`.
+        """
+        del found
+        return self
 
     def alone(self) -> Self:
         """The same without tangents."""
@@ -169,9 +177,10 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
         def restarted(before):
             y0, solver_state = before
-            after = after_jump(terms, t0, y0, args)
+            found = found_at_jump(terms, t0, y0, args)
+            after = after_jump(terms, t0, y0, found, args)
             chart = chart_after_jump(terms, solver_state.chart)
-            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state)
+            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(found)
 
         cond = cond_of_jumps(guards_of(terms))
         return cond(made_jump, restarted, lambda before: before, (y0, solver_state))

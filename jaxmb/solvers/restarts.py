@@ -9,19 +9,39 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._compat import any_of_batch
-from .evaluation import after_jump, chart_after_jump, field_of, guards_of, next_chart, ravel, unravel_like
+from .evaluation import (
+    after_jump,
+    at_solution,
+    chart_after_jump,
+    field_of,
+    found_at_jump,
+    guards_of,
+    next_chart,
+    ravel,
+    unravel_like,
+)
 from .times import twice_differentiable
 
 # Of more numbers than this, states and fields among them, tangents after a jump are computed one at a time.
 _MOST_COLUMNS = 256
 
 
+class AtRestart(eqx.Module):
+    """What is stored of a restart after a jump: what the term has `found` there; the field `f` after it; what is `kept`
+    of the chart there.
+    """
+
+    found: PyTree[Array]
+    f: Float[Array, " n"]
+    kept: Any
+
+
 class Jump(eqx.Module):
-    """What is stored of a start: whether there was a jump, the times `before` and after it, and the state, the field
-    and the chart before it.
+    """What is stored of a start: whether there was a jump, the times `before` and after it, the state, the field and
+    the chart before it; what is known `after` it, None where derivatives find that again.
     """
 
     made: Any
@@ -30,6 +50,7 @@ class Jump(eqx.Module):
     y: Float[Array, " n"]
     f: Float[Array, " n"]
     chart: Any
+    after: AtRestart | None
 
 
 def restarts(
@@ -94,7 +115,10 @@ def _restart(of, like, jump, numbers, at_jump, moved, flat, f):
         field = field_of(terms, jump.before, unravel_like(like, flat), jump.chart, args)
         flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
         at = jump.time + late
-    y = after_jump(terms, jump.time if at is None else at, unravel_like(like, flat), args)
+    known, y, time = jump.after, unravel_like(like, flat), jump.time if at is None else at
+    y = after_jump(terms, time, y, found_at_jump(terms, time, y, args) if known is None else known.found, args)
+    if late is None and known is not None:
+        return at_solution(terms, jump.time, ravel(y), known.f, like, known.kept, args)
     chart = next_chart(terms, jump.time, y, chart_after_jump(terms, jump.chart), args)
     field = field_of(terms, jump.time, y, chart, args)
     if late is None:
