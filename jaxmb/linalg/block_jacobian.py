@@ -92,9 +92,9 @@ class JointOrder:
         """Whether each of all m rows is independent of the others."""
         return self.kept.reshape(-1)[self.place]
 
-    def of_first(self, rows: int) -> "JointOrder":
+    def of_rows(self, numbers: tuple[int, ...]) -> "JointOrder":
         """The same order with these rows kept at most."""
-        return dataclasses.replace(self, key=(self.key, rows), kept=self.kept & (self.rows < rows))
+        return dataclasses.replace(self, key=(self.key, numbers), kept=self.kept & np.isin(self.rows, numbers))
 
 
 class BlockJacobian(AbstractJacobian):
@@ -146,8 +146,8 @@ class BlockJacobian(AbstractJacobian):
         matrix, kept = jax.vmap(self.product, in_axes=1, out_axes=1)(unit), self.order.is_kept
         return DenseJacobian(matrix, rows=None if kept.all() else jnp.asarray(np.flatnonzero(kept)))
 
-    def of_first(self, rows):
-        return BlockJacobian(self.blocks, self.order.of_first(rows))
+    def of_rows(self, numbers):
+        return BlockJacobian(self.blocks, self.order.of_rows(numbers))
 
     def selected(self, rank, scale, level=None):
         # The order of elimination leaves implied rows out.

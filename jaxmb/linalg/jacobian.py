@@ -10,6 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -17,6 +18,7 @@ from .elimination import Factor, PivotOrder, eliminate, full_pivot
 from .inertia import AbstractInertia
 from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor, DensePositiveDefinite
 from .rotations import norm
+from .sums import unchecked_take
 
 # A solution is refined until its rows are met to this many rounding errors of what adds up in them, or as often.
 _ROUNDING = 512
@@ -64,8 +66,8 @@ class AbstractJacobian(eqx.Module):
         """The same as one full matrix."""
 
     @abc.abstractmethod
-    def of_first(self, rows: int) -> "AbstractJacobian":
-        """The same matrix whose independent rows are those of the first ones: `gather_rows` keeps no others."""
+    def of_rows(self, numbers: tuple[int, ...]) -> "AbstractJacobian":
+        """The same matrix whose independent rows are among these, in ascending order: `gather_rows` keeps no others."""
 
     @abc.abstractmethod
     def selected(self, rank: int, scale: Float[Array, "n"], level: Int[Array, "m"] | None = None) -> "AbstractJacobian":
@@ -211,13 +213,13 @@ class DenseJacobian(AbstractJacobian):
     """A full matrix.
 
     **Fields:** `matrix` (m × n); its `factor` in a chart, or None without one; the independent `rows`, or None where
-    all of the `first` ones, default all rows, are independent and no pivots were searched for.
+    all with these `numbers`, default all rows, are independent and no pivots were searched for.
     """
 
     matrix: Float[Array, "m n"]
     factor: Factor | None = None
     rows: Int[Array, "r"] | None = None
-    first: int | None = eqx.field(static=True, default=None)
+    numbers: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     @property
     def independent(self) -> Float[Array, "r n"]:
@@ -244,13 +246,18 @@ class DenseJacobian(AbstractJacobian):
 
     def gather_rows(self, values):
         if self.rows is None:
-            return values if self.first is None else values[: self.first]
+            return values if self.numbers is None else unchecked_take(values, np.array(self.numbers, int))
         return values[self.rows]
 
     def scatter_rows(self, values):
         m = self.matrix.shape[0]
         if self.rows is None:
-            return values if self.first is None else jnp.pad(values, (0, m - self.first))
+            if self.numbers is None:
+                return values
+            # Zeros at the end for the others.
+            place = np.full(m, len(self.numbers))
+            place[list(self.numbers)] = np.arange(len(self.numbers))
+            return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), place)
         return jnp.zeros(m, values.dtype).at[self.rows].set(values)
 
     def gram(self, inertia):
@@ -260,15 +267,15 @@ class DenseJacobian(AbstractJacobian):
     def dense(self):
         return self
 
-    def of_first(self, rows):
+    def of_rows(self, numbers):
         assert self.rows is None, "rows are selected already"
-        return DenseJacobian(self.matrix, first=rows)
+        return DenseJacobian(self.matrix, numbers=numbers)
 
     def selected(self, rank, scale, level=None):
-        matrix = self.matrix if self.first is None else self.matrix[: self.first]
-        if self.rows is not None or matrix.shape[0] == rank:
+        if self.rows is not None or self.independent.shape[0] == rank:
             return self
-        return DenseJacobian(self.matrix, rows=full_pivot(matrix, scale=scale, level=level).order.rows[:rank])
+        rows = full_pivot(self.independent, scale=scale, level=level).order.rows[:rank]
+        return DenseJacobian(self.matrix, rows=rows if self.numbers is None else jnp.array(self.numbers)[rows])
 
     def eliminated(self, order: PivotOrder, rank: int) -> "DenseJacobian":
         """The same matrix with its factor in an order of elimination, which selects the independent rows."""

@@ -1,9 +1,10 @@
 """Forces of contacts and dry friction at a state, and what they are compared with."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..formulations import accelerations
+from ..formulations import Multipliers, accelerations
 from ..linalg.elimination import solve
 from ..linalg.rotations import norm
 from ..system.gaps import (
@@ -12,8 +13,10 @@ from ..system.gaps import (
     contacts_of,
     counts,
     direction_gradients,
+    direction_rows,
     frictions_of,
     modes_of,
+    with_modes,
 )
 from .contact_laws import sizes_of
 
@@ -65,23 +68,37 @@ def slow_slip(system, touch, u):
     return _SLOW * touch * (1 + jnp.max(jnp.abs(u) / system.velocity_scale()))
 
 
-def contact_forces(system, formulation, t, q, u):
-    """Accelerations and multipliers at a state, without a search for pivots where that is possible."""
+def contact_forces(system, t, q, u):
+    """Accelerations and multipliers at a state, without a search for pivots."""
     if not system.ideal_on_velocities:
-        return accelerations(system, formulation, t, q, u)
+        return accelerations(system, Multipliers(), t, q, u)
     jacobian = system.structured_jacobian(t, q, u).selected(system.acceleration_rank, system.velocity_scale())
-    return _by_projector(system, jacobian.projector(system.inertia(t, q, u)), t, q, u)
-
-
-def free_acceleration(system, formulation, projector, t, q, u):
-    """Accelerations and multipliers at coordinates without contacts and friction, where the projector on the other
-    constraints is known.
-    """
-    if not system.ideal_without_friction:
-        return accelerations(system, formulation, t, q, u)
-    return _by_projector(system, projector, t, q, u)
-
-
-def _by_projector(system, projector, t, q, u):
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-    return projector.solve(system.force(t, q, u), gamma)
+    return jacobian.projector(system.inertia(t, q, u)).solve(system.force(t, q, u), gamma)
+
+
+def directions(system, t, q, u):
+    """The rows of A of contacts that are closed, and of friction that sticks; A with the other rows that bind
+    velocities, which are selected.
+    """
+    numbers = direction_rows(system)
+    jacobian = system.structured_jacobian(t, bound(system, q), u)
+    unit = np.eye(system.acceleration_rows)[list(numbers)]
+    rows = jax.vmap(jacobian.transpose_product)(jnp.asarray(unit, q.dtype))
+    others = tuple(k for k in range(system.velocity_rows) if k not in numbers)
+    # Where contacts are open, and friction slips, their rows bind nothing but their modes.
+    return rows, jacobian.of_rows(others).selected(system.velocity_rank - len(numbers), system.velocity_scale())
+
+
+def free_accelerations(system, formulation, projector, t, q, u):
+    """Accelerations and multipliers without contacts and friction, and the accelerations along their directions.
+
+    **Arguments:** the `projector` on the other constraints.
+    """
+    residual = system.acceleration_residual(t, bound(system, q), u, jnp.zeros_like(u))
+    if system.ideal_without_friction:
+        udot, multipliers = projector.solve(system.force(t, q, u), -residual)
+    else:
+        udot, multipliers = accelerations(system, formulation, t, with_modes(system, q, 0.0), u)
+    along = projector.jacobian.product(udot) + residual
+    return udot, multipliers, along[np.array(direction_rows(system))]

@@ -77,7 +77,7 @@ class ContactGuards(AbstractGuards):
 
         def forces(_):
             own = system.at(y)
-            _, multipliers = contact_forces(own, self.formulation, t, q, y.u)
+            _, multipliers = contact_forces(own, t, q, y.u)
             largest = largest_force(own, t, dataclasses.replace(y, q=q), multipliers)
             taken = multipliers[np.array(direction_rows(system))]
             if frictions is not None:

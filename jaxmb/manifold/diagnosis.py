@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._results import RESULTS
 from .._types import Scalar, State
-from ..formulations import AbstractFormulation
+from ..formulations import AbstractFormulation, Multipliers
 from ..formulations.formulation import friction_coupling, row_levels
 from ..formulations.friction import contracts
 from ..linalg.elimination import full_pivot
@@ -71,6 +71,8 @@ def diagnose_friction(
     **Returns:** the result, and the coupling of friction with its own reactions; zero where it is not the reason.
     """
     none = jnp.zeros((system.friction_rows.size,) * 2, y.q.dtype)
+    # Without a search for pivots.
+    formulation = Multipliers() if system.positive_definite_mass else formulation
     coupling = lax.cond(failed, lambda: friction_coupling(system.at(y), formulation, t, y.q, y.u), lambda: none)
     singular = failed & jnp.all(jnp.isfinite(coupling)) & ~contracts((1 + _SINGULAR_COUPLING) * coupling)
     return RESULTS.where(singular, RESULTS.friction_undetermined, result), jnp.where(singular, coupling, none)

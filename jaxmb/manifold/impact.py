@@ -38,7 +38,6 @@ from ..system.gaps import (
     contacts_of,
     counts,
     direction_accelerations,
-    direction_gradients,
     direction_rates,
     direction_rows,
     frictions_of,
@@ -47,9 +46,9 @@ from ..system.gaps import (
     mode_places,
     with_modes,
 )
-from ..system.residuals import binding_velocities, velocity_rows
+from ..system.residuals import velocity_rows
 from .constraints import dense, push
-from .contact_forces import contact_forces, friction_coefficients, largest_force, stick_reserve
+from .contact_forces import contact_forces, directions, friction_coefficients, largest_force, stick_reserve
 from .impact_event import NEAR, Event, Phase, find_event
 
 NO_SECOND_DERIVATIVES = (
@@ -102,14 +101,14 @@ def impact(
     """
     t = jnp.asarray(t, y.q.dtype)
     found = find_event(system, formulation, touch, t, y) if found is None else found
-    after, event = _impact(system, t, y, found, formulation, jnp.asarray(touch, y.q.dtype), dated)
+    after, event = _impact(system, t, y, found, jnp.asarray(touch, y.q.dtype), dated)
     modes = kinds_of(system, event.modes[0]), kinds_of(system, event.modes[1])
     return Impact(after, event.late, event.impulses, modes, event.rest, event.energy, event.solvable)
 
 
 @eqx.filter_custom_jvp
-def _impact(system, t, y, event, formulation, touch, dated):
-    del formulation, touch, dated
+def _impact(system, t, y, event, touch, dated):
+    del touch, dated
     q = with_modes(system, y.q, event.modes[1])
     # The state moves on before the event, and back after it, each at the mean velocity.
     before = system.rates(t, y.q, event.at - 0.5 * event.late * event.before)
@@ -125,7 +124,7 @@ def _impact(system, t, y, event, formulation, touch, dated):
 
 @_impact.def_jvp
 def _impact_jvp(primals, tangents):
-    system, t, y, _, formulation, touch, dated = primals
+    system, t, y, _, touch, dated = primals
     dsystem, dt, dy, *_ = tangents
     after, event = _impact(*primals)
     system, t, y, event = _without_second_derivative((system, t, y, event))
@@ -147,7 +146,7 @@ def _impact_jvp(primals, tangents):
         zero, rate = jnp.concatenate([zero, slip]), rate.at[n:].set(slowing)
     dlate = jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
     if dated or (m and any(frictions_of(system).releases)):
-        dlate = dlate + _release(system, formulation, touch, event, (t, y), (dsystem, dt, dy))
+        dlate = dlate + _release(system, touch, event, (t, y), (dsystem, dt, dy))
     q = with_modes(system, y.q, event.modes[1])
     rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
     dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
@@ -241,10 +240,8 @@ class _Phases(NamedTuple):
 
 def _phases(event: Event, at, tangents, du) -> _Phases:
     system, t, q = at
-    free = with_modes(system, q, 0.0)
-    rows = direction_gradients(system, t, q, event.u)
-    jacobian = binding_velocities(system, t, free, event.u).selected(system.velocity_rank, system.velocity_scale())
-    projector = jacobian.projector(system.inertia(t, free, event.u))
+    rows, jacobian = directions(system, t, q, event.u)
+    projector = jacobian.projector(system.inertia(t, with_modes(system, q, 0.0), event.u))
     moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
     rebounds = ~event.low & ~np.array(contacts_of(system).by_poisson, bool)
     known = change = jnp.zeros(0, q.dtype)
@@ -308,7 +305,7 @@ def _friction_laws(of: _Phases, plain, phase: Phase, law, right):
     return law, right
 
 
-def _release(system, formulation, touch, event, at, along):
+def _release(system, touch, event, at, along):
     """The derivative of the time at which a force reaches its limit: that of a contact that opens, which is zero, or of
     friction that sticks, where slip begins at the event.
     """
@@ -321,7 +318,7 @@ def _release(system, formulation, touch, event, at, along):
 
     def reserves(system, t, y):
         """What the forces are within their limits, and what they are compared with."""
-        _, multipliers = contact_forces(system, formulation, t, y.q, y.u)
+        _, multipliers = contact_forces(system, t, y.q, y.u)
         own = multipliers[np.array(direction_rows(system))]
         if m:
             own = own.at[n:].set(stick_reserve(system, t, y.q, y.u, multipliers))

@@ -25,17 +25,16 @@ from ..system.gaps import (
     IMPLIED_STICK,
     OPEN,
     STICK,
+    bound,
     contacts_of,
     counts,
-    direction_accelerations,
-    direction_gradients,
-    direction_rates,
+    direction_rows,
     gaps,
     modes_of,
     with_modes,
 )
-from ..system.residuals import binding_velocities, velocity_rows
-from .contact_forces import free_acceleration, friction_coefficients, slow_slip
+from ..system.residuals import velocity_rows
+from .contact_forces import directions, free_accelerations, friction_coefficients, slow_slip
 from .contact_laws import REST, Laws, Problem, is_implied
 
 # A step that was meant to end at an event does so where a gap is below this multiple of what counts as zero.
@@ -100,15 +99,14 @@ def find_event(system, formulation, touch, t, y) -> Event:
     frictions, (n, m) = contacts.frictions, counts(system)
     modes, free_q = modes_of(system, q), with_modes(system, q, 0.0)
     inertia = system.inertia(t, free_q, u)
-    rows = direction_gradients(system, t, q, u)
-    jacobian = binding_velocities(system, t, free_q, u).selected(system.velocity_rank, system.velocity_scale())
+    rows, jacobian = directions(system, t, q, u)
     projector = jacobian.projector(inertia)
     zero = jnp.zeros(system.acceleration_rows, q.dtype)
     # The changes of velocities by unit impulses, with those that the other constraints answer with; in the last row the
     # change that these constraints ask for themselves.
-    unmet = -velocity_rows(system, t, free_q, u)
+    unmet = velocity_rows(system, t, bound(system, q), u)
     forces = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
-    asked = jnp.concatenate([jnp.tile(zero, (len(rows), 1)), unmet[None]])
+    asked = jnp.concatenate([jnp.tile(zero, (len(rows), 1)), -unmet[None]])
     moves, answers = jax.vmap(projector.solve)(forces, asked)
     moves, jump, answers = moves[:-1], moves[-1], answers[:-1]
     influence = rows @ moves.T
@@ -118,8 +116,7 @@ def find_event(system, formulation, touch, t, y) -> Event:
         """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
         that have friction, without forces along these and by a unit of each.
         """
-        udot, multipliers = free_acceleration(system, formulation, projector, t, free_q, u)
-        opening = direction_accelerations(system, t, q, u, udot)
+        udot, multipliers, opening = free_accelerations(system, formulation, projector, t, q, u)
         if not laws.of_joints.any():
             return udot, opening, None
         reactions = lambda own: system.friction_reactions(t, q, u, own)
@@ -129,7 +126,7 @@ def find_event(system, formulation, touch, t, y) -> Event:
     # Impulses, in one phase or two, and forces take turns.
     turns = 3 if by_poisson.any() else 2
     slow = slow_slip(system, touch, u)
-    rates = direction_rates(system, t, q, u)
+    rates = unmet[np.array(direction_rows(system))]
     rates_at = lambda other: rates + rows @ (other - u)
     gap = gaps(system, t, q)
 

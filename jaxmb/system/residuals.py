@@ -22,7 +22,9 @@ def velocity_rows(system: AbstractEquation, t: Scalar, q: Coordinates, u: Veloci
 def binding_velocities(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> AbstractJacobian:
     """A whose independent rows are those that bind positions or velocities."""
     jacobian = system.structured_jacobian(t, q, u)
-    return jacobian if system.acceleration_rows == system.velocity_rows else jacobian.of_first(system.velocity_rows)
+    if system.acceleration_rows == system.velocity_rows:
+        return jacobian
+    return jacobian.of_rows(tuple(range(system.velocity_rows)))
 
 
 def displaced(system: AbstractEquation, t: Scalar, q: Coordinates, step: Float[Array, "nu"]) -> Float[Array, "nq"]:
