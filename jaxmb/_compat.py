@@ -20,6 +20,7 @@ from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
 from jax._src import compilation_cache, xla_bridge
 from jax._src.compilation_cache_interface import CacheInterface
+from jax._src.interpreters.partial_eval import partial_eval_jaxpr_nounits
 from jax.core import ShapedArray
 from jax.extend import core
 from jax.extend.core import Primitive
@@ -48,6 +49,17 @@ REVERSE = "bwd"
 RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
 # A closed jaxpr as a function of its operands. (jax.extend.core.jaxpr_as_fun, 0.9 and 0.10.)
 jaxpr_as_function = core.jaxpr_as_fun
+
+
+def with_rest_computed(function: Callable[[Array], Array], like: Array) -> Callable[[Array], Array]:
+    """The same function of an array, in which everything that does not depend on the array is computed now, and not at
+    each call: a loop that calls it holds nothing else. `like`: an example of the array.
+
+    (jax._src.interpreters.partial_eval.partial_eval_jaxpr_nounits, 0.10.)
+    """
+    known, rest, *_ = partial_eval_jaxpr_nounits(jax.make_jaxpr(function)(like), [True], instantiate=True)
+    found = jaxpr_as_function(known)()
+    return lambda x: jaxpr_as_function(rest)(*found, x)[0]
 
 
 def like_of(aval: Any) -> jax.ShapeDtypeStruct:

@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .._compat import with_rest_computed
 from .._types import Coordinates, Scalar, Velocities
 from ..linalg.elimination import full_pivot
 from ..linalg.inertia import AbstractInertia
@@ -168,7 +169,8 @@ def solve_constrained(
 def _friction(system, t, q, u, inertia, jacobian, ideal, formulation):
     """Multipliers of the rows that forces depend on, their coupling, and whether they are not determined."""
     rows, none = system.friction_rows, jnp.zeros_like(ideal)
-    law = lambda own: system.nonideal_force(t, q, u, none.at[rows].set(own))
+    # Newton's method evaluates the law again and again, but only for other multipliers.
+    law = with_rest_computed(lambda own: system.nonideal_force(t, q, u, none.at[rows].set(own)), ideal[rows])
     respond = lambda force: formulation.solve(inertia, force, jacobian, none)[1][rows]
     _, pull = jax.vjp(respond, jnp.zeros_like(u))
     (influence,) = jax.vmap(pull)(jnp.eye(rows.size, dtype=u.dtype))

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 from precision import single_precision
 
 ROOT = Path(__file__).parents[2] / "jaxmb"
@@ -480,6 +481,23 @@ def test_steps_of_dense_solutions(compat):
     about = "dense solutions of diffrax no longer tell their steps in increasing time, and the direction of time"
     assert direction == -1 and direction.dtype == starts.dtype, about
     np.testing.assert_allclose(starts[1:11], -solution.ts[:10], err_msg=about)
+
+
+def test_functions_with_their_rest_computed(compat):
+    def slow(angle, x):
+        return jax.jit(lambda angle, x: jnp.sin(angle) * x**2 + jnp.cos(angle))(angle, x)
+
+    def run(angle, x):
+        own = compat.with_rest_computed(lambda x: slow(angle, x), x)
+        return lax.fori_loop(0, 3, lambda _, x: own(x), x)
+
+    loop = next(eqn for eqn in jax.make_jaxpr(run)(0.3, 0.5).eqns if eqn.primitive.name in ("scan", "while"))
+    about = "partial evaluation no longer takes what is known out of a function"
+    assert "sin" not in str(loop) and "cos" not in str(loop) and "mul" in str(loop), about
+    want = 0.5
+    for _ in range(3):
+        want = np.sin(0.3) * want**2 + np.cos(0.3)
+    np.testing.assert_allclose(jax.vmap(run, (0, None))(jnp.array([0.3]), 0.5), [want], rtol=1e-6, err_msg=about)
 
 
 # The standard library
