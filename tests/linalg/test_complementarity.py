@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.linalg.complementarity import Dry, frictional, laws_of, of_pairs, positive_components, solved_components
+from jaxmb.linalg.complementarity import (
+    Dry,
+    frictional,
+    independent_components,
+    laws_of,
+    of_pairs,
+    positive_components,
+    solved_components,
+)
 
 
 @jax.jit
@@ -46,6 +54,21 @@ def test_nothing_to_solve():
 
 def test_a_problem_without_solution_says_so():
     assert not solve(jnp.array([[-1.0]]), jnp.array([-1.0]))[2]
+
+
+def test_independent_components():
+    """Of random matrices, in units of any size: as many as the rank of those that are among them."""
+    random = np.random.default_rng(0)
+    independent = jax.jit(independent_components)
+    for _ in range(100):
+        among = random.random(6) < 0.7
+        A = random.normal(size=(6, random.integers(1, 7))) * 10.0 ** random.integers(-4, 5, (6, 1))
+        A[random.integers(6)] = 3 * A[random.integers(6)]
+        found = np.asarray(independent(A @ A.T, among))
+        units = A / np.linalg.norm(A, axis=1, keepdims=True)
+        rank = lambda rows: np.linalg.matrix_rank(rows, tol=1e-4) if len(rows) else 0
+        assert not np.any(found & ~among)
+        assert rank(units[found]) == np.sum(found) == rank(units[among])
 
 
 def test_derivative_of_a_solution():

@@ -471,6 +471,14 @@ def test_tangents_after_impacts_by_a_matrix_and_one_at_a_time(monkeypatch):
         np.testing.assert_allclose(other, forward, rtol=1e-10, atol=1e-13)
 
 
+@pytest.mark.long
+def test_events_are_found_once_in_a_program():
+    """Derivatives have them from the motion."""
+    found = lambda function: str(jax.make_jaxpr(function)(jnp.array([0.8, 0.1]))).count("name=find_event")
+    value = lambda at: end(at, 0.6)
+    assert found(value) == found(jax.grad(value)) == found(jax.jacfwd(value)) == 1
+
+
 def test_a_stop_that_vibrates():
     """Nothing of the motion towards it asks for short steps."""
     body = planar.Body("body", mass=2.0, inertia=0.1, velocity=(1.0, 0.0))
