@@ -191,7 +191,8 @@ class Mesh(eqx.Module):
             after = w, memory
             if rows:
                 own = self.steps.row_tangent(row.own, self.like, before, after)
-                along = self.layout.packed_tangent(row, Row(None, None, None, own))
+                none = jax.tree.map(lambda _: None, row)
+                along = self.layout.packed_tangent(row, none._replace(own=own))
                 rows = [buffer_set(buffer, self._place(k), x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x), ddense, dense)
