@@ -10,6 +10,7 @@ constraints, and not the assembly.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -138,19 +139,14 @@ _SPACE = _Turning(
 _TURNING = {2: _PLANE, 3: _SPACE}
 
 
-class ElementaryRows(eqx.Module):
-    """The rows of all joints that consist of elements.
+class _Rows:
+    """What the rows of elements are made of; methods of a plain class, which NumPy's code calls often."""
 
-    **Fields:** body-fixed `vectors`: of points of B, of points of A, X, Y in B, Y in A; `turns`: the rates of points of
-    B and of A for unit angular velocities; `lengths` of products, and their inverses, zero where there are none, None
-    where no product has a length.
-    """
-
-    vectors: Float[Array, "n d"]
-    turns: Float[Array, "p d turns"]
-    lengths: Float[Array, "d 1"] | None
-    inverses: Float[Array, "d 1"] | None
-    places: Places = eqx.field(static=True)
+    vectors: Any
+    turns: Any
+    lengths: Any
+    inverses: Any
+    places: Places
 
     @property
     def _turning(self):
@@ -232,7 +228,7 @@ class ElementaryRows(eqx.Module):
         of_world = matrix_products(matrices, namespace(poses).stack(columns, axis=-1))
         origins = [_cut(own, [d])[0] for own in (poses, *rates)]
         found = []
-        for own, moved in zip(_cut(of_world, len(columns)), origins, strict=True):
+        for own, moved in zip(_cut(of_world, list(range(1, len(columns)))), origins, strict=True):
             of_b, of_a, x, y_b, y_a = _cut(own[..., 0], places.ends, axis=0)
             apart = unchecked_take(moved, places.between[:, 1]) - unchecked_take(moved, places.between[:, 0])
             of_points, of_products = _cut(apart, [places.points], axis=0)
@@ -277,6 +273,37 @@ class ElementaryRows(eqx.Module):
     def _take_ordered(self, values):
         order = self.places.order
         return values if np.array_equal(order, np.arange(order.size)) else unchecked_take(values, order)
+
+
+class ElementaryRows(_Rows, eqx.Module):
+    """The rows of all joints that consist of elements.
+
+    **Fields:** body-fixed `vectors`: of points of B, of points of A, X, Y in B, Y in A; `turns`: the rates of points of
+    B and of A for unit angular velocities; `lengths` of products, and their inverses, zero where there are none, None
+    where no product has a length.
+    """
+
+    vectors: Float[Array, "n d"]
+    turns: Float[Array, "p d turns"]
+    lengths: Float[Array, "d 1"] | None
+    inverses: Float[Array, "d 1"] | None
+    places: Places = eqx.field(static=True)
+
+
+@dataclasses.dataclass
+class HostRows(_Rows):
+    """The same in NumPy; no module, whose methods take a hundred times as long to be called."""
+
+    vectors: np.ndarray
+    turns: np.ndarray
+    lengths: np.ndarray | None
+    inverses: np.ndarray | None
+    places: Places
+
+    @classmethod
+    def of(cls, rows: ElementaryRows) -> "HostRows":
+        """These rows, whose numbers are arrays of NumPy."""
+        return cls(rows.vectors, rows.turns, rows.lengths, rows.inverses, rows.places)  # pyright: ignore[reportArgumentType]
 
 
 def is_elementary(group: AbstractConstraintGroup) -> bool:
@@ -389,6 +416,10 @@ def _compared(system, t, state):
     }
 
 
-def _cut(values, places, axis=-1):
+def _cut(values: Any, places: Any, axis: int = -1) -> list[Any]:
     """Parts of an array; derivatives of these are joined, where those of slices would be padded and added."""
-    return namespace(values).split(values, places, axis=axis)
+    if isinstance(values, np.ndarray):
+        ends = [0, *places, values.shape[axis]]
+        every = (slice(None),) * (axis % values.ndim)
+        return [values[(*every, slice(a, b))] for a, b in itertools.pairwise(ends)]
+    return jnp.split(values, places, axis=axis)

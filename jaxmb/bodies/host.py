@@ -14,7 +14,7 @@ from ..linalg import rotations as rot
 from ..linalg.jitted import on_host
 from ..parts.elements import on_bodies
 from ..states.on_host import MOST, AbstractHost
-from .elementary import ElementaryRows, Listed, is_elementary, stacked
+from .elementary import HostRows, Listed, is_elementary, stacked
 
 
 class _Rows(NamedTuple):
@@ -49,7 +49,9 @@ class HostScene(AbstractHost):
         self._layout, self._groups, self._given = system.layout, system.joints, np.asarray(system.guess.u)
         self._t, self._positions = np.asarray(t, system.guess.q.dtype), len(system.constraints)
         self._elements, self._along = _elements(system)
-        self._others, self._last = tuple(g for g in self._groups if not _is_known(g)), None
+        self._known = [_is_known(g) for g in self._groups]
+        self._others = tuple(g for g, known in zip(self._groups, self._known, strict=True) if not known)
+        self._last = None
         places = [(g.group.body_index, g.rows) for g in self._groups]
         self._of_poses = self._layout.jacobian_source(places[: self._positions], of_poses=True)
         self._of_velocities = self._layout.jacobian_source(places, of_poses=False)
@@ -109,8 +111,8 @@ class HostScene(AbstractHost):
     def _joined(self, groups, of_elements: Any, of_others: Iterable[Any]) -> list[Any]:
         """What is known of elements and of other constraints, group by group."""
         others, out, first = iter(of_others), [], 0
-        for g in groups:
-            if not _is_known(g):
+        for g, known in zip(groups, self._known, strict=False):
+            if not known:
                 out.append(next(others))
                 continue
             count = len(g.group.names) * g.rows
@@ -219,7 +221,7 @@ def _is_known(group):
     return is_elementary(group) and not group.group.kernels
 
 
-def _elements(system) -> tuple[ElementaryRows | None, list[tuple[np.ndarray, Any, Any]]]:
+def _elements(system) -> tuple[HostRows | None, list[tuple[np.ndarray, Any, Any]]]:
     """The rows of joints that consist of elements; and where these have directions with a positive product, the bodies
     of joints and the directions.
     """
@@ -238,4 +240,4 @@ def _elements(system) -> tuple[ElementaryRows | None, list[tuple[np.ndarray, Any
                 along.append((own.body_index, element.along_a, element.along_b))
             places = places + element.rows(space.dimension)
         first += g.rows * len(own.names)
-    return stacked(listed, system.layout.ground, space.dimension) if listed else None, along
+    return HostRows.of(stacked(listed, system.layout.ground, space.dimension)) if listed else None, along

@@ -39,7 +39,8 @@ _OPTIONAL = {
 }
 _STEPPED = ("four_bar", "andrews", "rod_chain", "tracked_vehicle")
 _RTOL, _REPEATS = 1e-8, 5
-# What a user waits for in a new process [s], with a second call after each first one.
+# What a user waits for in a new process [s]: imports, and of some machines the first value with its scene, the first
+# gradient, and a second one of each.
 _FIRST_CALLS = """
 import time
 times = [time.perf_counter()]
@@ -51,29 +52,39 @@ done()
 jax.config.update("jax_enable_x64", True)
 mb.compile_quickly()
 mb.keep_compiled()
-machine = mb.mechanisms.get("four_bar")
+stop = mb.Stop("stop", "slide.displacement", lower=0.3, restitution=0.5)
+machines = [
+    ("four_bar", "coupler", [], None),
+    ("spatial_slider_crank", "slider", [], None),
+    ("slider_crank", "slider", [stop], None),
+    ("stiff_four_bar", "coupler", [], mb.solvers.Hermite()),
+]
+spans = []
+for name, body, joints, solver in machines:
+    done()
+    machine = mb.mechanisms.get(name)
+    system = machine.scene.extended(joints=joints).compile() if joints else machine.system
+    start = mb.assemble(system, fix=machine.fix, rates=machine.rates) if joints else machine.state
+    t1 = 0.02 if solver else machine.t1 / 10
 
-def end(mass):
-    system = mb.with_parameters(machine.system, {"coupler.mass": mass})
-    state = mb.assemble(system, machine.state)
-    return mb.simulate(system, state, t1=1.0, rtol=1e-8)["rocker"].angle[-1]
+    def end(mass):
+        own = mb.with_parameters(system, {body + ".mass": mass})
+        state = mb.assemble(own, start)
+        return mb.simulate(own, state, t1=t1, rtol=1e-8, solver=solver, throw=False).ys.u[-1, 0]
 
-for call in (end, jax.grad(end)):
-    for _ in range(2):
-        done()
-        call(3.0).block_until_ready()
-        done()
+    mass = float(mb.parameters(system)[body + ".mass"])
+    for call in (end, jax.grad(end)):
+        for _ in range(2):
+            call(mass).block_until_ready()
+            done()
 import json
 print(json.dumps([after - before for before, after in zip(times, times[1:])]))
 """
 # The durations among those that it prints, in the order of the table.
-_SHOWN = {
-    "import jax, diffrax": 0,
-    "import jaxmb": 1,
-    "four_bar: first value": 3,
-    "four_bar: first gradient": 7,
-    "four_bar: another value": 5,
-    "four_bar: another gradient": 9,
+_SHOWN = {"import jax, diffrax": 0, "import jaxmb": 1} | {
+    f"{name}: {call}": 3 + 5 * k + place
+    for k, name in enumerate(("four_bar", "spatial_slider_crank", "slider_crank with a stop", "stiff_four_bar"))
+    for call, place in {"first value": 0, "first gradient": 2, "another value": 1, "another gradient": 3}.items()
 }
 # How facts are printed: names and paths are for copying.
 _INDENT = 18
@@ -86,7 +97,7 @@ def add_to(commands: Any) -> None:
         "doctor",
         help="say what is installed, where compiled programs are kept, and how long things take on this machine",
     )
-    command.add_argument("--quick", action="store_true", help="leave out the measurements, which take a minute or two")
+    command.add_argument("--quick", action="store_true", help="leave out the measurements, which take some minutes")
     command.set_defaults(command=_doctor)
 
 
@@ -95,7 +106,9 @@ def _doctor(arguments: argparse.Namespace) -> None:
         print(_FILLED.fill(f"{name:{_INDENT}}{text}"))
     if arguments.quick:
         return
-    print("\nCalls in a new process [s]; the second finds the programs that the first kept:\n")
+    print(
+        "\nCalls in a new process [s], values with their scenes; the second finds the programs that the first kept:\n"
+    )
     print("\n".join(aligned(_first_calls())))
     print(f"\nWarm steps under jit at rtol {_RTOL:g}, the shortest of {_REPEATS} runs:\n")
     print("\n".join(aligned(_steps())))

@@ -334,23 +334,26 @@ class Hermite(AbstractMultistep):
         solution = lambda numbers: solution_of(eqx.combine(numbers, rest), t1, like, kept, args)
         formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
         free = free_components(terms, before, state.chart)
-        push = self.linearised(formula, (solution, numbers), (t1, end.after, newton.end.f), newton.matrix, free)
+        place = t1, end.after, newton.end.f
+        push = self.linearised(formula, (solution, numbers), place, free, newton.matrix, newton.inverses)
         at = lambda differences: History(differences, history.mesh, history.known)
         pushed = [push(of, x.w, at(x.memory[0])) for of, x in zip(along, tangents, strict=True)]
         # A derivative that is no number is taken as zero.
         return step, jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), pushed)
 
-    def linearised(self, formula: Formula, equations, end, matrix: AbstractLinearization, free):
+    def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, inverses: Any = None):
         """The end of a step, and the ends by all formulas, as a linear map of tangents: of numbers, of the state at its
         start, and of the history there, whose mesh is that of the step.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and these; the `end`: its
-        time, and the state and the field there; `matrix` and unknowns of the step.
+        time, and the state and the field there; `free`: the unknowns; a `matrix` of Newton's method, and its inverses
+        for this step, None if they are not known.
         """
         (solution, numbers), (t, y, f) = equations, end
         by_numbers, by_state = linearized(solution, numbers, t, y, f)
         _, a, b = self.equation(formula, y, jnp.zeros((formula.values.size, y.size), y.dtype))
-        solve = matrix.tangents(matrix.inverses(a, b, free), a, b, free, by_state)
+        inverses = matrix.inverses(a, b, free) if inverses is None else inverses
+        solve = matrix.tangents(inverses, a, b, free, by_state)
 
         def push(along, w, history):
             past, _, _ = self.equation(formula, w, history.differences)

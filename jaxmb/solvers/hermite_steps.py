@@ -82,7 +82,7 @@ class HermiteSteps(AbstractSteps):
         matrix = structured(jacobian_of(*freeze((terms, row.end, like, args))), freeze(row.y))
         if matrix is None:
             matrix = DenseLinearization.unknown(row.y, row.free)
-        step = solver.linearised(formula, (solution, moved.terms), (row.end, row.y, row.f), matrix, row.free)
+        step = solver.linearised(formula, (solution, moved.terms), (row.end, row.y, row.f), row.free, matrix)
 
         def push(dmoved, w, memory):
             differences, slope = memory
