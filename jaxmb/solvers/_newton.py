@@ -285,3 +285,36 @@ class Newton(eqx.Module):
         carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
         k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
         return Solved(end, k == _DONE, matrix, inverses, work)
+
+
+def tangents_nearby(
+    matrix: AbstractLinearization,
+    inverses: Any,
+    equation: StepEquation,
+    push: Callable[..., tuple[Array, Array, Array]],
+    own: tuple[Array, Array, Array],
+    predicted: tuple[Float[Array, " n"], Float[Array, " n"]],
+    size: Callable[[Array], Any],
+    tol: float,
+) -> tuple[Array, Array, Array]:
+    """The tangents of `(y, f, g)` at the end of a step, by Newton's method with the matrix of the step itself.
+
+    **Arguments:** `equation`: of the tangents, for its `past`, `a`, `b` and `free`; `push`, `own`: as of
+    `AbstractLinearization.tangents`; the `predicted` tangents of the state and of the rate; `size`, `tol`: as of
+    `Newton`.
+    """
+
+    def proceed(carry):
+        k, _, _, _, last, before = carry
+        return (k < _MAX_ITERATIONS) & ~(last <= tol) & ((k < 2) | (last < before))
+
+    def iterate(carry):
+        k, x, along, _, last, _ = carry
+        y, f, g = map(jnp.add, own, push(x, along))
+        change, without, f, g = matrix.correction(inverses, equation, y, f, g, along)
+        now = jnp.maximum(size(matrix.moved(change)), size(matrix.moved(without)))
+        return k + 1, x - matrix.moved(change), f, (y, f, g), now, last
+
+    infinite = jnp.full((), jnp.inf, own[0].dtype)
+    start = jnp.zeros((), jnp.int32), predicted[0] - own[0], predicted[1], own, infinite, infinite
+    return lax.while_loop(proceed, iterate, start)[3]

@@ -21,7 +21,7 @@ from ._formulas import FAMILIES, Formulas, double, formulas, start
 from ._history import History, advance, basis, before_each, step_end
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._neighbours import a_stable, damped_growth, ladder, responses
-from ._newton import AbstractLinearization, KnownStep, Newton, Solved, StepEquation, at_end
+from ._newton import AbstractLinearization, KnownStep, Newton, Solved, StepEquation, at_end, tangents_nearby
 from ._structured import unknown_structure
 from .controller import ControllerState, states_inside
 from .evaluation import (
@@ -300,16 +300,7 @@ class Hermite(AbstractMultistep):
         free = free_components(terms, before, state.chart)
         equation = StepEquation(field, jacobian_of(terms, t1, like, args), t1, formula.h, past, a, b, free)
 
-        # The prediction extrapolates y, not f: the remaining error of stiff components is large in f. It has the order
-        # of the formula, if there are enough points, since Newton's method converges only from nearby. Its slope
-        # follows from the logarithmic derivatives of the basis.
-        used = np.arange(FAMILIES[self.family].length, dtype=np.int32) <= formula.nodes + 2
-        recent = jnp.where(used, formula.values, jnp.zeros((), before.dtype))
-        rates = jnp.asarray(before_each(used.size), before.dtype) @ (1 / (formula.end - history.mesh)).astype(
-            before.dtype
-        )
-        predicted = recent @ history.differences[:, -n:], (recent * rates) @ history.differences[:, -n:]
-
+        predicted = self._predicted(formula, history, n)
         latest, scale = (before, state.slope[-n:]), self._tolerated(t1, before, state)
         size = lambda correction: self.weighted_norm(correction, freeze(scale), like)
         newton = Newton(freeze(equation), size, _NEWTON).solve(*freeze((predicted, latest, state.matrix)))
@@ -326,39 +317,58 @@ class Hermite(AbstractMultistep):
         if control is None:
             return step, []
         # Tangents that are carried along have no derivatives themselves.
-        terms, end, newton, tangents = freeze((terms, step.end, step.newton, state.tangents))
-        along = control.of_terms(terms)
+        terms, end, newton, tangents, history = freeze((terms, step.end, step.newton, state.tangents, state.history))
+        along, n = control.of_terms(terms), before.size
         used = jax.tree.map(lambda *own: any(x is not None for x in own), *along, is_leaf=lambda x: x is None)
         numbers, rest = eqx.partition(terms, used)
-        kept, history = kept_of_chart(terms, newton.end.rest[0]), state.history
+        kept = kept_of_chart(terms, newton.end.rest[0])
         solution = lambda numbers: solution_of(eqx.combine(numbers, rest), t1, like, kept, args)
+        by_numbers, by_state = linearized(solution, numbers, t1, end.after, newton.end.f)
         formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
-        free = free_components(terms, before, state.chart)
-        place = t1, end.after, newton.end.f
-        push = self.linearised(formula, (solution, numbers), place, free, newton.matrix, newton.inverses)
-        at = lambda differences: History(differences, history.mesh, history.known)
-        pushed = [push(of, x.w, at(x.memory[0])) for of, x in zip(along, tangents, strict=True)]
+        free, pushed = free_components(terms, before, state.chart), []
+        scales = control.scales(self.tolerances.rtol, tangents, [x.w for x in tangents])
+        for of, x, scale in zip(along, tangents, scales, strict=True):
+            own = History(x.memory[0], history.mesh, history.known)
+            past, a, b = self.equation(formula, x.w, own.differences)
+            equation = StepEquation(None, None, t1, formula.h, past, a, b, free)  # pyright: ignore[reportArgumentType]
+            size = lambda change, scale=scale: self.weighted_norm(change, scale, like)
+            numbers, predicted = by_numbers(of, None), self._predicted(formula, own, n)
+            solved = tangents_nearby(
+                newton.matrix, newton.inverses, equation, by_state, numbers, predicted, size, _NEWTON
+            )
+            end = self.ended(formula, own, (past, a, b), solved)
+            pushed.append((end, self._ends(formula, own, *solved[1:])))
         # A derivative that is no number is taken as zero.
         return step, jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), pushed)
 
-    def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, inverses: Any = None):
-        """The end of a step, and the ends by all formulas, as a linear map of tangents: of numbers, of the state at its
-        start, and of the history there, whose mesh is that of the step.
+    def _predicted(self, formula: Formula, history: History, n: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """The state and the rate at the end of a step, extrapolated.
+
+        The state is, and not f: the remaining error of stiff components is large in f. The prediction has the order of
+        the formula, if there are enough points, since Newton's method converges only from nearby. Its slope follows
+        from the logarithmic derivatives of the basis.
+        """
+        dtype, states = history.differences.dtype, history.differences[:, -n:]
+        used = np.arange(FAMILIES[self.family].length, dtype=np.int32) <= formula.nodes + 2
+        recent = jnp.where(used, formula.values, jnp.zeros((), dtype))
+        rates = jnp.asarray(before_each(used.size), dtype) @ (1 / (formula.end - history.mesh)).astype(dtype)
+        return recent @ states, (recent * rates) @ states
+
+    def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization):
+        """The end of a step as a linear map of tangents: of numbers, of the state at its start, and of the history there
+        on the mesh of the step.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and these; the `end`: its
-        time, and the state and the field there; `free`: the unknowns; a `matrix` of Newton's method, and its inverses
-        for this step, None if they are not known.
+        time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there.
         """
         (solution, numbers), (t, y, f) = equations, end
         by_numbers, by_state = linearized(solution, numbers, t, y, f)
         _, a, b = self.equation(formula, y, jnp.zeros((formula.values.size, y.size), y.dtype))
-        inverses = matrix.inverses(a, b, free) if inverses is None else inverses
-        solve = matrix.tangents(inverses, a, b, free, by_state)
+        solve = matrix.tangents(matrix.inverses(a, b, free), a, b, free, by_state)
 
         def push(along, w, history):
             past, _, _ = self.equation(formula, w, history.differences)
-            _, f, g = solved = solve(by_numbers(along, None), past)
-            return self.ended(formula, history, (past, a, b), solved), self._ends(formula, history, f, g)
+            return self.ended(formula, history, (past, a, b), solve(by_numbers(along, None), past))
 
         return push
 

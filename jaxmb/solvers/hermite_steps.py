@@ -91,7 +91,7 @@ class HermiteSteps(AbstractSteps):
                 first, _ = solver.begun(row.mesh[0], formula.h, new, f, g)
                 w = jnp.where(jump.made, new, w)
                 differences = jnp.where(jump.made, first.differences, differences)
-            end, _ = step(dmoved.terms, w, History(differences, row.mesh, row.known))
+            end = step(dmoved.terms, w, History(differences, row.mesh, row.known))
             return end.after, end.memory, solver.dense_info(end, like, row.order_index) | {"mesh": None}
 
         none = jnp.zeros_like(row.y)
