@@ -355,8 +355,8 @@ class Hermite(AbstractMultistep):
         return recent @ states, (recent * rates) @ states
 
     def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization):
-        """The end of a step as a linear map of tangents: of numbers, of the state at its start, and of the history there
-        on the mesh of the step.
+        """The end of a step as a linear map of tangents: of numbers, of the state at its start, and of the history
+        there, on the mesh of the step.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and these; the `end`: its
         time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there.
