@@ -92,6 +92,7 @@ def remainder(k: Any, size: int) -> Any:
     """The remainder of a number of steps, which is not negative: for any number it is ten operations, and each kernel
     repeats them that uses it as an index.
     """
+    k = jnp.asarray(k)
     return lax.rem(k, jnp.asarray(size, k.dtype))
 
 

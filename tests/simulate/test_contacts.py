@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 import jaxmb as mb
 from jaxmb import manifold, planar, spatial, terrain
 from jaxmb.manifold import Projection
-from jaxmb.solvers import adams_steps
+from jaxmb.solvers import restarts
 
 G = 9.81
 
@@ -462,7 +462,7 @@ def test_tangents_after_impacts_by_a_matrix_and_one_at_a_time(monkeypatch):
     at = mb.parameters(BALL)["gravity.acceleration"]
     found = {}
     for most in (256, 0):
-        monkeypatch.setattr(adams_steps, "_MOST_COLUMNS", most)
+        monkeypatch.setattr(restarts, "_MOST_COLUMNS", most)
         jax.clear_caches()
         found[most] = jit_quickly(jax.jacfwd(end))(at), jit_quickly(jax.jacrev(end))(at)
     (forward, reverse), others = found[256], found[0]
