@@ -1,5 +1,6 @@
 """The motion that a picture shows: one of a batch's, without the times that a run did not reach."""
 
+import jax
 import numpy as np
 
 from .._results import RESULTS
@@ -32,8 +33,7 @@ def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
 
 def check_finite(trajectory: Trajectory) -> None:
     """Raise a `ValueError` that names the first time at which a state is not finite."""
-    ys = (trajectory.ys.q, trajectory.ys.u) if trajectory.ys.z is None else tuple(trajectory.ys)
-    good = np.all([np.all(np.isfinite(np.asarray(y)), axis=-1) for y in ys], axis=0)
+    good = np.all([np.all(np.isfinite(np.asarray(y)), axis=-1) for y in jax.tree.leaves(trajectory.ys)], axis=0)
     if not good.all():
         t = float(np.asarray(trajectory.ts)[np.argmin(good)])
         raise ValueError(f"The state at {t:g} s is not finite: the simulation failed; see trajectory.result.")

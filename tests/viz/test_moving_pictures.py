@@ -309,6 +309,19 @@ def test_motions_that_cannot_be_shown(pendulum):
         viz.show([trajectory, still])
 
 
+def test_a_motion_with_internal_states():
+    follow = lambda t, measured, states, p: (states["lag"], {"lag": -measured["angle"]})
+    joint = planar.Revolute("pin", "ground", "wheel", point=(0.0, 0.0))
+    hold = mb.Controller("hold", follow, {"angle": "pin.angle"}, "pin.angle", states={"lag": 1.0})
+    system = mb.Scene([planar.Body("wheel", mass=1.0, inertia=0.1)], joints=[joint], forces=[hold]).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=0.1, saveat=[0.0, 0.05, 0.1])
+    assert viz.show(motion).html.count("<script") >= 2
+    ys = motion.ys
+    lost = dataclasses.replace(motion, ys=mb.State(ys.q, ys.u, ys.z.at[1].set(jnp.nan)))
+    with pytest.raises(ValueError, match=r"The state at 0\.05 s is not finite"):
+        viz.show(lost)
+
+
 def test_a_single_name(pendulum):
     """A word is one name and not its letters, and a name that stands twice counts once."""
     read = [Page(viz.show(pendulum[0], points=points, frames=2).html) for points in ("pin", ["pin", "pin"])]
