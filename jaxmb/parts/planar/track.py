@@ -126,10 +126,12 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         xp = namespace(d, self.radii)
         square = xp.sum(d * d, axis=1)
         more = xp.roll(self.radii, -1) - self.radii
-        straight = xp.sqrt(square - more**2)
-        # The unit vector along a tangent, turned from the line of centres towards the smaller circle.
         across = xp.stack([-d[:, 1], d[:, 0]], axis=1)
-        along = (straight[:, None] * d - more[:, None] * across) / square[:, None]
+        # Circles without a common tangent give NaN, without a warning of NumPy.
+        with np.errstate(invalid="ignore"):
+            straight = xp.sqrt(square - more**2)
+            # The unit vector along a tangent, turned from the line of centres towards the smaller circle.
+            along = (straight[:, None] * d - more[:, None] * across) / square[:, None]
         into = xp.roll(along, 1, axis=0)
         turn = xp.arctan2(into[:, 0] * along[:, 1] - into[:, 1] * along[:, 0], xp.sum(into * along, axis=1))
         # At its ends a track turns by half a turn or more; elsewhere it turns back by less than a quarter.
