@@ -26,15 +26,21 @@ class Recent:
 
     def found(self, arguments: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """The result that is kept for some arguments, or else the one that is computed."""
-        for known, result in self._kept:
-            if len(known) == len(arguments) and all(map(_are_same, arguments, known)):
-                return result
+        # Modules that are the same object are looked for first: it takes long to compare others.
+        for same in (_are_identical, _are_same):
+            for known, result in self._kept:
+                if len(known) == len(arguments) and all(map(same, arguments, known)):
+                    return result
         result = compute()
         if not is_traced((arguments, result)):
             # The user may change an array of NumPy later.
             copied = (np.array(own) if isinstance(own, _NUMPY) else own for own in arguments)
             self._kept.append((tuple(copied), result))
         return result
+
+
+def _are_identical(argument, known):
+    return argument is known or (not isinstance(argument, eqx.Module) and _are_same(argument, known))
 
 
 def _are_same(argument, known):

@@ -35,6 +35,11 @@ class AbstractSignal(eqx.Module):
     def __call__(self, t: Scalar) -> Array:
         """The value at a time [s]."""
 
+    def shape(self, t: Scalar) -> Any:
+        """The shape of the value at a time [s], or the value itself where it is no array."""
+        found = eqx.filter_eval_shape(self, t)
+        return getattr(found, "shape", found)
+
     def keep(self) -> None:
         """Hook: stay as it is now, after a call; see `Captured`."""
 
@@ -133,6 +138,9 @@ class Series(AbstractSignal):
             inside = inside + h * s * (1 - s) * (before * (1 - s) + after * s)
         # Not a clipped time, whose derivative would be halved at the first and the last one.
         return jnp.where(t < ts[0], values[0], jnp.where(t > ts[-1], values[-1], inside))
+
+    def shape(self, t):
+        return self.values.shape[1:]
 
     def break_times(self, *, of_rates):
         if self.interpolation == "cubic" or (self.interpolation == "linear" and not of_rates):

@@ -27,7 +27,7 @@ from ..solvers.gaps import GapController
 from ..solvers.one_step import OneStepController
 from ..solvers.tolerances import closer_tolerance
 from ..system import AbstractSystem
-from ..system.inputs import turning_times
+from ..system.inputs import input_break_times, turning_times
 from ..system.parameters import parameters
 
 DEFAULT_RTOL = 1e-8
@@ -42,8 +42,8 @@ _FEWEST_TIMES = 4
 # The least `rtol` with an error estimate, in units of the machine precision: a second run has a tenth.
 _CLOSEST = 100
 
-# The stops of the last few runs: a loop of simulations looks for them once.
-_stops = Recent(8)
+# The stops and the jumps of inputs of the last few runs: a loop of simulations looks for them once.
+_stops, _breaks = Recent(8), Recent(8)
 
 _KINDS: dict[str, tuple[type, str]] = {
     "solver": (diffrax.AbstractSolver, "jaxmb.solvers.Adams() or diffrax.Tsit5()"),
@@ -103,6 +103,12 @@ def stops_of(system: AbstractSystem, state: State, times: Mapping[str, Any], con
         return None
     own = system, state, times["t0"], times["t1"]
     return turning_times(*own) if traced else _stops.found(own, lambda: turning_times(*own))
+
+
+def breaks_of(system: AbstractSystem, times: Mapping[str, Any]) -> np.ndarray:
+    """Times [s] at which inputs of a run jump, or their rates where these count; see `input_break_times`."""
+    own = system, times["t0"], times["t1"]
+    return _breaks.found(own, lambda: input_break_times(*own))
 
 
 def with_restarts(controller: Any, restarts: Any, stops: Any, events: int | None, gaps: bool) -> Any:

@@ -26,10 +26,11 @@ from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..states.refusals import lost_rank
 from ..system import AbstractSystem
-from ..system.inputs import Signals, input_break_times, with_inputs
+from ..system.inputs import Signals, with_inputs
 from ..trajectory import Trajectory
 from .arguments import (
     DEFAULT_RTOL,
+    breaks_of,
     captured_event,
     check_error_estimate,
     check_fixed_steps,
@@ -239,7 +240,7 @@ def simulate(
     check_kinds(method, formulation, manifold, stepsize_controller, adjoint, event, progress_meter)
     check_fixed_steps(method, stepsize_controller)
     longest = checked_longest_step(dtmax, stepsize_controller, method, state.q.dtype)
-    restarts = checked_jumps(jumps, input_break_times(system, times["t0"], times["t1"]))
+    restarts = checked_jumps(jumps, breaks_of(system, times))
     saved = with_end(checked_saveat(saveat, times["t0"], times["t1"]), times["t0"], state)
     first = saved.subs[0]
     if error:

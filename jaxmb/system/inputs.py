@@ -59,12 +59,12 @@ def with_inputs(system: System, inputs: Signals) -> System:
         signals[name] = as_signal(name, value)
         t: Any = np.zeros((), known[name].dtype)
         with traced_by_jax(f"the input {name!r}", "the time"):
-            found = eqx.filter_eval_shape(signals[name], t)
+            shape = signals[name].shape(t)
         signals[name].keep()
-        if not hasattr(found, "shape") or found.shape != known[name].shape:
+        if shape != known[name].shape:
             raise ValueError(
                 f"The input {name!r} must have shape {known[name].shape} at each time, as the parameter has; got "
-                f"{getattr(found, 'shape', found)}."
+                f"{shape}."
             )
     return system.with_signals(signals)
 
