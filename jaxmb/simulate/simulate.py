@@ -157,7 +157,8 @@ def simulate(
         longer runs finds those of each part again. With `Adams` a gradient costs about three runs, whatever the number
         of parameters; forward mode costs as much for one parameter and somewhat less than half a run for each further
         one, whatever the number of outputs.
-    - `direction`: parameters by name with a change of each, for runs that are differentiated; see below.
+    - `direction`: parameters by name with a change of each, none of them for steps that derivatives do not change; for
+        runs that are differentiated, see below.
     - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run whose
         steps may err a hundredth as much; near rounding, and with a method of a fixed order, a tenth. Both together
         take two to two and a half times as long as one, more with a low order, and nothing more to compile.
@@ -221,6 +222,9 @@ def simulate(
     the one that they cause together, each changed by its own size, or by one where it is zero. Its values differ within
     the tolerance from those of the same run without derivatives. An effect that is much smaller than that of other
     parameters is resolved relative to theirs; `direction={"kick.strength": 1.0}` watches that of this change instead.
+    `direction={}` watches none: the steps are those of the motion alone. With `Hermite`, which damps the tangents of
+    fast modes as it damps these, gradients of stiff motions then take a fraction of the time; compare some with those
+    of a tighter tolerance. With explicit methods the tangents of modes at rest may grow without bound.
     Where a force sets in almost at once, as in an impact, derivatives are less accurate than the motion: for a ball on
     a stiff floor their error is about 5000 `rtol`. Compare them with those of a tolerance that is a hundred times
     tighter. A controller of the user's is treated in the same way if it is, or wraps, a `MultistepController` or a
@@ -257,7 +261,7 @@ def simulate(
         "saveat": saved,
         "restarts": restarts,
         "event": captured_event(event, times["t0"], state),
-        "changes": {} if direction is None else parameter_changes(system, direction),
+        "changes": None if direction is None else parameter_changes(system, direction),
     }
     traced = is_traced((system, state, others))
     if traced and solver == "switch":

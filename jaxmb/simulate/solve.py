@@ -69,9 +69,10 @@ class Problem(NamedTuple):
     at most, None for any; `times`: t0, t1, dt0; `saveat`; `adjoint`, None for derivatives on the mesh; `event`;
     `limit`: the largest number of steps, and `room`: that which the program has room for; `max_events`: the largest
     number of events of contacts; `progress_meter`; times of `restarts`, and of `stops`, which no step passes, or None;
-    `changes`: values of parameters with changes whose tangent is watched, by name; whether states are `interpolated`;
-    whether anything is `traced`; by which leaves of the system and the state derivatives are taken (`differentiated`),
-    empty where that is not known; whether the start, and the end or a saved time, are `moving`.
+    `changes`: values of parameters with changes whose tangent is watched, by name, None for all that are
+    differentiated, and empty for no tangent; whether states are `interpolated`; whether anything is `traced`; by which
+    leaves of the system and the state derivatives are taken (`differentiated`), empty where that is not known; whether
+    the start, and the end or a saved time, are `moving`.
     """
 
     system: AbstractSystem
@@ -93,7 +94,7 @@ class Problem(NamedTuple):
     progress_meter: Any
     restarts: Any
     stops: Any
-    changes: dict[str, tuple[Any, Any]]
+    changes: dict[str, tuple[Any, Any]] | None
     interpolated: bool
     traced: bool
     differentiated: tuple[bool, ...]
@@ -181,11 +182,11 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     start = problem.state
     if consistent is not True:
         start = jax.tree.map(lambda x: jnp.where(consistent, x, jnp.nan), start)
-    direction = None
-    if problem.changes:
-        moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in problem.changes.items()})
+    direction, changes = None, problem.changes
+    if changes:
+        moved = lambda step: with_parameters(system, {k: at + step * x for k, (at, x) in changes.items()})
         direction = eqx.filter_jvp(lambda step: problem.assembled(moved(step))[0], (0.0,), (1.0,))[1]
-    elif problem.differentiated:
+    elif problem.differentiated and changes is None:
         leaves, structure = jax.tree.flatten(system)
         used = jax.tree.unflatten(structure, problem.differentiated[: len(leaves)])
         direction = _pushed(lambda system: problem.assembled(system)[0], system, used)
@@ -234,12 +235,13 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if of_saved:
         options["saveat"] = eqx.tree_at(lambda saveat: saveat.subs[0].fn, options["saveat"], _STATES)
     control = _tangent_control(system, options, direction)
-    if problem.differentiated and not problem.changes:
+    if problem.differentiated and changes is None:
         excites = any(problem.differentiated[len(jax.tree.leaves(system)) :])
         control = dataclasses.replace(control, excites=excites)
+    watched = None if changes == {} else control
     # Where it is known which of the two a run is, the other is not traced.
     solve = _solve_with_tangents if problem.differentiated else _solve_on_mesh
-    solution: Any = solve((term, solver, options), control, problem.adjoint, problem.limit, problem.projects_steps)
+    solution: Any = solve((term, solver, options), watched, problem.adjoint, problem.limit, problem.projects_steps)
     ts, saved = solution.ts[0], solution.ys[0]
     if jumps is not None and first.t0:
         ts = ts.at[0].set(lax.stop_gradient(times["t0"]))
@@ -358,7 +360,7 @@ def _solve_on_mesh(arguments, control, adjoint, limit, projects_steps):
 @_solve_on_mesh.def_jvp
 def _solve_jvp(primals, tangents):
     arguments, control, adjoint, limit, projects_steps = primals
-    if control.direction is None:
+    if control is not None and control.direction is None:
         used = jax.tree.map(lambda x: x is not None, tangents[0][0], is_leaf=lambda x: x is None)
         direction = _pushed(lambda term: term, lax.stop_gradient(arguments[0]), used)
         excites = bool(jax.tree.leaves(tangents[0][2]["y0"]))
@@ -369,11 +371,13 @@ def _solve_jvp(primals, tangents):
 
 def _solve_with_tangents(arguments, control, adjoint, limit, projects_steps):
     term, solver, options = arguments
-    if projects_steps:
-        restore = lambda term, y: project(term.vector_field.system, options["t0"], y)
-        control = control.on_constraints(restore, *lax.stop_gradient((term, options["y0"])))
-    solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
-    options = options | {"stepsize_controller": controller}
+    without_tangents = lambda state: state
+    if control is not None:
+        if projects_steps:
+            restore = lambda term, y: project(term.vector_field.system, options["t0"], y)
+            control = control.on_constraints(restore, *lax.stop_gradient((term, options["y0"])))
+        solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
+        options = options | {"stepsize_controller": controller}
     solution = _solve_states(
         term, solver, options, adjoint, limit, MeshAdjoint(kept_steps(options["y0"]), "made_jump" in options)
     )

@@ -250,6 +250,34 @@ def test_a_mode_that_is_kicked_late():
         np.testing.assert_allclose(slope, exact, rtol=1e-5)
 
 
+@pytest.mark.parametrize("moves_start", [False, True])
+def test_no_direction_leaves_the_steps_of_the_motion(moves_start):
+    # A slow mode beside a fast one at rest, which a method for stiff systems damps, and so does its derivatives.
+    system = LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * jnp.dot(v, v),
+        potential=lambda t, q, p: 0.5 * (p["slow"] * q[0] ** 2 + p["fast"] * q[1] ** 2),
+        q=(1.0, 0.0),
+        parameters={"slow": 1.0, "fast": 1e6},
+    )
+
+    def end(x, direction):
+        own = mb.with_parameters(system, {"slow": x**2, "fast": 1e6 * x})
+        start = mb.State(q=jnp.stack([x if moves_start else jnp.ones(()), jnp.zeros(())]), u=jnp.zeros(2))
+        sol = mb.simulate(own, start, t1=2.0, rtol=1e-8, solver=mb.solvers.Hermite(), direction=direction)
+        return sol.ys.q[-1, 0], sol.stats["num_steps"]
+
+    def gradient(direction):
+        return jax.jit(jax.value_and_grad(lambda x: end(x, direction), has_aux=True))(1.0)
+
+    (_, steps), slope = gradient({})
+    (_, more), controlled = gradient(None)
+    assert steps == end(1.0, None)[1] < more
+    exact = moves_start * np.cos(2.0) - 2.0 * np.sin(2.0)
+    np.testing.assert_allclose([slope, controlled], exact, rtol=2e-7)
+    forward = jax.jit(lambda x: jax.jvp(lambda x: end(x, {})[0], (x,), (1.0,))[1])(1.0)
+    np.testing.assert_allclose(forward, slope, rtol=1e-11)
+
+
 def test_directions_are_checked():
     run = lambda direction: mb.simulate(two_masses(), at_rest(jnp.array(0.0)), t1=0.1, direction=direction)
     with pytest.raises(ValueError, match="rat"):
