@@ -1,7 +1,6 @@
-"""`jaxmb help NAME` and `jaxmb reference FOLDER`: what the docstrings say, in the terminal and as HTML."""
+"""`jaxmb help NAME` and `jaxmb reference FOLDER`: what docstrings and topics say, in the terminal and as HTML."""
 
 import argparse
-import functools
 import json
 import os
 import shutil
@@ -19,13 +18,14 @@ def add_to(commands: Any) -> None:
     """Add the commands to a parser's commands."""
     command = commands.add_parser(
         "help",
-        help="print what public names are, or list all of them",
-        description="Print the signatures and the docstrings of public names, or list all names by subject.",
+        help="print what public names are, a topic, or a list of all",
+        description="Print the signatures and the docstrings of public names, topics, or a list of all by subject.",
     )
     command.add_argument(
         "names",
         nargs="*",
-        help="such as simulate, planar.Revolute, Trajectory.reactions, four_bar, or a module: planar, solvers",
+        help="such as simulate, planar.Revolute, Trajectory.reactions, four_bar; a module: planar, solvers; or a "
+        "topic: tolerances, derivatives, contacts",
     )
     command.add_argument("--all", action="store_true", help="of parts also the methods, for parts of one's own")
     command.set_defaults(command=_help)
@@ -47,9 +47,15 @@ def add_to(commands: Any) -> None:
 def _help(arguments: argparse.Namespace) -> None:
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     styled = sys.stdout.isatty() and "NO_COLOR" not in os.environ
-    shown = functools.partial(reference.shown, width=width, styled=styled, every=arguments.all)
+    topics = reference.topics()
+
+    def shown(name):
+        if name in topics:
+            return reference.shown_topic(topics[name], width=width, styled=styled)
+        return reference.shown(reference.find(name), width=width, styled=styled, every=arguments.all)
+
     if arguments.names:
-        print("\n\n".join(shown(reference.find(name)) for name in arguments.names))
+        print("\n\n".join(map(shown, arguments.names)))
     else:
         print(reference.listed(width, styled))
 

@@ -27,6 +27,7 @@ from .entries import (
     subjects,
 )
 from .signatures import signature
+from .topics import topics
 
 _CONFIGURATION = f"""
 project = "{PACKAGE}"
@@ -98,6 +99,9 @@ def _write_sources(sources: Path, notebooks: list[Path]) -> None:
     (sources / "conf.py").write_text(_CONFIGURATION)
     for subject in subjects():
         (sources / f"{_page(subject)}.md").write_text("\n\n".join(_of_subject(subject)) + "\n")
+    for topic in topics().values():
+        text = _linked(topic.text, entries()["simulate"])
+        (sources / f"{topic.name}.md").write_text(f"# {topic.title}\n\n{text}\n")
     for path in notebooks:
         shutil.copy(path, sources)
     (sources / "index.md").write_text("\n\n".join(_of_index([path.stem for path in notebooks])) + "\n")
@@ -111,7 +115,8 @@ def _of_index(notebooks: list[str]) -> Iterable[str]:
     yield f"# {PACKAGE}"
     yield f"```{{py:module}} {PACKAGE}\n```"
     yield importlib.import_module(PACKAGE).__doc__ or ""
-    for caption, pages in (("Names", [_page(subject) for subject in subjects()]), ("Notebooks", notebooks)):
+    pages_of = {"Topics": [*topics()], "Names": [_page(subject) for subject in subjects()], "Notebooks": notebooks}
+    for caption, pages in pages_of.items():
         if pages:
             yield "\n".join(["```{toctree}", f":caption: {caption}", ":maxdepth: 1", "", *pages, "```"])
     for subject in subjects():

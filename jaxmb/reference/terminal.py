@@ -6,10 +6,11 @@ from collections.abc import Iterable
 
 from .entries import Entry, bases, further_fields, members, subjects
 from .signatures import signature
+from .topics import Topic, topics
 
 _HOW = (
-    "`jaxmb help NAME` explains a name, as in `jaxmb help simulate`, and of a module all its names, as in "
-    "`jaxmb help planar`. All public names:"
+    "`jaxmb help NAME` explains a name, as in `jaxmb help simulate`, of a module all its names, as in "
+    "`jaxmb help planar`, and topics, as in `jaxmb help tolerances`. All topics and public names:"
 )
 _BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
 _FENCE = re.compile(r"^( *)```")
@@ -32,9 +33,16 @@ def shown(entry: Entry, width: int = 80, styled: bool = False, every: bool = Fal
     return "\n\n".join(parts)
 
 
+def shown_topic(topic: Topic, width: int = 80, styled: bool = False) -> str:
+    """The text of a topic."""
+    parts = [f"**{topic.title}**", *(block for block, _ in _filled(topic.text, width))]
+    return "\n\n".join(_styled(part, styled) for part in parts)
+
+
 def listed(width: int = 80, styled: bool = False) -> str:
-    """How to go on, and all public names by subject, each with its first sentence."""
-    parts = [_hanging(_HOW, 0, 0, width)]
+    """How to go on, all topics, and all public names by subject, each with its first sentence."""
+    pages = _rows(((name, topic.summary) for name, topic in topics().items()), width)
+    parts = [_hanging(_HOW, 0, 0, width), "**Topics**", pages]
     for subject in subjects():
         # The names of some modules all belong to others.
         if subject.entries:
@@ -82,11 +90,11 @@ def _section(title: str, entries: tuple[Entry, ...], width: int) -> Iterable[str
 
 def _table(entries: Iterable[Entry], width: int) -> str:
     """Names with their first sentences beside them."""
-    lines = []
-    for entry in entries:
-        name = entry.short if entry.owner is not None else entry.name
-        lines.append(_hanging(f"**{name}**  {entry.summary}", 2, 6, width))
-    return "\n".join(lines)
+    return _rows(((own.name if own.owner is None else own.short, own.summary) for own in entries), width)
+
+
+def _rows(rows: Iterable[tuple[str, str]], width: int) -> str:
+    return "\n".join(_hanging(f"**{name}**  {summary}", 2, 6, width) for name, summary in rows)
 
 
 def _hanging(text: str, first: int, other: int, width: int) -> str:

@@ -102,134 +102,50 @@ def simulate(
     motion["bar"].angle, motion.energy, motion.reactions["pin"].force
     ```
 
-    The first call for a system compiles a program, which takes seconds; later ones with other numbers, times and
+    The first call for a system compiles a program, which takes seconds. Later ones with other numbers, times and
     tolerances do not. `jax.jit` is not needed: it compiles the motion anew, as a part of its function.
+
+    `jaxmb help` has more on `tolerances`, `derivatives`, `contacts`, `inputs`, `throw` (motions that
+    fail) and `large-scenes`.
 
     **Main arguments:**
 
     - `system`, `state`: a compiled scene and a consistent state of it, from `assemble`.
     - `t0`, `t1`: the interval [s]; `t1 < t0` runs backwards.
     - `saveat`: times to save at [s], or a `diffrax.SaveAt`; default only `t1`. `SaveAt(dense=True)` allows
-        `Trajectory.at(t)`; under `jit` it takes memory for `max_steps` steps, otherwise for those of the motion. A
-        function, `SaveAt(ts=times, fn=function)`, sees states on the constraints, as they are saved without it.
-    - `rtol`, `atol`: tolerances. `Adams` and `Hermite` let a step err by a twentieth of them, as errors add up: the
-        error of the result, relative to the largest coordinates and velocities, is then mostly below `rtol`; some ten
-        times `rtol` over many periods, more where neighbouring motions part quickly, and about the same as that of
-        `diffrax.Dopri8()`; `error=True` estimates it. Near rounding the part grows, up to all of it: steps are not
-        asked for less than 4e-14 (`Adams`) or 1e-11 (`Hermite`). `atol` defaults to one hundredth of `rtol`, times the
-        largest coordinate (in units of the machine's size, or radians) and the largest velocity so far, so that the
-        units do not matter and slow or small motions are as accurate as others; while all that moved since the
-        start was less than 2e-14 of that size in each step, velocities are taken for rounding errors of forces that
-        balance. Internal states count by kinds, each with its largest value, at least 1e-4 of its typical size. A
-        number is in SI units; it may be a vector of one for each coordinate, velocity and internal state,
-        (nq + nu + nz,): where stiff springs vibrate too little to matter in positions, a coarser one for velocities
-        saves most of the steps of `Hermite`.
-
-    - `inputs`: parameters as functions of time, by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a function
-        of t; see `with_inputs`, which also `assemble` needs where a driver has such an input. The solver restarts where
-        a held series jumps and, if it moves a point, an axis, a joint, a stop or the ground, or constraints depend on
-        it, at every time of a linear one. No step passes a pulse of an input, however long steps are where nothing
-        moves: a series is followed from value to value, a function at 513 times, and so are functions of time of
-        drivers, of `Force` and of constraints, with `of_time` those of one's own parts. Shorter ones need `jumps` or
-        `dtmax`, and so do those in a `LagrangianSystem`.
+        `Trajectory.at(t)`. A function, `SaveAt(ts=times, fn=function)`, sees states on the constraints.
+    - `rtol`, `atol`: tolerances of the errors of steps. The error of the result, relative to the largest coordinates
+        and velocities, is mostly below `rtol`. `atol` is a number or a vector (nq + nu + nz,) in SI units; its default
+        follows the motion.
+    - `inputs`: parameters as functions of time [s], by name: `{"motor.torque": jaxmb.Series(ts, torques)}`, or a
+        function; see `with_inputs`.
 
     **Other arguments, rarely needed:**
 
     - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is `Adams`,
-        which also detects whether stability instead of accuracy limits its steps: `stats["stiff"]`, and in how many
-        steps, `stats["stiff_steps"]`; a warning then advises `Hermite`. Counting takes some percent of a step. With
-        `"switch"` a motion that is detected to be stiff is simulated again from `t0` with `Hermite`; not under `jit`,
-        `vmap` or `grad`.
-    - `formulation`: how accelerations are solved for. Default `Partitioned()` with a `Partition`; otherwise
-        `Multipliers()`, which needs no search for pivots, or `NullSpace()` where the mass matrix is singular.
-    - `manifold`: how the state stays on the constraints. Default `Partition()` for `Adams` and `Hermite`, and
-        `Projection()` for other solvers; a system without constraints needs neither. For `Adams` on a scene of 30 or
-        more constraint rows, 150 where some are redundant, the default is `Projection()` as well, whose cost grows
-        with the number of joints and not with its cube, except that it does with the cube of the number of joints that
-        rub; so it is for `Hermite` on such a scene, or one without joints, of 40 or more velocities, without friction,
-        servos and internal states.
-    - `dt0`: first step [s], default chosen from the motion.
-    - `dtmax`: longest step [s], default none. Tolerances and everything else stay as they are.
+        which warns of stiff motions; `"switch"` simulates these again with `Hermite`, not under a trace.
+    - `formulation`: how accelerations are solved for, `Partitioned()`, `Multipliers()`, `NullSpace()`, …; default by
+        the scene.
+    - `manifold`: how the state stays on the constraints, `Partition()`, `Projection()` or others; default by the scene.
+    - `dt0`: first step [s], default chosen from the motion. `dtmax`: longest step [s], default none.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
-    - `adjoint`: how to differentiate instead, one of diffrax's. The default serves `jax.grad`, `jvp`, `jacfwd`,
-        `jacrev`, `hessian`, `vmap` of them, and nested ones; it keeps some numbers of up to 2048 steps (at most
-        128 MB with `Adams`, about eight times as much with solvers whose steps are differentiated as they are), and of
-        longer runs finds those of each part again. With `Adams` a gradient costs about three runs, whatever the number
-        of parameters; forward mode costs as much for one parameter and somewhat less than half a run for each further
-        one, whatever the number of outputs.
-    - `direction`: parameters by name with a change of each, none of them for steps that derivatives do not change; for
-        runs that are differentiated, see below.
-    - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run whose
-        steps may err a hundredth as much; near rounding, and with a method of a fixed order, a tenth. Both together
-        take two to two and a half times as long as one, more with a low order, and nothing more to compile.
-    - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector. The solver stops just before each,
-        and restarts just after it; where a driver's rate jumps, with the impulse `M (u⁺ − u⁻) = Aᵀ Λ` that constraints
-        then exert, without restitution where contacts are closed, except at those whose own terrain or ends jump. A
-        function that is evaluated at a jump should return its value after it, as a state saved there does. Needs
-        `Partition()` or `Projection()`, and a mass matrix that has an inverse, if there are constraints. A warning
-        tells of jumps and kinks of drivers at other times, except under `jit`, `vmap` or a derivative.
+    - `adjoint`: how to differentiate instead, one of diffrax's.
+    - `direction`: parameters by name with a change of each, whose effect steps resolve where a run is differentiated;
+        default all that derivatives are taken by. `{}` leaves the steps of the motion alone.
+    - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run.
+    - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector; the solver restarts there.
+    - `event`, `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event sees states between the ends of
+        steps as they are interpolated, off the constraints by about `rtol`.
+    - `max_steps`: the largest number of steps. `max_events`: that of impacts and other events of contacts.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
-        motion is NaN instead, with a `result` that says why; with `True` it is an error there as well, by a call of
-        Python from the program, which JAX then does not keep on disk (see `jaxmb.keep_compiled`). Under
-        `equinox.filter_jit` the message stands alone; `jax.jit` adds a page of JAX's own.
-    - `max_events`: the largest number of impacts and other events of contacts (`Stop`, `RigidContact`, …), whose times
-        and states are kept: a motion that has more of them fails.
-    - `event`, `max_steps` (an integer), `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event also
-        sees states between the ends of steps, as they are interpolated: off the constraints by about `rtol`. Where
-        `max_steps` is reached the error says how far the motion came and, of `Adams` and Runge–Kutta solvers, whether
-        it is stiff there, for which some more steps are simulated; not under `jit`, `vmap` or a derivative. A
-        derivative keeps at most 2048 steps. One of more steps needs a program that also finds steps again, which takes
-        a fifth longer to compile. Under `jit` and `vmap` every derivative with a larger `max_steps` has it; otherwise
-        one whose motion turns out to be long is computed again with it, and for the system from then on.
+        motion is NaN instead.
 
-    **Returns:** a `Trajectory`.
+    **Returns:** a `Trajectory`. With `throw=False` that of a motion that failed has its part before, and `result` says
+    why it failed; under a trace it is NaN.
 
     **Raises:** `ValueError` for arguments of the wrong type or out of range, for combinations that cannot work, and for
-    a state that violates the constraints (of other parameters, another system, another time), unless the manifold lets
-    states drift; under a trace such a run fails instead, with `RESULTS.assembly_failed`;
-    `RuntimeError`, unless `throw=False`, when the integration fails: the text of its `RESULTS` says how. Without it the
-    trajectory up to there is kept, with times and states of infinity after it. Under `jit`, `vmap` or a derivative,
-    where nothing can be kept for some members of a batch only, a motion that fails is NaN as a whole, and so
-    are its derivatives with respect to every input; its `ts`, `stats` and `result` say how far it came, and the other
-    members are as if it were not there.
-
-    Derivatives are taken on the mesh of the run, which is integrated once: steps are linear maps of tangents, and all
-    modes are the same numbers. `Adams` linearises the equations once a step, at its end: that is a discretisation of
-    the tangent equation of the same order as the method. Other solvers are differentiated as they step. Both converge
-    with the tolerance to the true derivatives. Times have first and second derivatives as well, and no third ones:
-    `t0`, `t1`, saved times, that of an event, and, with `Adams`, those of `jumps`. Second derivatives are those of
-    first ones in forward mode (`jax.hessian`, or `jax.jacfwd` of `jax.grad`), of runs of which all steps are kept.
-
-    Contacts (`Stop`, `RigidContact`, `Slack`, …) close and open, and `DryFriction` sticks and slips, at events, at
-    which a step ends: `Trajectory.events` lists them. An event is found to a thousandth of `rtol`, relative to the size
-    of the system; bounces that are lower than `rtol` are left out, and the contact stays closed. Dry friction in joints
-    that it loads then rubs earlier than it would, by a time of the size of √`rtol` s, and velocities err by what it
-    changes in that time: several hundred `rtol`, seen. Derivatives are those of a motion whose events move with the
-    parameters, while their sequence stays: the time of an impact has a derivative, its number has none.
-    After each event multistep methods start again with short steps: with many impacts Runge–Kutta solvers take fewer.
-    Gaps and forces of contacts are looked at in the middle of each step as well as at its ends. What comes and goes
-    between these is not seen, as a lone bump below a body in free flight: bound the steps there, with `dtmax=0.01`.
-
-    Compliant contacts and stops (`DiscContact`, `JointStop`, `Tyre`, …) have no events. Their gaps are followed along
-    each step, so that none closes and opens again within it unseen; a step that would hide that is tried again up to
-    where the gap is most closed. So it is with a `Force` that has a `gap`, and with parts that have `gaps`. The ground
-    of a `jaxmb.terrain.Surface` may rise and fall unseen where a body passes a hill within an eighth of a step.
-
-    A mesh that resolves a motion need not resolve its derivatives: those of a fast mode at rest would grow from
-    step to step, and a force whose strength is zero, as a control at the start of an optimisation, is seen by its
-    derivative only. So a run that is differentiated also controls, at five times `rtol`, the errors of tangents of the
-    state: where it is differentiated by the state, of one from a start that excites all modes; where by parameters, of
-    the one that they cause together, each changed by its own size, or by one where it is zero. Its values differ within
-    the tolerance from those of the same run without derivatives. An effect that is much smaller than that of other
-    parameters is resolved relative to theirs; `direction={"kick.strength": 1.0}` watches that of this change instead.
-    `direction={}` watches none: the steps are those of the motion alone. With `Hermite`, which damps the tangents of
-    fast modes as it damps these, gradients of stiff motions then take a fraction of the time; compare some with those
-    of a tighter tolerance. With explicit methods the tangents of modes at rest may grow without bound.
-    Where a force sets in almost at once, as in an impact, derivatives are less accurate than the motion: for a ball on
-    a stiff floor their error is about 5000 `rtol`. Compare them with those of a tolerance that is a hundred times
-    tighter. A controller of the user's is treated in the same way if it is, or wraps, a `MultistepController` or a
-    `diffrax.PIDController`; others choose the same steps with and without derivatives, and so does
-    `diffrax.diffeqsolve` when it is called directly.
+    a state that violates the constraints, unless the manifold lets states drift; `RuntimeError`, unless `throw=False`,
+    when the integration fails.
     """
     check_kind("system", system, AbstractSystem, "a compiled system", "scene.compile() makes one of a jaxmb.Scene")
     check_precision("simulate", system)

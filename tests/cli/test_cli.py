@@ -139,6 +139,16 @@ def test_help_on_a_part_has_its_methods_with_all(capsys):
     assert "From parts.AbstractPart" in capsys.readouterr().out
 
 
+def test_help_on_a_topic(capsys):
+    assert main(["help", "tolerances", "planar.Revolute"]) == 0
+    out = capsys.readouterr().out
+    assert (
+        out.startswith("Tolerances\n\n") and "\n    motion = jaxmb.simulate(" in out and "jaxmb.planar.Revolute(" in out
+    )
+    assert main(["help"]) == 0
+    assert "\n  tolerances  `rtol` and `atol` bound the error of each step.\n" in capsys.readouterr().out
+
+
 def test_help_on_an_unknown_name(capsys):
     assert main(["help", "simulat"]) == 2
     assert capsys.readouterr().err.startswith("jaxmb: Unknown name 'simulat'; did you mean 'simulate'")

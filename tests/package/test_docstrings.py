@@ -1,4 +1,4 @@
-"""The examples in docstrings run, and every public name has one, or stands in that of another name.
+"""The examples in docstrings and topics run, and every public name has one, or stands in that of another name.
 
 Examples refer to `jax`, `jnp`, `np`, `jaxmb` or `mb`, `planar` and `spatial`, to the pendulum of the example of `Scene`
 and a state of it, and to a `motion` of it. Those of joints run by themselves.
@@ -20,6 +20,7 @@ from exports import exported
 import jaxmb as mb
 from jaxmb import formulations, manifold, mechanisms, planar, spatial
 from jaxmb.parts import AbstractCompound, AbstractConstraint, AbstractVelocityConstraint
+from jaxmb.reference import topics
 from jaxmb.reference.entries import entries, members
 
 MODULES = {"jax": jax, "jnp": jnp, "np": np, "jaxmb": mb, "mb": mb, "planar": planar, "spatial": spatial}
@@ -199,6 +200,27 @@ def test_examples(name, names, request, tmp_path, monkeypatch):
             np.testing.assert_allclose(speed, 0.6 * np.sqrt(9.81 / 0.8), rtol=1e-5)
         case "Trajectory":
             assert np.ptp(scope["motion"].energy) < 1e-7
+
+
+@pytest.mark.parametrize("name", topics())
+def test_examples_of_topics(name, names, capsys, monkeypatch):
+    monkeypatch.setattr(mb, "compile_quickly", lambda: None)
+    code = codes(topics()[name].text)
+    assert code
+    scope = dict(names)
+    exec("\n".join(code), scope)
+    match name:
+        case "contacts":
+            assert len(scope["motion"].events) == 1
+        case "derivatives":
+            assert np.isfinite(scope["slope"])
+        case "inputs":
+            assert scope["motion"].stats["num_steps"] > 0
+        case "throw":
+            assert "came to t =" in (out := capsys.readouterr().out)
+            assert mb.RESULTS[mb.RESULTS.max_steps_reached] in out
+        case "tolerances":
+            assert 0.0 < scope["estimated"].error.largest < 1e-6
 
 
 # Results that the example of the function shows that returns them, and classes and functions for parts of the package.

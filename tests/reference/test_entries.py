@@ -5,7 +5,7 @@ import inspect
 import pytest
 
 import jaxmb as mb
-from jaxmb.reference import find, listed, shown, subjects
+from jaxmb.reference import find, listed, shown, subjects, topics
 from jaxmb.reference.entries import entries, public_names
 from jaxmb.reference.signatures import signature
 
@@ -39,6 +39,12 @@ def test_every_public_name_has_one_entry():
 def test_no_entry_is_private():
     for entry in entries().values():
         assert not any(word.startswith("_") for word in entry.name.split("."))
+
+
+def test_topics_hide_no_public_name():
+    for topic in topics():
+        with pytest.raises(mb.UnknownNameError):
+            find(topic)
 
 
 @pytest.mark.parametrize("subject", subjects(), ids=lambda subject: subject.title)
