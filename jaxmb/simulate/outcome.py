@@ -1,6 +1,7 @@
 """How a simulation ended: whether it failed, why, and warnings."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -86,6 +87,18 @@ def about_contacts(system, outcome: Outcome) -> str:
 
 def has_failed(result) -> Any:
     return ~((result == RESULTS.successful) | (result == RESULTS.event_occurred))
+
+
+def first_of(reasons: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
+    """The result of the first reason that holds.
+
+    **Arguments:** `reasons`: pairs of whether it holds, False where that is known before, and its result.
+    """
+    result = otherwise
+    for holds, reason in reversed(reasons):
+        if holds is not False:
+            result = RESULTS.where(holds, reason, result)
+    return result
 
 
 def warn_of_stiffness(stats) -> None:

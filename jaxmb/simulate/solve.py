@@ -32,7 +32,6 @@ from ..manifold import (
     with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
-from ..parts.series import of_one_kind
 from ..solvers import (
     NO_STATE,
     AbstractMultistep,
@@ -47,13 +46,14 @@ from ..solvers import (
 from ..solvers.gaps import GapSolver
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
+from ..system.inputs import inputs_ended
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
 from .arguments import MOST_ROWS, adapts, default_controller, kept_steps, with_restarts
 from .compiling import tracing_begins
 from .loop import Loop
 from .moving_times import at_frozen_start, at_moving_times, saved_times
-from .outcome import Flags, Outcome, has_failed
+from .outcome import Flags, Outcome, first_of, has_failed
 
 # What saves states as they are.
 _STATES = diffrax.SubSaveAt(t1=True).fn
@@ -269,16 +269,20 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         later = jnp.isfinite(found.times) & (found.times > end[0])
         found = found._replace(number=found.number - jnp.sum(later))
     result = RESULTS.promote(solution.result)
-    result = RESULTS.where(finite, result, RESULTS.assembly_failed)
-    if valid is not True:
-        result = RESULTS.where(valid, result, RESULTS.invalid_parameters)
+    reasons: list[tuple[Any, Any]] = [
+        (False if valid is True else ~valid, RESULTS.invalid_parameters),
+        (~finite, RESULTS.assembly_failed),
+    ]
     unknown = finite
     if found is not None:
-        no_state = result == RESULTS.promote(NO_STATE)
-        result, unknown = RESULTS.where(no_state, RESULTS.contacts_undetermined, result), unknown & ~no_state
-        result = RESULTS.where(found.number > problem.max_events, RESULTS.too_many_events, result)
-        backward = (times["t1"] < times["t0"]) & finite & valid
-        result, unknown = RESULTS.where(backward, RESULTS.impacts_backward, result), unknown & ~backward
+        backward, no_state = times["t1"] < times["t0"], result == RESULTS.promote(NO_STATE)
+        reasons += [
+            (backward, RESULTS.impacts_backward),
+            (found.number > problem.max_events, RESULTS.too_many_events),
+            (no_state, RESULTS.contacts_undetermined),
+        ]
+        unknown = finite & ~backward & ~no_state
+    result = first_of(reasons, result)
     # A run without enough steps is stuck where the rest would take a thousand times as many as it had.
     ran_out, step = result == RESULTS.max_steps_reached, intended_step(solution.controller_state)
     left = jnp.abs(options["t1"] - end[0])
@@ -287,18 +291,14 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     evidence = policy.evidence(solution.solver_state)
     if problem.traced:
         result, coupling = diagnosed(problem, *end, evidence, result, stuck)
-    violated = policy.violated(system, *end)
-    if violated is not False:
-        result = RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
-    if lost is not None:
-        result = RESULTS.where(lost & ~has_failed(result), RESULTS.newton_failed, result)
-    if problem.traced:
-        of_signal = lambda signal: signal.is_known(times["t0"], times["t1"])
-        for numbers, signal in of_one_kind([signal for signal, _ in system.signals.values()]):
-            known = of_signal(signal) if len(numbers) == 1 else jnp.all(jax.vmap(of_signal)(signal))
-            result = RESULTS.where(known | has_failed(result), result, RESULTS.input_ended)
-    if outside is not False:
-        result = RESULTS.where(outside & ~has_failed(result), RESULTS.saved_outside, result)
+    reasons = [
+        (policy.violated(system, *end), RESULTS.inconsistent_constraints),
+        (has_failed(result), result),
+        (False if lost is None else lost, RESULTS.newton_failed),
+        (inputs_ended(system, times["t0"], times["t1"]) if problem.traced else False, RESULTS.input_ended),
+        (outside, RESULTS.saved_outside),
+    ]
+    result = first_of(reasons, result)
     stats = dict(solution.stats) | {"max_steps": problem.limit}
     linearised = False
     if isinstance(solver, AbstractMultistep):

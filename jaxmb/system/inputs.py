@@ -81,6 +81,16 @@ def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndar
     return np.unique(np.concatenate([np.zeros(0), *own])) if own else np.zeros(0)
 
 
+def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
+    """Whether an input is not known from `t0` to `t1`, which may be traced; False without inputs."""
+    ended: Any = False
+    for numbers, signal in of_one_kind([signal for signal, _ in system.signals.values()]):
+        of_signal = lambda signal: signal.is_known(t0, t1)
+        known = of_signal(signal) if len(numbers) == 1 else jnp.all(jax.vmap(of_signal)(signal))
+        ended = ended | ~known
+    return ended
+
+
 def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) -> Float[Array, "n"] | None:
     """Times [s] that no step may pass, for no input or function of time to come and go unseen, and infinite ones; None
     where nothing depends on time.
