@@ -285,7 +285,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     evidence = policy.evidence(solution.solver_state)
     if problem.traced:
         result, coupling = diagnosed(problem, *end, evidence, result, stuck)
-    violated = policy.violated(system, *end)
+    violated = policy.violated(system.prepared(), *end)
     if violated is not False:
         result = RESULTS.where(violated, RESULTS.inconsistent_constraints, result)
     if lost is not None:
