@@ -174,7 +174,8 @@ class RigidBodySystem(AbstractSystem):
         """Prepared poses of the bodies, of scalar coordinates and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
-        return jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]])
+        # Computed once: what is cheap XLA would compute anew in each kernel that uses it.
+        return lax.optimization_barrier(jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]]))
 
     def all_velocities(self, u: Velocities) -> BodyVelocities:
         """Velocities of the bodies, of scalar coordinates and of the ground."""
