@@ -338,7 +338,7 @@ def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> 
     """Which rows of elementary joints belong to a product that vanishes half a turn away as well, at poses there."""
     space, listed = groups[0].group.layout.space, _listed(groups)
     rows = sum(own.element.rows(space.dimension) * len(own.rows) for own in listed)
-    told = [own for own in listed if not own.element.coincide and own.element.along_a is not None]
+    told = [own for own in listed if getattr(own.element, "along_a", None) is not None]
     if not told:
         return jnp.zeros(rows, bool)
     turned = jax.vmap(space.direction)
