@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._types import State
 from ..linalg import rotations as rot
@@ -316,6 +316,12 @@ def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> E
 
     **Arguments:** `ground`: the number of the ground, which is that of all bodies and scalar coordinates.
     """
+    listed = _listed(groups)
+    return stacked(listed, ground, groups[0].group.layout.space.dimension) if listed else None
+
+
+def _listed(groups: Sequence[AbstractConstraintGroup]) -> list[Listed]:
+    """The elements of those groups that are elementary; their rows are numbered through."""
     listed, first = [], 0
     for g in filter(is_elementary, groups):
         own = g.group
@@ -325,7 +331,22 @@ def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> E
             listed.append(Listed(element, own.body_index, places))
             places = places + element.rows(own.layout.space.dimension)
         first += g.rows * len(own.names)
-    return stacked(listed, ground, groups[0].group.layout.space.dimension) if listed else None
+    return listed
+
+
+def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> Bool[Array, "rows"]:
+    """Which rows of elementary joints belong to a product that vanishes half a turn away as well, at poses there."""
+    space, listed = groups[0].group.layout.space, _listed(groups)
+    rows = sum(own.element.rows(space.dimension) * len(own.rows) for own in listed)
+    told = [own for own in listed if getattr(own.element, "along_a", None) is not None]
+    if not told:
+        return jnp.zeros(rows, bool)
+    turned = jax.vmap(space.direction)
+    bodies = np.concatenate([own.bodies for own in told])
+    of_a, of_b = (jnp.concatenate([getattr(own.element, name) for own in told]) for name in ("along_a", "along_b"))
+    a, b = turned(unchecked_take(poses, bodies[:, 0]), of_a), turned(unchecked_take(poses, bodies[:, 1]), of_b)
+    opposite = _DOT[space.dimension](a, b)[:, 0] < 0
+    return jnp.zeros(rows, bool).at[np.concatenate([own.rows for own in told])].set(opposite)
 
 
 def stacked(listed: Sequence[Listed], ground: int, d: int) -> ElementaryRows:

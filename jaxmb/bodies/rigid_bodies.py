@@ -31,7 +31,7 @@ from ..system.quantities import Measure, view_of_motion
 from ..system.structures import of_structure
 from .constraint_set import ConstraintSet
 from .describe import describe_scene
-from .elementary import ElementaryRows, elementary_rows
+from .elementary import ElementaryRows, elementary_rows, half_turned, is_elementary
 from .field_jacobian import motion_jacobian
 from .groups import (
     AbstractConstraintGroup,
@@ -174,7 +174,8 @@ class RigidBodySystem(AbstractSystem):
         """Prepared poses of the bodies, of scalar coordinates and of the ground, the arguments of kernels."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
-        return jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]])
+        # Computed once: what is cheap XLA would compute anew in each kernel that uses it.
+        return lax.optimization_barrier(jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]]))
 
     def all_velocities(self, u: Velocities) -> BodyVelocities:
         """Velocities of the bodies, of scalar coordinates and of the ground."""
@@ -652,6 +653,14 @@ class RigidBodySystem(AbstractSystem):
 
     def prepared(self):
         return dataclasses.replace(self, elements=elementary_rows(self.constraints, self.layout.ground))
+
+    def half_turned(self, q):
+        groups = self.constraints
+        if self.elements is None:
+            return False
+        known = np.concatenate([np.full(len(g.group.names) * g.rows, is_elementary(g)) for g in groups])
+        found = half_turned(groups, self.prepared_poses(q))
+        return found if known.all() else jnp.zeros(known.size, bool).at[np.flatnonzero(known)].set(found)
 
     def on_host(self, t):
         return None if is_traced((self, t)) else host_scene(self, t)

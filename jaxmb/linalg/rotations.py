@@ -60,6 +60,7 @@ _EPSILON, _PRODUCT, _CONJUGATE, _OF_MATRIX, _OF_RATES = _tables()
 _CROSS, _MULTIPLY, _RATES = map(BilinearMap.of, (_EPSILON, _PRODUCT, _OF_RATES))
 _PULL_BACK = _RATES.transpose(2, 1, 0)
 _ROTATION = BilinearMap.of(_OF_MATRIX.reshape(9, 4, 4))
+_POLAR = BilinearMap.of(0.5 * (_ROTATION.table + _ROTATION.table.swapaxes(1, 2)))
 
 
 def norm(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
@@ -79,7 +80,19 @@ def rotate_2d(angle: Float[ArrayLike, ""], v: Float[Array, "2"]) -> Float[Array,
 
 def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Matrix from body to world components, `(e0² − e·e) I + 2 e eᵀ + 2 e0 ẽ`."""
-    return _ROTATION(p, p).reshape(3, 3)
+    return (_ROTATION(p, p) if namespace(p) is np else _square(p)).reshape(3, 3)
+
+
+@jax.custom_jvp
+def _square(p):
+    """The nine entries of the matrix, a quadratic form: its derivative is one product, where a bilinear map has two."""
+    return _ROTATION(p, p)
+
+
+@_square.defjvp
+def _square_jvp(primals, tangents):
+    (p,), (dp,) = primals, tangents
+    return _square(p), _POLAR(2.0 * p, dp)
 
 
 def rotate(p: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import namespace
@@ -96,14 +97,22 @@ class AbstractSpace(abc.ABC):
 # Shared by parts between two points: `part` has `point_a` and `point_b` [m], fixed in the first and the second body.
 
 
-def separation(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> Point:
-    """World vector [m] from point A to point B."""
-    return space.point(poses[1], part.point_b) - space.point(poses[0], part.point_a)
-
-
 def both_points(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> Float[Array, "2 d"]:
     """World positions [m] of point A and point B."""
-    return jnp.stack([space.point(poses[0], part.point_a), space.point(poses[1], part.point_b)])
+    return _of_both(space.point, part, poses[:2])
+
+
+def separation(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> Point:
+    """World vector [m] from point A to point B."""
+    points = both_points(space, part, poses)
+    return points[1] - points[0]
+
+
+def _of_both(function, part, *own):
+    """`function(…, point)` of both bodies, by one kernel: rows of some arrays, and points A and B."""
+    xp = namespace(*own, part.point_a, part.point_b)
+    own = *own, xp.stack([part.point_a, part.point_b])
+    return xp.stack([function(*x) for x in zip(*own, strict=True)]) if xp is np else jax.vmap(function)(*own)
 
 
 def nearest_to_origin(point: Point, axis: Point) -> Point:
@@ -115,8 +124,8 @@ def separation_rate(
     space: AbstractSpace, part: Any, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]
 ) -> Point:
     """Rate [m/s] of the world vector from point A to point B."""
-    of_b = space.point_velocity(poses[1], velocities[1], part.point_b)
-    rate = of_b - space.point_velocity(poses[0], velocities[0], part.point_a)
+    both = _of_both(space.point_velocity, part, poses[:2], velocities[:2])
+    rate = both[1] - both[0]
     return with_drift(part, rate, lambda part: separation(space, part, poses))
 
 
@@ -165,5 +174,5 @@ def with_drift(part: Any, rate: Array, function: Callable[[Any], Array]) -> Arra
 
 def force_pair(space: AbstractSpace, part: Any, poses: Float[Array, "k p"], force_W: Point) -> Float[Array, "2 v"]:
     """Wrenches of `force_W` [N] on B at point B and of its reaction on A at point A."""
-    reaction = space.point_force(poses[0], part.point_a, -force_W)
-    return jnp.stack([reaction, space.point_force(poses[1], part.point_b, force_W)])
+    forces = jnp.stack([-force_W, force_W])
+    return _of_both(lambda pose, force, s: space.point_force(pose, s, force), part, poses[:2], forces)

@@ -292,7 +292,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     if problem.traced:
         result, coupling = diagnosed(problem, *end, evidence, result, stuck)
     reasons = [
-        (policy.violated(system, *end), RESULTS.inconsistent_constraints),
+        (policy.violated(system.prepared(), *end), RESULTS.inconsistent_constraints),
         (has_failed(result), result),
         (False if lost is None else lost, RESULTS.newton_failed),
         (inputs_ended(system, times["t0"], times["t1"]) if problem.traced else False, RESULTS.input_ended),

@@ -183,11 +183,17 @@ class AdamsSteps(AbstractSteps):
                 w, memory = jnp.where(jump.made, new, w), jnp.where(jump.made, restarted, memory)
             partial_sums, neighbours, mean = formulas.sums(memory)
             predicted = w + formulas.h * mean
-            _, f = field(dmoved.terms, predicted)
-            corrected = predicted + formulas.h * formulas.last * (f - neighbours[1])
-            w, f = field(dmoved.terms, corrected)
+
+            def evaluated(before, _):
+                w, f = field(dmoved.terms, before[0])
+                corrected = predicted + formulas.h * formulas.last * (f - neighbours[1])
+                return (corrected, w, f), None
+
+            # A loop, so that there is one program for both evaluations, and one for their transposes.
+            none = jnp.zeros_like(predicted)
+            (corrected, w, f), _ = lax.scan(evaluated, (predicted, none, none), length=2)
             memory = known_differences(row.known, f, partial_sums)
-            mismatch = predicted + formulas.h * formulas.last * (f - neighbours[1]) - w
+            mismatch = corrected - w
             zero = jnp.zeros((), w.dtype)
             dense = {"y1": unravel_like(like, w), "differences": jnp.where(used, memory, zero), "mesh": None}
             return w, memory, dense | {"mismatch": mismatch}

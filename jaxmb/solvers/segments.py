@@ -89,11 +89,11 @@ def _at_event(old, new):
 
 
 def remainder(k: Any, size: int) -> Any:
-    """The remainder of a number of steps, which is not negative: for any number it is ten operations, and each kernel
-    repeats them that uses it as an index.
+    """The remainder of a number of steps, which is not negative: for any number it is ten operations, by a power of two
+    one, and each kernel repeats them that uses it as an index.
     """
     k = jnp.asarray(k)
-    return lax.rem(k, jnp.asarray(size, k.dtype))
+    return k & (size - 1) if size & (size - 1) == 0 else lax.rem(k, jnp.asarray(size, k.dtype))
 
 
 class Segments(eqx.Module):

@@ -60,6 +60,13 @@ class AbstractSystem(AbstractEquation):
         """
         return self
 
+    def half_turned(self, q: Coordinates) -> Any:
+        """Which rows of Φ vanish at q because the system is `prepared`, with a joint half a turn away from where its
+        residual vanishes; False without such rows.
+        """
+        del q
+        return False
+
     def on_host(self, t: Scalar) -> Any:
         """The constraints at a time in NumPy, whose numbers are known, so that little or nothing is compiled to satisfy
         them once; None where there is no such form.

@@ -11,6 +11,7 @@ from jaxmb import parts, planar, spatial
 from jaxmb.bodies.elementary import is_elementary
 from jaxmb.parts import coincident, perpendicular
 from jaxmb.report import check_elements
+from jaxmb.states.consistency import consistent, is_consistent
 
 POINTS = {"point_a": (0.3, -0.2, 0.5), "point_b": (-0.4, 0.1, 0.2)}
 PLACE = {"point": (0.2, 0.1, 0.4)}
@@ -236,6 +237,30 @@ def test_elements_that_differ_from_the_residual_are_refused():
 def test_a_newer_residual_counts_alone():
     system = system_with(Loose)
     assert not any(map(is_elementary, system.constraints)) and system.prepared().elements is None
+
+
+@pytest.mark.long
+def test_a_hinge_half_a_turn_away_is_not_consistent():
+    # With a joint without elements, whose rows stand before.
+    joints = [Loose("before", "ground", "a", **PLACE, **AXIS), spatial.Revolute("hinge", "a", "b", **PLACE, **AXIS)]
+    system = mb.Scene(bodies(), joints=joints).compile()
+    state = mb.State(system.guess.q, jnp.zeros(system.nu))
+    assert consistent(system, 0.0, state) is state
+    # About an axis across the hinge, through its point.
+    turn, point = mb.rotations.from_axis_angle(np.array([0.0, 1.0, 0.0]), np.pi), np.array(PLACE["point"])
+    r, p = state.q[7:10], state.q[10:14]
+    turned = jnp.concatenate([point + mb.rotations.rotate(turn, r - point), mb.rotations.multiply(turn, p)])
+    state = mb.State(state.q.at[7:14].set(turned), state.u)
+    assert largest(system.prepared().position_residual(jnp.zeros(()), state.q)) < 1e-12
+    with pytest.raises(ValueError, match=r"The state violates the constraints hinge \(2\)"):
+        consistent(system, 0.0, state)
+
+
+def test_a_weld_half_a_turn_away_is_not_consistent():
+    weld = planar.Fixed("weld", "ground", "bar", point=(0.0, 0.0))
+    system = mb.Scene([planar.Body("bar", mass=1.0, inertia=1.0)], joints=[weld]).compile()
+    for angle, holds in ((0.0, True), (np.pi, False)):
+        assert bool(is_consistent(system, 0.0, mb.State(jnp.array([0.0, 0.0, angle]), jnp.zeros(3)))) == holds
 
 
 @pytest.mark.long

@@ -67,15 +67,21 @@ class AbstractDisc(AbstractSpatialPart):
     point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
 
 
+def _uphill(space, part, pose):
+    """The part of the plane's normal that is perpendicular to the axle, `m = (n·n) e − (n·e) n`, n·n and |m|."""
+    n = space.direction(pose, part.axis)
+    square = dot(n, n)
+    m = square * part.normal - dot(n, part.normal) * n
+    return m, square, norm(m)
+
+
 def _lowest_rim_point(space, part, pose):
-    """From the centre of a disc to the lowest point of its rim over the plane [m], `ρ = −r m/|m|`, `m = n × (e × n)`.
+    """From the centre of a disc to the lowest point of its rim over the plane [m], `ρ = −r m/|m|`.
 
     The direction does not depend on the lengths of e and n. For a disc that lies flat, which has no lowest point, ρ =
     0.
     """
-    n = space.direction(pose, part.axis)
-    m = cross(n, cross(part.normal, n))
-    length = norm(m)
+    m, _, length = _uphill(space, part, pose)
     return -part.radius * m / jnp.where(length > 0, length, 1.0)
 
 
@@ -122,8 +128,9 @@ class DiscContact(AbstractDisc, AbstractConstraint):
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):
-        lowest = space.point(poses[0], self.centre) + _lowest_rim_point(space, self, poses[0])
-        return dot(self.normal, lowest - self.point)[None]
+        _, square, length = _uphill(space, self, poses[0])
+        # The lowest point is ρ from the centre, with `e·ρ = −r |m| / n·n`.
+        return (dot(self.normal, _from_plane(space, self, poses[0])) - self.radius * length / square)[None]
 
     def shapes(self, space, size):
         disc = ((0, shape) for shape in wheel(self.radius, size, self.centre, self.axis))
