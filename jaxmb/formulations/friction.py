@@ -27,6 +27,8 @@ from ..linalg.elimination import gauss_jordan
 from ..linalg.newton import newton
 
 _CORRECTIONS = 16
+# The correction that is left out is at most this many rounding errors.
+_ROUNDING = 64
 
 
 def find_multipliers(
@@ -45,21 +47,22 @@ def find_multipliers(
     one = jnp.eye(start.size, dtype=start.dtype)
 
     def correct(carry):
-        x, _ = carry
+        x, _, before = carry
         force, push = jax.linearize(law, x)
         slope = influence @ jax.vmap(push, out_axes=1)(one)
         step = solve_coupled(one - slope, start + influence @ force - x)
         # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
         size = jnp.abs(start) + jnp.abs(x) + jnp.abs(influence) @ jnp.abs(force)
-        return (x + step, slope), jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
+        size = jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
+        # Corrections shrink quadratically, so the size of the next one is known.
+        shrinks = jnp.where(before > 0, size / before, 1.0)
+        return (x + step, slope, size), size * shrinks**2
 
-    # Corrections shrink quadratically in the end: the next one is below rounding errors.
-    tol = jnp.finfo(start.dtype).eps ** 0.625
-    far = lambda _, size: ~(size <= tol)
-    first = start, jnp.zeros_like(one)
-    (x, slope), size = newton(correct, far, first, most=_CORRECTIONS, dtype=start.dtype)
+    far = lambda _, ahead: ~(ahead <= _ROUNDING * jnp.finfo(start.dtype).eps)
+    first = start, jnp.zeros_like(one), jnp.zeros((), start.dtype)
+    (x, slope, _), ahead = newton(correct, far, first, most=_CORRECTIONS, dtype=start.dtype)
     coupling = jnp.where(np.diag(pushes), slope, jnp.abs(slope))
-    failed = far(x, size) | ~contracts(coupling)
+    failed = far(x, ahead) | ~contracts(coupling)
     return jnp.where(failed, start, x), coupling, failed
 
 

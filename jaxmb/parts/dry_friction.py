@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.complementarity import slip_direction
 from ..linalg.rotations import norm
+from ..linalg.sums import unchecked_take
 from . import fields
 from .base import (
     AbstractLink,
@@ -133,8 +134,8 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
         return pull(-force * slip_direction(self._modes(poses), slip))[0]
 
     def _slip(self, space, poses, velocities):
-        at = jnp.array(self.places[0])
-        return self.slip(space, poses[at], velocities[at])
+        at = np.array(self.places[0])
+        return self.slip(space, unchecked_take(poses, at), unchecked_take(velocities, at))
 
     def _modes(self, poses):
         return lax.stop_gradient(poses[-self.rows :, 0])
