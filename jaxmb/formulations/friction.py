@@ -29,6 +29,8 @@ from ..linalg.newton import newton
 _CORRECTIONS = 16
 # The correction that is left out is at most this many rounding errors.
 _ROUNDING = 64
+# So many rows are eliminated without a loop.
+_FEW = 2
 
 
 def find_multipliers(
@@ -78,7 +80,13 @@ def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Ar
     """Solve with `1 − P ∂C/∂x`. Where the coupling contracts, the diagonal dominates in some units, and its pivots need
     no search.
     """
-    return gauss_jordan(matrix, b.size) @ b
+    if b.size > _FEW:
+        return gauss_jordan(matrix, b.size) @ b
+    both, rows = jnp.concatenate([matrix, b[:, None]], axis=1), np.arange(b.size)
+    for k in rows:
+        row = both[k] / both[k, k]
+        both = jnp.where((rows == k)[:, None], row, both - both[:, k, None] * row)
+    return both[:, -1]
 
 
 def coupled_most(coupling: Float[np.ndarray, "k k"]) -> Bool[np.ndarray, "k"]:

@@ -130,8 +130,9 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
         """The wrench of slip on each of the joint's bodies; `reactions`: those that the joint exerts besides."""
         del t
         slip, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
-        force = self.coefficient * self.normal_force(space, poses, reactions)
-        return pull(-force * slip_direction(self._modes(poses), slip))[0]
+        # Its direction does not depend on reactions, which are solved for by iteration.
+        (against,) = pull(-slip_direction(self._modes(poses), slip))
+        return self.coefficient * self.normal_force(space, poses, reactions) * against
 
     def _slip(self, space, poses, velocities):
         at = np.array(self.places[0])
