@@ -12,6 +12,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
@@ -97,9 +98,11 @@ def cond_of_jumps(guards: AbstractGuards | None) -> Callable:
     return cond_of_any_lane if guards is None else cond_of_lanes
 
 
-# What the search in a step looks for: a zero at its end or in its middle, forces at its start, where one of them is
-# least, where the rate of a guard is zero, a point before a zero at which guards are positive, the zero; nothing more.
-_LOOK, _HALF, _START, _LEAST, _DIP, _RISE, _ZERO, _DONE = range(8)
+# What the search in a step looks for: a zero at its end or in its middle, where a force is least, where the rate of a
+# guard is zero, a point before a zero at which guards are positive, the zero; nothing more.
+_LOOK, _LEAST, _DIP, _RISE, _ZERO, _DONE = range(6)
+# Where guards are evaluated first, all at once: an evaluation of one point takes nearly as long.
+_POINTS = np.array([1.0, 0.5, 0.0])
 
 
 class Bracket(NamedTuple):
@@ -159,20 +162,23 @@ def crossing(
     begins = guards.begins(t0 * sign, y0)
     known = _Known(start, guards.forces(y0), begins, (t1 - t0).astype(start.dtype), guards.touch, guards.near)
 
+    def guarded(s):
+        t = t0 + s * (t1 - t0)
+        y = jax.tree.map(lambda end, inside: jnp.where(s == 1, end, inside), y1, at(t))
+        return guards.values(t * sign, y), guards.rates(t * sign, y) * sign.astype(start.dtype)
+
     def advance(search):
         # One evaluation for all that is looked for, so that the guards are compiled once.
-        s, t = search.s, t0 + search.s * (t1 - t0)
-        y = jax.tree.map(lambda end, inside: jnp.where(s == 1, end, inside), y1, at(t))
-        values, rates = guards.values(t * sign, y), guards.rates(t * sign, y) * sign.astype(start.dtype)
-        out = lax.switch(
+        points = jnp.where(search.phase == _LOOK, _POINTS.astype(t0.dtype), search.s)
+        values, rates = jax.vmap(guarded)(points)
+        return lax.switch(
             search.phase,
-            [_looked, _halved, _started, _least_found, _dipped, _risen, _zero_found],
+            [_looked, _least_found, _dipped, _risen, _zero_found],
             search._replace(count=search.count + 1),
             values,
             rates,
             known,
         )
-        return out
 
     none, one = jnp.zeros_like(start), jnp.ones((), t0.dtype)
     zero, no = jnp.zeros((), start.dtype), jnp.array(False)
@@ -204,17 +210,12 @@ class _Known(NamedTuple):
 
 
 def _looked(search: _Search, values, rates, known):
-    """At the end of a step."""
-    del known
-    return search._replace(
-        phase=jnp.array(_HALF), s=search.s / 2, end=values, rates=rates, count=jnp.zeros_like(search.count)
-    )
-
-
-def _halved(search: _Search, values, rates, known):
-    """At the middle: guards that are negative there, those that are least in one of the halves, and those whose rate is
-    another than that of a cubic polynomial with what is known of them at both ends and their value here.
+    """At the end, the middle and the start of a step: guards that are negative in the middle, those that are least in
+    one of the halves, and those whose rate there is another than that of a cubic polynomial with what is known of them
+    at both ends and their value in the middle; forces that vary.
     """
+    (last, values, first), (ends, rates, _) = values, rates
+    search = search._replace(s=0.5 * jnp.ones_like(search.s), end=last, rates=ends, count=jnp.zeros_like(search.count))
     dips, risen = _negative_within(search, values, known)
     watched = jnp.isfinite(known.start) & jnp.isfinite(search.rates)
     at_start, at_end = known.length * known.start, known.length * search.rates
@@ -228,15 +229,14 @@ def _halved(search: _Search, values, rates, known):
     turns = jnp.where(rates > 0, known.start < 0, search.rates > 0)
     waiting = turns & watched & jnp.isfinite(rates) & (search.end >= -known.touch)
     search = search._replace(coarse=coarse, middle=values, slopes=rates, waiting=waiting)
-    starts = search._replace(phase=jnp.array(_START), s=jnp.zeros_like(search.s))
-    other = _chosen(jnp.any(known.forces), starts, _next_dip(search, known))
-    return _chosen(dips, risen, other)._replace(count=jnp.zeros_like(search.count))
+    return _chosen(dips, risen, _next_force(search, first, known))
 
 
-def _started(search: _Search, values, rates, known):
-    """At the start: forces that vary by more than a parabola shows, and those that it shows to be next to zero."""
-    del rates
-    first, middle, last = values, search.middle, search.end
+def _next_force(search: _Search, first, known):
+    """Forces that vary by more than a parabola shows, and those that it shows to be next to zero, from the `first`
+    ones, those in the middle and those at the end.
+    """
+    middle, last = search.middle, search.end
     bent, sloped = 2 * (first + last - 2 * middle), 4 * middle - 3 * first - last
     least_at = jnp.where(bent > 0, -sloped / jnp.where(bent > 0, 2 * bent, 1.0), 0.0)
     inside = known.forces & (least_at > 0) & (least_at < 1)
@@ -251,14 +251,13 @@ def _started(search: _Search, values, rates, known):
     looks = search._replace(
         phase=jnp.array(_LEAST), s=least_at[own].astype(search.s.dtype), looked_at=jnp.arange(least.size) == own
     )
-    found = _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
-    return found._replace(count=jnp.zeros_like(search.count))
+    return _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
 
 
 def _least_found(search: _Search, values, rates, known):
     """Where a force is about the least of the step."""
     del rates
-    dips, risen = _negative_within(search, values, known)
+    dips, risen = _negative_within(search, values[0], known)
     return _chosen(dips, risen, _next_dip(search, known))._replace(count=jnp.zeros_like(search.count))
 
 
@@ -306,7 +305,7 @@ def _next_dip(search: _Search, known):
 
 def _dipped(search: _Search, values, rates, known):
     """Towards the zero of a guard's rate, where it is least."""
-    own = jnp.argmax(search.looked_at)
+    (values, _, _), (rates, _, _), own = values, rates, jnp.argmax(search.looked_at)
     again = _narrowed(search, rates[own])
     ends = _is_short(again)
     dips = ends & (values[own] < -known.touch)
@@ -321,6 +320,7 @@ def _dipped(search: _Search, values, rates, known):
 def _risen(search: _Search, values, rates, known):
     """Back from a point where guards are negative to one where they are positive; near the start there may be none."""
     del rates
+    values = values[0]
     least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
     positive, ends = least > 0, search.count >= _HALVINGS
     before = search.bracket
@@ -344,7 +344,7 @@ def _risen(search: _Search, values, rates, known):
 def _zero_found(search: _Search, values, rates, known):
     """Towards the first zero of guards, between a point where they are positive and one where one is negative."""
     del rates, known
-    again = _narrowed(search, jnp.min(jnp.where(search.looked_at, values, jnp.inf)))
+    again = _narrowed(search, jnp.min(jnp.where(search.looked_at, values[0], jnp.inf)))
     return again._replace(phase=jnp.where(_is_short(again), _DONE, _ZERO))
 
 
