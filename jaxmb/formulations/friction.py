@@ -46,7 +46,7 @@ def find_multipliers(
     **Returns:** x; the coupling `|influence ∂law/∂x|` there, with the sign of what such a component does to itself; and
     whether the equation failed to have one solution and no other, in which case x is `start`.
     """
-    one = jnp.eye(start.size, dtype=start.dtype)
+    one, sizes = jnp.eye(start.size, dtype=start.dtype), (jnp.abs(start), jnp.abs(influence))
 
     def correct(carry):
         x, _, before = carry
@@ -54,7 +54,7 @@ def find_multipliers(
         slope = influence @ jax.vmap(push, out_axes=1)(one)
         step = solve_coupled(one - slope, start + influence @ force - x)
         # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
-        size = jnp.abs(start) + jnp.abs(x) + jnp.abs(influence) @ jnp.abs(force)
+        size = sizes[0] + jnp.abs(x) + sizes[1] @ jnp.abs(force)
         size = jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
         # Corrections shrink quadratically, so the size of the next one is known.
         shrinks = jnp.where(before > 0, size / before, 1.0)

@@ -21,7 +21,7 @@ from .._compat import cond_of_any_lane, cond_of_lanes, loop_of_lanes
 from .controller import AbstractControllerAround, AbstractControllerState, intended_step, states_inside
 from .evaluation import ravel
 from .manifold_term import AbstractGuards
-from .packing import Layout
+from .packing import Layout, switch
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -462,7 +462,7 @@ class EventController(AbstractControllerAround):
         )
         # A branch, so that the compiler does not repeat the verdict wherever it matters.
         verdict = _verdict(keep, (t0, t1), found, before)
-        plan = lax.switch(verdict, [_refused, _crossed, _too_coarse, _passed, _ended], step, plan)
+        plan = switch(verdict, [_refused, _crossed, _too_coarse, _passed, _ended], step, plan)
         # A place at which nothing changed is that of the next event.
         idle = plan.accepted & before.ended & (found.idle > 0)
         count = before.count - idle.astype(before.count.dtype)
