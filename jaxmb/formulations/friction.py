@@ -51,7 +51,8 @@ def find_multipliers(
     def correct(carry):
         x, _, before = carry
         force, push = jax.linearize(law, x)
-        slope = influence @ jax.vmap(push, out_axes=1)(one)
+        # As sums: XLA hands products of matrices to a library, which takes longer than all else where they are small.
+        slope = jnp.sum(influence[:, None] * jax.vmap(push)(one)[None], axis=2)
         step = solve_coupled(one - slope, start + influence @ force - x)
         # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
         size = sizes[0] + jnp.abs(x) + sizes[1] @ jnp.abs(force)

@@ -372,7 +372,7 @@ class ChartConstraints(AbstractConstraints):
         frictions = jax.jacfwd(law)(unchecked_take(multipliers, own)).T
         responses = jax.vmap(lambda force: cancel(-force, jnp.zeros_like(rows)))(frictions)
         balance = unchecked_take(self._of_accelerations.right_inverse.T, own)
-        reaction = lambda change, forces: balance @ (inertia.product(change) + forces)
+        reaction = lambda change, forces: jnp.sum(balance * (inertia.product(change) + forces)[None], axis=1)
         coupling = jax.vmap(reaction, out_axes=1)(responses, -frictions)
         own_change = solve_coupled(jnp.eye(own.size, dtype=rows.dtype) - coupling, reaction(change, forces))
         return change + own_change @ responses, own_change
