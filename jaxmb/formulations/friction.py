@@ -51,7 +51,7 @@ def find_multipliers(
     def correct(carry):
         x, _, before = carry
         force, push = jax.linearize(law, x)
-        # As sums: XLA hands products of matrices to a library, which takes longer than all else where they are small.
+        # As sums: the library for products of matrices takes longer than all else where they are small.
         slope = jnp.sum(influence[:, None] * jax.vmap(push)(one)[None], axis=2)
         step = solve_coupled(one - slope, start + influence @ force - x)
         # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
