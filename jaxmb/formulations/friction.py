@@ -86,7 +86,7 @@ def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Ar
     both, rows = jnp.concatenate([matrix, b[:, None]], axis=1), np.arange(b.size)
     for k in rows:
         row = both[k] / both[k, k]
-        both = jnp.where((rows == k)[:, None], row, both - both[:, k, None] * row)
+        both = jnp.where((rows == k)[:, None], row[None], both - both[:, k, None] * row[None])
     return both[:, -1]
 
 

@@ -83,4 +83,4 @@ def _summed(matrix, x):
     """A product as sums, for several right-hand sides: XLA hands products of matrices to a library, which takes longer
     than all else where they are small.
     """
-    return jnp.sum(matrix * x, axis=-1)
+    return jnp.sum(matrix * x[None], axis=1)

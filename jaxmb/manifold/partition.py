@@ -326,7 +326,8 @@ class ChartConstraints(AbstractConstraints):
         """`C` at (t, q, u), from the multipliers that it depends on."""
         if system.ideal:
             return jnp.zeros(system.nu, at[2].dtype)
-        return friction_force(system, *at, jnp.zeros(0, at[2].dtype) if own is None else own)
+        (t, q, u), own = at, jnp.zeros(0, at[2].dtype) if own is None else own
+        return friction_force(system, t, q, u, own)
 
     def _unbalanced(self, system, t, at):
         """`M u̇ − F`, what the constraints have to balance."""

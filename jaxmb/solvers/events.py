@@ -5,7 +5,6 @@ finds one negative at its end, or in between, is tried again up to the first zer
 that ends at a zero is followed by a restart, as after a jump; what changes there is left to the term, by `after_jump`.
 """
 
-import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -176,17 +175,31 @@ def crossing(
         search = layout.unpacked(packed)
         points = jnp.where(search.phase == _LOOK, _POINTS.astype(t0.dtype), search.s)
         values, rates, begins = jax.vmap(guarded)(points)
-        look = lambda search, *seen: _looked(search, *seen, begins, known)
-        after = [look, *(functools.partial(own, known=known) for own in (_least_found, _dipped, _risen, _zero_found))]
-        after = [lambda *seen, own=own: layout.packed(own(*seen)) for own in after]
-        return lax.switch(search.phase, after, search._replace(count=search.count + 1), values, rates)
+        if begins is not None:
+            begins = jnp.where(search.phase == _LOOK, begins[2], search.begins)
+        search = search._replace(begins=begins, count=search.count + 1)
+        after = [_looked, _least_found, _dipped, _risen, _zero_found]
+        after = [lambda *given, own=own: layout.packed(own(*given)) for own in after]
+        return lax.switch(search.phase, after, search, values, rates, known)
 
     zero, no = jnp.zeros((), none.dtype), jnp.array(False)
     bracket = Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0))
     begins = None if guards.begins(t0 * sign, y0) is None else none > 0
-    guards_seen = (none,) * 5
     first = _Search(
-        jnp.array(_LOOK), one, bracket, none > 0, none > 0, *guards_seen, begins, no, zero, jnp.array(0)
+        phase=jnp.array(_LOOK),
+        s=one,
+        bracket=bracket,
+        looked_at=none > 0,
+        waiting=none > 0,
+        end=none,
+        rates=none,
+        middle=none,
+        slopes=none,
+        start=none,
+        begins=begins,
+        dips=no,
+        coarse=zero,
+        count=jnp.array(0),
     )
     # In few vectors, since the loop copies each of its numbers.
     layout = Layout(first)
@@ -214,15 +227,14 @@ class _Known(NamedTuple):
     near: Any
 
 
-def _looked(search: _Search, values, rates, begins, known):
+def _looked(search: _Search, values, rates, known):
     """At the end, the middle and the start of a step: guards that are negative in the middle, those that are least in
     one of the halves, and those whose rate there is another than that of a cubic polynomial with what is known of them
     at both ends and their value in the middle; forces that vary.
     """
     (last, values, first), (ends, rates, start) = values, rates
-    begins = None if begins is None else begins[2]
     search = search._replace(s=0.5 * search.s, end=last, rates=ends, middle=values, slopes=rates, start=start)
-    search = search._replace(begins=begins, count=jnp.zeros_like(search.count))
+    search = search._replace(count=jnp.zeros_like(search.count))
     dips, risen = _negative_within(search, values, known)
     watched = jnp.isfinite(start) & jnp.isfinite(ends)
     at_start, at_end = known.length * start, known.length * ends
