@@ -83,11 +83,12 @@ def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Ar
     """
     if b.size > _FEW:
         return gauss_jordan(matrix, b.size) @ b
-    both, rows = jnp.concatenate([matrix, b[:, None]], axis=1), np.arange(b.size)
+    # The inverse, so that the solution stays a linear function of b.
+    both, rows = jnp.concatenate([matrix, jnp.eye(b.size, dtype=b.dtype)], axis=1), np.arange(b.size)
     for k in rows:
         row = both[k] / both[k, k]
         both = jnp.where((rows == k)[:, None], row[None], both - both[:, k, None] * row[None])
-    return both[:, -1]
+    return both[:, b.size :] @ b
 
 
 def coupled_most(coupling: Float[np.ndarray, "k k"]) -> Bool[np.ndarray, "k"]:
