@@ -642,8 +642,8 @@ class RigidBodySystem(AbstractSystem):
         jacobian = self._assemble(blocks, groups, q.dtype, of_poses=True)
         rotating = _rotating(self.layout)
         index = self.layout.pose_index[rotating, 3:]
-        rows = jnp.zeros((len(rotating), self.nq), q.dtype).at[jnp.arange(len(rotating))[:, None], index].set(q[index])
-        return jnp.concatenate([jacobian, rows])
+        own = (index[:, :, None] == np.arange(self.nq)).any(1)
+        return jnp.concatenate([jacobian, jnp.where(own, q[None], 0.0)])
 
     @eqx.filter_jit
     def velocity_residual(self, t, q, u):

@@ -21,7 +21,9 @@ from ..linalg.elimination import full_pivot
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..linalg.newton import root
+from ..linalg.sums import unchecked_take
 from ..system import AbstractEquation
+from ..system.residuals import friction_force
 from .friction import find_multipliers
 
 if TYPE_CHECKING:
@@ -147,35 +149,36 @@ def solve_constrained(
     inertia, force = system.inertia(t, q, u), system.force(t, q, u)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
     gamma = gamma if gamma_shift is None else gamma - gamma_shift
-    if not system.ideal:
-        formulation = formulation.prepared(inertia, jacobian)
-    udot, multipliers = formulation.solve(inertia, force, jacobian, gamma)
     if system.ideal:
-        return Solution(udot, multipliers, None)
-    failed, rows = None, system.friction_rows
+        return Solution(*formulation.solve(inertia, force, jacobian, gamma), None)
+    rows, failed, own = system.friction_rows, None, jnp.zeros(0, u.dtype)
     if rows.size:
-        known = lax.stop_gradient((system, t, q, u, inertia, jacobian, multipliers, formulation))
+        formulation = formulation.prepared(inertia, jacobian)
+        known = lax.stop_gradient((system, t, q, u, inertia, force, jacobian, gamma, formulation))
         found, _, failed = _friction(*known)
 
         def residual(own):
-            law = system.nonideal_force(t, q, u, multipliers.at[rows].set(own))
-            return own - formulation.solve(inertia, force + law, jacobian, gamma)[1][rows]
+            law = friction_force(system, t, q, u, own)
+            return own - unchecked_take(formulation.solve(inertia, force + law, jacobian, gamma)[1], rows)
 
-        multipliers = multipliers.at[rows].set(root(residual, found, lambda _, found: found))
-    force = force + system.nonideal_force(t, q, u, multipliers)
+        own = root(residual, found, lambda _, found: found)
+    force = force + friction_force(system, t, q, u, own)
     return Solution(*formulation.solve(inertia, force, jacobian, gamma), failed)
 
 
-def _friction(system, t, q, u, inertia, jacobian, ideal, formulation):
+def _friction(system, t, q, u, inertia, force, jacobian, gamma, formulation):
     """Multipliers of the rows that forces depend on, their coupling, and whether they are not determined."""
-    rows, none = system.friction_rows, jnp.zeros_like(ideal)
+    rows = system.friction_rows
+    # The equations are symmetric: what a force does to a multiplier, its row does to the accelerations.
+    units = jnp.asarray(np.eye(gamma.size)[rows], gamma.dtype)
+    forces = jnp.concatenate([force[None], jnp.zeros((rows.size, force.size), force.dtype)])
+    solve = jax.vmap(lambda force, gamma: formulation.solve(inertia, force, jacobian, gamma))
+    udot, multipliers = solve(forces, jnp.concatenate([gamma[None], units]))
+    start, influence = unchecked_take(multipliers[0], rows), -udot[1:]
     # Newton's method evaluates the law again and again, but only for other multipliers.
-    law = with_rest_computed(lambda own: system.nonideal_force(t, q, u, none.at[rows].set(own)), ideal[rows])
-    respond = lambda force: formulation.solve(inertia, force, jacobian, none)[1][rows]
-    _, pull = jax.vjp(respond, jnp.zeros_like(u))
-    (influence,) = jax.vmap(pull)(jnp.eye(rows.size, dtype=u.dtype))
+    law = with_rest_computed(lambda own: friction_force(system, t, q, u, own), start)
     contacts = () if system.contacts is None else system.contacts.rows
-    return find_multipliers(law, influence, ideal[rows], np.isin(rows, contacts))
+    return find_multipliers(law, influence, start, np.isin(rows, contacts))
 
 
 def friction_coupling(
@@ -186,6 +189,6 @@ def friction_coupling(
     """
     system, t, q, u = lax.stop_gradient((system, t, q, u))
     jacobian, inertia = _jacobian(system, formulation, t, q, u), system.inertia(t, q, u)
+    formulation = formulation.prepared(inertia, jacobian)
     gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-    _, ideal = formulation.solve(inertia, system.force(t, q, u), jacobian, gamma)
-    return _friction(system, t, q, u, inertia, jacobian, ideal, formulation)[1]
+    return _friction(system, t, q, u, inertia, system.force(t, q, u), jacobian, gamma, formulation)[1]

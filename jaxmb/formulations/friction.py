@@ -27,6 +27,10 @@ from ..linalg.elimination import gauss_jordan
 from ..linalg.newton import newton
 
 _CORRECTIONS = 16
+# The correction that is left out is at most this many rounding errors.
+_ROUNDING = 64
+# So many rows are eliminated without a loop.
+_FEW = 2
 
 
 def find_multipliers(
@@ -42,24 +46,26 @@ def find_multipliers(
     **Returns:** x; the coupling `|influence ∂law/∂x|` there, with the sign of what such a component does to itself; and
     whether the equation failed to have one solution and no other, in which case x is `start`.
     """
-    one = jnp.eye(start.size, dtype=start.dtype)
+    one, sizes = jnp.eye(start.size, dtype=start.dtype), (jnp.abs(start), jnp.abs(influence))
 
     def correct(carry):
-        x, _ = carry
+        x, _, before = carry
         force, push = jax.linearize(law, x)
-        slope = influence @ jax.vmap(push, out_axes=1)(one)
+        # As sums: the library for products of matrices takes longer than all else where they are small.
+        slope = jnp.sum(influence[:, None] * jax.vmap(push)(one)[None], axis=2)
         step = solve_coupled(one - slope, start + influence @ force - x)
         # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
-        size = jnp.abs(start) + jnp.abs(x) + jnp.abs(influence) @ jnp.abs(force)
-        return (x + step, slope), jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
+        size = sizes[0] + jnp.abs(x) + sizes[1] @ jnp.abs(force)
+        size = jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
+        # Corrections shrink quadratically, so the size of the next one is known.
+        shrinks = jnp.where(before > 0, size / before, 1.0)
+        return (x + step, slope, size), size * shrinks**2
 
-    # Corrections shrink quadratically in the end: the next one is below rounding errors.
-    tol = jnp.finfo(start.dtype).eps ** 0.625
-    far = lambda _, size: ~(size <= tol)
-    first = start, jnp.zeros_like(one)
-    (x, slope), size = newton(correct, far, first, most=_CORRECTIONS, dtype=start.dtype)
+    far = lambda _, ahead: ~(ahead <= _ROUNDING * jnp.finfo(start.dtype).eps)
+    first = start, jnp.zeros_like(one), jnp.zeros((), start.dtype)
+    (x, slope, _), ahead = newton(correct, far, first, most=_CORRECTIONS, dtype=start.dtype)
     coupling = jnp.where(np.diag(pushes), slope, jnp.abs(slope))
-    failed = far(x, size) | ~contracts(coupling)
+    failed = far(x, ahead) | ~contracts(coupling)
     return jnp.where(failed, start, x), coupling, failed
 
 
@@ -75,7 +81,14 @@ def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Ar
     """Solve with `1 − P ∂C/∂x`. Where the coupling contracts, the diagonal dominates in some units, and its pivots need
     no search.
     """
-    return gauss_jordan(matrix, b.size) @ b
+    if b.size > _FEW:
+        return gauss_jordan(matrix, b.size) @ b
+    # The inverse, so that the solution stays a linear function of b.
+    both, rows = jnp.concatenate([matrix, jnp.eye(b.size, dtype=b.dtype)], axis=1), np.arange(b.size)
+    for k in rows:
+        row = both[k] / both[k, k]
+        both = jnp.where((rows == k)[:, None], row[None], both - both[:, k, None] * row[None])
+    return both[:, b.size :] @ b
 
 
 def coupled_most(coupling: Float[np.ndarray, "k k"]) -> Bool[np.ndarray, "k"]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import ClassVar
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..linalg.elimination import Factor, gauss_jordan, positive_solver
@@ -55,7 +56,8 @@ class ReducedPartitioned(AbstractFormulation):
     inverts_mass: ClassVar[bool] = False
 
     def solve(self, inertia, force, jacobian, gamma):
-        return _solve(inertia, force, jacobian.dense().pivoted, gamma, lambda load: self.inverse @ load)
+        solve = lambda load: _summed(self.inverse, load)
+        return _solve(inertia, force, jacobian.dense().pivoted, gamma, solve, _summed)
 
 
 def reduced_accelerations(
@@ -64,12 +66,21 @@ def reduced_accelerations(
     factor: Factor,
     gamma: Float[Array, "m"],
     solve: Callable[[Float[Array, "f"]], Float[Array, "f"]],
+    product: Callable[[Array, Array], Array] = jnp.matmul,
 ) -> Float[Array, "nu"]:
     """The accelerations by the `factor` of A, with the solution of the reduced equations, `(EᵀME)⁻¹`."""
-    particular = factor.right_inverse @ gamma
-    return particular + factor.null_space @ solve(factor.null_space.T @ (force - inertia.product(particular)))
+    particular = product(factor.right_inverse, gamma)
+    load = product(factor.null_space.T, force - inertia.product(particular))
+    return particular + product(factor.null_space, solve(load))
 
 
-def _solve(inertia, force, factor, gamma, solve):
-    udot = reduced_accelerations(inertia, force, factor, gamma, solve)
-    return udot, factor.right_inverse.T @ (inertia.product(udot) - force)
+def _solve(inertia, force, factor, gamma, solve, product=jnp.matmul):
+    udot = reduced_accelerations(inertia, force, factor, gamma, solve, product)
+    return udot, product(factor.right_inverse.T, inertia.product(udot) - force)
+
+
+def _summed(matrix, x):
+    """A product as sums, for several right-hand sides: XLA hands products of matrices to a library, which takes longer
+    than all else where they are small.
+    """
+    return jnp.sum(matrix * x[None], axis=1)

@@ -81,7 +81,7 @@ def _lemke(W, b):
     left = jnp.where(jnp.min(right) >= 0, 2 * k, -1)
     first = table, jnp.arange(k), left, jnp.array(True), jnp.array(0)
     _, basis, left, solvable, _ = lax.while_loop(proceed, advance, first)
-    found = jnp.zeros(2 * k + 1, bool).at[basis].set(True)[k : 2 * k]
+    found = jnp.any(basis[None, :] == np.arange(k, 2 * k)[:, None], axis=1)
     return found, solvable & (left == 2 * k)
 
 

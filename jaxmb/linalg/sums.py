@@ -64,6 +64,11 @@ def placed_sums(place: Int[np.ndarray, "e"], places: int) -> PlacedSums:
     return PlacedSums(digest(passes), tuple(passes))
 
 
+def with_entries(values: Float[Array, "n"], places: Int[np.ndarray, "e"], entries: Float[Array, "e"]) -> Array:
+    """A copy of values with other entries at static places, all different."""
+    return jnp.where(np.isin(np.arange(values.size), places), placed_sums(places, values.size)(entries), values)
+
+
 def unchecked_take(values: Float[Array, "n *k"], index: Int[np.ndarray, "..."]) -> Float[Array, "..."]:
     """`values[index]` as a gather without checks: the indices are in bounds by construction. NumPy in, NumPy out."""
     if isinstance(values, np.ndarray):

@@ -7,6 +7,7 @@ import numpy as np
 from ..formulations import Multipliers, accelerations
 from ..linalg.elimination import solve
 from ..linalg.rotations import norm
+from ..linalg.sums import unchecked_take
 from ..system.gaps import (
     STICK,
     bound,
@@ -37,7 +38,7 @@ def stick_reserve(system, t, q, u, multipliers):
     """By how much the forces [N] of friction that sticks are within their limits."""
     frictions = frictions_of(system)
     normal = norm(system.friction_reactions(t, q, u, multipliers))
-    forces = multipliers[np.array(frictions.rows)]
+    forces = unchecked_take(multipliers, np.array(frictions.rows))
     if len(frictions.pairs) > 1:
         # Those that are not determined are as small as they can be.
         n = counts(system)[0]

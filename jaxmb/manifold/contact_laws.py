@@ -161,8 +161,8 @@ class Laws(NamedTuple):
             normal = norm(reaction)
             along = reaction / jnp.where(normal > 0, normal, 1.0)[:, None]
             slope = jnp.einsum("kmd,md->mk", reactions[1:], along)
-            own = matrix.at[self.n :].add(factor[:, None] * slope)
-            return solve(own, right.at[self.n :].add(factor * (slope @ forces - normal)))
+            own = matrix + jnp.pad(factor[:, None] * slope, ((self.n, 0), (0, 0)))
+            return solve(own, right + jnp.pad(factor * (slope @ forces - normal), (self.n, 0)))
 
         linear = solve(matrix, right)
         return jnp.where(act, lax.fori_loop(0, _CORRECTIONS, correct, linear), 0.0)

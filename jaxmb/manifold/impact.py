@@ -29,6 +29,7 @@ from ..formulations import AbstractFormulation
 from ..linalg.complementarity import of_pairs
 from ..linalg.elimination import solve
 from ..linalg.rotations import norm
+from ..linalg.sums import with_entries
 from ..system import AbstractEquation
 from ..system.gaps import (
     CLOSED,
@@ -141,9 +142,9 @@ def _impact_jvp(primals, tangents):
         if own.size:
             # Slip in two directions ends where it is zero along its modes.
             along = event.modes[0][n:][own]
-            slip = slip.at[own[:, 0]].set(jnp.sum(along * slip[own], axis=1), unique_indices=True)
-            slowing = slowing.at[own[:, 0]].set(jnp.sum(along * slowing[own], axis=1))
-        zero, rate = jnp.concatenate([zero, slip]), rate.at[n:].set(slowing)
+            slip = with_entries(slip, own[:, 0], jnp.sum(along * slip[own], axis=1))
+            slowing = with_entries(slowing, own[:, 0], jnp.sum(along * slowing[own], axis=1))
+        zero, rate = jnp.concatenate([zero, slip]), jnp.concatenate([rate[:n], slowing])
     dlate = jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
     if dated or (m and any(frictions_of(system).releases)):
         dlate = dlate + _release(system, touch, event, (t, y), (dsystem, dt, dy))
@@ -260,7 +261,7 @@ def _equations(of: _Phases, before, dbefore, phase: Phase, normal):
     event, (system, t, q), numbers = of.event, of.at, np.array(direction_rows(of.at[0]))
     n, m = counts(system)
     _, multipliers = of.projector.solve(phase.impulses @ of.rows, of.jacobian.product(phase.u - before))
-    multipliers = multipliers.at[numbers].set(phase.impulses)
+    multipliers = with_entries(multipliers, numbers, phase.impulses)
 
     def unmet(system, t, q, first, u):
         """What is left of the rates, and of the balance of momentum."""
@@ -321,7 +322,7 @@ def _release(system, touch, event, at, along):
         _, multipliers = contact_forces(system, t, y.q, y.u)
         own = multipliers[np.array(direction_rows(system))]
         if m:
-            own = own.at[n:].set(stick_reserve(system, t, y.q, y.u, multipliers))
+            own = jnp.concatenate([own[:n], stick_reserve(system, t, y.q, y.u, multipliers)])
         return own, largest_force(system, t, y, multipliers)
 
     left, largest = reserves(system, t, y)

@@ -33,9 +33,10 @@ from ..formulations.partitioned import reduced_accelerations
 from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot, positive_solver
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.newton import chord
+from ..linalg.sums import unchecked_take, with_entries
 from ..solvers import AbstractManifoldTerm, AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractEquation
-from ..system.residuals import drops_rows, row_sizes, violation_of_dropped_rows
+from ..system.residuals import drops_rows, friction_force, row_sizes, violation_of_dropped_rows
 from .compliant_gaps import compliant_gaps
 from .constraints import (
     AbstractConstraints,
@@ -201,7 +202,7 @@ def _general_acceleration(system, formulation, t, q, u, split):
     every = None if split.acceleration is None else eliminate(jacobian, split.acceleration, system.acceleration_rank)
     factor = solved if every is None else every
     out = solve_constrained(system, formulation, t, q, u, DenseJacobian(jacobian, factor, factor.rows))
-    own = None if out.failed is None else out.multipliers[system.friction_rows]
+    own = None if out.failed is None else unchecked_take(out.multipliers, system.friction_rows)
     return ConstrainedAcceleration(u, out.udot, solved, every, own, out.failed)
 
 
@@ -308,7 +309,7 @@ class ChartConstraints(AbstractConstraints):
         unbalanced = unbalanced - self._friction(system, at, near.multipliers)
         multipliers = self._of_accelerations.right_inverse.T @ unbalanced
         if near.multipliers is not None:
-            multipliers = multipliers.at[own].set(near.multipliers)
+            multipliers = with_entries(multipliers, own, near.multipliers)
         forces = unbalanced - system.constraint_force(*at, multipliers)
         change, reactions = self.cancel_residuals(system, at, multipliers, forces, rows)
         found = None if near.multipliers is None or reactions is None else near.multipliers + reactions
@@ -325,8 +326,8 @@ class ChartConstraints(AbstractConstraints):
         """`C` at (t, q, u), from the multipliers that it depends on."""
         if system.ideal:
             return jnp.zeros(system.nu, at[2].dtype)
-        none = jnp.zeros(system.acceleration_rows, at[2].dtype)
-        return system.nonideal_force(*at, none if own is None else none.at[system.friction_rows].set(own))
+        (t, q, u), own = at, jnp.zeros(0, at[2].dtype) if own is None else own
+        return friction_force(system, t, q, u, own)
 
     def _unbalanced(self, system, t, at):
         """`M u̇ − F`, what the constraints have to balance."""
@@ -368,11 +369,11 @@ class ChartConstraints(AbstractConstraints):
         if own.size == 0:
             return change, None
         # Friction answers a change of the multipliers that it depends on, and so changes them again.
-        law = lambda x: system.nonideal_force(*at, multipliers.at[own].set(x))
-        frictions = jax.jacfwd(law)(multipliers[own]).T
+        law = lambda x: friction_force(system, *at, x)
+        frictions = jax.jacfwd(law)(unchecked_take(multipliers, own)).T
         responses = jax.vmap(lambda force: cancel(-force, jnp.zeros_like(rows)))(frictions)
-        balance = self._of_accelerations.right_inverse[:, own].T
-        reaction = lambda change, forces: balance @ (inertia.product(change) + forces)
+        balance = unchecked_take(self._of_accelerations.right_inverse.T, own)
+        reaction = lambda change, forces: jnp.sum(balance * (inertia.product(change) + forces)[None], axis=1)
         coupling = jax.vmap(reaction, out_axes=1)(responses, -frictions)
         own_change = solve_coupled(jnp.eye(own.size, dtype=rows.dtype) - coupling, reaction(change, forces))
         return change + own_change @ responses, own_change

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.complementarity import slip_direction
 from ..linalg.rotations import norm
+from ..linalg.sums import unchecked_take
 from . import fields
 from .base import (
     AbstractLink,
@@ -129,12 +130,13 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
         """The wrench of slip on each of the joint's bodies; `reactions`: those that the joint exerts besides."""
         del t
         slip, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
-        force = self.coefficient * self.normal_force(space, poses, reactions)
-        return pull(-force * slip_direction(self._modes(poses), slip))[0]
+        # Its direction does not depend on reactions, which are solved for by iteration.
+        (against,) = pull(-slip_direction(self._modes(poses), slip))
+        return self.coefficient * self.normal_force(space, poses, reactions) * against
 
     def _slip(self, space, poses, velocities):
-        at = jnp.array(self.places[0])
-        return self.slip(space, poses[at], velocities[at])
+        at = np.array(self.places[0])
+        return self.slip(space, unchecked_take(poses, at), unchecked_take(velocities, at))
 
     def _modes(self, poses):
         return lax.stop_gradient(poses[-self.rows :, 0])

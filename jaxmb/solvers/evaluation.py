@@ -25,6 +25,7 @@ from .manifold_term import (
     ManifoldEvaluation,
     stop,
 )
+from .packing import Layout
 
 
 class Evaluation(NamedTuple):
@@ -99,15 +100,20 @@ def refused(term: Any, chart: Chart | None, before: Chart | None) -> Any:
 
 
 def found_at_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
-    """The numbers of a jump by which `after_jump` knows the state after it; None for a plain vector field."""
+    """The numbers of a jump by which `after_jump` knows the state after it, as few vectors; None without any."""
     manifold = _manifold(term)
-    return None if manifold is None else manifold.found_at_jump(t * direction_of(term), y, args)
+    found = None if manifold is None else manifold.found_at_jump(t * direction_of(term), y, args)
+    return None if found is None else Layout(found).packed(found)
 
 
 def after_jump(term: Any, t: Any, y: PyTree[Array], found: PyTree[Array], args: Args) -> PyTree[Array]:
     """The state just after a jump; `y` for a plain vector field."""
-    manifold = _manifold(term)
-    return y if manifold is None else manifold.after_jump(t * direction_of(term), y, found, args)
+    manifold, t = _manifold(term), t * direction_of(term)
+    if manifold is None:
+        return y
+    if found is not None:
+        found = Layout(eqx.filter_eval_shape(manifold.found_at_jump, t, y, args)).unpacked(found)
+    return manifold.after_jump(t, y, found, args)
 
 
 def chart_after_jump(term: Any, chart: Chart | None) -> Chart | None:

@@ -12,6 +12,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
@@ -19,6 +20,7 @@ from .._compat import cond_of_any_lane, cond_of_lanes, loop_of_lanes
 from .controller import AbstractControllerAround, AbstractControllerState, intended_step, states_inside
 from .evaluation import ravel
 from .manifold_term import AbstractGuards
+from .packing import Layout, switch
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -97,9 +99,11 @@ def cond_of_jumps(guards: AbstractGuards | None) -> Callable:
     return cond_of_any_lane if guards is None else cond_of_lanes
 
 
-# What the search in a step looks for: a zero at its end or in its middle, forces at its start, where one of them is
-# least, where the rate of a guard is zero, a point before a zero at which guards are positive, the zero; nothing more.
-_LOOK, _HALF, _START, _LEAST, _DIP, _RISE, _ZERO, _DONE = range(8)
+# What the search in a step looks for: a zero at its end or in its middle, where a force is least, where the rate of a
+# guard is zero, a point before a zero at which guards are positive, the zero; nothing more.
+_LOOK, _LEAST, _DIP, _RISE, _ZERO, _DONE = range(6)
+# Where guards are evaluated first, all at once: an evaluation of one point takes nearly as long.
+_POINTS = np.array([1.0, 0.5, 0.0])
 
 
 class Bracket(NamedTuple):
@@ -118,9 +122,9 @@ class _Search(NamedTuple):
     """The search for the first zero in a step, whose times are fractions of it.
 
     **Fields:** the `phase`; `s`: where guards are evaluated next; the `bracket` of what changes its sign; which guards
-    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step, and guards and
-    their `slopes` at its `middle`; whether one is negative within it, and how `coarse` it is; the number of evaluations
-    in this `phase`.
+    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step, guards and their
+    `slopes` at its `middle`, the rates at its `start`, and which guards begin there, see `AbstractGuards`; whether one
+    is negative within it, and how `coarse` it is; the number of evaluations in this `phase`.
     """
 
     phase: Any
@@ -132,6 +136,8 @@ class _Search(NamedTuple):
     rates: Any
     middle: Any
     slopes: Any
+    start: Any
+    begins: Any
     dips: Any
     coarse: Any
     count: Any
@@ -154,70 +160,84 @@ def crossing(
     `retry`: see `Crossing`.
     """
     (t0, t1), (before, y0, y1) = step, ends
-    sign = jnp.asarray(direction, t0.dtype)
-    start = guards.rates(t0 * sign, y0) * sign.astype(ravel(y0).dtype)
-    begins = guards.begins(t0 * sign, y0)
-    known = _Known(start, guards.forces(y0), begins, (t1 - t0).astype(start.dtype), guards.touch, guards.near)
+    sign, forces = jnp.asarray(direction, t0.dtype), guards.forces(y0)
+    none, one = jnp.zeros(forces.shape, ravel(y0).dtype), jnp.ones((), t0.dtype)
+    known = _Known(forces, (t1 - t0).astype(none.dtype), guards.touch, guards.near)
 
-    def advance(search):
+    def guarded(s):
+        t = t0 + s * (t1 - t0)
+        inside = lambda y0, y1, y: jnp.where(s == 0, y0, jnp.where(s == 1, y1, y))
+        t, y = t * sign, jax.tree.map(inside, y0, y1, at(t))
+        return guards.values(t, y), guards.rates(t, y) * sign.astype(none.dtype), guards.begins(t, y)
+
+    def advance(packed):
         # One evaluation for all that is looked for, so that the guards are compiled once.
-        s, t = search.s, t0 + search.s * (t1 - t0)
-        y = jax.tree.map(lambda end, inside: jnp.where(s == 1, end, inside), y1, at(t))
-        values, rates = guards.values(t * sign, y), guards.rates(t * sign, y) * sign.astype(start.dtype)
-        out = lax.switch(
-            search.phase,
-            [_looked, _halved, _started, _least_found, _dipped, _risen, _zero_found],
-            search._replace(count=search.count + 1),
-            values,
-            rates,
-            known,
-        )
-        return out
+        search = layout.unpacked(packed)
+        points = jnp.where(search.phase == _LOOK, _POINTS.astype(t0.dtype), search.s)
+        values, rates, begins = jax.vmap(guarded)(points)
+        if begins is not None:
+            begins = jnp.where(search.phase == _LOOK, begins[2], search.begins)
+        search = search._replace(begins=begins, count=search.count + 1)
+        after = [_looked, _least_found, _dipped, _risen, _zero_found]
+        after = [lambda *given, own=own: layout.packed(own(*given)) for own in after]
+        return lax.switch(search.phase, after, search, values, rates, known)
 
-    none, one = jnp.zeros_like(start), jnp.ones((), t0.dtype)
-    zero, no = jnp.zeros((), start.dtype), jnp.array(False)
+    zero, no = jnp.zeros((), none.dtype), jnp.array(False)
     bracket = Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0))
-    first = _Search(jnp.array(_LOOK), one, bracket, none > 0, none > 0, none, none, none, none, no, zero, jnp.array(0))
+    begins = None if guards.begins(t0 * sign, y0) is None else none > 0
+    first = _Search(
+        phase=jnp.array(_LOOK),
+        s=one,
+        bracket=bracket,
+        looked_at=none > 0,
+        waiting=none > 0,
+        end=none,
+        rates=none,
+        middle=none,
+        slopes=none,
+        start=none,
+        begins=begins,
+        dips=no,
+        coarse=zero,
+        count=jnp.array(0),
+    )
+    # In few vectors, since the loop copies each of its numbers.
+    layout = Layout(first)
     # Each lane evaluates its guards at a few points; few of them have a zero to find.
-    looks, goes = lambda search: search.phase <= _LEAST, lambda search: search.phase != _DONE
-    found = loop_of_lanes(looks, goes, advance, first)
+    phase = lambda packed: layout.unpacked(packed).phase
+    looks, goes = lambda packed: phase(packed) <= _LEAST, lambda packed: phase(packed) != _DONE
+    found = layout.unpacked(loop_of_lanes(looks, goes, advance, layout.packed(first)))
     falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
     lost = jnp.any(jnp.isinf(ravel(y0)))
     idle = made_jump & ~guards.changed(before, y0)
-    falling, lost, within, idle = (x.astype(start.dtype) for x in (falling, lost, found.dips, idle))
-    touch, near, retry = (jnp.asarray(x, start.dtype) for x in (guards.touch, guards.near, retry))
+    falling, lost, within, idle = (x.astype(none.dtype) for x in (falling, lost, found.dips, idle))
+    touch, near, retry = (jnp.asarray(x, none.dtype) for x in (guards.touch, guards.near, retry))
     target = t0 + found.bracket.b * (t1 - t0)
     return Crossing(error, target, within, jnp.min(found.end), falling, lost, found.coarse, touch, near, retry, idle)
 
 
 class _Known(NamedTuple):
-    """What a search knows of a step: the rates of guards at its start, which of them are forces, and which begin there;
-    its length, what counts as zero, and what does at the end of a step that was made to end there.
+    """What a search knows of a step: which guards are forces, its length, what counts as zero, and what does at the end
+    of a step that was made to end there.
     """
 
-    start: Any
     forces: Any
-    begins: Any
     length: Any
     touch: Any
     near: Any
 
 
 def _looked(search: _Search, values, rates, known):
-    """At the end of a step."""
-    del known
-    return search._replace(
-        phase=jnp.array(_HALF), s=search.s / 2, end=values, rates=rates, count=jnp.zeros_like(search.count)
-    )
-
-
-def _halved(search: _Search, values, rates, known):
-    """At the middle: guards that are negative there, those that are least in one of the halves, and those whose rate is
-    another than that of a cubic polynomial with what is known of them at both ends and their value here.
+    """At the end, the middle and the start of a step: guards that are negative in the middle, those that are least in
+    one of the halves, and those whose rate there is another than that of a cubic polynomial with what is known of them
+    at both ends and their value in the middle; forces that vary.
     """
+    (last, values, first), (ends, rates, start) = values, rates
+    search = search._replace(s=0.5 * search.s, end=last, rates=ends, middle=values, slopes=rates, start=start)
+    search = search._replace(count=jnp.zeros_like(search.count))
     dips, risen = _negative_within(search, values, known)
-    watched = jnp.isfinite(known.start) & jnp.isfinite(search.rates)
-    at_start, at_end = known.length * known.start, known.length * search.rates
+    watched = jnp.isfinite(start) & jnp.isfinite(ends)
+    at_start, at_end = known.length * start, known.length * ends
     cubic = 4 * (0.125 * at_start + 0.375 * at_end - (search.end - values))
     expected = at_start + 0.5 * (at_end - at_start - 3 * cubic) + 0.75 * cubic
     off = jnp.abs(expected - known.length * rates)
@@ -225,18 +245,17 @@ def _halved(search: _Search, values, rates, known):
     # A guard that the step was made to end at has no size there.
     counts = watched & (jnp.abs(search.end) > known.near)
     coarse = jnp.max(jnp.where(counts, off / (_COARSE * size), 0.0), initial=0.0)
-    turns = jnp.where(rates > 0, known.start < 0, search.rates > 0)
+    turns = jnp.where(rates > 0, start < 0, ends > 0)
     waiting = turns & watched & jnp.isfinite(rates) & (search.end >= -known.touch)
-    search = search._replace(coarse=coarse, middle=values, slopes=rates, waiting=waiting)
-    starts = search._replace(phase=jnp.array(_START), s=jnp.zeros_like(search.s))
-    other = _chosen(jnp.any(known.forces), starts, _next_dip(search, known))
-    return _chosen(dips, risen, other)._replace(count=jnp.zeros_like(search.count))
+    search = search._replace(coarse=coarse, waiting=waiting)
+    return _chosen(dips, risen, _next_force(search, first, known))
 
 
-def _started(search: _Search, values, rates, known):
-    """At the start: forces that vary by more than a parabola shows, and those that it shows to be next to zero."""
-    del rates
-    first, middle, last = values, search.middle, search.end
+def _next_force(search: _Search, first, known):
+    """Forces that vary by more than a parabola shows, and those that it shows to be next to zero, from the `first`
+    ones, those in the middle and those at the end.
+    """
+    middle, last = search.middle, search.end
     bent, sloped = 2 * (first + last - 2 * middle), 4 * middle - 3 * first - last
     least_at = jnp.where(bent > 0, -sloped / jnp.where(bent > 0, 2 * bent, 1.0), 0.0)
     inside = known.forces & (least_at > 0) & (least_at < 1)
@@ -251,22 +270,21 @@ def _started(search: _Search, values, rates, known):
     looks = search._replace(
         phase=jnp.array(_LEAST), s=least_at[own].astype(search.s.dtype), looked_at=jnp.arange(least.size) == own
     )
-    found = _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
-    return found._replace(count=jnp.zeros_like(search.count))
+    return _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
 
 
 def _least_found(search: _Search, values, rates, known):
     """Where a force is about the least of the step."""
     del rates
-    dips, risen = _negative_within(search, values, known)
+    dips, risen = _negative_within(search, values[0], known)
     return _chosen(dips, risen, _next_dip(search, known))._replace(count=jnp.zeros_like(search.count))
 
 
 def _negative_within(search: _Search, values, known):
     """Whether guards are negative at a point within the step, and the search back from there if they are."""
     below = values < -known.touch
-    if known.begins is not None:
-        below = below & ~known.begins
+    if search.begins is not None:
+        below = below & ~search.begins
     bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
     dips = jnp.any(below)
     return dips, search._replace(phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, looked_at=below, dips=dips)
@@ -281,10 +299,10 @@ def _next_dip(search: _Search, known):
     at the end of the step. Where none does, guards that are negative at the end are next; the search is done without.
     """
     least = jnp.argmin(jnp.where(search.waiting, search.end, jnp.inf))
-    own, half = jnp.arange(known.start.size) == least, 0.5 * jnp.ones_like(search.s)
+    own, half = jnp.arange(search.start.size) == least, 0.5 * jnp.ones_like(search.s)
     # In the first half where the guard rises at the middle.
     middle, first = search.slopes[least], search.slopes[least] > 0
-    of_a, of_b = jnp.where(first, known.start[least], middle), jnp.where(first, middle, search.rates[least])
+    of_a, of_b = jnp.where(first, search.start[least], middle), jnp.where(first, middle, search.rates[least])
     turn = Bracket(jnp.where(first, 0.0, half), jnp.where(first, half, 2 * half), of_a, of_b, jnp.array(0))
     dip = search._replace(
         phase=jnp.array(_DIP),
@@ -306,7 +324,7 @@ def _next_dip(search: _Search, known):
 
 def _dipped(search: _Search, values, rates, known):
     """Towards the zero of a guard's rate, where it is least."""
-    own = jnp.argmax(search.looked_at)
+    (values, _, _), (rates, _, _), own = values, rates, jnp.argmax(search.looked_at)
     again = _narrowed(search, rates[own])
     ends = _is_short(again)
     dips = ends & (values[own] < -known.touch)
@@ -321,6 +339,7 @@ def _dipped(search: _Search, values, rates, known):
 def _risen(search: _Search, values, rates, known):
     """Back from a point where guards are negative to one where they are positive; near the start there may be none."""
     del rates
+    values = values[0]
     least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
     positive, ends = least > 0, search.count >= _HALVINGS
     before = search.bracket
@@ -329,7 +348,7 @@ def _risen(search: _Search, values, rates, known):
     bracket = jax.tree.map(lambda found, back: jnp.where(positive, found, back), found, back)
     # Those that have been negative all the time, and have risen, are not crossed here.
     overlap = search.looked_at & (values < -known.touch) & (values >= -_OVERLAP)
-    overlap = overlap & (known.start > 0) & (search.end >= values)
+    overlap = overlap & (search.start > 0) & (search.end >= values)
     eases = ends & ~positive & jnp.all(overlap | ~search.looked_at)
     return search._replace(
         phase=jnp.where(positive, _ZERO, jnp.where(ends, _DONE, _RISE)),
@@ -344,7 +363,7 @@ def _risen(search: _Search, values, rates, known):
 def _zero_found(search: _Search, values, rates, known):
     """Towards the first zero of guards, between a point where they are positive and one where one is negative."""
     del rates, known
-    again = _narrowed(search, jnp.min(jnp.where(search.looked_at, values, jnp.inf)))
+    again = _narrowed(search, jnp.min(jnp.where(search.looked_at, values[0], jnp.inf)))
     return again._replace(phase=jnp.where(_is_short(again), _DONE, _ZERO))
 
 
@@ -455,7 +474,7 @@ class EventController(AbstractControllerAround):
         )
         # A branch, so that the compiler does not repeat the verdict wherever it matters.
         verdict = _verdict(keep, (t0, t1), found, before)
-        plan = lax.switch(verdict, [_refused, _crossed, _too_coarse, _passed, _ended], step, plan)
+        plan = switch(verdict, [_refused, _crossed, _too_coarse, _passed, _ended], step, plan)
         # A place at which nothing changed is that of the next event.
         idle = plan.accepted & before.ended & (found.idle > 0)
         count = before.count - idle.astype(before.count.dtype)
@@ -465,8 +484,8 @@ class EventController(AbstractControllerAround):
             plan.target,
             plan.length,
             count + plan.ends.astype(count.dtype),
-            before.times.at[place].set(t1),
-            before.states.at[place].set(ravel(y1_candidate)),
+            lax.dynamic_update_index_in_dim(before.times, t1, place, 0),
+            lax.dynamic_update_index_in_dim(before.states, ravel(y1_candidate), place, 0),
             found.touch,
             plan.halved,
             plan.starts,

@@ -28,6 +28,7 @@ from .events import Crossing, cond_of_jumps, crossing
 from .gaps import Hidden, hidden
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
+from .packing import Layout
 from .steps import AbstractSteps
 from .tangent import Tangent, TangentControl, pushed, pushed_only
 from .tolerances import MultistepNorm, Tolerances, norm_of
@@ -175,15 +176,19 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         if made_jump is False:
             return y0, solver_state
 
+        # In few vectors, since those of most steps are copied.
+        layout = Layout((y0, solver_state))
+
         def restarted(before):
-            y0, solver_state = before
+            y0, solver_state = layout.unpacked(before)
             found = found_at_jump(terms, t0, y0, args)
             after = after_jump(terms, t0, y0, found, args)
             chart = chart_after_jump(terms, solver_state.chart)
-            return after, self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(found)
+            state = self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(found)
+            return layout.packed((after, state))
 
         cond = cond_of_jumps(guards_of(terms))
-        return cond(made_jump, restarted, lambda before: before, (y0, solver_state))
+        return layout.unpacked(cond(made_jump, restarted, lambda before: before, layout.packed((y0, solver_state))))
 
     def linear_steps(self, jumps: bool) -> AbstractSteps | None:
         """The steps of the method as linear maps of tangents, if it knows a cheaper form than their derivatives.

@@ -1,8 +1,11 @@
 """Pytrees of arrays as rows of tables."""
 
+from collections.abc import Callable, Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, PyTree
 
 from .linear_map import filled
@@ -44,3 +47,10 @@ class Layout:
             leaves.append(given[of.dtype][start : start + of.size].reshape(of.shape))
             starts[of.dtype] = start + of.size
         return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)
+
+
+def switch(index: Array, branches: Sequence[Callable[..., PyTree]], *operands: PyTree) -> PyTree:
+    """`lax.switch` with a result in few vectors: XLA copies each array that a branch returns as it is."""
+    layout = Layout(eqx.filter_eval_shape(branches[0], *operands))
+    packed = [lambda *given, own=own: layout.packed(own(*given)) for own in branches]
+    return layout.unpacked(lax.switch(index, packed, *operands))

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._types import Coordinates, Scalar, Velocities
 from ..linalg.complementarity import of_pairs
 from ..linalg.rotations import norm
+from ..linalg.sums import unchecked_take, with_entries
 from .equation import AbstractEquation, Contacts, Frictions
 
 # Modes of a contact: open; closed; closed, where others that are closed as well imply it and take the force.
@@ -57,7 +58,7 @@ def mode_places(system: AbstractEquation) -> np.ndarray:
 
 def modes_of(system: AbstractEquation, q: Coordinates) -> Float[Array, "laws"]:
     """The modes of contacts and friction in some coordinates; whole numbers but for slip in two directions."""
-    modes, own = q[mode_places(system)], pairs_of(system)
+    modes, own = unchecked_take(q, mode_places(system)), pairs_of(system)
     if not own.size:
         return jnp.round(modes)
     return jnp.where(np.isin(np.arange(modes.size), own), modes, jnp.round(modes))
@@ -70,7 +71,7 @@ def kinds_of(system: AbstractEquation, modes: Float[Array, "laws"]) -> Float[Arr
         return modes
     sizes = norm(modes[own])
     kinds = jnp.where(sizes > STICK, STICK, jnp.where(sizes > 0, FORWARD, FREE)).astype(modes.dtype)
-    return modes.at[own].set(kinds[:, None])
+    return with_entries(modes, own.reshape(-1), jnp.repeat(kinds, 2))
 
 
 def pairs_of(system: AbstractEquation) -> Int[np.ndarray, "pairs 2"]:
@@ -88,7 +89,8 @@ def are_open(system: AbstractEquation, q: Coordinates) -> Bool[Array, "contacts"
 
 def with_modes(system: AbstractEquation, q: Coordinates, modes: ArrayLike) -> Float[Array, "nq"]:
     """The coordinates with other modes."""
-    return q.at[mode_places(system)].set(modes, unique_indices=True)
+    places = mode_places(system)
+    return with_entries(q, places, jnp.broadcast_to(jnp.asarray(modes, q.dtype), places.shape))
 
 
 def gaps(system: AbstractEquation, t: Scalar, q: Coordinates) -> Float[Array, "contacts"]:

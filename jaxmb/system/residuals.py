@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.jacobian import AbstractJacobian
+from ..linalg.sums import placed_sums
 from .equation import AbstractEquation
 
 
@@ -33,6 +34,13 @@ def displaced(system: AbstractEquation, t: Scalar, q: Coordinates, step: Float[A
         return q + step
     _, change = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(step),), (step,))
     return system.normalize(q + change)
+
+
+def friction_force(
+    system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities, own: Float[Array, "k"]
+) -> Float[Array, "nu"]:
+    """C, from the multipliers of the `friction_rows` that it depends on."""
+    return system.nonideal_force(t, q, u, placed_sums(system.friction_rows, system.acceleration_rows)(own))
 
 
 def drops_rows(system: AbstractEquation) -> bool:
