@@ -17,7 +17,7 @@ from .._arguments import whole_number
 from ._damping import is_resolved
 from ._dense import DenseLinearization
 from ._field import at_start, derivatives, linearized
-from ._formulas import FAMILIES, Formulas, double, formulas, start
+from ._formulas import FAMILIES, Formulas, double, formulas, is_start, spacing_of, start
 from ._history import History, advance, basis, before_each, step_end
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._neighbours import a_stable, damped_growth, ladder, responses
@@ -121,6 +121,16 @@ class _Step(AbstractAttempt):
     @property
     def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
         return self.end.memory
+
+
+class PushedTangent(NamedTuple):
+    """A tangent that is carried along, `before` a step, with its memory there, at its `end`, and there by every formula
+    (`ends`).
+    """
+
+    before: Tangent
+    end: StepEnd
+    ends: Float[Array, "formulas n"]
 
 
 class Formula(NamedTuple):
@@ -278,16 +288,14 @@ class Hermite(AbstractMultistep):
         # The NaN reaches the error estimate, so the step is rejected.
         end = at, jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f), first.g
 
-        def numbers(terms, flat):
-            return at_start(end, solution_of(terms, t0, y0, kept_of_chart(terms, chart), args), t0, flat)
-
-        def memory(terms, flat):
-            y, f, g = numbers(terms, flat)
-            history, slope = self.begun(t0, t1 - t0, y, f, g)
-            return y, (history.differences, slope)
-
-        history, slope = self.begun(t0, t1 - t0, *numbers(terms, flat))
-        tangents = self.first_tangents(memory, terms, flat, before)
+        solution = solution_of(terms, t0, y0, kept_of_chart(terms, chart), args)
+        history, slope = self.begun(t0, t1 - t0, *at_start(end, solution, t0, flat))
+        control, tangents = self.tangent_control, None
+        if control is not None:
+            # The first step finds their memory.
+            ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
+            none = jax.tree.map(jnp.zeros_like, (history.differences, slope))
+            tangents = tuple(Tangent(w, none, control.largest(w)) for w in ws)
         index = jnp.asarray(1, np.int32)
         sizes = self.first_sizes(flat, end[1], before)
         return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
@@ -317,29 +325,54 @@ class Hermite(AbstractMultistep):
         if control is None:
             return step, []
         # Tangents that are carried along have no derivatives themselves.
-        terms, end, newton, tangents, history = freeze((terms, step.end, step.newton, state.tangents, state.history))
-        along, n = control.of_terms(terms), before.size
+        terms, step_, state, before = freeze((terms, step, state, before))
+        along, newton, history = control.of_terms(terms), step_.newton, state.history
         used = jax.tree.map(lambda *own: any(x is not None for x in own), *along, is_leaf=lambda x: x is None)
         numbers, rest = eqx.partition(terms, used)
-        kept = kept_of_chart(terms, newton.end.rest[0])
-        solution = lambda numbers: solution_of(eqx.combine(numbers, rest), t1, like, kept, args)
-        by_numbers, by_state = linearized(solution, numbers, t1, end.after, newton.end.f)
         formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
-        free, pushed = free_components(terms, before, state.chart), []
-        scales = control.scales(self.tolerances.rtol, tangents, [x.w for x in tangents])
-        for of, x, scale in zip(along, tangents, scales, strict=True):
-            own = History(x.memory[0], history.mesh, history.known)
-            past, a, b = self.equation(formula, x.w, own.differences)
+        free = free_components(terms, before, state.chart)
+        start = history.mesh[0], before, state.slope[-before.size :], state.chart
+        end = t1, step_.after, newton.end.f, newton.end.rest[0]
+
+        def pushed(x: Tangent, scale, own, by_state, begins):
+            of = History(x.memory[0], history.mesh, history.known)
+            past, a, b = self.equation(formula, x.w, of.differences)
             equation = StepEquation(None, None, t1, formula.h, past, a, b, free)  # pyright: ignore[reportArgumentType]
-            size = lambda change, scale=scale: self.weighted_norm(change, scale, like)
-            numbers, predicted = by_numbers(of, None), self._predicted(formula, own, n)
+            size = lambda change: self.weighted_norm(change, scale, like)
+            predicted = self._predicted(formula, of, before.size)
+            predicted = jnp.where(begins, x.w, predicted[0]), predicted[1]
             solved = tangents_nearby(
-                newton.matrix, newton.inverses, equation, by_state, numbers, predicted, size, _NEWTON
+                newton.matrix, newton.inverses, equation, by_state, own, predicted, size, _NEWTON, begins
             )
-            end = self.ended(formula, own, (past, a, b), solved)
-            pushed.append((end, self._ends(formula, own, *solved[1:])))
-        # A derivative that is no number is taken as zero.
-        return step, jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), pushed)
+            first, slope = self.begun(*spacing_of(history), *solved)
+            first = Tangent(solved[0], (first.differences, slope), control.largest(solved[0]))
+            ended = self.ended(formula, of, (past, a, b), solved)
+            found = PushedTangent(
+                jax.tree.map(lambda a, b: jnp.where(begins, a, b), first, x),
+                ended,
+                self._ends(formula, of, *solved[1:]),
+            )
+            # A derivative that is no number is taken as zero.
+            return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), found)
+
+        def advanced(carry):
+            # In a first step the equations are linearised at its start, then at its end.
+            k, last = carry
+            begins = k == 0
+            t, y, f, chart = jax.tree.map(lambda a, b: jnp.where(begins, a, b), start, end)
+            solution = lambda numbers: solution_of(
+                eqx.combine(numbers, rest), t, like, kept_of_chart(terms, chart), args
+            )
+            by_numbers, by_state = linearized(solution, numbers, t, y, f)
+            tangents = [own.before for own in last]
+            scales = control.scales(self.tolerances.rtol, tangents, [x.w for x in tangents])
+            each = zip(tangents, scales, along, strict=True)
+            return k + 1, [pushed(x, scale, by_numbers(of, None), by_state, begins) for x, scale, of in each]
+
+        blank = PushedTangent(None, step_.end, step_.ends)
+        blank = jax.tree.map(jnp.zeros_like, blank)
+        carry = jnp.where(is_start(history), 0, 1), [blank._replace(before=x) for x in state.tangents]
+        return step, lax.while_loop(lambda carry: carry[0] < 2, advanced, carry)[1]
 
     def _predicted(self, formula: Formula, history: History, n: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state and the rate at the end of a step, extrapolated.
@@ -354,21 +387,29 @@ class Hermite(AbstractMultistep):
         rates = jnp.asarray(before_each(used.size), dtype) @ (1 / (formula.end - history.mesh)).astype(dtype)
         return recent @ states, (recent * rates) @ states
 
-    def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization):
+    def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, begins: Any):
         """The end of a step as a linear map of tangents: of numbers, of the state at its start, and of the history
         there, on the mesh of the step.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and these; the `end`: its
-        time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there.
+        time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there; `begins`:
+        whether this is the start of the step instead, whose history follows from the state.
         """
         (solution, numbers), (t, y, f) = equations, end
         by_numbers, by_state = linearized(solution, numbers, t, y, f)
         _, a, b = self.equation(formula, y, jnp.zeros((formula.values.size, y.size), y.dtype))
+        a, b = (jnp.where(begins, jnp.zeros_like(x), x) for x in (a, b))
         solve = matrix.tangents(matrix.inverses(a, b, free), a, b, free, by_state)
 
         def push(along, w, history):
-            past, _, _ = self.equation(formula, w, history.differences)
-            return self.ended(formula, history, (past, a, b), solve(by_numbers(along, None), past))
+            past = jnp.where(begins, w, self.equation(formula, w, history.differences)[0])
+            solved = solve(by_numbers(along, None), past)
+            end = self.ended(formula, history, (past, a, b), solved)
+            if begins is False:
+                return end
+            first, _ = self.begun(*spacing_of(history), *solved)
+            differences = jnp.where(begins, first.differences, end.history.differences)
+            return eqx.tree_at(lambda end: end.history.differences, end, differences)
 
         return push
 
@@ -442,9 +483,9 @@ class Hermite(AbstractMultistep):
         stable = a_stable(self.family, self.past_points)
         candidates = jnp.append(around, stable or 1)
         sizes = self._sizes(step.ends, candidates, family, newton, free, scale, y0)
-        tangents, scales = self.tangents_after(state.tangents, [end for end, _ in along])
-        for (_, ends), scale in zip(along, scales, strict=True):
-            sizes = jnp.maximum(sizes, self._sizes(ends, candidates, family, newton, free, scale, y0))
+        tangents, scales = self.tangents_after(tuple(own.before for own in along), [own.end for own in along])
+        for own, scale in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(own.ends, candidates, family, newton, free, scale, y0))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         bounded = None
         if stable is not None:

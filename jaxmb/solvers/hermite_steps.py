@@ -5,6 +5,7 @@ of the linearised equation, and nothing else is solved. So little of a step is s
 did.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -17,13 +18,13 @@ from ._field import derivatives
 from ._formulas import FAMILIES, start
 from ._history import History
 from ._structured import structured
-from .evaluation import free_components, freeze, jacobian_of, kept_of_chart, ravel, solution_of
+from .evaluation import at_solution, free_components, freeze, jacobian_of, kept_of_chart, ravel, solution_of
 from .restarts import Jump, restarts
 from .steps import AbstractSteps, LinearStep
 
 
 class HermiteRow(eqx.Module):
-    """What is stored of a step.
+    """What is stored of a step, or of the start of a run: then nothing is `known`, and y and f are of the start.
 
     **Fields:** its `end`; the `mesh`, the number of `known` points and the `order_index` at its start; state `y` and
     field `f` at its end; what is `kept` of the chart there, and its `free` components; `jump` at its start, None where
@@ -42,10 +43,33 @@ class HermiteRow(eqx.Module):
 
 
 class HermiteSteps(AbstractSteps):
-    """The steps of `Hermite`; `jumps`: whether they may begin after a jump; its `family` of formulas."""
+    """The steps of `Hermite`; `jumps`: whether they may begin after a jump; its `family` of formulas; whether a run
+    begins with a state alone (`anew`).
+    """
 
     jumps: bool = eqx.field(static=True)
     family: str = eqx.field(static=True)
+    anew: bool = eqx.field(static=True, default=False)
+
+    @property
+    def starts(self):
+        return self.anew
+
+    def from_start(self):
+        return dataclasses.replace(self, anew=True)
+
+    def start(self, terms, before, after):
+        del after
+        if not self.anew:
+            return None
+        old, flat = before.solver_state, ravel(before.y)
+        history, f, jump = old.history, old.slope[-flat.size :], None
+        if self.jumps:
+            made = jnp.zeros_like(jnp.asarray(before.made_jump))
+            jump = Jump(made, history.mesh[0], before.tprev, flat, f, old.chart, None)
+        kept, free = kept_of_chart(terms, old.chart), free_components(terms, flat, old.chart)
+        nothing = jnp.zeros_like(history.known)
+        return HermiteRow(before.tnext, history.mesh, nothing, old.order_index, flat, f, kept, free, jump)
 
     def row(self, terms, before, after):
         old, new, n = before.solver_state, after.solver_state, ravel(after.y).size
@@ -75,14 +99,22 @@ class HermiteSteps(AbstractSteps):
         jump = row.jump
         restart = None if jump is None else restarts(of, moved, like, jump, lambda *at: derivatives(*at)[:3])
 
+        time, y, f, begins = row.end, row.y, row.f, False
+        if self.anew:
+            begins = row.known == 0
+            # Higher derivatives see those of the start itself.
+            start = ravel(like)
+            found = at_solution(terms, row.mesh[0], start, row.f, like, row.kept, args)[1]
+            time, y, f = (jnp.where(begins, *x) for x in ((row.mesh[0], time), (start, y), (found, f)))
+
         def solution(numbers):
             own, args, _ = of(numbers)
-            return solution_of(own, row.end, like, row.kept, args)
+            return solution_of(own, time, like, row.kept, args)
 
-        matrix = structured(jacobian_of(*freeze((terms, row.end, like, args))), freeze(row.y))
+        matrix = structured(jacobian_of(*freeze((terms, time, like, args))), freeze(y))
         if matrix is None:
             matrix = DenseLinearization.unknown(row.y, row.free)
-        step = solver.linearised(formula, (solution, moved.terms), (row.end, row.y, row.f), row.free, matrix)
+        step = solver.linearised(formula, (solution, moved.terms), (time, y, f), row.free, matrix, begins)
 
         def push(dmoved, w, memory):
             differences, slope = memory
