@@ -74,8 +74,10 @@ class AbstractLinearization(eqx.Module):
         """The linearisation is renewed after a step whose corrections shrank more slowly than by this factor."""
 
     @abc.abstractmethod
-    def probed(self, field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None) -> Derivatives:
-        """The derivatives of the field, with a warning if its differences contradict them; `size` of the components."""
+    def probed(
+        self, field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None
+    ) -> tuple[Derivatives, Bool[Array, ""]]:
+        """The derivatives of the field, and whether its differences contradict them; `size` of the components."""
 
     @abc.abstractmethod
     def renewed(self, equation: StepEquation, y: Float[Array, " n"], rate: Float[Array, " n"]) -> Any:

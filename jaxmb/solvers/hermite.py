@@ -64,6 +64,7 @@ class HermiteState(AbstractMultistepState):
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
     - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
+    - `wrong_derivative`: whether differences of the vector field contradict its derivative at the first start.
     """
 
     history: History
@@ -75,6 +76,7 @@ class HermiteState(AbstractMultistepState):
     chart: Chart | None
     sizes: Float[Array, " sizes"] | None
     tangents: tuple[Tangent, ...] | None
+    wrong_derivative: Bool[Array, ""]
 
     @property
     def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
@@ -182,6 +184,10 @@ class Hermite(AbstractMultistep):
     step, where lightly damped vibrations and growing components are found first. One such vibration among many
     components that are damped well may be missed; the error estimate then keeps steps short.
 
+    At the start the derivative of the vector field is compared with its differences. Where it contradicts them, as with
+    `stop_gradient`, rounding or integers in the vector field, results would be wrong: `jaxmb.simulate` warns, except
+    under `jit` and `vmap`, where `stats["wrong_derivative"]` says it.
+
     Use it with `MultistepController`, as `Adams`; the term, `diffrax.SaveAt`,
     events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the
     implicit function theorem, with the exact Jacobian. Non-stiff problems are solved as accurately as by `Adams`, but
@@ -265,6 +271,7 @@ class Hermite(AbstractMultistep):
             "num_evaluations": solver_state.step_counts[0] + work[0],
             "num_matrices": work[1],
             "past_points": solver_state.step_counts[1:],
+            "wrong_derivative": solver_state.wrong_derivative,
         }
 
     def initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
@@ -280,10 +287,11 @@ class Hermite(AbstractMultistep):
         field, at = freeze((field_of(terms, t0, y0, chart, args), flat))
         if before is None:
             size = None if scales is None else scales.expected(at)
-            first = matrix.probed(field, t0, at, size)
+            first, wrong = matrix.probed(field, t0, at, size)
             step_counts, work = jnp.zeros(family.highest + 1, np.int32), jnp.zeros(2, np.int32)
         else:
-            first, step_counts, work = derivatives(field, t0, at), before.step_counts, before.work
+            first, wrong = derivatives(field, t0, at), before.wrong_derivative
+            step_counts, work = before.step_counts, before.work
         chart, failed = freeze(first.rest)
         # The NaN reaches the error estimate, so the step is rejected.
         end = at, jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f), first.g
@@ -298,7 +306,8 @@ class Hermite(AbstractMultistep):
             tangents = tuple(Tangent(w, none, control.largest(w)) for w in ws)
         index = jnp.asarray(1, np.int32)
         sizes = self.first_sizes(flat, end[1], before)
-        return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
+        counts = step_counts.at[0].add(1)
+        return HermiteState(history, slope, index, matrix, counts, work, chart, sizes, tangents, wrong)
 
     def attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
         history, n = state.history, before.size
@@ -527,6 +536,7 @@ class Hermite(AbstractMultistep):
             chart=renewed,
             sizes=self.grown_sizes(state.sizes, step.after),
             tangents=tangents,
+            wrong_derivative=state.wrong_derivative,
         )
         return y1, estimate, self.dense_info(step.end, y0, k), new_state, failed
 

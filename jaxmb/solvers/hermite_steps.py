@@ -18,7 +18,7 @@ from ._field import derivatives
 from ._formulas import FAMILIES, start
 from ._history import History
 from ._structured import structured
-from .evaluation import at_solution, free_components, freeze, jacobian_of, kept_of_chart, ravel, solution_of
+from .evaluation import free_components, freeze, jacobian_of, kept_of_chart, ravel, solution_of
 from .restarts import Jump, restarts
 from .steps import AbstractSteps, LinearStep
 
@@ -99,22 +99,17 @@ class HermiteSteps(AbstractSteps):
         jump = row.jump
         restart = None if jump is None else restarts(of, moved, like, jump, lambda *at: derivatives(*at)[:3])
 
-        time, y, f, begins = row.end, row.y, row.f, False
-        if self.anew:
-            begins = row.known == 0
-            # Higher derivatives see those of the start itself.
-            start = ravel(like)
-            found = at_solution(terms, row.mesh[0], start, row.f, like, row.kept, args)[1]
-            time, y, f = (jnp.where(begins, *x) for x in ((row.mesh[0], time), (start, y), (found, f)))
+        begins = row.known == 0 if self.anew else False
+        time = jnp.where(begins, row.mesh[0], row.end)
 
         def solution(numbers):
             own, args, _ = of(numbers)
             return solution_of(own, time, like, row.kept, args)
 
-        matrix = structured(jacobian_of(*freeze((terms, time, like, args))), freeze(y))
+        matrix = structured(jacobian_of(*freeze((terms, time, like, args))), freeze(row.y))
         if matrix is None:
             matrix = DenseLinearization.unknown(row.y, row.free)
-        step = solver.linearised(formula, (solution, moved.terms), (time, y, f), row.free, matrix, begins)
+        step = solver.linearised(formula, (solution, moved.terms), (time, row.y, row.f), row.free, matrix, begins)
 
         def push(dmoved, w, memory):
             differences, slope = memory

@@ -73,16 +73,16 @@ class Mesh(eqx.Module):
     """The steps of a run.
 
     **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms, their arguments and the solver;
-    `steps`; what is stored of the start, packed (`first`), with its layout; `rows`: buffers of packed rows; `layout`
-    of a row; their `count`; the `saved` series; `like`: a state; `memory` of the solver at the start; `dense`: of how
-    many steps dense output is kept; whether the run ends at an `event`; its `segments`, None where there is one only.
+    `steps`; what is stored of the `start`, if that is no row; `rows`: buffers of packed rows, behind them that of the
+    start if it is one; `layout` of a row; their `count`; the `saved` series; `like`: a state; `memory` of the solver at
+    the start; `dense`: of how many steps dense output is kept; whether the run ends at an `event`; its `segments`, None
+    where there is one only.
     """
 
     moved: Moving
     still: PyTree
     steps: AbstractSteps
-    first: list[Array]
-    of_first: Layout = eqx.field(static=True)
+    start: PyTree
     rows: list[Array]
     layout: Layout = eqx.field(static=True)
     count: Any
@@ -95,15 +95,12 @@ class Mesh(eqx.Module):
 
     @property
     def size(self) -> int:
-        return self.rows[0].shape[0]
+        return self.rows[0].shape[0] - self.steps.starts
 
     def row(self, rows: list[Array], k: Any) -> Row:
         """The row of a step, from those of its segment."""
         place = self._place(k)
-        vectors = [buffer[place] for buffer in rows]
-        if self.steps.starts:
-            vectors = [jnp.where(k < 0, first, own) for first, own in zip(self.first, vectors, strict=True)]
-        return self.layout.unpacked(vectors)
+        return self.layout.unpacked([buffer[place] for buffer in rows])
 
     @property
     def _begin(self) -> Any:
@@ -116,7 +113,8 @@ class Mesh(eqx.Module):
 
     def _place(self, k: Any) -> Any:
         """The index of the row of a step, among those of its segment."""
-        return k if self.segments is None else remainder(k, self.size)
+        place = k if self.segments is None else remainder(k, self.size)
+        return jnp.where(k < 0, self.size, place) if self.steps.starts else place
 
     def linearised(self, row: Row) -> LinearStep:
         return self.steps.linearised(lambda terms: eqx.combine(terms, self.still), self.moved, self.like, row.own)
@@ -206,8 +204,7 @@ class Mesh(eqx.Module):
                 own = self.steps.row_tangent(row.own, self.like, before, after)
                 none = jax.tree.map(lambda _: None, row)
                 along = self.layout.packed_tangent(row, none._replace(own=own))
-                place, counts = self._place(k), self._is_step(k)
-                rows = [buffer_set(buffer, place, x, counts) for buffer, x in zip(rows, along, strict=True)]
+                rows = [buffer_set(buffer, self._place(k), x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x, self._is_step(k)), ddense, dense)
             each = zip(self.saved, saved, places, strict=True)
@@ -248,8 +245,7 @@ class Mesh(eqx.Module):
     def _memory_at_start(self, dterms, w, memory):
         """The tangent of the memory that the first step begins with."""
         of = lambda terms: eqx.combine(terms, self.still)
-        start = self.of_first.unpacked(self.first)
-        return self.steps.memory_at_start(of, self.moved.terms, self.like, start, (dterms, w, memory))
+        return self.steps.memory_at_start(of, self.moved.terms, self.like, self.start, (dterms, w, memory))
 
     def _pulled(self, cotangents: Tangents, carry, rows, first):
         """The carry of the loop over steps before the step `first`."""
@@ -393,8 +389,8 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 def _recorded(equations, init_state, fixed, known, limit, most):
     """The last state of diffrax's loop; what is stored of the start; the rows of the last segment of steps, of which
-    each has `most`; the starts of all segments and the choices of all steps, None where there is one segment only. All
-    but the first are packed.
+    each has `most`, and behind them that of the start if it is one; the starts of all segments and the choices of all
+    steps, None where there is one segment only. All but the first are packed.
     """
     (given, steps), terms = fixed, equations["terms"]
     size = min(most, given["max_steps"])
@@ -431,11 +427,14 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         last, _, first, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
-            (init, since, of_first.blank(1), layout.blank(size), starts, choices),
+            (init, since, of_first.blank(1), layout.blank(size + steps.starts), starts, choices),
             max_steps=None,
             buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",
         )
+        if steps.starts:
+            # Not in the loop, where two rows that are written make a copy of all.
+            rows = _written(rows, size, [table[0] for table in first], True)
         return last, first, rows, None if starts is None else (starts, choices)
 
     return stepped(init_state, outer, known, **equations, **given)
@@ -484,6 +483,7 @@ def _with_derivatives_jvp(primals, tangents):
     saveat = given["saveat"]
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
+    at_start = _layout_of_first(steps, equations[0], init_state).unpacked([table[0] for table in first])
     # At a start the memory follows from the state.
     own = jax.tree.map(jnp.zeros_like, memory) if steps.starts else filled(memory, steps.memory(dinit.solver_state))
     w = ravel(filled(y0, dinit.y))
@@ -504,8 +504,7 @@ def _with_derivatives_jvp(primals, tangents):
         moved=Moving(moved, None if djumps is None else jumps),
         still=still,
         steps=steps,
-        first=[table[0] for table in first],
-        of_first=_layout_of_first(steps, equations[0], init_state),
+        start=at_start,
         rows=rows,
         layout=layout,
         count=final.num_accepted_steps,

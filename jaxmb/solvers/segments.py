@@ -128,7 +128,7 @@ class Segments(eqx.Module):
         **Arguments:** `equations`: the terms, their arguments and the solver without tangents.
         """
         terms, args, solver = equations
-        steps, size = steps.of_solver_alone(), rows[0].shape[0]
+        steps, size = steps.of_solver_alone(), rows[0].shape[0] - steps.starts
         first = segment * size
         last = jnp.where(lost, jnp.minimum(first + size, count), first)
 
