@@ -334,14 +334,14 @@ class Hermite(AbstractMultistep):
         if control is None:
             return step, []
         # Tangents that are carried along have no derivatives themselves.
-        terms, step_, state, before = freeze((terms, step, state, before))
-        along, newton, history = control.of_terms(terms), step_.newton, state.history
+        terms, own_step, state, before = freeze((terms, step, state, before))
+        along, newton, history = control.of_terms(terms), own_step.newton, state.history
         used = jax.tree.map(lambda *own: any(x is not None for x in own), *along, is_leaf=lambda x: x is None)
         numbers, rest = eqx.partition(terms, used)
         formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
         free = free_components(terms, before, state.chart)
         start = history.mesh[0], before, state.slope[-before.size :], state.chart
-        end = t1, step_.after, newton.end.f, newton.end.rest[0]
+        end = t1, own_step.after, newton.end.f, newton.end.rest[0]
 
         def pushed(x: Tangent, scale, own, by_state, begins):
             of = History(x.memory[0], history.mesh, history.known)
@@ -378,9 +378,8 @@ class Hermite(AbstractMultistep):
             each = zip(tangents, scales, along, strict=True)
             return k + 1, [pushed(x, scale, by_numbers(of, None), by_state, begins) for x, scale, of in each]
 
-        blank = PushedTangent(None, step_.end, step_.ends)
-        blank = jax.tree.map(jnp.zeros_like, blank)
-        carry = jnp.where(is_start(history), 0, 1), [blank._replace(before=x) for x in state.tangents]
+        blank = jax.tree.map(jnp.zeros_like, (own_step.end, own_step.ends))
+        carry = jnp.where(is_start(history), 0, 1), [PushedTangent(x, *blank) for x in state.tangents or ()]
         return step, lax.while_loop(lambda carry: carry[0] < 2, advanced, carry)[1]
 
     def _predicted(self, formula: Formula, history: History, n: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
