@@ -112,13 +112,13 @@ class Trajectory(eqx.Module):
     **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
     integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
     accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
-    `num_evaluations` of f with its time derivative, `num_matrices` made, and `past_points`: accepted steps with 1, 2,
-    … points of the past; `num_events`: times of `events`; and `linearised_steps`: whether
-    derivatives take one linearisation of the equations at each step, and not the derivative of each step as it is,
-    which costs more); `result`, how it ended. `trajectory["crank"]` is the motion of a body, a `BodyMotion`, and
-    `trajectory["hip"]` that of a joint, a frame or a part with internal states, a `PartMotion`; of a system in
-    generalized coordinates `trajectory["theta"]` is a coordinate and `trajectory["theta_rate"]` its rate, shape
-    (times,).
+    `num_evaluations` of f with its time derivative, `num_matrices` made, `past_points`: accepted steps with 1, 2, …
+    points of the past, and `wrong_derivative`: whether differences of f contradict its derivative; `num_events`: times
+    of `events`; and `linearised_steps`: whether derivatives take one linearisation of the equations at each step, and
+    not the derivative of each step as it is, which costs more); `result`, how it ended. `trajectory["crank"]` is the
+    motion of a body, a `BodyMotion`, and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a
+    `PartMotion`; of a system in generalized coordinates `trajectory["theta"]` is a coordinate and
+    `trajectory["theta_rate"]` its rate, shape (times,).
 
     `events` are the impacts of unilateral constraints, as a table.
 

@@ -39,7 +39,8 @@ class Flags(NamedTuple):
 
     **Fields:** whether it `failed`; whether its start violates the constraints (`inconsistent`); whether it got `stuck`
     on its way; whether nothing of what was to be saved is missing (`whole`); whether there were too few steps
-    (`ran_out`); whether it took at least as many as derivatives keep at most (`long`).
+    (`ran_out`); whether it took at least as many as derivatives keep at most (`long`); whether differences of the
+    vector field contradict its derivative, where a solver looks (`wrong_derivative`).
     """
 
     failed: Any
@@ -48,6 +49,7 @@ class Flags(NamedTuple):
     whole: Any
     ran_out: Any
     long: Any
+    wrong_derivative: Any
 
 
 class Outcome(NamedTuple):
@@ -107,7 +109,15 @@ def warn_of_stiffness(stats) -> None:
     warnings.warn(
         f"The motion is stiff: in {stats['stiff_steps']} of {stats['num_steps']} steps of Adams' method stability was "
         "the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
-        stacklevel=3,
+        stacklevel=4,
+    )
+
+
+def warn_of_wrong_derivative() -> None:
+    warnings.warn(
+        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and its results would be "
+        "wrong: look for `stop_gradient`, rounding and integers in the functions of parts.",
+        stacklevel=5,
     )
 
 
@@ -131,7 +141,7 @@ def warn_of_jumps(system, outcome: Outcome, times, restarts, announced) -> None:
         f"The motion that {names} prescribes has a jump or a kink at t = {' and '.join(str(t) for t in times)}, which "
         "an integration passes without an impulse or in many steps; "
         f"simulate(..., jumps=[{every}]) restarts there.",
-        stacklevel=3,
+        stacklevel=4,
     )
 
 

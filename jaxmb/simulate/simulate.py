@@ -52,7 +52,7 @@ from .arguments import (
 )
 from .compiling import told_of_compiling
 from .moving_times import may_move
-from .outcome import Flags, message_of_failure, warn_of_jumps, warn_of_stiffness
+from .outcome import Flags, message_of_failure, warn_of_jumps, warn_of_stiffness, warn_of_wrong_derivative
 from .solve import Problem, made_precise, solved
 
 # Defaults, made once: their construction would take as long as the rest of a call.
@@ -233,6 +233,8 @@ def simulate(
             if is_traced(outcome.flags):
                 return trajectory, outcome, None
             flags = Flags(*np.asarray(outcome.flags))
+            if flags.wrong_derivative:
+                warn_of_wrong_derivative()
             structure = jax.tree.structure((system, problem.solver))
             if flags.long and structure not in _long:
                 _long.append(structure)

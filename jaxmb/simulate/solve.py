@@ -316,8 +316,9 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         inputs = system, problem.state, times, problem.formulation, problem.manifold, problem.event, first.fn
         motion = nan_where(failed, motion, inputs)
     whole, long = jnp.all(jnp.isfinite(ts)), stats["num_steps"] >= MOST_ROWS
-    flags = Flags(failed, ~jnp.asarray(consistent), stuck, whole, ran_out, long)
-    outcome = Outcome(jnp.stack(flags), *end, step, coupling, evidence)
+    wrong = stats.get("wrong_derivative", False)
+    flags = Flags(failed, ~jnp.asarray(consistent), stuck, whole, ran_out, long, wrong)
+    outcome = Outcome(jnp.stack([jnp.asarray(flag) for flag in flags]), *end, step, coupling, evidence)
     fields = {
         "formulation": problem.method,
         "ts": ts,

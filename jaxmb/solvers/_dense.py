@@ -174,7 +174,7 @@ def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free fr
     identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
     # complex for all formulas with equal steps; real roots are replaced by the nearest complex ones.
-    product, least = -b - a**2 / 4, a**2 / 1000
+    product, least = -b - a**2 / 4, a**2 / 1000 + jnp.finfo(jacobian.dtype).tiny
     real, imaginary = a / 2, jnp.sqrt(jnp.maximum(product, least))
     once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
     # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.

@@ -1,6 +1,5 @@
 """A vector field on raveled states, its second derivative in time, and its linearisation."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,9 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PyTree
-
-from .._compat import any_of_batch
+from jaxtyping import Array, Bool, Float, PyTree
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
@@ -36,8 +33,8 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
 
 def probed_derivatives(
     field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None, along: bool = False
-) -> Derivatives:
-    """The same, with a warning if differences of f contradict its derivative; `size` of the components, if known;
+) -> tuple[Derivatives, Bool[Array, ""]]:
+    """The same, and whether differences of f contradict its derivative; `size` of the components, if known;
     `along`: whether to take differences along the manifold only, where a projection returns to it.
     """
     eps = jnp.finfo(y.dtype).eps
@@ -61,16 +58,7 @@ def probed_derivatives(
     wrong = jnp.abs(change - expected)
     rounding = 1e-6 * jnp.max(jnp.abs(change)) + 1e3 * eps * jnp.max(jnp.abs(f))
     contradiction = jnp.any((wrong > 0.3 * jnp.maximum(jnp.abs(change), jnp.abs(expected))) & (wrong > rounding))
-    lax.cond(any_of_batch(contradiction), lambda: jax.debug.callback(_warn), lambda: None)
-    return jax.tree.map(lambda x: x[0], both)
-
-
-def _warn():
-    warnings.warn(
-        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and its "
-        "results would be wrong: look for `stop_gradient`, rounding and integers in the vector field.",
-        stacklevel=2,
-    )
+    return jax.tree.map(lambda x: x[0], both), contradiction
 
 
 def filled(tangent: Array | None, primal: Array) -> Array:

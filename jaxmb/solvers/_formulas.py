@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._history import NODES, WEIGHTS, History, basis, before_each, spans
 
@@ -111,6 +111,16 @@ def start(family: Family, t: Any, z: Float[Array, " n"], slope: Float[Array, " n
     rest = jnp.zeros((family.length - 2, z.size), z.dtype)
     differences = jnp.concatenate([z[None], spacing.astype(z.dtype) * slope[None], rest])
     return History(differences, t - spacing * before.astype(spacing.dtype), jnp.asarray(2, np.int32))
+
+
+def is_start(history: History) -> Bool[Array, ""]:
+    """Whether a history has one point only."""
+    return history.known == 2
+
+
+def spacing_of(history: History) -> tuple[Any, Any]:
+    """The latest time of a history, and the spacing with which it was started there."""
+    return history.mesh[0], spans(history.mesh)[0]
 
 
 def double(history: History, slope: Float[Array, " n"]) -> History:

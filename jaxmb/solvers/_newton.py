@@ -74,8 +74,10 @@ class AbstractLinearization(eqx.Module):
         """The linearisation is renewed after a step whose corrections shrank more slowly than by this factor."""
 
     @abc.abstractmethod
-    def probed(self, field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None) -> Derivatives:
-        """The derivatives of the field, with a warning if its differences contradict them; `size` of the components."""
+    def probed(
+        self, field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None
+    ) -> tuple[Derivatives, Bool[Array, ""]]:
+        """The derivatives of the field, and whether its differences contradict them; `size` of the components."""
 
     @abc.abstractmethod
     def renewed(self, equation: StepEquation, y: Float[Array, " n"], rate: Float[Array, " n"]) -> Any:
@@ -296,12 +298,13 @@ def tangents_nearby(
     predicted: tuple[Float[Array, " n"], Float[Array, " n"]],
     size: Callable[[Array], Any],
     tol: float,
+    begins: Bool[Array, ""],
 ) -> tuple[Array, Array, Array]:
     """The tangents of `(y, f, g)` at the end of a step, by Newton's method with the matrix of the step itself.
 
     **Arguments:** `equation`: of the tangents, for its `past`, `a`, `b` and `free`; `push`, `own`: as of
     `AbstractLinearization.tangents`; the `predicted` tangents of the state and of the rate; `size`, `tol`: as of
-    `Newton`.
+    `Newton`; `begins`: whether this is a start, whose state is the predicted one.
     """
 
     def proceed(carry):
@@ -311,9 +314,12 @@ def tangents_nearby(
     def iterate(carry):
         k, x, along, _, last, _ = carry
         y, f, g = map(jnp.add, own, push(x, along))
-        change, without, f, g = matrix.correction(inverses, equation, y, f, g, along)
+        change, without, *corrected = matrix.correction(inverses, equation, y, f, g, along)
         now = jnp.maximum(size(matrix.moved(change)), size(matrix.moved(without)))
-        return k + 1, x - matrix.moved(change), f, (y, f, g), now, last
+        # At a start the rate is known after the first evaluation, and after the second g along it.
+        now = jnp.where(begins, jnp.where(k == 0, jnp.inf, 0.0).astype(now.dtype), now)
+        f, g = (jnp.where(begins, *both) for both in zip((f, g), corrected, strict=True))
+        return k + 1, jnp.where(begins, x, x - matrix.moved(change)), f, (y, f, g), now, last
 
     infinite = jnp.full((), jnp.inf, own[0].dtype)
     start = jnp.zeros((), jnp.int32), predicted[0] - own[0], predicted[1], own, infinite, infinite

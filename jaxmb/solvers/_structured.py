@@ -98,7 +98,7 @@ class StructuredLinearization(AbstractLinearization):
     def inverses(self, a: Any, b: Any, free: Int[Array, " free"] | None = None) -> StructuredInverses:
         del free
         # The roots are complex for all formulas with equal steps; real roots are replaced by the nearest complex ones.
-        product, least = -b - a**2 / 4, a**2 / 1000
+        product, least = -b - a**2 / 4, a**2 / 1000 + jnp.finfo(jnp.result_type(a)).tiny
         r = lax.complex(a / 2, jnp.sqrt(jnp.maximum(product, least)))
         return StructuredInverses(self.jacobian.resolvent(r * self.direction.astype(r.dtype)), a, b, r)
 

@@ -17,7 +17,7 @@ from .._arguments import whole_number
 from ._damping import is_resolved
 from ._dense import DenseLinearization
 from ._field import at_start, derivatives, linearized
-from ._formulas import FAMILIES, Formulas, double, formulas, start
+from ._formulas import FAMILIES, Formulas, double, formulas, is_start, spacing_of, start
 from ._history import History, advance, basis, before_each, step_end
 from ._interpolation import MultistepInterpolation, RateInterpolation, StateInterpolation
 from ._neighbours import a_stable, damped_growth, ladder, responses
@@ -64,6 +64,7 @@ class HermiteState(AbstractMultistepState):
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
     - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
+    - `wrong_derivative`: whether differences of the vector field contradict its derivative at the first start.
     """
 
     history: History
@@ -75,6 +76,7 @@ class HermiteState(AbstractMultistepState):
     chart: Chart | None
     sizes: Float[Array, " sizes"] | None
     tangents: tuple[Tangent, ...] | None
+    wrong_derivative: Bool[Array, ""]
 
     @property
     def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
@@ -121,6 +123,16 @@ class _Step(AbstractAttempt):
     @property
     def memory(self) -> tuple[Float[Array, "length m"], Float[Array, " m"]]:
         return self.end.memory
+
+
+class PushedTangent(NamedTuple):
+    """A tangent that is carried along, `before` a step, with its memory there, at its `end`, and there by every formula
+    (`ends`).
+    """
+
+    before: Tangent
+    end: StepEnd
+    ends: Float[Array, "formulas n"]
 
 
 class Formula(NamedTuple):
@@ -171,6 +183,10 @@ class Hermite(AbstractMultistep):
     with that structure costs. Of its eigenvalues sixteen are known, by Arnoldi's method: those near the inverse of the
     step, where lightly damped vibrations and growing components are found first. One such vibration among many
     components that are damped well may be missed; the error estimate then keeps steps short.
+
+    At the start the derivative of the vector field is compared with its differences. Where it contradicts them, as with
+    `stop_gradient`, rounding or integers in the vector field, results would be wrong: `jaxmb.simulate` warns, except
+    under `jit` and `vmap`, where `stats["wrong_derivative"]` says it.
 
     Use it with `MultistepController`, as `Adams`; the term, `diffrax.SaveAt`,
     events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the
@@ -255,6 +271,7 @@ class Hermite(AbstractMultistep):
             "num_evaluations": solver_state.step_counts[0] + work[0],
             "num_matrices": work[1],
             "past_points": solver_state.step_counts[1:],
+            "wrong_derivative": solver_state.wrong_derivative,
         }
 
     def initial_state(self, terms, t0, t1, y0, args, chart, before: HermiteState | None) -> HermiteState:
@@ -270,27 +287,27 @@ class Hermite(AbstractMultistep):
         field, at = freeze((field_of(terms, t0, y0, chart, args), flat))
         if before is None:
             size = None if scales is None else scales.expected(at)
-            first = matrix.probed(field, t0, at, size)
+            first, wrong = matrix.probed(field, t0, at, size)
             step_counts, work = jnp.zeros(family.highest + 1, np.int32), jnp.zeros(2, np.int32)
         else:
-            first, step_counts, work = derivatives(field, t0, at), before.step_counts, before.work
+            first, wrong = derivatives(field, t0, at), before.wrong_derivative
+            step_counts, work = before.step_counts, before.work
         chart, failed = freeze(first.rest)
         # The NaN reaches the error estimate, so the step is rejected.
         end = at, jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f), first.g
 
-        def numbers(terms, flat):
-            return at_start(end, solution_of(terms, t0, y0, kept_of_chart(terms, chart), args), t0, flat)
-
-        def memory(terms, flat):
-            y, f, g = numbers(terms, flat)
-            history, slope = self.begun(t0, t1 - t0, y, f, g)
-            return y, (history.differences, slope)
-
-        history, slope = self.begun(t0, t1 - t0, *numbers(terms, flat))
-        tangents = self.first_tangents(memory, terms, flat, before)
+        solution = solution_of(terms, t0, y0, kept_of_chart(terms, chart), args)
+        history, slope = self.begun(t0, t1 - t0, *at_start(end, solution, t0, flat))
+        control, tangents = self.tangent_control, None
+        if control is not None:
+            # The first step finds their memory.
+            ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
+            none = jax.tree.map(jnp.zeros_like, (history.differences, slope))
+            tangents = tuple(Tangent(w, none, control.largest(w)) for w in ws)
         index = jnp.asarray(1, np.int32)
         sizes = self.first_sizes(flat, end[1], before)
-        return HermiteState(history, slope, index, matrix, step_counts.at[0].add(1), work, chart, sizes, tangents)
+        counts = step_counts.at[0].add(1)
+        return HermiteState(history, slope, index, matrix, counts, work, chart, sizes, tangents, wrong)
 
     def attempt(self, terms, t1, before, like, args, state: HermiteState) -> _Step:
         history, n = state.history, before.size
@@ -317,29 +334,53 @@ class Hermite(AbstractMultistep):
         if control is None:
             return step, []
         # Tangents that are carried along have no derivatives themselves.
-        terms, end, newton, tangents, history = freeze((terms, step.end, step.newton, state.tangents, state.history))
-        along, n = control.of_terms(terms), before.size
+        terms, own_step, state, before = freeze((terms, step, state, before))
+        along, newton, history = control.of_terms(terms), own_step.newton, state.history
         used = jax.tree.map(lambda *own: any(x is not None for x in own), *along, is_leaf=lambda x: x is None)
         numbers, rest = eqx.partition(terms, used)
-        kept = kept_of_chart(terms, newton.end.rest[0])
-        solution = lambda numbers: solution_of(eqx.combine(numbers, rest), t1, like, kept, args)
-        by_numbers, by_state = linearized(solution, numbers, t1, end.after, newton.end.f)
         formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
-        free, pushed = free_components(terms, before, state.chart), []
-        scales = control.scales(self.tolerances.rtol, tangents, [x.w for x in tangents])
-        for of, x, scale in zip(along, tangents, scales, strict=True):
-            own = History(x.memory[0], history.mesh, history.known)
-            past, a, b = self.equation(formula, x.w, own.differences)
+        free = free_components(terms, before, state.chart)
+        start = history.mesh[0], before, state.slope[-before.size :], state.chart
+        end = t1, own_step.after, newton.end.f, newton.end.rest[0]
+
+        def pushed(x: Tangent, scale, own, by_state, begins):
+            of = History(x.memory[0], history.mesh, history.known)
+            past, a, b = self.equation(formula, x.w, of.differences)
             equation = StepEquation(None, None, t1, formula.h, past, a, b, free)  # pyright: ignore[reportArgumentType]
-            size = lambda change, scale=scale: self.weighted_norm(change, scale, like)
-            numbers, predicted = by_numbers(of, None), self._predicted(formula, own, n)
+            size = lambda change: self.weighted_norm(change, scale, like)
+            predicted = self._predicted(formula, of, before.size)
+            predicted = jnp.where(begins, x.w, predicted[0]), predicted[1]
             solved = tangents_nearby(
-                newton.matrix, newton.inverses, equation, by_state, numbers, predicted, size, _NEWTON
+                newton.matrix, newton.inverses, equation, by_state, own, predicted, size, _NEWTON, begins
             )
-            end = self.ended(formula, own, (past, a, b), solved)
-            pushed.append((end, self._ends(formula, own, *solved[1:])))
-        # A derivative that is no number is taken as zero.
-        return step, jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), pushed)
+            first, slope = self.begun(*spacing_of(history), *solved)
+            first = Tangent(solved[0], (first.differences, slope), control.largest(solved[0]))
+            ended = self.ended(formula, of, (past, a, b), solved)
+            found = PushedTangent(
+                jax.tree.map(lambda a, b: jnp.where(begins, a, b), first, x),
+                ended,
+                self._ends(formula, of, *solved[1:]),
+            )
+            # A derivative that is no number is taken as zero.
+            return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), found)
+
+        def advanced(carry):
+            # In a first step the equations are linearised at its start, then at its end.
+            k, last = carry
+            begins = k == 0
+            t, y, f, chart = jax.tree.map(lambda a, b: jnp.where(begins, a, b), start, end)
+            solution = lambda numbers: solution_of(
+                eqx.combine(numbers, rest), t, like, kept_of_chart(terms, chart), args
+            )
+            by_numbers, by_state = linearized(solution, numbers, t, y, f)
+            tangents = [own.before for own in last]
+            scales = control.scales(self.tolerances.rtol, tangents, [x.w for x in tangents])
+            each = zip(tangents, scales, along, strict=True)
+            return k + 1, [pushed(x, scale, by_numbers(of, None), by_state, begins) for x, scale, of in each]
+
+        blank = jax.tree.map(jnp.zeros_like, (own_step.end, own_step.ends))
+        carry = jnp.where(is_start(history), 0, 1), [PushedTangent(x, *blank) for x in state.tangents or ()]
+        return step, lax.while_loop(lambda carry: carry[0] < 2, advanced, carry)[1]
 
     def _predicted(self, formula: Formula, history: History, n: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state and the rate at the end of a step, extrapolated.
@@ -354,21 +395,29 @@ class Hermite(AbstractMultistep):
         rates = jnp.asarray(before_each(used.size), dtype) @ (1 / (formula.end - history.mesh)).astype(dtype)
         return recent @ states, (recent * rates) @ states
 
-    def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization):
+    def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, begins: Any):
         """The end of a step as a linear map of tangents: of numbers, of the state at its start, and of the history
         there, on the mesh of the step.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and these; the `end`: its
-        time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there.
+        time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there; `begins`:
+        whether this is the start of the step instead, whose history follows from the state.
         """
         (solution, numbers), (t, y, f) = equations, end
         by_numbers, by_state = linearized(solution, numbers, t, y, f)
         _, a, b = self.equation(formula, y, jnp.zeros((formula.values.size, y.size), y.dtype))
+        a, b = (jnp.where(begins, jnp.zeros_like(x), x) for x in (a, b))
         solve = matrix.tangents(matrix.inverses(a, b, free), a, b, free, by_state)
 
         def push(along, w, history):
-            past, _, _ = self.equation(formula, w, history.differences)
-            return self.ended(formula, history, (past, a, b), solve(by_numbers(along, None), past))
+            past = jnp.where(begins, w, self.equation(formula, w, history.differences)[0])
+            solved = solve(by_numbers(along, None), past)
+            end = self.ended(formula, history, (past, a, b), solved)
+            if begins is False:
+                return end
+            first, _ = self.begun(*spacing_of(history), *solved)
+            differences = jnp.where(begins, first.differences, end.history.differences)
+            return eqx.tree_at(lambda end: end.history.differences, end, differences)
 
         return push
 
@@ -442,9 +491,9 @@ class Hermite(AbstractMultistep):
         stable = a_stable(self.family, self.past_points)
         candidates = jnp.append(around, stable or 1)
         sizes = self._sizes(step.ends, candidates, family, newton, free, scale, y0)
-        tangents, scales = self.tangents_after(state.tangents, [end for end, _ in along])
-        for (_, ends), scale in zip(along, scales, strict=True):
-            sizes = jnp.maximum(sizes, self._sizes(ends, candidates, family, newton, free, scale, y0))
+        tangents, scales = self.tangents_after(tuple(own.before for own in along), [own.end for own in along])
+        for own, scale in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(own.ends, candidates, family, newton, free, scale, y0))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         bounded = None
         if stable is not None:
@@ -486,6 +535,7 @@ class Hermite(AbstractMultistep):
             chart=renewed,
             sizes=self.grown_sizes(state.sizes, step.after),
             tangents=tangents,
+            wrong_derivative=state.wrong_derivative,
         )
         return y1, estimate, self.dense_info(step.end, y0, k), new_state, failed
 

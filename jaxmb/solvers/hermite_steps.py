@@ -5,6 +5,7 @@ of the linearised equation, and nothing else is solved. So little of a step is s
 did.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from .steps import AbstractSteps, LinearStep
 
 
 class HermiteRow(eqx.Module):
-    """What is stored of a step.
+    """What is stored of a step, or of the start of a run: then nothing is `known`, and y and f are of the start.
 
     **Fields:** its `end`; the `mesh`, the number of `known` points and the `order_index` at its start; state `y` and
     field `f` at its end; what is `kept` of the chart there, and its `free` components; `jump` at its start, None where
@@ -42,10 +43,33 @@ class HermiteRow(eqx.Module):
 
 
 class HermiteSteps(AbstractSteps):
-    """The steps of `Hermite`; `jumps`: whether they may begin after a jump; its `family` of formulas."""
+    """The steps of `Hermite`; `jumps`: whether they may begin after a jump; its `family` of formulas; whether a run
+    begins with a state alone (`anew`).
+    """
 
     jumps: bool = eqx.field(static=True)
     family: str = eqx.field(static=True)
+    anew: bool = eqx.field(static=True, default=False)
+
+    @property
+    def starts(self):
+        return self.anew
+
+    def from_start(self):
+        return dataclasses.replace(self, anew=True)
+
+    def start(self, terms, before, after):
+        del after
+        if not self.anew:
+            return None
+        old, flat = before.solver_state, ravel(before.y)
+        history, f, jump = old.history, old.slope[-flat.size :], None
+        if self.jumps:
+            made = jnp.zeros_like(jnp.asarray(before.made_jump))
+            jump = Jump(made, history.mesh[0], before.tprev, flat, f, old.chart, None)
+        kept, free = kept_of_chart(terms, old.chart), free_components(terms, flat, old.chart)
+        nothing = jnp.zeros_like(history.known)
+        return HermiteRow(before.tnext, history.mesh, nothing, old.order_index, flat, f, kept, free, jump)
 
     def row(self, terms, before, after):
         old, new, n = before.solver_state, after.solver_state, ravel(after.y).size
@@ -75,14 +99,17 @@ class HermiteSteps(AbstractSteps):
         jump = row.jump
         restart = None if jump is None else restarts(of, moved, like, jump, lambda *at: derivatives(*at)[:3])
 
+        begins = row.known == 0 if self.anew else False
+        time = jnp.where(begins, row.mesh[0], row.end)
+
         def solution(numbers):
             own, args, _ = of(numbers)
-            return solution_of(own, row.end, like, row.kept, args)
+            return solution_of(own, time, like, row.kept, args)
 
-        matrix = structured(jacobian_of(*freeze((terms, row.end, like, args))), freeze(row.y))
+        matrix = structured(jacobian_of(*freeze((terms, time, like, args))), freeze(row.y))
         if matrix is None:
             matrix = DenseLinearization.unknown(row.y, row.free)
-        step = solver.linearised(formula, (solution, moved.terms), (row.end, row.y, row.f), row.free, matrix)
+        step = solver.linearised(formula, (solution, moved.terms), (time, row.y, row.f), row.free, matrix, begins)
 
         def push(dmoved, w, memory):
             differences, slope = memory

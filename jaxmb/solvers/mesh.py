@@ -22,7 +22,7 @@ from .evaluation import freeze, ravel, unravel_like
 from .events import events_found
 from .linear_map import filled, linear_map
 from .packing import Layout
-from .segments import Row, Segments, choice_of, remainder, row_of, start_of
+from .segments import Row, Segments, choice_of, first_of, remainder, row_of, start_of
 from .stepping import ended, known_in_steps, stepped
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
@@ -52,7 +52,7 @@ class Saved(eqx.Module):
         """Whether the state at the end of the step k is saved; False of a series without such states."""
         if self.events:
             return row.at_event.here
-        return (k + 1) % self.steps == 0 if self.steps else False
+        return ((k + 1) % self.steps == 0) & (k >= 0) if self.steps else False
 
 
 class Tangents(NamedTuple):
@@ -73,9 +73,10 @@ class Mesh(eqx.Module):
     """The steps of a run.
 
     **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms, their arguments and the solver;
-    `steps`; what is stored of the `start`; `rows`: buffers of packed rows; `layout` of a row; their `count`; the
-    `saved` series; `like`: a state; `memory` of the solver at the start; `dense`: of how many steps dense output is
-    kept; whether the run ends at an `event`; its `segments`, None where there is one only.
+    `steps`; what is stored of the `start`, if that is no row; `rows`: buffers of packed rows, behind them that of the
+    start if it is one; `layout` of a row; their `count`; the `saved` series; `like`: a state; `memory` of the solver at
+    the start; `dense`: of how many steps dense output is kept; whether the run ends at an `event`; its `segments`, None
+    where there is one only.
     """
 
     moved: Moving
@@ -94,16 +95,26 @@ class Mesh(eqx.Module):
 
     @property
     def size(self) -> int:
-        return self.rows[0].shape[0]
+        return self.rows[0].shape[0] - self.steps.starts
 
     def row(self, rows: list[Array], k: Any) -> Row:
         """The row of a step, from those of its segment."""
         place = self._place(k)
         return self.layout.unpacked([buffer[place] for buffer in rows])
 
+    @property
+    def _begin(self) -> Any:
+        """The index of the first row: that of the start is -1, where there are steps."""
+        return -(self.count > 0).astype(self.count.dtype) if self.steps.starts else jnp.zeros_like(self.count)
+
+    def _is_step(self, k: Any) -> Any:
+        """Whether a row is of a step, and not of the start."""
+        return k >= 0 if self.steps.starts else True
+
     def _place(self, k: Any) -> Any:
         """The index of the row of a step, among those of its segment."""
-        return k if self.segments is None else remainder(k, self.size)
+        place = k if self.segments is None else remainder(k, self.size)
+        return jnp.where(k < 0, self.size, place) if self.steps.starts else place
 
     def linearised(self, row: Row) -> LinearStep:
         return self.steps.linearised(lambda terms: eqx.combine(terms, self.still), self.moved, self.like, row.own)
@@ -174,7 +185,7 @@ class Mesh(eqx.Module):
             table.at[0].set(w) if series.start else table for series, table in zip(self.saved, out.saved, strict=True)
         )
         places = tuple(jnp.array([int(series.start), 0]) for series in self.saved)
-        return jnp.zeros_like(self.count), (w, memory), saved, places, out.rows, out.dense, out.last
+        return self._begin, (w, memory), saved, places, out.rows, out.dense, out.last
 
     def _out(self, carry, blank: Tangents) -> Tangents:
         _, end, saved, _, rows, dense, last = carry
@@ -195,7 +206,7 @@ class Mesh(eqx.Module):
                 along = self.layout.packed_tangent(row, none._replace(own=own))
                 rows = [buffer_set(buffer, self._place(k), x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
-                dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x), ddense, dense)
+                dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x, self._is_step(k)), ddense, dense)
             each = zip(self.saved, saved, places, strict=True)
             new = [_saved(series, table, place, k, row, after[0], ddense, step.at) for series, table, place in each]
             saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
@@ -209,13 +220,14 @@ class Mesh(eqx.Module):
         places = tuple(series.passed for series in self.saved)
         carry = self.count, *end, places, jax.tree.map(jnp.zeros_like, self.moved)
         if self.segments is None:
-            carry = self._pulled(cotangents, carry, self.rows, 0)
+            carry = self._pulled(cotangents, carry, self.rows, self._begin)
         else:
 
             def body(carry):
                 segment, inner, rows = carry
                 rows = self._rows_again(segment, rows, segment < last)
-                return segment - 1, self._pulled(cotangents, inner, rows, segment * self.size), rows
+                first = jnp.where(segment == 0, self._begin, segment * self.size)
+                return segment - 1, self._pulled(cotangents, inner, rows, first), rows
 
             last = (self.count - 1) // self.size
             carry = last, carry, self.rows
@@ -247,7 +259,8 @@ class Mesh(eqx.Module):
             shapes = eqx.filter_eval_shape(step.push, nothing, lw, lmemory)[2]
             ldense = zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
             if cotangents.dense is not None:
-                ldense = jax.tree.map(lambda z, c: z if c is None else z + c[k], zeros, cotangents.dense)
+                own = lambda z, c: z if c is None else z + jnp.where(self._is_step(k), c[k], 0)
+                ldense = jax.tree.map(own, zeros, cotangents.dense)
             if cotangents.last is not None:
                 is_last = k + 1 == self.count
                 ldense = jax.tree.map(
@@ -357,9 +370,10 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         **options,
     ):
         """diffrax's loop with room for `max_steps` steps, of which `limit` are taken at most."""
-        del throw, passed_solver_state, passed_controller_state
+        del throw, passed_controller_state
         steps, own = steps_of(solver, options["stepsize_controller"])
         steps = steps.after_first_jump() if self.begins else steps
+        steps = steps if passed_solver_state else steps.from_start()
         jumps = jump_times(options["stepsize_controller"])
         given = {"solver": solver, "saveat": saveat, "max_steps": max_steps, **options}
         fixed = given, steps = freeze((given, steps))
@@ -375,8 +389,8 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 def _recorded(equations, init_state, fixed, known, limit, most):
     """The last state of diffrax's loop; what is stored of the start; the rows of the last segment of steps, of which
-    each has `most`; the starts of all segments and the choices of all steps, None where there is one segment only. All
-    but the first are packed.
+    each has `most`, and behind them that of the start if it is one; the starts of all segments and the choices of all
+    steps, None where there is one segment only. All but the first are packed.
     """
     (given, steps), terms = fixed, equations["terms"]
     size = min(most, given["max_steps"])
@@ -393,7 +407,7 @@ def _recorded(equations, init_state, fixed, known, limit, most):
             old, since, first, rows, starts, choices = carry
             new = body_fun(old)
             k, kept = old.num_accepted_steps, new.num_accepted_steps > old.num_accepted_steps
-            first = _written(first, 0, of_first.packed(steps.start(terms, old, new)), kept & (k == 0))
+            first = _written(first, 0, of_first.packed(first_of(steps, terms, old, new)), kept & (k == 0))
             if starts is not None:
                 # In the middle of a segment what is written comes to lie behind the last start.
                 place = jnp.where(remainder(k, size) == 0, k // size, segments)
@@ -413,11 +427,14 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         last, _, first, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
-            (init, since, of_first.blank(1), layout.blank(size), starts, choices),
+            (init, since, of_first.blank(1), layout.blank(size + steps.starts), starts, choices),
             max_steps=None,
             buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",
         )
+        if steps.starts:
+            # Not in the loop, where two rows that are written make a copy of all.
+            rows = _written(rows, size, [table[0] for table in first], True)
         return last, first, rows, None if starts is None else (starts, choices)
 
     return stepped(init_state, outer, known, **equations, **given)
@@ -429,7 +446,7 @@ def _written(tables, index, row, kept):
 
 def _layout_of_first(steps, terms, state):
     """The layout of what is stored of the start of a run."""
-    return Layout(eqx.filter_eval_shape(lambda state: steps.start(terms, state, state), state))
+    return Layout(eqx.filter_eval_shape(lambda state: first_of(steps, terms, state, state), state))
 
 
 def _layouts_again(steps, old, new):
@@ -466,9 +483,11 @@ def _with_derivatives_jvp(primals, tangents):
     saveat = given["saveat"]
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
-    w, inner = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
     at_start = _layout_of_first(steps, equations[0], init_state).unpacked([table[0] for table in first])
-    x = Moving(dequations, djumps), (w, inner)
+    # At a start the memory follows from the state.
+    own = jax.tree.map(jnp.zeros_like, memory) if steps.starts else filled(memory, steps.memory(dinit.solver_state))
+    w = ravel(filled(y0, dinit.y))
+    x = Moving(dequations, djumps), (w, own)
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
         raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")

@@ -8,6 +8,7 @@ the tangents whose errors were controlled.
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, PyTree
@@ -69,6 +70,17 @@ def row_of(steps: AbstractSteps, terms: PyTree, since: Any, old: Any, new: Any) 
     return Row(since, old.tnext, _at_event(old, new), steps.row(terms, old, new))
 
 
+def first_of(steps: AbstractSteps, terms: PyTree, old: Any, new: Any) -> PyTree[Array]:
+    """What is stored of the start of a run, from the states before and after its first step; a row, in which no time
+    lies, where the steps have one.
+    """
+    own = steps.start(terms, old, new)
+    if not steps.starts:
+        return own
+    ever, nothing = jnp.full_like(old.tprev, jnp.inf), jax.tree.map(jnp.zeros_like, _at_event(old, new))
+    return Row(ever, -ever, nothing, own)
+
+
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
     """What was chosen for the same step."""
     jump = (old.tprev, jnp.asarray(old.made_jump)) if steps.jumps else (None, None)
@@ -116,7 +128,7 @@ class Segments(eqx.Module):
         **Arguments:** `equations`: the terms, their arguments and the solver without tangents.
         """
         terms, args, solver = equations
-        steps, size = steps.of_solver_alone(), rows[0].shape[0]
+        steps, size = steps.of_solver_alone(), rows[0].shape[0] - steps.starts
         first = segment * size
         last = jnp.where(lost, jnp.minimum(first + size, count), first)
 

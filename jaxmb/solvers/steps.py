@@ -42,6 +42,13 @@ class AbstractSteps(eqx.Module):
 
     jumps: AbstractVar[bool]
 
+    @property
+    def starts(self) -> bool:
+        """Whether the start of a run is a row before that of its first step, at which the memory follows from the
+        state.
+        """
+        return False
+
     @abc.abstractmethod
     def row(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
         """What is stored of an accepted step, from the states of diffrax's loop before and after it."""
@@ -64,13 +71,17 @@ class AbstractSteps(eqx.Module):
         """The same for runs that begin with a jump."""
         return self
 
+    def from_start(self) -> Self:
+        """The same for runs that begin with a state alone, and not with the memory of another run."""
+        return self
+
     @abc.abstractmethod
     def memory(self, solver_state: Any) -> PyTree[Array]:
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
     def start(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
         """What is stored of the start of a run, from the states of diffrax's loop before and after its first accepted
-        step; by default nothing.
+        step; by default nothing. Of steps that have one (`starts`) it is a row.
         """
         del terms, before, after
         return None

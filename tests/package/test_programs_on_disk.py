@@ -152,6 +152,28 @@ print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts[
     assert second["hits"] == second["asked"] == first["asked"] > first["hits"]
 
 
+@pytest.mark.long
+def test_programs_of_stiff_motions_are_found(tmp_path):
+    code = """
+mb.keep_compiled()
+from jaxmb import planar
+body = planar.Body("bob", mass=1.0, inertia=1.0, position=(1.0, 0.0), angle=0.0)
+law = lambda poses, velocities, t, p: -p["stiffness"] * poses
+system = mb.Scene([body], forces=[mb.Force("pull", "bob", law, parameters={"stiffness": 1e3})]).compile()
+
+def place(stiffness):
+    own = mb.with_parameters(system, {"pull.stiffness": stiffness})
+    motion = mb.simulate(own, system.guess, t1=0.01, rtol=1e-4, solver=mb.solvers.Hermite())
+    return motion["bob"].position[-1, 0]
+
+found = [float(f(1e3)).hex() for f in (place, jax.grad(place), jax.jit(place))]
+print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts["cache_hits"]))
+"""
+    first, second = (process(code, JAXMB_CACHE=str(tmp_path), XLA_FLAGS=QUICKLY)[0] for _ in range(2))
+    assert second["found"] == first["found"]
+    assert second["hits"] == second["asked"] == first["asked"] > first["hits"]
+
+
 def test_a_program_that_was_compiled_before_is_not_kept(tmp_path):
     code = "f = jax.jit(lambda x: jnp.sin(x) + x)\nf(1.0)\nmb.keep_compiled()\nf(1.0)\nf(jnp.ones(3))" + REPORT
     found, _ = process(code, JAXMB_CACHE=str(tmp_path))

@@ -1,5 +1,7 @@
 """The implicit second-derivative methods: orders, stiff problems, derivatives, diffrax's features, and bad input."""
 
+import functools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -9,6 +11,8 @@ import optimistix as optx
 import pytest
 from stiff_problems import PROBLEMS, solve, van_der_pol
 
+import jaxmb as mb
+from jaxmb import planar
 from jaxmb.solvers import Hermite, MultistepController
 from jaxmb.solvers._formulas import FAMILIES, double, formulas, start
 from jaxmb.solvers._history import advance, basis, before_each
@@ -227,12 +231,33 @@ def test_derivatives_of_a_reaction_over_eleven_decades():
 
 def test_a_field_without_derivative_is_noticed():
     hidden = lambda t, y, args: jnp.stack([-jax.lax.stop_gradient(y[0]), -y[1]])
-    solve = lambda y0: diffrax.diffeqsolve(
-        diffrax.ODETerm(hidden), Hermite(), 0.0, 1.0, None, y0, stepsize_controller=MultistepController(1e-4, 1e-4)
-    )
-    with pytest.warns(UserWarning, match="contradicts its differences"):
-        jax.block_until_ready(jax.jit(jax.vmap(lambda y0: solve(y0).ys))(jnp.ones((3, 2))))
-        jax.effects_barrier()
+    shown = lambda t, y, args: -y
+
+    def is_wrong(field, y0):
+        terms, control = diffrax.ODETerm(field), MultistepController(1e-4, 1e-4)
+        saveat = diffrax.SaveAt(solver_state=True, controller_state=True)
+        out = diffrax.diffeqsolve(
+            terms, Hermite(), 0.0, 1.0, None, y0, stepsize_controller=control, saveat=saveat, throw=False
+        )
+        return Hermite().statistics(out.solver_state, out.controller_state, out.stats)["wrong_derivative"]
+
+    y0 = jnp.array([[1.0, 1.0], [0.5, 2.0]])
+    for field, wrong in ((hidden, True), (shown, False)):
+        program = jax.jit(jax.vmap(functools.partial(is_wrong, field)))
+        assert "callback" not in str(jax.make_jaxpr(program)(y0))
+        assert program(y0).tolist() == [wrong] * 2
+
+
+@pytest.mark.parametrize("hides", [True, False])
+def test_a_simulation_warns_of_a_part_without_derivative(hides, recwarn):
+    hide = jax.lax.stop_gradient if hides else lambda x: x
+    law = lambda poses, velocities, t, p: -1e3 * hide(poses)
+    body = planar.Body("bob", mass=1.0, inertia=1.0, position=(1.0, 0.5), angle=0.1)
+    system = mb.Scene([body], forces=[mb.Force("pull", "bob", law, parameters={})]).compile()
+    motion = mb.simulate(system, system.guess, t1=0.01, rtol=1e-4, solver=Hermite(), throw=False)
+    assert bool(motion.stats["wrong_derivative"]) == hides
+    told = [w for w in recwarn if "contradicts its differences" in str(w.message)]
+    assert [w.filename for w in told] == [__file__] * hides
 
 
 # Diffrax's features
