@@ -16,7 +16,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from .._compat import any_of_batch
 from ._history import INDEX, LENGTH, basis_means, known_differences, start, step_end
 from ._interpolation import RateInterpolation
 from .evaluation import at_solution, guards_of, kept_of_chart, ravel, unravel_like
@@ -68,24 +67,12 @@ def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, 
     return Coefficients(h, end, products, integrals[2], jnp.diff(integrals))
 
 
-class StartRow(NamedTuple):
-    """What is stored of the start of a run.
-
-    **Fields:** whether the memory is `asked` for the field there, and not given; its time, and the field `f`; what is
-    `kept` of its chart.
-    """
-
-    asked: Any
-    time: Any
-    f: Float[Array, " n"]
-    kept: Any
-
-
 class AdamsRow(eqx.Module):
-    """What is stored of a step.
+    """What is stored of a step, or of the start of a run.
 
     **Fields:** its `end`; the `mesh`, the `order` and the number of `known` points at its start; state `y` and field
-    `f` at its end; what is `kept` of the chart there; `jump` at its start, None where steps have none.
+    `f` at its end; what is `kept` of the chart there; `jump` at its start, None where steps have none. At the start of
+    a run the order is zero, nothing is known unless the memory is given, and y, f and the chart are those there.
     """
 
     end: Any
@@ -141,37 +128,32 @@ class AdamsSteps(AbstractSteps):
     def memory(self, solver_state):
         return solver_state.memory
 
-    def start(self, terms, before, after):
-        if self.begins:
-            return None
+    @property
+    def starts(self):
         # A run that begins with a jump has no field before it.
-        asked = (before.solver_state.history.known == 0) & ~jnp.asarray(before.made_jump)
-        return StartRow(asked, before.tprev, *_at_start(terms, after.solver_state))
+        return not self.begins
 
-    def memory_at_start(self, of, terms, like, row, along):
-        *inward, given = along
-        if self.begins:
-            return given
-
-        def field(terms, flat):
-            own, args, _ = of(terms)
-            return at_solution(own, row.time, flat, row.f, like, row.kept, args)[1]
-
-        def found():
-            # Of zeros nothing that is not finite comes, in either mode.
-            within = jax.tree.map(lambda x: jnp.where(row.asked, x, jnp.zeros((), x.dtype)), tuple(inward))
-            _, f = jax.jvp(field, (terms, ravel(like)), within)
-            return jnp.where(row.asked, given.at[0].set(f), given)
-
-        return lax.cond(any_of_batch(row.asked), found, lambda: given)
+    def start(self, terms, before, after):
+        own, known = self.row(terms, before, after), before.solver_state.history.known
+        given = (known > 0) | jnp.asarray(before.made_jump)
+        own = eqx.tree_at(lambda row: row.jump.made, own, jnp.zeros_like(own.jump.made)) if self.jumps else own
+        f, kept = _at_start(terms, after.solver_state)
+        numbers = jnp.zeros_like(own.order), given.astype(known.dtype), ravel(before.y), f, kept
+        return eqx.tree_at(
+            lambda row: (row.order, row.known, row.y, row.f, row.kept), own, numbers, is_leaf=lambda x: x is None
+        )
 
     def linearised(self, of, moved, like, row):
+        begins = row.order == 0 if self.starts else jnp.array(False)
+        time = jnp.where(begins, row.mesh[0], row.end)
+
         def at(of_terms, flat):
             terms, args, _ = of(of_terms)
-            return at_solution(terms, row.end, flat, row.f, like, row.kept, args)
+            return at_solution(terms, time, flat, row.f, like, row.kept, args)
 
         _, field = jax.linearize(at, moved.terms, row.y)
         formulas = coefficients(row.mesh, row.order, row.end, row.y.dtype)
+        h = jnp.where(begins, 0.0, formulas.h)
         used = (row.order >= INDEX)[:, None]
         jump = row.jump
         restart = None if jump is None else restarts(of, moved, like, jump, lambda field, t, y: field(t, y)[0])
@@ -182,18 +164,19 @@ class AdamsSteps(AbstractSteps):
                 restarted = jnp.concatenate([f[None], jnp.zeros_like(memory[1:])])
                 w, memory = jnp.where(jump.made, new, w), jnp.where(jump.made, restarted, memory)
             partial_sums, neighbours, mean = formulas.sums(memory)
-            predicted = w + formulas.h * mean
+            predicted = w + h * mean
 
             def evaluated(before, _):
                 w, f = field(dmoved.terms, before[0])
-                corrected = predicted + formulas.h * formulas.last * (f - neighbours[1])
+                corrected = predicted + h * formulas.last * (f - neighbours[1])
                 return (corrected, w, f), None
 
             # A loop, so that there is one program for both evaluations, and one for their transposes.
             none = jnp.zeros_like(predicted)
-            (corrected, w, f), _ = lax.scan(evaluated, (predicted, none, none), length=2)
-            memory = known_differences(row.known, f, partial_sums)
-            mismatch = corrected - w
+            (corrected, after, f), _ = lax.scan(evaluated, (predicted, none, none), length=2)
+            of_start = jnp.where(row.known == 0, jnp.zeros_like(memory).at[0].set(f), memory)
+            memory = jnp.where(begins, of_start, known_differences(row.known, f, partial_sums))
+            mismatch, w = corrected - after, jnp.where(begins, w, after)
             zero = jnp.zeros((), w.dtype)
             dense = {"y1": unravel_like(like, w), "differences": jnp.where(used, memory, zero), "mesh": None}
             return w, memory, dense | {"mismatch": mismatch}

@@ -60,8 +60,6 @@ class HermiteSteps(AbstractSteps):
 
     def start(self, terms, before, after):
         del after
-        if not self.anew:
-            return None
         old, flat = before.solver_state, ravel(before.y)
         history, f, jump = old.history, old.slope[-flat.size :], None
         if self.jumps:
@@ -113,6 +111,8 @@ class HermiteSteps(AbstractSteps):
 
         def push(dmoved, w, memory):
             differences, slope = memory
+            # At a start the memory follows from the state.
+            differences = jnp.where(begins, 0.0, differences)
             if jump is not None and restart is not None:
                 new, f, g = restart(dmoved, w, slope[-w.size :])
                 first, _ = solver.begun(row.mesh[0], formula.h, new, f, g)

@@ -73,16 +73,14 @@ class Mesh(eqx.Module):
     """The steps of a run.
 
     **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms, their arguments and the solver;
-    `steps`; what is stored of the `start`, if that is no row; `rows`: buffers of packed rows, behind them that of the
-    start if it is one; `layout` of a row; their `count`; the `saved` series; `like`: a state; `memory` of the solver at
-    the start; `dense`: of how many steps dense output is kept; whether the run ends at an `event`; its `segments`, None
-    where there is one only.
+    `steps`; `rows`: buffers of packed rows, behind them that of the start if there is one; `layout` of a row; their
+    `count`; the `saved` series; `like`: a state; `memory` of the solver at the start; `dense`: of how many steps dense
+    output is kept; whether the run ends at an `event`; its `segments`, None where there is one only.
     """
 
     moved: Moving
     still: PyTree
     steps: AbstractSteps
-    start: PyTree
     rows: list[Array]
     layout: Layout = eqx.field(static=True)
     count: Any
@@ -145,7 +143,6 @@ class Mesh(eqx.Module):
         zeros unless they are `used`.
         """
         blank, (w, memory) = self.blank(), x[1]
-        memory = self._memory_at_start(x[0].terms, w, memory)
         first = self._first(w, memory, blank if any(used.rows) else blank._replace(rows=[]))
         if self.segments is None:
             return self._out(self._pushed(x[0], first, self.rows, self.count), blank)
@@ -234,18 +231,10 @@ class Mesh(eqx.Module):
             kept = lambda carry: carry[2]
             _, carry, _ = while_loop(lambda c: c[0] >= 0, body, carry, max_steps=None, buffers=kept, kind="lax")
         _, lw, lmemory, places, total = carry
-        nothing = jax.tree.map(jnp.zeros_like, (self.moved.terms, lw, lmemory))
-        dterms, more, lmemory = jax.linear_transpose(self._memory_at_start, *nothing)(lmemory)
-        lw, total = lw + more, total._replace(terms=jax.tree.map(jnp.add, total.terms, dterms))
         for series, table in zip(self.saved, cotangents.saved, strict=True):
             if series.start and table is not None:
                 lw = lw + table[0]
         return total, (lw, lmemory)
-
-    def _memory_at_start(self, dterms, w, memory):
-        """The tangent of the memory that the first step begins with."""
-        of = lambda terms: eqx.combine(terms, self.still)
-        return self.steps.memory_at_start(of, self.moved.terms, self.like, self.start, (dterms, w, memory))
 
     def _pulled(self, cotangents: Tangents, carry, rows, first):
         """The carry of the loop over steps before the step `first`."""
@@ -388,9 +377,9 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 
 def _recorded(equations, init_state, fixed, known, limit, most):
-    """The last state of diffrax's loop; what is stored of the start; the rows of the last segment of steps, of which
-    each has `most`, and behind them that of the start if it is one; the starts of all segments and the choices of all
-    steps, None where there is one segment only. All but the first are packed.
+    """The last state of diffrax's loop; the rows of the last segment of steps, of which each has `most`, and behind them
+    that of the start if there is one; the starts of all segments and the choices of all steps, None where there is one
+    segment only. All but the first are packed.
     """
     (given, steps), terms = fixed, equations["terms"]
     size = min(most, given["max_steps"])
@@ -400,14 +389,14 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         del max_steps
         since = jnp.asarray(-jnp.inf, init.tprev.dtype)
         layout = Layout(eqx.filter_eval_shape(lambda init: row_of(steps, terms, since, init, body_fun(init)), init))
-        of_first = _layout_of_first(steps, terms, init)
         of_starts, of_choices = _layouts_again(steps, init, eqx.filter_eval_shape(body_fun, init))
 
         def body(carry):
             old, since, first, rows, starts, choices = carry
             new = body_fun(old)
             k, kept = old.num_accepted_steps, new.num_accepted_steps > old.num_accepted_steps
-            first = _written(first, 0, of_first.packed(first_of(steps, terms, old, new)), kept & (k == 0))
+            if steps.starts:
+                first = _written(first, 0, layout.packed(first_of(steps, terms, old, new)), kept & (k == 0))
             if starts is not None:
                 # In the middle of a segment what is written comes to lie behind the last start.
                 place = jnp.where(remainder(k, size) == 0, k // size, segments)
@@ -427,7 +416,7 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         last, _, first, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
-            (init, since, of_first.blank(1), layout.blank(size + steps.starts), starts, choices),
+            (init, since, layout.blank(1), layout.blank(size + steps.starts), starts, choices),
             max_steps=None,
             buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",
@@ -435,18 +424,13 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         if steps.starts:
             # Not in the loop, where two rows that are written make a copy of all.
             rows = _written(rows, size, [table[0] for table in first], True)
-        return last, first, rows, None if starts is None else (starts, choices)
+        return last, rows, None if starts is None else (starts, choices)
 
     return stepped(init_state, outer, known, **equations, **given)
 
 
 def _written(tables, index, row, kept):
     return [buffer_set(table, index, x, kept) for table, x in zip(tables, row, strict=True)]
-
-
-def _layout_of_first(steps, terms, state):
-    """The layout of what is stored of the start of a run."""
-    return Layout(eqx.filter_eval_shape(lambda state: first_of(steps, terms, state, state), state))
 
 
 def _layouts_again(steps, old, new):
@@ -478,16 +462,13 @@ def _with_derivatives_jvp(primals, tangents):
     _, dequations, djumps, dinit, *_ = tangents
     # Second derivatives see those of the rows.
     out = _with_derivatives(*primals)
-    final, first, rows, again = out
+    final, rows, again = out
     given, steps = fixed
     saveat = given["saveat"]
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
-    at_start = _layout_of_first(steps, equations[0], init_state).unpacked([table[0] for table in first])
-    # At a start the memory follows from the state.
-    own = jax.tree.map(jnp.zeros_like, memory) if steps.starts else filled(memory, steps.memory(dinit.solver_state))
-    w = ravel(filled(y0, dinit.y))
-    x = Moving(dequations, djumps), (w, own)
+    w, inner = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
+    x = Moving(dequations, djumps), (w, inner)
     series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
         raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")
@@ -504,7 +485,6 @@ def _with_derivatives_jvp(primals, tangents):
         moved=Moving(moved, None if djumps is None else jumps),
         still=still,
         steps=steps,
-        start=at_start,
         rows=rows,
         layout=layout,
         count=final.num_accepted_steps,
@@ -518,8 +498,7 @@ def _with_derivatives_jvp(primals, tangents):
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
     of_one = lambda mesh, *x: mesh.of_one_segment().push(*x), lambda mesh, x: mesh.of_one_segment().pull(x)
     along = linear_map(Mesh.push, Mesh.pull, of_one, mesh, x, like)
-    none = jax.tree.map(lambda _: None, (first, again))
-    return out, (_of_loop(final, along, y0), none[0], _of_rows(rows, along.rows), none[1])
+    return out, (_of_loop(final, along, y0), _of_rows(rows, along.rows), jax.tree.map(lambda _: None, again))
 
 
 def _segments(again, layout, steps, old, new):

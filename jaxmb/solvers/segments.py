@@ -70,15 +70,10 @@ def row_of(steps: AbstractSteps, terms: PyTree, since: Any, old: Any, new: Any) 
     return Row(since, old.tnext, _at_event(old, new), steps.row(terms, old, new))
 
 
-def first_of(steps: AbstractSteps, terms: PyTree, old: Any, new: Any) -> PyTree[Array]:
-    """What is stored of the start of a run, from the states before and after its first step; a row, in which no time
-    lies, where the steps have one.
-    """
-    own = steps.start(terms, old, new)
-    if not steps.starts:
-        return own
+def first_of(steps: AbstractSteps, terms: PyTree, old: Any, new: Any) -> Row:
+    """The row of the start of a run, in which no time lies, from the states before and after its first step."""
     ever, nothing = jnp.full_like(old.tprev, jnp.inf), jax.tree.map(jnp.zeros_like, _at_event(old, new))
-    return Row(ever, -ever, nothing, own)
+    return Row(ever, -ever, nothing, steps.start(terms, old, new))
 
 
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:

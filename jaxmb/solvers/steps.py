@@ -44,9 +44,7 @@ class AbstractSteps(eqx.Module):
 
     @property
     def starts(self) -> bool:
-        """Whether the start of a run is a row before that of its first step, at which the memory follows from the
-        state.
-        """
+        """Whether the start of a run is a row, before that of its first step."""
         return False
 
     @abc.abstractmethod
@@ -80,23 +78,10 @@ class AbstractSteps(eqx.Module):
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
     def start(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
-        """What is stored of the start of a run, from the states of diffrax's loop before and after its first accepted
-        step; by default nothing. Of steps that have one (`starts`) it is a row.
+        """The row of the start of a run, if it `starts` with one, from the states of diffrax's loop before and after
+        its first accepted step.
         """
-        del terms, before, after
-        return None
-
-    def memory_at_start(
-        self, of: Callable, terms: PyTree, like: PyTree[Array], row: PyTree[Array], along: tuple[PyTree, Array, PyTree]
-    ) -> PyTree[Array]:
-        """The tangent of the memory that the first step of a run begins with; by default the one that it is given.
-
-        **Arguments:** `of(terms)`: the terms, their arguments and the solver; `like`: the first state; `row`: what is
-        stored of the start, zeros in a run without steps; `along`: the tangents of the terms, of the raveled state and
-        of the memory, in which the result is linear.
-        """
-        del of, terms, like, row
-        return along[2]
+        raise NotImplementedError
 
     @abc.abstractmethod
     def linearised(self, of: Callable, moved: Moving, like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
