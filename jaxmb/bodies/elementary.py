@@ -335,7 +335,9 @@ def _listed(groups: Sequence[AbstractConstraintGroup]) -> list[Listed]:
 
 
 def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> Bool[Array, "rows"]:
-    """Which rows of elementary joints belong to a product that vanishes half a turn away as well, at poses there."""
+    """Which rows of elementary joints belong to a product that vanishes at these poses, but not where its joint closes:
+    half a turn away, or a third of one about a diagonal.
+    """
     space, listed = groups[0].group.layout.space, _listed(groups)
     rows = sum(own.element.rows(space.dimension) * len(own.rows) for own in listed)
     told = [own for own in listed if getattr(own.element, "along_a", None) is not None]
@@ -345,7 +347,9 @@ def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> 
     bodies = np.concatenate([own.bodies for own in told])
     of_a, of_b = (jnp.concatenate([getattr(own.element, name) for own in told]) for name in ("along_a", "along_b"))
     a, b = turned(unchecked_take(poses, bodies[:, 0]), of_a), turned(unchecked_take(poses, bodies[:, 1]), of_b)
-    opposite = _DOT[space.dimension](a, b)[:, 0] < 0
+    sizes = jnp.linalg.norm(of_a, axis=1) * jnp.linalg.norm(of_b, axis=1)
+    # They are parallel where the joint closes.
+    opposite = _DOT[space.dimension](a, b)[:, 0] < 0.5 * sizes
     return jnp.zeros(rows, bool).at[np.concatenate([own.rows for own in told])].set(opposite)
 
 

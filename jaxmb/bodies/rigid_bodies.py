@@ -654,6 +654,10 @@ class RigidBodySystem(AbstractSystem):
     def prepared(self):
         return dataclasses.replace(self, elements=elementary_rows(self.constraints, self.layout.ground))
 
+    def closing(self):
+        # In the plane a residual tells whole turns, which no product does.
+        return self.prepared() if self.layout.space.dimension == 3 else self
+
     def half_turned(self, q):
         groups = self.constraints
         if self.elements is None:

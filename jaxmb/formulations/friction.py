@@ -27,7 +27,7 @@ from ..linalg.elimination import gauss_jordan
 from ..linalg.newton import newton
 
 _CORRECTIONS = 16
-# The correction that is left out is at most this many rounding errors.
+# The correction that is left out is about this many rounding errors, as the last two show.
 _ROUNDING = 64
 # So many rows are eliminated without a loop.
 _FEW = 2

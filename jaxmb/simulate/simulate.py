@@ -140,7 +140,7 @@ def simulate(
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
         motion is NaN instead.
 
-    **Returns:** a `Trajectory`. With `throw=False` that of a motion that failed has its part before, and `result` says
+    **Returns:** a `Trajectory`. With `throw=False` it has the part of the motion before a failure, and `result` says
     why it failed; under a trace it is NaN.
 
     **Raises:** `ValueError` for arguments of the wrong type or out of range, for combinations that cannot work, and for

@@ -7,7 +7,7 @@ the mesh of the motion; it differs from the derivative of the step by less than 
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -136,7 +136,8 @@ class AdamsSteps(AbstractSteps):
     def start(self, terms, before, after):
         own, known = self.row(terms, before, after), before.solver_state.history.known
         given = (known > 0) | jnp.asarray(before.made_jump)
-        own = eqx.tree_at(lambda row: row.jump.made, own, jnp.zeros_like(own.jump.made)) if self.jumps else own
+        if own.jump is not None:
+            own = eqx.tree_at(lambda row: row.jump.made, own, jnp.zeros_like(own.jump.made))
         f, kept = _at_start(terms, after.solver_state)
         numbers = jnp.zeros_like(own.order), given.astype(known.dtype), ravel(before.y), f, kept
         return eqx.tree_at(

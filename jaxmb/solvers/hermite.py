@@ -186,7 +186,8 @@ class Hermite(AbstractMultistep):
 
     At the start the derivative of the vector field is compared with its differences. Where it contradicts them, as with
     `stop_gradient`, rounding or integers in the vector field, results would be wrong: `jaxmb.simulate` warns, except
-    under `jit` and `vmap`, where `stats["wrong_derivative"]` says it.
+    under `jit` and `vmap`, where `stats["wrong_derivative"]` says it. With `diffrax.diffeqsolve` the solver's
+    state does.
 
     Use it with `MultistepController`, as `Adams`; the term, `diffrax.SaveAt`,
     events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the

@@ -377,9 +377,9 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 
 def _recorded(equations, init_state, fixed, known, limit, most):
-    """The last state of diffrax's loop; the rows of the last segment of steps, of which each has `most`, and behind them
-    that of the start if there is one; the starts of all segments and the choices of all steps, None where there is one
-    segment only. All but the first are packed.
+    """The last state of diffrax's loop; the rows of the last segment of steps, of which each has `most`, and behind
+    them that of the start if there is one; the starts of all segments and the choices of all steps, None where there is
+    one segment only. All but the first are packed.
     """
     (given, steps), terms = fixed, equations["terms"]
     size = min(most, given["max_steps"])
@@ -416,7 +416,7 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         last, _, first, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
-            (init, since, layout.blank(1), layout.blank(size + steps.starts), starts, choices),
+            (init, since, layout.blank(int(steps.starts)), layout.blank(size + steps.starts), starts, choices),
             max_steps=None,
             buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",

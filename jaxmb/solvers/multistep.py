@@ -224,6 +224,8 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
         **Arguments:** `t1`: the end of the first step that is tried; `chart`: one that `next_chart` makes one at `y0`;
         `before`: the state before a jump, None at the first start.
+
+        **Returns:** a state whose numbers are arrays of JAX.
         """
 
     @abc.abstractmethod

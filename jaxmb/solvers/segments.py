@@ -27,7 +27,7 @@ class AtEvent(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What is stored of a step.
+    """What is stored of a step, or of the start of a run, in which no time lies.
 
     **Fields:** the end of the last step, which is the start of this one unless there was a jump, and minus infinity
     before the first; the `end` of this one; what is known of events there, None in a run that

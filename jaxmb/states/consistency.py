@@ -95,7 +95,7 @@ def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
 def _violated(system, t, y) -> Any:
     y = dataclasses.replace(y, q=system.normalize(y.q))
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
-    near = system.prepared()
+    near = system.closing()
     positions, velocities = violations(near, t, y, row_sizes(near, t, y))
     depths = jnp.zeros(0, y.q.dtype) if system.contacts is None else -gaps(system, t, y.q) / system.length
     return (positions > tol) | near.half_turned(y.q), velocities > tol, depths > tol

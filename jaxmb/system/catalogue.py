@@ -60,8 +60,12 @@ class AbstractSystem(AbstractEquation):
         """
         return self
 
+    def closing(self) -> Self:
+        """The system whose rows, with `half_turned`, tell whether a state is consistent."""
+        return self.prepared()
+
     def half_turned(self, q: Coordinates) -> Any:
-        """Which rows of Φ vanish at q because the system is `prepared`, with a joint half a turn away from where its
+        """Which rows of Φ vanish at q because the system is `prepared`, with a joint turned away from where its
         residual vanishes; False without such rows.
         """
         del q

@@ -87,7 +87,8 @@ def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
     for numbers, signal in of_one_kind([signal for signal, _ in system.signals.values()]):
         of_signal = lambda signal: signal.is_known(t0, t1)
         known = of_signal(signal) if len(numbers) == 1 else jnp.all(jax.vmap(of_signal)(signal))
-        ended = ended | ~known
+        if known is not True:
+            ended = ended | ~known
     return ended
 
 

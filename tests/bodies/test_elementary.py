@@ -259,8 +259,18 @@ def test_a_hinge_half_a_turn_away_is_not_consistent():
 def test_a_weld_half_a_turn_away_is_not_consistent():
     weld = planar.Fixed("weld", "ground", "bar", point=(0.0, 0.0))
     system = mb.Scene([planar.Body("bar", mass=1.0, inertia=1.0)], joints=[weld]).compile()
-    for angle, holds in ((0.0, True), (np.pi, False)):
+    for angle, holds in ((0.0, True), (np.pi, False), (2 * np.pi, False)):
         assert bool(is_consistent(system, 0.0, mb.State(jnp.array([0.0, 0.0, angle]), jnp.zeros(3)))) == holds
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, -1, -1), (1, -1, 1), (-1, 1, 1)])
+def test_a_weld_a_third_of_a_turn_away_is_not_consistent(signs):
+    # About diagonals, after which the axes are those of the body in another order.
+    weld = spatial.Fixed("weld", "ground", "bar", point=(0.0, 0.0, 0.0))
+    system = mb.Scene([spatial.Body("bar", mass=1.0, inertia=(1.0, 1.0, 1.0))], joints=[weld]).compile()
+    for p, holds in ((np.array([1.0, 0.0, 0.0, 0.0]), True), (0.5 * np.array([1, *signs]), False)):
+        state = mb.State(jnp.concatenate([jnp.zeros(3), p]), jnp.zeros(6))
+        assert bool(is_consistent(system, 0.0, state)) == holds
 
 
 @pytest.mark.long

@@ -31,9 +31,9 @@ def results():
     floor = mb.RigidContact("floor", "ball", terrain=mb.terrain.Flat(), radius=0.1, restitution=0.0)
 
     def law(poses, velocities, t, p):
-        return jnp.stack([p["size"] + 0.01 * jnp.sin(p["rate"] * t), 0.0 * t, 0.0 * t])[None]
+        return jnp.stack([p["size"] + p["shift"] + 0.01 * jnp.sin(p["rate"] * t), 0.0 * t, 0.0 * t])[None]
 
-    push = mb.Force("push", "ball", law, parameters={"size": 0.0, "rate": 1.0})
+    push = mb.Force("push", "ball", law, parameters={"size": 0.0, "rate": 1.0, "shift": 0.0})
     system = mb.Scene([ball], joints=[floor], forces=[mb.Gravity((0.0, -9.81)), push]).compile()
     state = mb.assemble(system)
 
@@ -50,7 +50,7 @@ def results():
             mb.State(jnp.where(own["start"], jnp.nan, state.q), state.u),
             t1=jnp.where(own["backward"], -2.0, 2.0),
             saveat=jnp.where(own["backward"] ^ own["saved"], -1, 1) * jnp.array([0.0, 0.4, 0.8]),
-            inputs={"push.size": size},
+            inputs={"push.size": size, "push.shift": lambda t: 0.0 * t},
             max_steps=1000,
             max_events=3,
         )
