@@ -48,6 +48,11 @@ def _scale(W):
     return jnp.sqrt(jnp.maximum(jnp.diag(W), jnp.finfo(W.dtype).tiny))
 
 
+def _product(a, b):
+    """`a @ b`; XLA loses the types of LAPACK calls in programs with products of empty arrays (jaxlib 0.10)."""
+    return a @ b if a.size and b.size else jnp.zeros((a.shape[0], b.shape[1]), a.dtype)
+
+
 def _lemke(W, b):
     k, dtype = b.size, b.dtype
     right = b + _APART * jnp.max(jnp.abs(b), initial=0.0) * jnp.asarray(np.arange(1, k + 1) / k, dtype)
@@ -330,10 +335,10 @@ def _in_lines(W, b, dry, among):
     sign = jnp.where(dry.slips == 0, 1.0, dry.slips)
     of_normal, fixed = -sign[:, None] * limits, -sign * bound
     of_right = jnp.diag(may.astype(b.dtype))
-    to_normal, to_slip = W[:, :n] + W[:, n:] @ of_normal, W[:, n:] @ of_right
+    to_normal, to_slip = W[:, :n] + _product(W[:, n:], of_normal), W[:, n:] @ of_right
     # A normal force whose own friction draws the bodies together more than it pushes them apart, in Painlevé's paradox,
     # has no value or two.
-    of_itself = jnp.diag(W[:n, :n] + W[:n, n:] @ jnp.where(may[:, None], 0.0, of_normal))
+    of_itself = jnp.diag(W[:n, :n] + _product(W[:n, n:], jnp.where(may[:, None], 0.0, of_normal)))
     unique = jnp.all(of_itself >= -_PIVOT)
     free = b + W[:, n:] @ fixed
     idle = ~among[:n]

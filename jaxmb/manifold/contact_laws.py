@@ -179,6 +179,8 @@ class Laws(NamedTuple):
 
 def is_implied(influence, closed):
     """Which gaps cannot move where some contacts are closed, up to rounding errors."""
+    if not closed.size:
+        return closed
     influence, closed = lax.stop_gradient((influence, closed))
     columns = jnp.where(closed[:, None], influence, 0.0)
     matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))

@@ -413,10 +413,11 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         several = segments > 1
         starts = of_starts.blank(segments + 1) if several else None
         choices = of_choices.blank(segments * size) if several else None
+        # A place for the start where it is no row as well: XLA loses the types of calls beside arrays without entries.
         last, _, first, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
-            (init, since, layout.blank(int(steps.starts)), layout.blank(size + steps.starts), starts, choices),
+            (init, since, layout.blank(1), layout.blank(size + steps.starts), starts, choices),
             max_steps=None,
             buffers=lambda carry: (buffers(carry[0]), *carry[2:]),
             kind="lax",
