@@ -347,7 +347,7 @@ def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> 
     bodies = np.concatenate([own.bodies for own in told])
     of_a, of_b = (jnp.concatenate([getattr(own.element, name) for own in told]) for name in ("along_a", "along_b"))
     a, b = turned(unchecked_take(poses, bodies[:, 0]), of_a), turned(unchecked_take(poses, bodies[:, 1]), of_b)
-    sizes = jnp.linalg.norm(of_a, axis=1) * jnp.linalg.norm(of_b, axis=1)
+    sizes = rot.norm(of_a) * rot.norm(of_b)
     # They are parallel where the joint closes.
     opposite = _DOT[space.dimension](a, b)[:, 0] < 0.5 * sizes
     return jnp.zeros(rows, bool).at[np.concatenate([own.rows for own in told])].set(opposite)

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Coordinates, Scalar, Velocities
 from ..linalg.arrays import namespace
-from ..linalg.elimination import full_pivot
+from ..linalg.elimination import full_pivot, solve
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.jitted import jitted
@@ -107,7 +107,7 @@ def meet_constraints(
         scaled = jacobian * scale[None, :]
         gram = scaled @ scaled.T
         shift = _SHIFT * jnp.max(jnp.diag(gram)) + jnp.finfo(q.dtype).tiny
-        step = -scale * (scaled.T @ jnp.linalg.solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), before))
+        step = -scale * (scaled.T @ solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), before))
         longest = jnp.max(jnp.where(scale > 0, jnp.abs(step) / jnp.where(scale > 0, scale, 1.0), 0.0))
         best, size, _ = _shortened(residual, lambda step: q + step, q, step, longest)
         return (best, jacobian), size
@@ -217,7 +217,7 @@ def closest_configuration(
         return jnp.concatenate([jnp.where(closed, balance, q - guess), jnp.where(closed, residual, multipliers)])
 
     selected = (jacobian * scale[None, :])[rows]
-    multipliers = jnp.linalg.solve(
+    multipliers = solve(
         selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square))
     )
     nearby = jnp.concatenate([jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)])
@@ -266,7 +266,7 @@ def closest_velocities(
         bound = jnp.arange(rank) >= pivots.rank
         selected = jnp.where(bound[:, None], 0.0, jacobian[rows] * scale[None, :])
         gram = selected @ selected.T + jnp.diag(bound.astype(u.dtype))
-        u = u - scale * (selected.T @ jnp.linalg.solve(gram, system.velocity_residual(t, q, u)[rows]))
+        u = u - scale * (selected.T @ solve(gram, system.velocity_residual(t, q, u)[rows]))
     residual = system.velocity_residual(t, q, u)
     size = 1.0 + jnp.max(jnp.abs(jacobian) @ jnp.abs(u))
     return u, ok & (jnp.max(jnp.abs(residual)) <= 1e2 * tolerance(u.dtype) * size)
