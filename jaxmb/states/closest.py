@@ -217,9 +217,7 @@ def closest_configuration(
         return jnp.concatenate([jnp.where(closed, balance, q - guess), jnp.where(closed, residual, multipliers)])
 
     selected = (jacobian * scale[None, :])[rows]
-    multipliers = solve(
-        selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square))
-    )
+    multipliers = solve(selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square)))
     nearby = jnp.concatenate([jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)])
     refined = root(optimality, nearby, _refine)[: system.nq]
     ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined, jacobian) <= tolerance(q.dtype))
