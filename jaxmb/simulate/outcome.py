@@ -17,6 +17,7 @@ from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
 from ..states.refusals import LostRank, lost_rank, violated_joints
 from ..system.gaps import counts, gaps, names_of
+from .span import Span
 
 # Gaps below this fraction of the system's size are named where contacts have no solution.
 _TOUCH = 1e-6
@@ -109,7 +110,7 @@ def warn_of_stiffness(stats) -> None:
     warnings.warn(
         f"The motion is stiff: in {stats['stiff_steps']} of {stats['num_steps']} steps of Adams' method stability was "
         "the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
-        stacklevel=4,
+        stacklevel=5,
     )
 
 
@@ -121,11 +122,11 @@ def warn_of_wrong_derivative() -> None:
     )
 
 
-def warn_of_jumps(system, outcome: Outcome, times, restarts, announced) -> None:
+def warn_of_jumps(system, outcome: Outcome, span: Span, restarts, announced) -> None:
     """Warn of jumps of prescribed rates between restarts of a motion that is not traced; `announced` are those that the
     user gave, or None.
     """
-    q, t0, t1 = outcome.y.q, times["t0"], times["t1"]
+    q, t0, t1 = outcome.y.q, span.t0, span.t1
     restarts = np.zeros(0) if restarts is None else np.asarray(restarts)
     # What is prescribed jumps at the same times with other coordinates.
     found = _jumps.found((system, t0, t1, restarts), lambda: find_jumps(system, q, t0, t1, restarts))
@@ -141,35 +142,35 @@ def warn_of_jumps(system, outcome: Outcome, times, restarts, announced) -> None:
         f"The motion that {names} prescribes has a jump or a kink at t = {' and '.join(str(t) for t in times)}, which "
         "an integration passes without an impulse or in many steps; "
         f"simulate(..., jumps=[{every}]) restarts there.",
-        stacklevel=4,
+        stacklevel=6,
     )
 
 
-def message_of_failure(system, result, times, outcome: Outcome, stats, solver, probe) -> str:
+def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solver, probe) -> str:
     """Why a simulation with a solver failed, and where; `probe` as in `is_stiff_at_end`."""
-    if is_traced((system, outcome, times)):
+    if is_traced((system, outcome, span)):
         return RESULTS[result]
     if np.any(outcome.coupling):
-        return f"{how_far(outcome, times)} {about_friction(system, outcome.coupling)}"
+        return f"{how_far(outcome, span)} {about_friction(system, outcome.coupling)}"
     if result == RESULTS.contacts_undetermined:
         return about_contacts(system, outcome)
     if result == RESULTS.max_steps_reached:
-        return about_steps(outcome, times, stats, is_stiff_at_end(probe, stats, solver))
+        return about_steps(outcome, span, stats, is_stiff_at_end(probe, stats, solver))
     if not np.all(np.isfinite(np.concatenate(jax.tree.leaves(outcome.y)))):
         return RESULTS[result]
     if result == RESULTS.inconsistent_constraints:
         return contradiction(system, outcome.t, outcome.y)
-    return f"{how_far(outcome, times)} {reason_of_failure(system, result, times, outcome)}"
+    return f"{how_far(outcome, span)} {reason_of_failure(system, result, span, outcome)}"
 
 
-def how_far(outcome: Outcome, times) -> str:
+def how_far(outcome: Outcome, span: Span) -> str:
     """The time at the end and that to be reached, with six digits of the time that they differ from the start."""
-    t0, t, t1 = float(times["t0"]), float(outcome.t), float(times["t1"])
+    t0, t, t1 = float(span.t0), float(outcome.t), float(span.t1)
     digits = 6 + max(0, int(np.log10(max(abs(t0), 1e-300) / max(abs(t1 - t0), 1e-300))))
     return f"The motion came to t = {t:.{digits}g} of {t1:.{digits}g}."
 
 
-def about_steps(outcome: Outcome, times, stats, stiff) -> str:
+def about_steps(outcome: Outcome, span: Span, stats, stiff) -> str:
     """How far a motion came in the largest number of steps, and what takes it further.
 
     **Arguments:** `stiff`: whether it is stiff at its end, None where that is not known, and False with a solver for
@@ -177,7 +178,7 @@ def about_steps(outcome: Outcome, times, stats, stiff) -> str:
     """
     steps = int(stats["num_steps"])
     length = "" if outcome.step is None else f", with steps of about {abs(float(outcome.step)):.2g} in the end"
-    text = f"{how_far(outcome, times).rstrip('.')} in max_steps = {steps} steps{length}. "
+    text = f"{how_far(outcome, span).rstrip('.')} in max_steps = {steps} steps{length}. "
     if stiff:
         return text + (
             "It is stiff there: stability is the limit of its steps. simulate(..., solver=jaxmb.solvers.Hermite()) "
@@ -212,14 +213,14 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
             return None
 
 
-def reason_of_failure(system, result, times, outcome: Outcome) -> str:
+def reason_of_failure(system, result, span: Span, outcome: Outcome) -> str:
     """Why a simulation ended at a finite state: numbers that are not finite there or just beyond, the joints whose
     constraints lose rank, those that cannot be met, or times that are too coarse.
     """
     t, y = outcome.t, outcome.y
     system = system.at(y)
     rates = system.rates(t, y.q, y.u)
-    ahead = np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(times["t1"], t - 1.0, t + 1.0) - t)
+    ahead = np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(span.t1, t - 1.0, t + 1.0) - t)
     for step in ahead:
         wrong = system.not_finite(t + step, y.q + step * rates, y.u)
         if wrong:
@@ -230,7 +231,7 @@ def reason_of_failure(system, result, times, outcome: Outcome) -> str:
     lost = lost_rank(system, t, y)
     if lost is not None:
         return about_lost_rank(lost)
-    coarse = about_coarse_times(system, times, t, y)
+    coarse = about_coarse_times(system, span, t, y)
     return f"{coarse} Or: {RESULTS[result]}" if coarse else RESULTS[result] + about_unmet(system, outcome, ahead, rates)
 
 
@@ -265,12 +266,12 @@ def about_unmet(system, outcome: Outcome, ahead, rates) -> str:
     return ""
 
 
-def about_coarse_times(system, times, t, y) -> str:
+def about_coarse_times(system, span: Span, t, y) -> str:
     """What to do where a motion changes by more than it resolves from one number for the time to the next; empty where
     it does not.
     """
     coarse = float(np.spacing(np.abs(np.asarray(t))))
-    speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=1 / abs(times["t1"] - times["t0"]))
+    speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=1 / abs(span.t1 - span.t0))
     moved = coarse * float(speed)
     single = np.finfo(y.q.dtype).bits < 64
     if moved < (_MOVED_SINGLE if single else _MOVED):

@@ -15,6 +15,7 @@ from jaxmb.simulate.loop import Loop
 
 # `jaxmb.simulate` is the function.
 solve = importlib.import_module("jaxmb.simulate.solve")
+integrate = importlib.import_module("jaxmb.simulate.integrate")
 
 
 @pytest.fixture
@@ -58,13 +59,13 @@ def test_twenty_calls_of_a_user(programs):
 
 def test_a_run_that_is_differentiated_is_traced_once(monkeypatch):
     """A derivative that is known to be taken needs no program of the run without one."""
-    traced, states = [], solve._solve_states
+    traced, states = [], integrate._solution
 
     def counted(*arguments):
         traced.append(arguments[-1] is not None)
         return states(*arguments)
 
-    monkeypatch.setattr(solve, "_solve_states", counted)
+    monkeypatch.setattr(integrate, "_solution", counted)
     machine = mb.mechanisms.pendulum(length=1.25)
 
     def end(strength):

@@ -553,7 +553,7 @@ def test_numbers_that_do_not_agree_where_they_are_traced():
 def test_second_derivatives_through_impacts_are_refused(around, monkeypatch):
     if around is not jax.jit:
         # Before anything is traced.
-        monkeypatch.setattr(importlib.import_module("jaxmb.simulate.simulate"), "solved", None)
+        monkeypatch.setattr(importlib.import_module("jaxmb.simulate.run"), "solved", None)
     with pytest.raises(ValueError, match="Second derivatives through impacts are not supported"):
         jax.hessian(around(lambda at: end(at, 0.6)))(jnp.array([0.8, 0.1]))
 

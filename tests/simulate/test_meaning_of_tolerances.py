@@ -13,7 +13,7 @@ from compiling import jit_quickly
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.manifold import counted_components
-from jaxmb.simulate.solve import running_scales
+from jaxmb.simulate.method import running_scales
 from jaxmb.solvers.tolerances import NormOfCounted
 
 TOLERANCES = 10.0 ** -np.arange(4.0, 11.1, 1.0)
@@ -185,7 +185,7 @@ def test_modes_of_friction_do_not_count():
 def test_a_contact_that_is_closed_is_no_size_of_a_motion():
     """A small motion stays small where a mode is one."""
     start = mb.assemble(AMONG_STOPS, fix={"bar.angle": 0.5})
-    scales = running_scales(AMONG_STOPS, start, {"t0": 0.0, "t1": 1.0})
+    scales = running_scales(AMONG_STOPS, start, 1.0)
     modes = jnp.arange(AMONG_STOPS.nq) >= PENDULUM.nq
     at = lambda mode: jnp.concatenate([jnp.where(modes, mode, 1e-3), jnp.zeros(AMONG_STOPS.nu)])
     sizes = [scales.start(at(mode), jnp.zeros_like(at(mode))) for mode in (0.0, 1.0)]

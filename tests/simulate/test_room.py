@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb.simulate import arguments, solve
+from jaxmb.simulate import room, solve
 
-# The name of the function hides the module that it is in.
-module = importlib.import_module("jaxmb.simulate.simulate")
+run = importlib.import_module("jaxmb.simulate.run")
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +28,8 @@ def test_a_long_motion_finds_more_room(pendulum, monkeypatch, kept):
     system, state = pendulum
     saveat = diffrax.SaveAt(**{kept: True})
     with monkeypatch.context() as patch:
-        patch.setattr(arguments, "_ROOM", 1.0)
-        patch.setattr(arguments, "_FEWEST_STEPS", 16)
+        patch.setattr(room, "_MEMORY", 1.0)
+        patch.setattr(room, "_FEWEST_STEPS", 16)
         found = mb.simulate(system, state, t1=1.0, saveat=saveat)
         steps = int(found.stats["num_steps"])
         assert steps > 16 and found.stats["max_steps"] == 65536 and found.result == mb.RESULTS.successful
@@ -49,17 +48,17 @@ def test_a_long_motion_finds_more_room(pendulum, monkeypatch, kept):
 @pytest.fixture
 def rooms(monkeypatch):
     """For how many steps the programs have room that are used. Derivatives keep 16 of them."""
-    used, solved = [], module.solved
+    used, solved = [], run.solved
 
     def spied(problem):
-        used.append(problem.room)
+        used.append(problem.room.rows)
         return solved(problem)
 
-    for where in (arguments, solve):
+    for where in (room, solve):
         monkeypatch.setattr(where, "MOST_ROWS", 16)
-    monkeypatch.setattr(arguments, "_FEWEST_ROWS", 16)
-    monkeypatch.setattr(module, "_long", collections.deque(maxlen=2))
-    monkeypatch.setattr(module, "solved", spied)
+    monkeypatch.setattr(room, "_FEWEST_ROWS", 16)
+    monkeypatch.setattr(room, "_long", collections.deque(maxlen=2))
+    monkeypatch.setattr(run, "solved", spied)
     return used
 
 
@@ -138,7 +137,7 @@ def test_too_few_steps_are_no_singularity(narrow, rooms):
     short = mb.simulate(system, state, t1=1.0, max_steps=20, throw=False)
     assert short.result == mb.RESULTS.max_steps_reached
     long = end(system, state, 1.0)
-    module._long.clear()
+    room._long.clear()
     rooms.clear()
     slope = jax.grad(long)(9.81)
     assert rooms == [16, 65536]
@@ -155,4 +154,4 @@ def test_room_counts_internal_states():
 
 
 def test_few_systems_are_remembered_as_long():
-    assert 0 < module._long.maxlen < 100
+    assert 0 < room._long.maxlen < 100

@@ -16,7 +16,7 @@ from ..._traced_functions import traced_by_jax
 from ..._types import Scalar, State, VectorLike
 from ...parts.names import UnknownNameError, unknown
 from ...simulate import simulate
-from ...simulate.moving_times import frozen_times
+from ...simulate.span import frozen_times
 from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...trajectory import Trajectory

@@ -1,4 +1,4 @@
-"""Derivatives by the times of a run: its start, its end, and those that states are saved at.
+"""The interval of a run, and derivatives by its times: its start, its end, and those that states are saved at.
 
 The mesh of a run has no derivatives. Where a time moves, the states that belong to it follow by Taylor's series of the
 solution, with coefficients from the field there: its first two terms, so that second derivatives are right as well.
@@ -7,18 +7,68 @@ solution, with coefficients from the field there: its first two terms, so that s
 import contextlib
 import contextvars
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
+from .._arguments import real_array
 from ..linalg.arrays import is_traced
+from ..manifold import next_number
 from ..solvers import twice_differentiable
 
 _FROZEN = contextvars.ContextVar("frozen", default=False)
+
+
+class Span(NamedTuple):
+    """The interval of a run.
+
+    **Fields:** `dt0`: the first step, None for the default; whether the start, and the end or a saved time, are
+    `moving`: derivatives may be taken by them.
+    """
+
+    t0: Any
+    t1: Any
+    dt0: Any
+    moving: tuple[bool, bool]
+
+    @classmethod
+    def checked(cls, t0: Any, t1: Any, dt0: Any, saved: Any, dtype: Any) -> "Span":
+        """**Arguments:** `saved`: as the user gave it, since under a trace the times of a `SaveAt` that is made here
+        are traced as well.
+        """
+        start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
+        for name, time in (("t0", start), ("t1", end)):
+            if not is_traced(time) and not np.isfinite(time):
+                raise ValueError(f"{name} must be finite, got {time}.")
+        moving = may_move(start), may_move((end, saved))
+        if dt0 is None:
+            return cls(start, end, None, moving)
+        step = real_array("dt0", dt0, dtype)
+        if not is_traced((start, end, step)) and not (np.isfinite(step) and step * (1 if end >= start else -1) > 0):
+            raise ValueError(
+                f"dt0 must be a finite step from t0 = {t0} towards t1 = {t1}, got {dt0}; leave it out for the default."
+            )
+        return cls(start, end, step, moving)
+
+    def is_backward(self) -> bool:
+        """Whether it is known that the run goes back in time."""
+        return not is_traced((self.t0, self.t1)) and self.t1 < self.t0
+
+    def frozen(self, finite: Any) -> "Span":
+        """The same without derivatives; no time at all where no `finite` numbers are to start from."""
+        t0, t1, dt0 = lax.stop_gradient((self.t0, self.t1, self.dt0))
+        return Span(t0, jnp.where(finite, t1, t0), dt0, (False, False))
+
+    def before_jump(self, jumps: Any) -> "Span":
+        """A run backward starts before a jump at its start."""
+        if jumps is None:
+            return self
+        before = jnp.isin(self.t0, jumps) & (self.t1 < self.t0)
+        return self._replace(t0=jnp.where(before, next_number(self.t0, -1), self.t0))
 
 
 @contextlib.contextmanager
@@ -73,21 +123,3 @@ def _series(term, t, y, step):
     field = lambda t, y: term.vf(t, y, None)
     first, second = jax.jvp(field, (t, y), (jnp.ones_like(t), field(t, y)))
     return jax.tree.map(lambda y, f, g: y + step.astype(y.dtype) * (f + step.astype(y.dtype) / 2 * g), y, first, second)
-
-
-def saved_times(series: diffrax.SubSaveAt, found: Any, start: Any, end: Any) -> tuple[Any, Any]:
-    """The times of a series of saved states with the derivatives of those that were asked for, and the moves of these:
-    zeros with their derivatives.
-
-    **Arguments:** `found`: the times without derivatives, but for those of events.
-    """
-    if series.steps:
-        # Only the ends of a run move among its steps.
-        asked = jnp.broadcast_to(end, found.shape)
-        asked = asked.at[0].set(jnp.where(found[0] == lax.stop_gradient(start), start, end)) if series.t0 else asked
-    else:
-        asked = ([start[None]] if series.t0 else []) + ([] if series.ts is None else [series.ts])
-        asked = jnp.concatenate(asked + ([end[None]] if series.t1 else []))
-    frozen = lax.stop_gradient(asked)
-    is_asked = found == frozen
-    return jnp.where(is_asked, asked, found), jnp.where(is_asked, asked - frozen, 0.0)

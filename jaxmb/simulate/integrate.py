@@ -1,0 +1,83 @@
+"""The integration of a motion by diffrax's protocol, whose mesh resolves derivatives where they are taken."""
+
+import dataclasses
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+from jax import lax
+
+from ..manifold import project
+from ..solvers import MeshAdjoint, TangentControl, with_tangents
+from .loop import Loop
+from .room import Room, kept_steps
+from .saves import STATES, seen
+from .watch import pushed
+
+
+def integrated(
+    integration: tuple[Any, Any, dict[str, Any]],
+    control: TangentControl | None,
+    room: Room,
+    projects_steps: bool,
+    differentiated: bool,
+) -> Any:
+    """The solution of `diffrax.diffeqsolve`, with derivatives.
+
+    **Arguments:** `integration`: term, solver and options of `diffeqsolve`; `control` of tangents, None for none;
+    whether states return to constraints after steps (`projects_steps`); whether it is known to be `differentiated`.
+    """
+    if differentiated:
+        # Where that is known, a run without derivatives is not traced.
+        return _with_tangents(integration, control, room, projects_steps)
+    return _on_mesh(integration, control, room, projects_steps)
+
+
+@eqx.filter_custom_jvp
+def _on_mesh(integration, control, room, projects_steps):
+    """The solution, whose mesh resolves the motion; where it is differentiated, tangents as well."""
+    del control, projects_steps
+    return _solution(*integration, room, None)
+
+
+@_on_mesh.def_jvp
+def _on_mesh_jvp(primals, tangents):
+    integration, control, room, projects_steps = primals
+    if control is not None and control.direction is None:
+        used = jax.tree.map(lambda x: x is not None, tangents[0][0], is_leaf=lambda x: x is None)
+        direction = pushed(lambda term: term, lax.stop_gradient(integration[0]), used)
+        excites = bool(jax.tree.leaves(tangents[0][2]["y0"]))
+        control = dataclasses.replace(control, direction=direction, excites=excites)
+    solve = lambda integration: _with_tangents(integration, control, room, projects_steps)
+    return eqx.filter_jvp(solve, (integration,), (tangents[0],))
+
+
+def _with_tangents(integration, control, room, projects_steps):
+    term, solver, options = integration
+    without_tangents = lambda state: state
+    if control is not None:
+        if projects_steps:
+            restore = lambda term, y: project(term.vector_field.system, options["t0"], y)
+            control = control.on_constraints(restore, *lax.stop_gradient((term, options["y0"])))
+        solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
+        options = options | {"stepsize_controller": controller}
+    derivatives = MeshAdjoint(kept_steps(options["y0"]), "made_jump" in options)
+    solution = _solution(term, solver, options, room, derivatives)
+    return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
+
+
+def _solution(term, solver, options, room, derivatives):
+    """The solution with states saved first, and then the user's function of them."""
+    adjoint, saveat = room.adjoint, options["saveat"]
+    function = saveat.subs[0].fn
+    if function is not STATES and derivatives is not None:
+        saveat = eqx.tree_at(lambda saveat: saveat.subs[0].fn, saveat, STATES)
+    if adjoint is None:
+        adjoint, saveat = Loop.around(saveat, room.limit, derivatives)
+    options = options | {"adjoint": adjoint, "saveat": saveat, "max_steps": room.rows}
+    solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options)
+    if function is STATES or derivatives is None:
+        return solution
+    ys = seen(function, solution.ts[0], solution.ys[0], (options["t0"], options["y0"]))
+    return eqx.tree_at(lambda solution: solution.ys[0], solution, ys)

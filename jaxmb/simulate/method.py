@@ -1,0 +1,108 @@
+"""The numerical method of a motion: solver, manifold policy, formulation, tolerances."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import jax.numpy as jnp
+from jax import lax
+
+from .._types import State
+from ..formulations import AbstractFormulation
+from ..manifold import (
+    AbstractManifold,
+    counted_components,
+    default_manifold,
+    natural_units,
+    state_blocks,
+    with_internal_states,
+)
+from ..solvers import AbstractMultistep, MultistepController, RunningScales, with_counted
+from ..solvers.gaps import GapSolver
+from ..solvers.one_step import OneStepController
+from ..system import AbstractSystem
+
+
+class Method(NamedTuple):
+    """How a motion is computed.
+
+    **Fields:** `controller`, None for that of `rtol` and `atol`; `atol`, None for running scales; `dtmax`, the longest
+    step, None for any.
+    """
+
+    solver: diffrax.AbstractSolver
+    policy: AbstractManifold
+    formulation: AbstractFormulation
+    controller: Any
+    rtol: Any
+    atol: Any
+    dtmax: Any
+
+    @classmethod
+    def chosen(
+        cls,
+        system: AbstractSystem,
+        solver: diffrax.AbstractSolver,
+        manifold: AbstractManifold | None,
+        formulation: AbstractFormulation | None,
+        **others: Any,
+    ) -> "Method":
+        """The method with those that suit the system and the solver where the user names none."""
+        policy = default_manifold(system, solver, formulation) if manifold is None else manifold
+        formulation = policy.default_formulation(system) if formulation is None else formulation
+        return cls(solver, policy, formulation, **others)
+
+    def check_impulses(self, system: AbstractSystem, jumps: bool) -> None:
+        """Raise a `ValueError` where the velocities after an impulse would not be known.
+
+        **Arguments:** `jumps`: whether a run restarts at jumps of inputs, or at those that the user announces.
+        """
+        jumps = jumps and system.velocity_rows > 0
+        if not jumps and system.contacts is None:
+            return
+        if not (self.policy.takes_impulses and system.positive_definite_mass):
+            needs = "jumps, or inputs that jump, a constrained system" if jumps else "contacts a system"
+            raise ValueError(
+                f"With {needs} needs manifold=Partition() or Projection(), and a mass matrix that has an inverse; got "
+                f"{type(self.policy).__name__}() and positive_definite_mass = {system.positive_definite_mass}."
+            )
+
+    def projects_steps(self, system: AbstractSystem) -> bool:
+        """Whether states return to constraints after the steps of a method that does not know of them."""
+        return system.velocity_rows > 0 and not isinstance(self.solver, AbstractMultistep)
+
+    def watches_gaps(self, system: AbstractSystem) -> bool:
+        """Whether steps pass over no force that acts in a gap; those of a fixed length may."""
+        return system.has_gaps and adapts(self.controller)
+
+    def prepared(self, system: AbstractSystem) -> tuple[Any, Any]:
+        """The term of a system, and the solver, prepared for it."""
+        term, solver = self.policy.prepare(system.prepared(), self.formulation, self.solver, self.rtol)
+        if self.watches_gaps(system) and not isinstance(solver, AbstractMultistep):
+            solver = GapSolver(solver)
+        return with_internal_states(term), solver
+
+    def controls(self, system: AbstractSystem, state: State, duration: Any) -> Any:
+        """The controller of the steps of a motion from a state."""
+        controller, absolute = self.controller, self.rtol / 100 if self.atol is None else self.atol
+        if controller is None:
+            scales = running_scales(system, state, duration) if self.atol is None else None
+            if isinstance(self.solver, AbstractMultistep):
+                controller = MultistepController(self.rtol, absolute, scales=scales, dtmax=self.dtmax)
+            else:
+                controller = diffrax.PIDController(self.rtol, absolute, dtmax=self.dtmax)
+                controller = OneStepController.around(controller, scales)
+        return with_counted(controller, counted_components(system))
+
+
+def adapts(controller: Any) -> bool:
+    """Whether a controller, None for the default, chooses steps by their errors."""
+    return controller is None or isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+
+
+def running_scales(system: AbstractSystem, state: State, duration: Any) -> RunningScales:
+    """Natural units of coordinates, velocities and internal states; what is expected of velocities where nothing moves
+    yet is one unit in the whole duration [s].
+    """
+    units = natural_units(system, system.velocity_scale(), state.q.dtype)
+    units, rate = lax.stop_gradient((units, 1 / jnp.where(duration > 0, duration, 1.0)))
+    return RunningScales(units, state_blocks(system, rate), counted_components(system))

@@ -1,0 +1,286 @@
+"""A motion that is asked for: checked, solved, and finished."""
+
+import contextlib
+import dataclasses
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import numpy as np
+from jax import lax
+
+from .._arguments import check_kind
+from .._results import RESULTS
+from ..linalg.arrays import derivatives_of, is_traced
+from ..manifold.impact import NO_SECOND_DERIVATIVES
+from ..solvers import Adams, Hermite
+from ..states.arguments import check_precision
+from ..states.consistency import consistent
+from ..states.refusals import lost_rank
+from ..system import AbstractSystem
+from ..system.inputs import with_inputs
+from ..trajectory import Trajectory
+from .arguments import (
+    check_error_estimate,
+    check_fixed_steps,
+    check_kinds,
+    check_steps,
+    checked_longest_step,
+    checked_state,
+    checked_tolerances,
+    closer_tolerances,
+    named_solver,
+)
+from .captured import captured_event
+from .compiling import told_of_compiling
+from .method import Method
+from .outcome import (
+    Flags,
+    Outcome,
+    message_of_failure,
+    warn_of_jumps,
+    warn_of_stiffness,
+    warn_of_wrong_derivative,
+)
+from .room import Room, note_long, rooms_for, was_long
+from .saves import checked_saveat, padded, with_end
+from .solve import Problem, made_precise, solved
+from .span import Span
+from .stops import Stops, breaks_of, checked_jumps, turns_of
+from .watch import Watch, parameter_changes
+
+# Defaults, made once: their construction would take as long as the rest of a call.
+_ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
+_HIDDEN = (
+    "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
+    "an attribute of an object: make it a parameter, or let the function close over it."
+)
+
+
+class Asked(NamedTuple):
+    """The arguments of `simulate`, as the user gave them."""
+
+    system: Any
+    state: Any
+    t1: Any
+    t0: Any
+    dt0: Any
+    saveat: Any
+    solver: Any
+    formulation: Any
+    manifold: Any
+    rtol: Any
+    atol: Any
+    dtmax: Any
+    stepsize_controller: Any
+    adjoint: Any
+    inputs: Any
+    jumps: Any
+    event: Any
+    direction: Any
+    error: bool
+    max_steps: int
+    max_events: int
+    throw: bool | None
+    progress_meter: Any
+
+
+# Of another run of the same motion, which the user does not see.
+_ALONE = {"event": None, "direction": None, "error": False, "throw": False, "progress_meter": None}
+
+
+class Ended(NamedTuple):
+    """A run that was solved.
+
+    **Fields:** how it ended (`outcome`), and its `flags` as numbers, None under a trace.
+    """
+
+    problem: Problem
+    trajectory: Trajectory
+    outcome: Outcome
+    flags: Flags | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A motion with checked arguments.
+
+    **Fields:** `asked`, with the system that has the inputs; the `problem` of the program; the `rooms` for steps that
+    are tried one after the other; whether values are `known`, so that it can be seen after it how many steps it took.
+    """
+
+    asked: Asked
+    problem: Problem
+    rooms: list[int]
+    known: bool
+
+    @classmethod
+    def checked(cls, asked: Asked) -> "Run":
+        """**Raises:** `ValueError` for arguments of the wrong type or out of range, or that cannot work together."""
+        cure = "scene.compile() makes one of a jaxmb.Scene"
+        check_kind("system", asked.system, AbstractSystem, "a compiled system", cure)
+        check_precision("simulate", asked.system)
+        system = asked.system if asked.inputs is None else with_inputs(asked.system, asked.inputs)
+        state = checked_state(system, asked.state)
+        asked = asked._replace(system=system, state=state, inputs=None)
+        # Numbers become arrays, so that other tolerances and times do not compile anew.
+        rtol, atol = checked_tolerances(asked.rtol, asked.atol, state)
+        span = Span.checked(asked.t0, asked.t1, asked.dt0, asked.saveat, state.q.dtype)
+        method = _method(asked, rtol, atol)
+        restarts = checked_jumps(asked.jumps, breaks_of(system, span.t0, span.t1))
+        saves = with_end(checked_saveat(asked.saveat, span.t0, span.t1), span.t0, state)
+        first = saves.subs[0]
+        if asked.error:
+            check_error_estimate(first.steps, asked.stepsize_controller, asked.event, rtol)
+        max_events = None if system.contacts is None else asked.max_events
+        stops = Stops(restarts, None, captured_event(asked.event, span.t0, state), max_events)
+        watched = Watch(parameter_changes(system, asked.direction), ())
+        meter = _NO_METER if asked.progress_meter is None else asked.progress_meter
+        interpolated = asked.event is not None or first.ts is not None
+        room = Room(asked.max_steps, None, asked.adjoint)
+        problem = Problem(system, state, span, method, saves, interpolated, stops, watched, room, meter, False)
+        return cls(asked, *_settled(problem, asked))
+
+    def solved(self) -> Ended:
+        """The motion, again with more room where it took more steps than the program had room for."""
+        problem, max_steps = self.problem, self.asked.max_steps
+        if not self.known:
+            return Ended(problem, *solved(problem), None)
+        with contextlib.nullcontext() if problem.traced else told_of_compiling(problem.system):
+            trajectory, outcome = solved(problem)
+            if is_traced(outcome.flags) and not problem.traced:
+                raise ValueError(_HIDDEN)
+            for rows in self.rooms[1:]:
+                # A value that is traced and hidden in a function leaves it open whether the steps sufficed.
+                if is_traced(outcome.flags) or not Flags(*np.asarray(outcome.flags)).ran_out:
+                    break
+                problem = problem._replace(room=problem.room.of(rows, max_steps))
+                trajectory, outcome = solved(problem)
+        if problem.room.rows < max_steps:
+            trajectory = eqx.tree_at(lambda motion: motion.stats["max_steps"], trajectory, np.asarray(max_steps))
+        if is_traced(outcome.flags):
+            return Ended(problem, trajectory, outcome, None)
+        flags = Flags(*np.asarray(outcome.flags))
+        if flags.wrong_derivative:
+            warn_of_wrong_derivative()
+        if flags.long:
+            note_long(problem.system, problem.method.solver)
+        return Ended(problem, trajectory, outcome, None if problem.traced else flags)
+
+    def finished(self, ended: Ended) -> Trajectory:
+        """The motion that the user gets.
+
+        **Raises:** `ValueError` for a start that violates the constraints; `RuntimeError` for a motion that failed,
+        unless the user does not want it.
+        """
+        asked, stats = self.asked, ended.trajectory.stats
+        if asked.solver == "switch" and stats["stiff"]:
+            told = {name: stats[name] for name in ("stiff", "stiff_steps")}
+            run = Run.checked(asked._replace(solver=Hermite()))
+            trajectory = run.finished(run.solved())
+            return eqx.tree_at(lambda motion: motion.stats, trajectory, trajectory.stats | told)
+        if asked.solver == "auto":
+            warn_of_stiffness(stats)
+        if ended.flags is None:
+            trajectory = ended.trajectory.trimmed()
+            if asked.throw:
+                trajectory = trajectory.result.error_if(trajectory, ended.outcome.flags[0])
+        else:
+            trajectory = self._explained(ended)
+        if asked.error:
+            closer = self._closer(ended.problem)
+            trajectory = eqx.tree_at(lambda t: t.closer, trajectory, closer, is_leaf=lambda leaf: leaf is None)
+        return trajectory
+
+    def _explained(self, ended):
+        """A motion whose numbers are known, with the precise reason where it failed."""
+        problem, trajectory, outcome, flags = ended
+        system, span, asked = problem.system, problem.span, self.asked
+        if flags.inconsistent:
+            consistent(system, span.t0, problem.state)
+        if flags.stuck:
+            result, coupling = made_precise(problem, trajectory.result, outcome)
+            if result == RESULTS.newton_failed and lost_rank(system.at(outcome.y), outcome.t, outcome.y) is not None:
+                # Elimination in blocks does not tell.
+                result = RESULTS.singular_configuration
+            trajectory = eqx.tree_at(lambda motion: motion.result, trajectory, result)
+            outcome = outcome._replace(coupling=coupling)
+        if not system.drift_free and system.acceleration_rows > 0:
+            warn_of_jumps(system, outcome, span, problem.stops.restarts, asked.jumps)
+        if flags.failed and asked.throw is not False:
+            probe = self._probe(problem, outcome)
+            solver, stats = problem.method.solver, trajectory.stats
+            raise RuntimeError(message_of_failure(system, trajectory.result, span, outcome, stats, solver, probe))
+        return trajectory if flags.whole else trajectory.trimmed()
+
+    def _probe(self, problem, outcome):
+        """The same motion from its end on, by a solver in a number of steps."""
+        end = self.asked._replace(state=outcome.y, t0=outcome.t, rtol=problem.method.rtol, atol=problem.method.atol)
+        if problem.method.policy.restores:
+            # What was chosen for another method need not serve the one that looks for stiffness.
+            end = end._replace(formulation=None, manifold=None)
+        on = end._replace(**_ALONE, saveat=None, dt0=None, stepsize_controller=None, adjoint=None)
+        return lambda solver, steps: _motion(on._replace(solver=solver, max_steps=steps))
+
+    def _closer(self, problem):
+        """The same motion at tighter tolerances."""
+        asked, method = self.asked, problem.method
+        rtol, atol = closer_tolerances(method.solver, method.rtol, method.atol)
+        closer = asked._replace(**_ALONE, solver=method.solver, rtol=rtol, atol=atol)
+        if problem.traced:
+            system, state = lax.stop_gradient((asked.system, asked.state))
+            closer = closer._replace(system=system, state=state)
+        return _motion(closer)
+
+
+def _motion(asked):
+    run = Run.checked(asked)
+    return run.finished(run.solved())
+
+
+def _method(asked, rtol, atol):
+    check_steps(asked.max_steps)
+    check_steps(asked.max_events, "max_events")
+    solver, controller = asked.solver, asked.stepsize_controller
+    solver = named_solver(solver) if isinstance(solver, str) else _ADAMS if solver is None else solver
+    check_kinds(solver, asked.formulation, asked.manifold, controller, asked.adjoint, asked.event, asked.progress_meter)
+    check_fixed_steps(solver, controller)
+    dtmax = checked_longest_step(asked.dtmax, controller, solver, asked.state.q.dtype)
+    others = {"controller": controller, "rtol": rtol, "atol": atol, "dtmax": dtmax}
+    return Method.chosen(asked.system, solver, asked.manifold, asked.formulation, **others)
+
+
+def _settled(problem, asked):
+    """The problem with what depends on what is traced, the rooms for its steps, and whether values are known."""
+    system, state, span = problem.system, problem.state, problem.span
+    traced = is_traced(problem)
+    if traced and asked.solver == "switch":
+        raise ValueError(
+            "solver='switch' looks at a motion before it decides, which it cannot under jit, vmap or grad. Simulate "
+            "once with solver='auto', outside, and then choose Adams() or Hermite()."
+        )
+    turns = turns_of(system, state, span.t0, span.t1, problem.method.controller)
+    saves = problem.saveat
+    if not traced and asked.adjoint is None:
+        saves = padded(saves, span.t0, span.t1)
+    taken = derivatives_of(problem) if traced else None
+    orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
+    if max(orders, default=0) > 1 and system.contacts is not None:
+        raise ValueError(NO_SECOND_DERIVATIVES)
+    # Where values are known, so is after it how many steps a motion took.
+    known = not traced or (taken is not None and taken.known)
+    tries = traced and known and not was_long(system, problem.method.solver)
+    rooms = [asked.max_steps]
+    if asked.adjoint is None:
+        rooms = rooms_for(asked.max_steps, problem.saveat, state, traced, tries)
+    if span.is_backward() and system.contacts is not None:
+        raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {asked.t0} and {asked.t1}.")
+    problem = problem._replace(
+        saveat=saves,
+        stops=problem.stops._replace(turns=turns),
+        watched=problem.watched._replace(differentiated=tuple(order > 0 for order in orders) if any(orders) else ()),
+        room=problem.room.of(rooms[0], asked.max_steps),
+        traced=traced,
+    )
+    return problem, rooms, known
