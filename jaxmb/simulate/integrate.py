@@ -38,7 +38,8 @@ def integrated(
 def _on_mesh(integration, control, room, projects_steps):
     """The solution, whose mesh resolves the motion; where it is differentiated, tangents as well."""
     del control, projects_steps
-    return _solution(*integration, room, None)
+    term, solver, options = integration
+    return _solution(term, solver, options, room, None)
 
 
 @_on_mesh.def_jvp

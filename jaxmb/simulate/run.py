@@ -133,8 +133,7 @@ class Run:
         first = saves.subs[0]
         if asked.error:
             check_error_estimate(first.steps, asked.stepsize_controller, asked.event, rtol)
-        max_events = None if system.contacts is None else asked.max_events
-        stops = Stops(restarts, None, captured_event(asked.event, span.t0, state), max_events)
+        stops = Stops(restarts, None, captured_event(asked.event, span.t0, state), asked.max_events)
         watched = Watch(parameter_changes(system, asked.direction), ())
         meter = _NO_METER if asked.progress_meter is None else asked.progress_meter
         interpolated = asked.event is not None or first.ts is not None

@@ -54,6 +54,7 @@ class Problem(NamedTuple):
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
         """Those of `diffrax.diffeqsolve`."""
         system, method = self.system, self.method
+        contacts, gaps = system.contacts is not None, method.watches_gaps(system)
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
         return {
             "y0": y0,
@@ -61,11 +62,11 @@ class Problem(NamedTuple):
             "t1": span.t1,
             "dt0": span.dt0,
             "saveat": saveat,
-            "stepsize_controller": self.stops.around(controller, method.watches_gaps(system)),
+            "stepsize_controller": self.stops.around(controller, contacts, gaps),
             "event": self.stops.event,
             "progress_meter": self.progress_meter,
             # Contacts may close, or be closed, at the start.
-            **({} if system.contacts is None else {"made_jump": jnp.array(True)}),
+            **({"made_jump": jnp.array(True)} if contacts else {}),
         }
 
 

@@ -24,19 +24,19 @@ class Stops(NamedTuple):
     """Where a run stops, or its steps.
 
     **Fields:** times of `restarts`, or None; times of `turns`, which no step passes, or None; the user's `event`, or
-    None; `max_events` of contacts, None without contacts.
+    None; `max_events` of contacts.
     """
 
     restarts: Any
     turns: Any
     event: diffrax.Event | None
-    max_events: int | None
+    max_events: int
 
-    def around(self, controller: Any, gaps: bool) -> Any:
-        """A controller that steps to these times and restarts there, and at events of contacts. Where forces have
+    def around(self, controller: Any, contacts: bool, gaps: bool) -> Any:
+        """A controller that steps to these times and restarts there, and at events of `contacts`. Where forces have
         `gaps`, its steps hide none of these.
         """
-        controller = controller if self.max_events is None else EventController(controller, self.max_events)
+        controller = EventController(controller, self.max_events) if contacts else controller
         controller = GapController(controller) if gaps else controller
         if self.restarts is None and self.turns is None:
             return controller

@@ -13,7 +13,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import parts, planar
-from jaxmb.simulate import solve
+from jaxmb.simulate import saves
 from jaxmb.solvers import Adams, Hermite, MeshAdjoint
 
 SYSTEM = mb.Scene(
@@ -194,7 +194,7 @@ def test_derivatives_by_all_times(solver):
 def test_times_that_are_numbers_have_no_derivatives_to_compile(moves, monkeypatch):
     """Also under `jit`, where JAX traces what is made of them."""
     found = []
-    monkeypatch.setattr(solve, "at_moving_times", lambda term, ts, moves, ys: found.append(ts) or ys)
+    monkeypatch.setattr(saves, "at_moving_times", lambda term, ts, moves, ys: found.append(ts) or ys)
     system = mb.Scene([planar.Body("body", mass=2.0, inertia=1.0)], forces=[mb.Gravity((0.0, -9.81))]).compile()
 
     def end(x):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb.simulate import room, solve
+from jaxmb.simulate import room, saves, solve
 
 run = importlib.import_module("jaxmb.simulate.run")
 
@@ -146,11 +146,11 @@ def test_too_few_steps_are_no_singularity(narrow, rooms):
 
 def test_room_counts_internal_states():
     """Of which a system may have many more than coordinates."""
-    saveat = arguments.with_end(diffrax.SaveAt(steps=True), jnp.zeros(()), mb.State(jnp.zeros(8), jnp.zeros(8)))
+    saveat = saves.with_end(diffrax.SaveAt(steps=True), jnp.zeros(()), mb.State(jnp.zeros(8), jnp.zeros(8)))
     few, many = mb.State(jnp.zeros(8), jnp.zeros(8)), mb.State(jnp.zeros(8), jnp.zeros(8), jnp.zeros(4096))
-    first = [arguments.rooms_for(2**30, saveat, state, False, False)[0] for state in (few, many)]
+    first = [room.rooms_for(2**30, saveat, state, False, False)[0] for state in (few, many)]
     assert first == [2**17, 2**8 * 4]
-    assert first[1] * (16 + 4096) * 8 < 4 * arguments._ROOM
+    assert first[1] * (16 + 4096) * 8 < 4 * room._MEMORY
 
 
 def test_few_systems_are_remembered_as_long():
