@@ -1,7 +1,7 @@
 """Jumps of prescribed rates: the velocities after them, and a search for them."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Coordinates, Scalar, State
+from ..contacts.impacting import Event
 from ..system import AbstractEquation
 from .orthogonal_projection import project_velocities
 
@@ -65,6 +66,20 @@ def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
     """
     u, failed = project_velocities(system, t, y.q, y.u, system.inertia(t, y.q, y.u))
     return dataclasses.replace(y, u=jnp.where(failed, jnp.nan, u))
+
+
+def found_at_jump(term: Any, t: Scalar, y: State) -> Event | None:
+    """The event of contacts that close or open at a jump, of a term with `guards`; None without them."""
+    return None if term.guards is None else term.guards.event(t, y)
+
+
+def after_jump(term: Any, t: Scalar, y: State, found: Event | None) -> State:
+    """The state after prescribed rates have jumped, or contacts closed or opened, of a term with `system` and `guards`,
+    which are None without contacts.
+    """
+    if term.guards is None:
+        return after_impulse(term.system, t, y)
+    return term.guards.impact(t, y, found=found).after
 
 
 class Jump(NamedTuple):

@@ -16,8 +16,7 @@ from .._types import State
 from ..solvers import AbstractManifoldTerm, Block
 from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractSystem
-from ..system.gaps import mode_places
-from .contact_guards import after_jump, found_at_jump
+from .impulse import after_jump, found_at_jump
 
 
 def with_internal_states(term: Any) -> Any:
@@ -159,9 +158,9 @@ def counted_components(system: AbstractSystem) -> tuple[int, ...] | None:
     """The indices of the components of a raveled state whose sizes and errors count: all but the modes of contacts and
     dry friction, which have none; None for all.
     """
-    if system.contacts is None:
+    if not system.contacts:
         return None
-    modes = np.isin(np.arange(system.nq), mode_places(system))
+    modes = np.isin(np.arange(system.nq), system.contacts.places)
     along = system.held_velocities(modes)
     assert along is not None, "a mode is no part of a rotation"
     uncounted = np.concatenate([modes, along, np.zeros(system.nz, bool)])

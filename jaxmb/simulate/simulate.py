@@ -16,10 +16,10 @@ from jaxtyping import ArrayLike
 from .._arguments import check_kind
 from .._results import RESULTS
 from .._types import Scalar, State, VectorLike
+from ..contacts.impact import NO_SECOND_DERIVATIVES
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import derivatives_of, is_traced
 from ..manifold import AbstractManifold
-from ..manifold.impact import NO_SECOND_DERIVATIVES
 from ..parts.names import names_arguments
 from ..solvers import Adams, Hermite
 from ..states.arguments import check_precision
@@ -190,7 +190,7 @@ def simulate(
         others["saveat"] = padded(saved, times["t0"], times["t1"])
     taken = derivatives_of((system, state, others)) if traced else None
     orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
-    if max(orders, default=0) > 1 and system.contacts is not None:
+    if max(orders, default=0) > 1 and system.contacts:
         raise ValueError(NO_SECOND_DERIVATIVES)
     # Where values are known, so is after it how many steps a motion took.
     known = not traced or (taken is not None and taken.known)
@@ -212,7 +212,7 @@ def simulate(
         moving=(may_move(times["t0"]), may_move((times["t1"], saveat))),
     )
     backward = not is_traced((times["t0"], times["t1"])) and times["t1"] < times["t0"]
-    if backward and system.contacts is not None:
+    if backward and system.contacts:
         raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {t0} and {t1}.")
 
     def run(problem):

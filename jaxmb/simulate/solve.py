@@ -14,7 +14,8 @@ from jax import lax
 from .._compat import with_values
 from .._results import RESULTS
 from .._types import State
-from ..contact_events import FoundEvents
+from ..contacts.events import FoundEvents
+from ..contacts.guards import contact_guards
 from ..formulations import AbstractFormulation
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
@@ -22,7 +23,6 @@ from ..linalg.members import vmap_states
 from ..manifold import (
     AbstractManifold,
     after_jumps,
-    contact_guards,
     counted_components,
     default_manifold,
     natural_units,
@@ -114,7 +114,7 @@ class Problem(NamedTuple):
         """Raise a `ValueError` where the velocities after an impulse would not be known."""
         system, policy = self.system, self.policy
         jumps = self.restarts is not None and system.velocity_rows > 0
-        if not jumps and system.contacts is None:
+        if not jumps and not system.contacts:
             return
         if not (policy.takes_impulses and system.positive_definite_mass):
             what = "jumps, or inputs that jump, a constrained system" if jumps else "contacts a system"
@@ -154,7 +154,7 @@ class Problem(NamedTuple):
                 controller,
                 self.restarts,
                 self.stops,
-                None if self.system.contacts is None else self.max_events,
+                self.max_events if self.system.contacts else None,
                 self.watches_gaps,
             ),
             "event": self.event,
@@ -195,7 +195,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
     first = problem.saveat.subs[0]
     options = problem.options(start) | lax.stop_gradient(times)
-    if system.contacts is not None:
+    if system.contacts:
         # Contacts may close, or be closed, at the start.
         options["made_jump"] = jnp.array(True)
     given = start

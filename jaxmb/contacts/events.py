@@ -9,16 +9,16 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from ._arguments import package_for_tables
-from ._printed import preformatted
-from ._types import State
-from .formulations import AbstractFormulation
-from .linalg.arrays import is_traced
-from .linalg.jitted import jitted
-from .manifold import contact_guards
-from .system import AbstractSystem
-from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
-from .system.structures import of_structure
+from .._arguments import package_for_tables
+from .._printed import preformatted
+from .._types import State
+from ..formulations import AbstractFormulation
+from ..linalg.arrays import is_traced
+from ..linalg.jitted import jitted
+from ..parts.modes import CLOSED, FREE, OPEN, STICK
+from ..system import AbstractSystem
+from .guards import ContactGuards
+from .tolerance import ContactTolerance
 
 # Impulses of contacts that are this small beside another one at the same time are none.
 _ROUNDING = 1e-12
@@ -176,15 +176,8 @@ class ContactEvents(eqx.Module):
 def contact_events(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> ContactEvents:
     """The events of a run, or of a batch of runs, from what is noted of them."""
     evaluated = _evaluated if is_traced((system, formulation, found)) else _happened
-    return ContactEvents(**_parts(system), **dict(zip(_NUMBERS, evaluated(system, formulation, found), strict=True)))
-
-
-_NUMBERS = ("times", "impulses", "kinetic_energy_lost", "before", "after", "rest")
-
-
-@of_structure
-def _parts(system):
-    return {"names": names_of(system), "contacts": counts(system)[0]}
+    contacts = system.contacts
+    return ContactEvents(contacts.names, contacts.n, *evaluated(system, formulation, found))
 
 
 def _happened(system, formulation, found):
@@ -215,8 +208,7 @@ def _happened(system, formulation, found):
 def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> Any:
     if found.times.ndim > 1:
         return eqx.filter_vmap(_evaluated)(system, formulation, found)
-    guards = contact_guards(system, formulation, found.touch)
-    assert guards is not None, "a system without contacts has no events"
+    guards = ContactGuards(system, formulation, ContactTolerance(found.touch))
     nq, nu = system.nq, system.nu
     # Behind the last event a state is needed that has no failure, nor its derivative.
     guess = system.guess
