@@ -158,6 +158,33 @@ class Round(NamedTuple):
     pushed: Float[Array, "laws"] | None
 
 
+class Moves(NamedTuple):
+    """How velocities respond to impulses along the directions of contacts and friction, where the other constraints
+    hold.
+
+    **Fields:** `rows`, the derivatives of the rates of gaps and slips by velocities; the `projector` on the other
+    constraints; `by_unit`, the changes of velocities by unit impulses, and the impulses that the other constraints
+    answer with, `answers`; the change that these ask for themselves, `jump`.
+    """
+
+    rows: Float[Array, "laws nu"]
+    projector: Any
+    by_unit: Float[Array, "laws nu"]
+    answers: Float[Array, "laws acceleration_rows"]
+    jump: Float[Array, "nu"]
+
+    @classmethod
+    def at(cls, system, t, q, u, inertia: AbstractInertia, unmet) -> "Moves":
+        """The moves at a state, whose velocities leave the rates of all rows `unmet`."""
+        rows, jacobian = directions(system, t, q, u)
+        projector = jacobian.projector(inertia)
+        # The last one is without an impulse.
+        impulses = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
+        asked = jnp.concatenate([jnp.zeros((len(rows), unmet.size), q.dtype), -unmet[None]])
+        moves, answers = jax.vmap(projector.solve)(impulses, asked)
+        return cls(rows, projector, moves[:-1], answers[:-1], moves[-1])
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Impacting:
     """An event at a state: in each round first impulses are found, in one phase or in the two of Poisson's law, and
@@ -165,10 +192,8 @@ class Impacting:
 
     The first impulse is none, and the forces after it are those before the event, which tell when it is.
 
-    **Fields:** `tolerance` [m, rad]; t, q and the velocities `u`; the `modes` there; the `gap`s, and the `rates` of
-    gaps and slips; `rows`, their derivatives by velocities; the `projector` on the other constraints; `moves`, the
-    changes of velocities by unit impulses, with the impulses that these constraints answer with, `responses`, and the
-    change that they ask for themselves, `jump`; the `laws`; the velocity up to which slip in a plane has ended, `slow`.
+    **Fields:** `tolerance` [m, rad]; t, q and the velocities `u`; the `inertia` and the `modes` there; the `gap`s, and
+    the `rates` of gaps and slips; the `moves`; the `laws`; the velocity up to which slip in a plane has ended, `slow`.
     """
 
     system: AbstractEquation
@@ -177,50 +202,26 @@ class Impacting:
     t: Float[Array, ""]
     q: Float[Array, "nq"]
     u: Float[Array, "nu"]
+    inertia: AbstractInertia
     modes: Modes
     gap: Float[Array, "contacts"]
     rates: Float[Array, "laws"]
-    inertia: AbstractInertia
-    rows: Float[Array, "laws nu"]
-    projector: Any
-    moves: Float[Array, "laws nu"]
-    responses: Float[Array, "laws acceleration_rows"]
-    jump: Float[Array, "nu"]
+    moves: Moves
     laws: Laws
     slow: Float[Array, ""]
 
     @classmethod
     def at(cls, system, formulation, tolerance: ContactTolerance, t, y) -> "Impacting":
         contacts, q, u = system.contacts, y.q, y.u
-        inertia = system.inertia(t, contacts.with_modes(q, 0.0), u)
-        rows, jacobian = directions(system, t, q, u)
-        projector = jacobian.projector(inertia)
-        zero = jnp.zeros(system.acceleration_rows, q.dtype)
-        # In the last row there is no impulse.
-        unmet = velocity_rows(system, t, contacts.bound(q), u)
-        impulses = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
-        asked = jnp.concatenate([jnp.tile(zero, (len(rows), 1)), -unmet[None]])
-        moves, responses = jax.vmap(projector.solve)(impulses, asked)
-        moves, jump, responses = moves[:-1], moves[-1], responses[:-1]
-        return cls(
-            system=system,
-            formulation=formulation,
-            tolerance=tolerance,
-            t=t,
-            q=q,
-            u=u,
-            modes=contacts.modes(q),
-            gap=contacts.gaps(system, t, q),
-            rates=contacts.at_rows(unmet),
-            inertia=inertia,
-            rows=rows,
-            projector=projector,
-            moves=moves,
-            responses=responses,
-            jump=jump,
-            laws=Laws(rows @ moves.T, contacts, *friction_coefficients(system, t, q, u)),
-            slow=tolerance.slow(system, u),
+        inertia, unmet = (
+            system.inertia(t, contacts.with_modes(q, 0.0), u),
+            velocity_rows(system, t, contacts.bound(q), u),
         )
+        moves = Moves.at(system, t, q, u, inertia, unmet)
+        laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(system, t, q, u))
+        gap, rates = contacts.gaps(system, t, q), contacts.at_rows(unmet)
+        known = inertia, contacts.modes(q), gap, rates, moves, laws, tolerance.slow(system, u)
+        return cls(system, formulation, tolerance, t, q, u, *known)
 
     @property
     def contacts(self) -> ContactSet:
@@ -243,18 +244,22 @@ class Impacting:
 
     def rates_at(self, u):
         """The rates of gaps and slips at other velocities."""
-        return self.rates + self.rows @ (u - self.u)
+        return self.rates + self.moves.rows @ (u - self.u)
+
+    def sizes_of_rates(self, *velocities):
+        """The sizes that add up in the rates at some velocities."""
+        return jnp.abs(self.moves.rows) @ sum(map(jnp.abs, velocities))
 
     def accelerated(self, u):
         """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
         that have friction, without forces along these and by a unit of each.
         """
         system, t, q = self.system, self.t, self.q
-        udot, multipliers, opening = free_accelerations(system, self.formulation, self.projector, t, q, u)
+        udot, multipliers, opening = free_accelerations(system, self.formulation, self.moves.projector, t, q, u)
         if not self.contacts.in_joints.any():
             return udot, opening, None
         reactions = lambda multipliers: system.friction_reactions(t, q, u, multipliers)
-        return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], self.responses]))
+        return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], self.moves.answers]))
 
     # When the event is
 
@@ -315,23 +320,27 @@ class Impacting:
         whole rebound; by Poisson's law none does at the end of compression.
         """
         back = jnp.where(low | np.array(self.contacts.by_poisson, bool), 0.0, share * self.bounces(when))
-        approach = when.at + self.rows @ self.jump - jnp.pad(back, (0, self.contacts.m))
+        approach = when.at + self.moves.rows @ self.moves.jump - jnp.pad(back, (0, self.contacts.m))
         if self.contacts.pairs:
             # Directions of rounding errors have no sense.
-            approach = jnp.where(jnp.abs(approach) <= REST * (jnp.abs(self.rows) @ jnp.abs(when.u)), 0.0, approach)
+            approach = jnp.where(jnp.abs(approach) <= REST * self.sizes_of_rates(when.u), 0.0, approach)
         return self.laws.of_impulses(approach, when.touching, reactions)
+
+    def moved(self, k, when: "When", impulses):
+        """The velocities after impulses; in the first round there is no event yet."""
+        return when.u + jnp.where(k < self.turns, 0.0, self.moves.jump) + impulses @ self.moves.by_unit
 
     def expand(self, k, before: Round, answers, impulses) -> Round:
         """The end of the compression, and the impulses that are asked for besides those with which contacts push again
         in the expansion.
         """
-        when, rows = before.when, jnp.abs(self.rows)
+        when = before.when
         again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]
         pushes = np.array(self.contacts.by_poisson, bool) & ~before.low
         again = jnp.where(pushes, before.trial.share * again, 0.0)
-        u = when.u + jnp.where(k < self.turns, 0.0, self.jump) + impulses @ self.moves
+        u = self.moved(k, when, impulses)
         free = before.problem.free + self.influence @ impulses
-        free = jnp.where(jnp.abs(free) <= REST * (rows @ (jnp.abs(u) + jnp.abs(when.u))), 0.0, free)
+        free = jnp.where(jnp.abs(free) <= REST * self.sizes_of_rates(u, when.u), 0.0, free)
         held = jnp.concatenate([answers.closed, answers.sticks])
         return before._replace(
             problem=self.laws.of_expansion(free, again, when.touching, before.problem.reactions),
@@ -345,12 +354,12 @@ class Impacting:
         when, n, solvable = before.when, self.contacts.n, answers.solvable
         if before.pushed is not None:
             impulses, solvable = before.pushed + impulses, solvable & before.solvable
-        after = when.u + jnp.where(k < self.turns, 0.0, self.jump) + impulses @ self.moves
+        after = self.moved(k, when, impulses)
         rate = self.rates_at(after)
         gained = jnp.dot(impulses, when.at + rate)
         size = jnp.dot(jnp.abs(impulses), jnp.abs(when.at) + jnp.abs(rate))
         udot, opening, reactions = self.accelerated(after)
-        sizes = jnp.abs(self.rows) @ (jnp.abs(after) + jnp.abs(when.u))
+        sizes = self.sizes_of_rates(after, when.u)
         resting = when.touching & ((rate[:n] <= REST * sizes[:n]) | before.low)
         ended, slips = self.slips_left(rate[n:], sizes[n:])
         struck = Struck(answers, impulses, after, rate, udot, resting, ended, (gained, size), before.trial.share)
@@ -368,7 +377,9 @@ class Impacting:
     def begin(self, k, before: Round, answers, forces) -> Round:
         """The time of the event, by the equations before it, and its impulses."""
         del k, answers
-        when = self.at_event(before.struck.udot + forces @ self.moves, before.problem.free + self.influence @ forces)
+        when = self.at_event(
+            before.struck.udot + forces @ self.moves.by_unit, before.problem.free + self.influence @ forces
+        )
         problem = self.impulse_of(when, before.low, before.trial.share, before.problem.reactions)
         return before._replace(problem=problem, when=when)
 
@@ -450,36 +461,41 @@ class Impacting:
     def event(self) -> Event:
         """The event, after all rounds."""
         _, settled = lax.while_loop(self.goes_on, self.advance, (jnp.array(0), self.start()))
-        when, struck, compression = settled.when, settled.struck, settled.compression
+        when, struck = settled.when, settled.struck
         modes, implied = self.new_modes(settled)
         held, lost = self.lost(settled, implied)
-        if compression is not None:
-            independent = independent_components(self.influence, compression.held)
-            compression = compression._replace(held=compression.held & independent)
-        after = struck.u + lost @ self.moves
-        # Impulses of rounding errors are none.
-        sizes = jnp.abs(self.rows) @ (jnp.abs(after) + jnp.abs(when.u))
-        is_none = jnp.abs(jnp.diag(self.influence) * struck.impulses) <= REST * sizes
+        after = struck.u + lost @ self.moves.by_unit
         kinetic = lambda u: jnp.dot(u, self.inertia.product(u))
         return Event(
             late=when.late,
             first=when.first,
             hits=when.hits,
             before=when.before,
-            after=struck.udot + settled.forces @ self.moves,
+            after=struck.udot + settled.forces @ self.moves.by_unit,
             at=when.u,
             u=after,
             held=held,
             low=settled.low,
             slips=struck.answers.slips,
-            impulses=jnp.where(is_none, 0.0, struck.impulses),
+            impulses=self.seen(struck.impulses, self.sizes_of_rates(after, when.u)),
             modes=(self.modes.numbers, modes),
             rest=jnp.pad(settled.rest, (0, self.contacts.m)),
             energy=0.5 * (kinetic(when.u) - kinetic(after)),
             solvable=settled.solvable,
             share=struck.share,
-            compression=compression,
+            compression=self.compressed(settled.compression),
         )
+
+    def seen(self, impulses, sizes):
+        """The impulses, of which those of rounding errors are none."""
+        return jnp.where(jnp.abs(jnp.diag(self.influence) * impulses) <= REST * sizes, 0.0, impulses)
+
+    def independent(self, laws):
+        """As many of some laws as are independent of each other."""
+        return laws & independent_components(self.influence, laws)
+
+    def compressed(self, phase: Phase | None) -> Phase | None:
+        return None if phase is None else phase._replace(held=self.independent(phase.held))
 
     def new_modes(self, settled: Round):
         """The modes after the event, and contacts that are closed while others imply them."""
@@ -504,12 +520,11 @@ class Impacting:
             cancelled = held & jnp.concatenate([staying, rests])
         else:
             left, cancelled = jnp.where(staying, rate, 0.0), held & settled.low
-        held = held & independent_components(self.influence, held)
+        held = self.independent(held)
         cancelled = held & cancelled
         if m:
             # Bodies that move side by side would come nearer, at a rate that is too small beside slips to close their
             # contact, and each step would end with an event.
             drifts = jnp.pad(staying & ~held[:n] & ~implied & (rate[:n] < 0), (0, m))
-            cancelled = cancelled | drifts
-            cancelled = cancelled & independent_components(self.influence, cancelled)
+            cancelled = self.independent(cancelled | drifts)
         return held, jnp.where(cancelled, solved_components(self.influence, left, cancelled), 0.0)

@@ -1,7 +1,7 @@
 """Jumps of prescribed rates: the velocities after them, and a search for them."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Coordinates, Scalar, State
+from ..contacts.guards import ContactGuards
 from ..contacts.impacting import Event
 from ..system import AbstractEquation
 from .orthogonal_projection import project_velocities
@@ -68,18 +69,18 @@ def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
     return dataclasses.replace(y, u=jnp.where(failed, jnp.nan, u))
 
 
-def found_at_jump(term: Any, t: Scalar, y: State) -> Event | None:
-    """The event of contacts that close or open at a jump, of a term with `guards`; None without them."""
-    return None if term.guards is None else term.guards.event(t, y)
+def found_at_jump(guards: ContactGuards | None, t: Scalar, y: State) -> Event | None:
+    """The event of contacts that close or open at a jump; None without contacts."""
+    return None if guards is None else guards.event(t, y)
 
 
-def after_jump(term: Any, t: Scalar, y: State, found: Event | None) -> State:
-    """The state after prescribed rates have jumped, or contacts closed or opened, of a term with `system` and `guards`,
-    which are None without contacts.
+def after_jump(
+    system: AbstractEquation, guards: ContactGuards | None, t: Scalar, y: State, found: Event | None = None
+) -> State:
+    """The state after prescribed rates have jumped, or contacts closed or opened; `guards` are None without contacts,
+    and `found` is the event where it is known.
     """
-    if term.guards is None:
-        return after_impulse(term.system, t, y)
-    return term.guards.impact(t, y, found=found).after
+    return after_impulse(system, t, y) if guards is None else guards.impact(t, y, found=found).after
 
 
 class Jump(NamedTuple):

@@ -106,11 +106,11 @@ class StatefulTerm(AbstractManifoldTerm):
         return self.term.gaps
 
     def found_at_jump(self, t, y, args):
-        return found_at_jump(self, t, y)
+        return found_at_jump(self.guards, t, y)
 
     def after_jump(self, t, y, found, args):
         if self.guards is not None:
-            return after_jump(self, t, y, found)
+            return after_jump(self.system, self.guards, t, y, found)
         after = self.term.after_jump(t, _mechanical(y), found, args)
         return State(after.q, after.u, y.z)
 

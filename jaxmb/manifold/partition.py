@@ -630,10 +630,10 @@ class PartitionTerm(AbstractManifoldTerm):
         return compliant_gaps(self.system)
 
     def found_at_jump(self, t, y, args):
-        return found_at_jump(self, t, y)
+        return found_at_jump(self.guards, t, y)
 
     def after_jump(self, t, y, found, args):
-        return after_jump(self, t, y, found)
+        return after_jump(self.system, self.guards, t, y, found)
 
     def chart_after_jump(self, chart):
         if not self.system.contacts:

@@ -31,7 +31,7 @@ from ..system.residuals import binding_velocities, drops_rows, row_sizes, violat
 from .compliant_gaps import compliant_gaps
 from .constraints import RestoredState, SolvedState, rates_along, restore, solved
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
-from .impulse import after_impulse, after_jump, found_at_jump
+from .impulse import after_jump, found_at_jump
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (
     ProjectorConstraints,
@@ -254,10 +254,10 @@ class ProjectionTerm(AbstractManifoldTerm):
         return compliant_gaps(self.system)
 
     def found_at_jump(self, t, y, args):
-        return found_at_jump(self, t, y)
+        return found_at_jump(self.guards, t, y)
 
     def after_jump(self, t, y, found, args):
-        return after_jump(self, t, y, found)
+        return after_jump(self.system, self.guards, t, y, found)
 
     def controlled(self, chart):
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
@@ -287,7 +287,7 @@ class ProjectedSolver(WrappedSolver):
         system, direction = inner_term(terms).vector_field.system, direction_of(terms)
         before = y0
         if made_jump is not False:
-            after = lambda y: self._after_jump(system, t0 * direction, y)
+            after = lambda y: after_jump(system, self.guards, t0 * direction, y)
             y0 = cond_of_jumps(self.guards)(made_jump, after, lambda y: y, y0)
         first, last = t0, t1
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
@@ -307,8 +307,3 @@ class ProjectedSolver(WrappedSolver):
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate
             error = crossing(self.guards, direction, error, (first, last), (before, y0, y1), at, made_jump)
         return y1, error, dense_info, solver_state, result
-
-    def _after_jump(self, system, t, y):
-        if self.guards is None:
-            return after_impulse(system, t, y)
-        return self.guards.impact(t, y).after

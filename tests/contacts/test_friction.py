@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.contacts.dry_laws import Dry, laws_of
-from jaxmb.contacts.friction import frictional
+from jaxmb.contacts.dry_laws import Answers, Dry, laws_of
+from jaxmb.contacts.friction import SlipSearch, frictional, with_implied
 from jaxmb.linalg.pairs import of_pairs
 
 
@@ -47,3 +47,41 @@ def test_friction_in_two_directions(contacts):
                 np.testing.assert_allclose(force, against, atol=1e-6 * push)
                 seen.add("slip")
     assert seen == {"open", "stick", "slip"}
+
+
+def searched(W, b):
+    """The search of a contact with friction in two directions, which may have a force."""
+    dry = Dry((0, 0), (0,), jnp.array([0.3, 0.3]), jnp.zeros(2), jnp.zeros(2))
+    return SlipSearch.of(jnp.asarray(W), jnp.asarray(b), dry, jnp.ones(3, bool))
+
+
+def test_slip_goes_where_it_goes_without_forces():
+    """At first; and with forces where the nearest ones in the cone do not end it."""
+    search = searched(np.eye(3), np.array([-1.0, 3.0, -4.0]))
+    np.testing.assert_allclose(search.start(), [[0.6, -0.8]], rtol=1e-15)
+    x = jnp.array([1.0, -0.3 * 0.6, 0.3 * 0.8])
+    np.testing.assert_allclose(search.direction(jnp.array([[1.0, 0.0]]), x), [[0.6, -0.8]], rtol=1e-15)
+    assert not search.misses(search.answers(), x)
+
+
+def test_equations_of_slip_hold_at_a_solution():
+    """Also where the matrix turns the slip, so that its direction is not that of the start."""
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(3, 4))
+    search = searched(root @ root.T + 0.1 * np.eye(3), np.array([-2.0, 5.0, 3.0]))
+    answers = search.answers()
+    assert answers.solvable and answers.closed and not answers.sticks.any()
+    x = jnp.linalg.solve(*laws_of(search.W, search.b, search.dry, answers))
+    matrix, right = search.corrected(answers, answers.slips[None], x)
+    np.testing.assert_allclose(matrix @ x, right, atol=1e-6)
+    e, _ = search.with_slips(answers, answers.slips[None])
+    np.testing.assert_array_equal(e.slips, answers.slips)
+
+
+def test_stick_that_others_imply():
+    """Of three feet that stick in one direction, as their rows depend on each other."""
+    rows = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    yes, none = jnp.ones(3, bool), jnp.zeros(3)
+    answers = Answers(jnp.zeros(0, bool), yes, none, jnp.array(True), ~yes)
+    found = with_implied(jnp.asarray(rows @ rows.T), answers)
+    assert np.sum(found.sticks) == 2 and np.sum(found.implied) == 1 and not np.any(found.sticks & found.implied)
