@@ -16,7 +16,7 @@ event by that before it is the saltation matrix: P. C. Müller, "Calculation of 
 with discontinuities", Chaos, Solitons & Fractals 5, 1995.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,15 +26,13 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
-from ..linalg.elimination import solve
 from ..linalg.pairs import of_pairs
 from ..linalg.pushed import dense, push
-from ..linalg.rotations import norm
 from ..linalg.sums import with_entries
 from ..system import AbstractEquation
-from ..system.residuals import velocity_rows
-from .forces import contact_forces, directions, friction_coefficients, largest_force, reserves
-from .impacting import Event, Phase, find_event
+from .forces import contact_forces, largest_force, reserves
+from .impacting import Event, find_event
+from .phases import Phases
 from .tolerance import ContactTolerance
 
 NO_SECOND_DERIVATIVES = (
@@ -124,7 +122,7 @@ def _impact_jvp(primals, tangents):
     rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
     dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
 
-    impulses, change = _struck(event, (system, t, y.q), (dsystem, dt, dq, du))
+    impulses, change = Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du).changes()
     at, along = (system, t, y.q), (dsystem, dt, dq)
     kinetic = lambda system, t, q, u: 0.5 * jnp.dot(u, system.inertia(t, q, u).product(u))
     energy = push(kinetic, (*at, event.at), (*along, du)) - push(kinetic, (*at, event.u), (*along, change))
@@ -153,147 +151,6 @@ def _later(event: Event, at, along):
             slowing = with_entries(slowing, both[:, 0], jnp.sum(modes * slowing[both], axis=1))
         zero, rate = jnp.concatenate([zero, slip]), jnp.concatenate([rate[: contacts.n], slowing])
     return jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
-
-
-def _struck(event: Event, at, along):
-    """The derivatives of the impulses, and of the velocities after them, by those before an impact.
-
-    Of `M (u⁺ − u⁻) = Aᵀ Λ` and the rates of gaps that are held, and slips that end, each phase has one linear system.
-    """
-    (system, t, q), tangents, du = at, along[:3], along[3]
-    contacts, compression = system.contacts, event.compression
-    of, (n, m), restitution = _phases(event, at, tangents, du), (contacts.n, contacts.m), _restitution(system)
-
-    def solved(plain, matrix, right):
-        impulses = solve(matrix, right)
-        return impulses, plain + impulses @ of.moves
-
-    # By the share of the rebounds velocities and impulses change as well.
-    at_rates = contacts.rates(system, t, q, event.at)
-    bounce = restitution * jnp.maximum(-at_rates[:n], 0.0)
-    bounce = jnp.pad(jnp.where(of.rebounds, bounce, 0.0), (0, m))
-    none = jnp.zeros(n, q.dtype)
-    if compression is None:
-        last = Phase(event.u, event.held, event.slips, event.impulses)
-        plain, matrix, right = _equations(of, event.at, du, last, none)
-        impulses, change = solved(plain, matrix, right)
-        by_share = solve(matrix, jnp.where(event.held, bounce, 0.0))
-    else:
-        plain, matrix, right = _equations(of, event.at, du, compression, none)
-        first, between = solved(plain, matrix, right)
-        first_by_share = solve(matrix, jnp.where(compression.held, bounce, 0.0))
-        pushes = ~event.low & np.array(contacts.by_poisson, bool)
-        again = lambda system, impulses: jnp.where(pushes, event.share * _restitution(system) * impulses[:n], 0.0)
-        normal = push(again, (system, compression.impulses), (tangents[0], first))
-        last = Phase(event.u, event.held, event.slips, event.impulses - compression.impulses)
-        plain, matrix, right = _equations(of, compression.u, between, last, normal)
-        second, change = solved(plain, matrix, right)
-        normal = restitution * (compression.impulses + event.share * first_by_share)[:n]
-        normal = jnp.where(pushes, normal, 0.0)
-        closing = bounce - of.rows @ (first_by_share @ of.moves)
-        right = jnp.where(event.held, closing, jnp.pad(normal, (0, m)))
-        impulses, by_share = first + second, first_by_share + solve(matrix, right)
-
-    # The share is that at which no energy is gained.
-    both = at_rates + contacts.rates(system, t, q, event.u)
-    changed = push(contacts.rates, (*at, event.at), along)
-    changed = changed + push(contacts.rates, (*at, event.u), (*tangents, change))
-    gained = jnp.dot(impulses, both) + jnp.dot(event.impulses, changed)
-    slope = jnp.dot(by_share, both) + jnp.dot(event.impulses, of.rows @ (by_share @ of.moves))
-    less = event.share < 1
-    less = jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * by_share
-    return impulses + less, change + less @ of.moves
-
-
-def _restitution(system):
-    return system.contact_numbers.restitution
-
-
-class _Phases(NamedTuple):
-    """What the linear equations of the phases of an impact have in common.
-
-    **Fields:** system, t and q `at` the `event`, their `tangents`, and that of the velocities before it, `du`; the
-    `rows` of A of contacts and friction, the `jacobian` of the other constraints with its `projector`, and the changes
-    of velocities, `moves`, by unit impulses; contacts whose rebound is asked for by Newton's law; the `coefficients` of
-    friction and their derivatives.
-    """
-
-    event: Event
-    at: Any
-    tangents: Any
-    du: Float[Array, "nu"]
-    rows: Float[Array, "laws nu"]
-    jacobian: Any
-    projector: Any
-    moves: Float[Array, "laws nu"]
-    rebounds: Bool[Array, "contacts"]
-    coefficients: tuple[Float[Array, "frictions"], Float[Array, "frictions"]]
-
-
-def _phases(event: Event, at, tangents, du) -> _Phases:
-    system, t, q = at
-    contacts = system.contacts
-    rows, jacobian = directions(system, t, q, event.u)
-    projector = jacobian.projector(system.inertia(t, contacts.with_modes(q, 0.0), event.u))
-    moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
-    rebounds = ~event.low & ~np.array(contacts.by_poisson, bool)
-    known = change = jnp.zeros(0, q.dtype)
-    if contacts.m:
-        coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
-        known, change = coefficients(*at), push(coefficients, at, tangents)
-    return _Phases(event, at, tangents, du, rows, jacobian, projector, moves, rebounds, (known, change))
-
-
-def _equations(of: _Phases, before, dbefore, phase: Phase, normal):
-    """The velocities at the end of a phase without a change of its impulses, and the linear equations for that change.
-
-    **Arguments:** the velocities `before` the phase, and their derivative; the changes of the impulses along the
-    `normal` of contacts that are not held.
-    """
-    event, (system, t, q), contacts = of.event, of.at, of.at[0].contacts
-    numbers, n = np.array(contacts.rows), contacts.n
-    _, multipliers = of.projector.solve(phase.impulses @ of.rows, of.jacobian.product(phase.u - before))
-    multipliers = with_entries(multipliers, numbers, phase.impulses)
-
-    def unmet(system, t, q, first, u):
-        """What is left of the rates, and of the balance of momentum."""
-        rates = velocity_rows(system, t, q, phase.u)
-        bounce = _restitution(system) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
-        bounce = jnp.where(phase.held[:n] & of.rebounds, event.share * bounce, 0.0)
-        rates = rates.at[numbers[:n]].add(-bounce)
-        momentum = system.inertia(t, q, u).product(phase.u - u)
-        return rates, momentum - system.constraint_force(t, q, phase.u, multipliers)
-
-    point = system, t, contacts.bound(q), event.at, before
-    rates, forces = push(unmet, point, (*of.tangents, of.du, dbefore))
-    # Rows of modes ask for nothing.
-    plain, _ = of.projector.solve(-forces, jnp.where(np.isin(np.arange(rates.size), numbers), 0.0, -rates))
-    asked = -(rates[numbers] + of.rows @ plain)
-    law, right = jnp.eye(numbers.size, dtype=q.dtype), jnp.pad(normal, (0, contacts.m))
-    if contacts.m:
-        law, right = _friction_laws(of, plain, phase, law, right)
-    matrix = jnp.where(phase.held[:, None], of.rows @ of.moves.T, law)
-    return plain, matrix, jnp.where(phase.held, asked, right)
-
-
-def _friction_laws(of: _Phases, plain, phase: Phase, law, right):
-    """The equations with those of friction that slips, whose impulses are in proportion to those of the contacts."""
-    contacts, (known, change) = of.at[0].contacts, of.coefficients
-    n, contact_of = contacts.n, np.array(contacts.contact_of)
-    pushed = jnp.where(contacts.in_joints, 0.0, phase.impulses[contact_of])
-    right = jnp.concatenate([right[:n], -change * phase.slips * pushed])
-    for k in np.flatnonzero(~contacts.in_joints):
-        law = law.at[n + k, contact_of[k]].set(known[k] * phase.slips[k])
-    rates = lambda system, t, q: contacts.rates(system, t, q, phase.u)
-    for both in of_pairs(contacts.pairs):
-        # The direction of slip changes with the velocity after the impact.
-        k, laws, slips = both[0], n + both, phase.slips[both]
-        turned, last, speed = push(rates, of.at, of.tangents)[laws], rates(*of.at)[laws], norm(slips)
-        across = jnp.eye(2, dtype=law.dtype) - jnp.outer(slips, slips)
-        by = known[k] * pushed[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
-        law = law.at[laws].add(by @ of.rows[laws] @ of.moves.T, unique_indices=True)
-        right = right.at[laws].add(-by @ (turned + of.rows[laws] @ plain), unique_indices=True)
-    return law, right
 
 
 def _release(system, tolerance, event, at, along):

@@ -70,31 +70,31 @@ class SlipInPlane(NamedTuple):
 class Modes(NamedTuple):
     """The modes of a system's contacts, and behind them those of its dry friction.
 
-    **Fields:** the `numbers`, whole ones but for slip in two directions; how many are of contacts; `pairs`: the places
-    of the first directions of friction that has two, among all friction.
+    **Fields:** the `numbers`, whole ones but for slip in two directions; how many are of contacts, `n`; `pairs`: the
+    places of the first directions of friction that has two, among all friction.
     """
 
     numbers: Float[Array, "laws"]
-    contacts: int
+    n: int
     pairs: tuple[int, ...]
 
     @classmethod
-    def of(cls, numbers: Float[Array, "laws"], contacts: int, pairs: tuple[int, ...]) -> "Modes":
+    def of(cls, numbers: Float[Array, "laws"], n: int, pairs: tuple[int, ...]) -> "Modes":
         """The modes that some coordinates are."""
-        out = cls(jnp.round(numbers), contacts, pairs)
+        out = cls(jnp.round(numbers), n, pairs)
         return out._replace(numbers=jnp.where(out._paired, numbers, out.numbers)) if pairs else out
 
     @property
     def _paired(self):
-        return np.isin(np.arange(self.numbers.size), self.contacts + of_pairs(self.pairs))
+        return np.isin(np.arange(self.numbers.size), self.n + of_pairs(self.pairs))
 
     @property
     def of_contacts(self) -> Float[Array, "contacts"]:
-        return self.numbers[: self.contacts]
+        return self.numbers[: self.n]
 
     @property
     def of_friction(self) -> Float[Array, "frictions"]:
-        return self.numbers[self.contacts :]
+        return self.numbers[self.n :]
 
     @property
     def open(self) -> Bool[Array, "contacts"]:
@@ -129,7 +129,7 @@ class Modes(NamedTuple):
     @property
     def in_plane(self) -> SlipInPlane:
         """Friction in two directions."""
-        modes = self.numbers[self.contacts + of_pairs(self.pairs)]
+        modes = self.numbers[self.n + of_pairs(self.pairs)]
         return SlipInPlane(modes, norm(modes))
 
     def slips(self, slip: Float[Array, "frictions"]) -> Float[Array, "frictions"]:

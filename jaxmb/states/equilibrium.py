@@ -298,6 +298,8 @@ def _balanced(
 def _against(system, t, q, multipliers, implied):
     """Which open contacts are overlapped, and which closed ones pull."""
     contacts = system.contacts
+    if not contacts:
+        return (jnp.zeros(0, bool),) * 2
     alone = contacts.at_rows(jnp.diag(implied))[: contacts.n] <= tolerance(q.dtype) ** 0.5
     return contacts_against(system, t, q, jnp.zeros(system.nu, q.dtype), multipliers, alone)
 

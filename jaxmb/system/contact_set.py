@@ -100,6 +100,8 @@ class ContactSet:
 
     def modes(self, q: Coordinates) -> Modes:
         """The modes in some coordinates."""
+        if not self:
+            return self.as_modes(jnp.zeros(0, q.dtype))
         return Modes.of(unchecked_take(q, np.array(self.places, int)), self.n, self.pairs)
 
     def as_modes(self, numbers: Float[Array, "laws"]) -> Modes:
