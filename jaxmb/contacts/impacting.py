@@ -145,7 +145,7 @@ class Round(NamedTuple):
     """
 
     problem: Problem
-    when: "When"
+    when: When
     low: Bool[Array, "contacts"]
     rest: Float[Array, "contacts"]
     struck: Struck
@@ -153,7 +153,7 @@ class Round(NamedTuple):
     forces: Float[Array, "laws"]
     solvable: Bool[Array, ""]
     rounds: Int[Array, ""]
-    trial: "Trial"
+    trial: Trial
     compression: Phase | None
     pushed: Float[Array, "laws"] | None
 
@@ -213,10 +213,8 @@ class Impacting:
     @classmethod
     def at(cls, system, formulation, tolerance: ContactTolerance, t, y) -> "Impacting":
         contacts, q, u = system.contacts, y.q, y.u
-        inertia, unmet = (
-            system.inertia(t, contacts.with_modes(q, 0.0), u),
-            velocity_rows(system, t, contacts.bound(q), u),
-        )
+        inertia = system.inertia(t, contacts.with_modes(q, 0.0), u)
+        unmet = velocity_rows(system, t, contacts.bound(q), u)
         moves = Moves.at(system, t, q, u, inertia, unmet)
         laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(system, t, q, u))
         gap, rates = contacts.gaps(system, t, q), contacts.at_rows(unmet)
@@ -263,7 +261,7 @@ class Impacting:
 
     # When the event is
 
-    def at_event(self, before, curve) -> "When":
+    def at_event(self, before, curve) -> When:
         """The first of the zeros that are next, with accelerations until then, and those along the directions."""
         n, system = self.contacts.n, self.system
         until, about_to = self.zeros(curve)
@@ -311,11 +309,11 @@ class Impacting:
 
     # The turns of a round
 
-    def bounces(self, when: "When"):
+    def bounces(self, when: When):
         """The rates at which gaps would open by Newton's law."""
         return self.system.contact_numbers.restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
 
-    def impulse_of(self, when: "When", low, share, reactions) -> Problem:
+    def impulse_of(self, when: When, low, share, reactions) -> Problem:
         """The problem of the impulses, where contacts that are `low` do not bounce, and others with a share of the
         whole rebound; by Poisson's law none does at the end of compression.
         """
@@ -326,7 +324,7 @@ class Impacting:
             approach = jnp.where(jnp.abs(approach) <= REST * self.sizes_of_rates(when.u), 0.0, approach)
         return self.laws.of_impulses(approach, when.touching, reactions)
 
-    def moved(self, k, when: "When", impulses):
+    def moved(self, k, when: When, impulses):
         """The velocities after impulses; in the first round there is no event yet."""
         return when.u + jnp.where(k < self.turns, 0.0, self.moves.jump) + impulses @ self.moves.by_unit
 
@@ -377,9 +375,8 @@ class Impacting:
     def begin(self, k, before: Round, answers, forces) -> Round:
         """The time of the event, by the equations before it, and its impulses."""
         del k, answers
-        when = self.at_event(
-            before.struck.udot + forces @ self.moves.by_unit, before.problem.free + self.influence @ forces
-        )
+        udot, curve = before.struck.udot + forces @ self.moves.by_unit, before.problem.free + self.influence @ forces
+        when = self.at_event(udot, curve)
         problem = self.impulse_of(when, before.low, before.trial.share, before.problem.reactions)
         return before._replace(problem=problem, when=when)
 

@@ -15,7 +15,6 @@ from .._compat import with_values
 from .._results import RESULTS
 from .._types import State
 from ..contacts.events import FoundEvents
-from ..contacts.guards import contact_guards
 from ..formulations import AbstractFormulation
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
@@ -23,6 +22,7 @@ from ..linalg.members import vmap_states
 from ..manifold import (
     AbstractManifold,
     after_jumps,
+    contact_guards,
     counted_components,
     default_manifold,
     natural_units,
