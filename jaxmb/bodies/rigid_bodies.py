@@ -103,7 +103,7 @@ class RigidBodySystem(AbstractSystem):
     **Fields:** the groups of `bodies` and of other parts, `free_joints` those of joints without rows; `gravity`
     [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`; `ranks`;
     `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`; of a system that is
-    `prepared` for a motion, the rows of joints by their `elements`.
+    `prepared` for a motion, the rows of joints by their `elements`; the `contacts` and dry friction among the rows.
     """
 
     bodies: tuple[BodyGroup, ...]
@@ -126,6 +126,10 @@ class RigidBodySystem(AbstractSystem):
     tendons: tuple[CoordinateGroup, ...] = ()
     free_joints: tuple[CoordinateGroup, ...] = ()
     elements: ElementaryRows | None = None
+    contacts: ContactSet = eqx.field(static=True, init=False)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __post_init__(self):
+        self.contacts = contact_set(self.constraints, self.velocity_constraints)
 
     # Sizes and names
 
@@ -307,10 +311,6 @@ class RigidBodySystem(AbstractSystem):
         """Name and number within its part of every row of A."""
         groups = [(g.group.names, range(g.rows)) for g in self.joints]
         return tuple((name, k) for names, rows in groups for name in names for k in rows)
-
-    @functools.cached_property
-    def contacts(self) -> ContactSet:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return contact_set(self.constraints, self.velocity_constraints)
 
     @property
     def contact_numbers(self):

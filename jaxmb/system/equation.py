@@ -58,6 +58,7 @@ class AbstractEquation(eqx.Module):
     - `positive_definite_mass`: whether M is positive definite for all velocities, also those that violate constraints.
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
     - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
+    - `contacts`: the unilateral constraints and dry friction. Static.
     """
 
     nq: AbstractVar[int]
@@ -69,6 +70,7 @@ class AbstractEquation(eqx.Module):
     linear: ClassVar[bool] = True
     drift_free: ClassVar[bool] = True
     elimination: ClassVar[JointOrder | None] = None
+    contacts: ClassVar[ContactSet] = ContactSet()
 
     # Sizes
 
@@ -264,13 +266,8 @@ class AbstractEquation(eqx.Module):
     # Unilateral constraints
 
     @property
-    def contacts(self) -> ContactSet:
-        """The unilateral constraints and dry friction."""
-        return ContactSet()
-
-    @property
     def contact_numbers(self) -> ContactNumbers:
-        """The numbers of these, which are parameters."""
+        """The numbers of `contacts`, which are parameters."""
         return ContactNumbers(*[jnp.zeros(0)] * 4)
 
     def friction_reactions(

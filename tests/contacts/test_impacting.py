@@ -93,8 +93,8 @@ def test_the_share_of_the_rebounds_is_found_by_trials():
     trial = Trial(one, Bracket(zero, one, zero, one, jnp.array(0)), jnp.array(False))
     gain = lambda share: share**2 + share - 0.75
     for k in range(40):
-        trial = next_trial(trial, gain(trial.share), one, k)
+        trial = next_trial(trial, gain(trial.share), one, jnp.array(k))
         if not trial.again:
             break
     np.testing.assert_allclose(trial.share, 0.5, atol=1e-11)
-    assert not next_trial(trial._replace(share=one), -one, one, 0).again
+    assert not next_trial(trial._replace(share=one), -one, one, jnp.array(0)).again

@@ -25,12 +25,12 @@ def scene(contacts=True):
 def test_laws_of_contacts_and_friction():
     system = scene()
     contacts, numbers = system.contacts, system.contact_numbers
-    assert contacts and contacts is system.contacts
+    assert contacts and contacts == system.contacts
     assert (contacts.n, contacts.m) == (1, 3)
     assert contacts.contact_names == ("floor",) and sorted(contacts.friction_names) == ["brake", "rub"]
     of_rows = dict(zip(contacts.names, (system.rows[row][0] for row in contacts.rows), strict=True))
     assert all(name == of_row for name, of_row in of_rows.items())
-    names = system.coordinate_names()
+    names = {places[0]: name for name, places in system.coordinate_names().items() if len(places) == 1}
     assert all(
         names[place].startswith(f"{name}.mode") for name, place in zip(contacts.names, contacts.places, strict=True)
     )
@@ -60,7 +60,7 @@ def test_modes_take_their_places():
 def test_contacts_of_a_driven_system_follow_its_rows():
     """Rows that are held come before those of friction."""
     system = scene()
-    held = system.holding({"slide.displacement": jnp.zeros(())}, {}, jnp.zeros(()))
+    held = system.holding({"slide.displacement": jnp.zeros(())}, {"slide.displacement": jnp.zeros(())}, jnp.zeros(()))
     n = system.contacts.n
     assert held.contacts.rows[:n] == system.contacts.rows[:n]
     assert [row - 1 for row in held.contacts.rows[n:]] == list(system.contacts.rows[n:])
