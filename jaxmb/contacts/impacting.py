@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..formulations import AbstractFormulation
+from ..linalg.arrays import add_up
 from ..linalg.complementarity import independent_components, solved_components
 from ..linalg.inertia import AbstractInertia
 from ..linalg.pairs import for_first, of_pairs
@@ -246,7 +247,7 @@ class Impacting:
 
     def sizes_of_rates(self, *velocities):
         """The sizes that add up in the rates at some velocities."""
-        return jnp.abs(self.moves.rows) @ sum(map(jnp.abs, velocities))
+        return jnp.abs(self.moves.rows) @ add_up(map(jnp.abs, velocities))
 
     def accelerated(self, u):
         """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
@@ -272,7 +273,7 @@ class Impacting:
         hits = about_to[first]
         late = jnp.where(hits, until[first], 0.0)
         closes = about_to[:n] & (np.arange(n) == first)
-        touching = ~self.modes.open | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
+        touching = self.modes.shut | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
         at = self.u + late * before
         return When(late, first, hits, before, at, self.rates_at(at), touching)
 
@@ -384,9 +385,8 @@ class Impacting:
         """The laws that hold after an impact with their forces, and the impulses that are asked for in a further round,
         in which other contacts may bounce too low to be seen.
         """
-        struck, is_first = before.struck, k == 2 * self.turns - 1
-        low, rest = self.low_bounces(before, (before.problem.free + self.influence @ forces)[: self.contacts.n])
-        low, rest = jnp.where(is_first, low, before.low), jnp.where(is_first, rest, before.rest)
+        struck, curve = before.struck, before.problem.free + self.influence @ forces
+        low, rest = self.low_bounces(before, curve[: self.contacts.n], k == 2 * self.turns - 1)
         # Where nothing bounces low, and no force depends on others, a second round would find the same.
         rounds = before.rounds if self.contacts.in_joints.any() else jnp.where(jnp.any(low), 2, 1)
         trial = next_trial(before.trial, *struck.gained, k // self.turns - rounds)
@@ -401,18 +401,20 @@ class Impacting:
             solvable=before.solvable & answers.solvable,
         )
 
-    def low_bounces(self, before: Round, curve):
-        """Contacts that would open by less than can be seen, before they close again, and the times until they rest;
-        `curve`: the second derivatives of the gaps.
+    def low_bounces(self, before: Round, curve, is_first):
+        """Contacts that would open in the first round by less than can be seen, before they close again, and the times
+        until they rest; `curve`: the second derivatives of the gaps.
         """
         when, struck, restitution = before.when, before.struck, self.system.contact_numbers.restitution
         rate, bounce = struck.rate[: self.contacts.n], self.bounces(when)
         falls = jnp.where(curve < 0, -curve, 1.0)
         opens = rate**2 <= 2 * falls * self.tolerance.bounce
         low = when.touching & ~struck.resting & (curve < 0) & opens & (restitution < 1)
+        low = jnp.where(is_first, low, before.low)
         # Each bounce takes `restitution` times the time of the one before.
         ratio = jnp.where(low & (bounce > 0), restitution, 0.0)
-        return low, jnp.where(low & (bounce > 0), 2 * rate / (falls * (1 - ratio)), 0.0)
+        rest = jnp.where(low & (bounce > 0), 2 * rate / (falls * (1 - ratio)), 0.0)
+        return low, jnp.where(is_first, rest, before.rest)
 
     # The rounds
 

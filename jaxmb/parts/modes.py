@@ -102,6 +102,11 @@ class Modes(NamedTuple):
         return self.of_contacts == OPEN
 
     @property
+    def shut(self) -> Bool[Array, "contacts"]:
+        """Contacts that are closed, with a force or without."""
+        return self.of_contacts != OPEN
+
+    @property
     def closed(self) -> Bool[Array, "contacts"]:
         """Contacts that are closed and have a force."""
         return self.of_contacts == CLOSED

@@ -74,7 +74,7 @@ def test_low_bounces_and_how_long_they_take(speed):
     start = event.start()
     struck = start.struck._replace(rate=jnp.array([0.5 * speed]))
     at = start._replace(when=start.when._replace(touching=jnp.array([True])), struck=struck)
-    low, rest = event.low_bounces(at, jnp.array([-G]))
+    low, rest = event.low_bounces(at, jnp.array([-G]), True)
     assert low == ((0.5 * speed) ** 2 / (2 * G) <= 1e3 * TOUCH) == (speed < 0.1)
     # Each bounce takes half of the time of the one before.
     np.testing.assert_allclose(rest, 2 * (2 * 0.5 * speed / G) if low else 0.0, rtol=1e-12)

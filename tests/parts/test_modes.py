@@ -31,6 +31,7 @@ def test_modes_of_contacts_and_of_friction_in_one_direction():
     """Rounding errors of the numbers do not count."""
     modes = modes_of([OPEN + 1e-9, CLOSED - 1e-9, IMPLIED], [-FORWARD + 1e-9], [FREE, FREE])
     np.testing.assert_array_equal(modes.open, [True, False, False])
+    np.testing.assert_array_equal(modes.shut, [False, True, True])
     np.testing.assert_array_equal(modes.closed, [False, True, False])
     np.testing.assert_array_equal(modes.slides, [True, False, False])
     np.testing.assert_array_equal(modes.slips(jnp.ones(3)), [-1, 0, 0])
