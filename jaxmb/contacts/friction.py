@@ -152,7 +152,7 @@ class SlipSearch:
         """
         n, m, dry = self.n, len(self.dry.contact_of), self.dry
         others = np.diag(~np.isin(np.arange(n + m), self.both)).astype(self.W.dtype)
-        turn = others + jnp.tensordot(e, self.turns, 2)
+        turn = jnp.tensordot(e, self.turns, 2) + others
         matrix, right = turn @ self.W @ turn.T, turn @ self.b
         share = jnp.where(np.isin(np.arange(m), self.pairs[:, 1]), across, 1.0)
         slips = turn[n:, n:] @ dry.slips

@@ -85,8 +85,8 @@ def impact(
     t, touch = jnp.asarray(t, y.q.dtype), jnp.asarray(tolerance.touch, y.q.dtype)
     found = find_event(system, formulation, tolerance, t, y) if found is None else found
     after, event = _impact(system, t, y, found, ContactTolerance(touch), dated)
-    modes = tuple(system.contacts.as_modes(numbers).kinds for numbers in event.modes)
-    return Impact(after, event.late, event.impulses, modes, event.rest, event.energy, event.solvable)
+    old, new = (system.contacts.as_modes(numbers).kinds for numbers in event.modes)
+    return Impact(after, event.late, event.impulses, (old, new), event.rest, event.energy, event.solvable)
 
 
 @eqx.filter_custom_jvp

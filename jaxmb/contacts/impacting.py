@@ -501,7 +501,7 @@ class Impacting:
         n, struck, last = self.contacts.n, settled.struck, settled.answers
         implied = struck.resting & ~last.closed & is_implied(self.influence[:n, :n], last.closed)
         of_contacts = modes_of_contacts(last.closed, implied)
-        begun = self.contacts.in_pairs & struck.ended
+        begun = struck.ended & self.contacts.in_pairs
         of_friction = modes_of_friction(last.sticks, last.implied, last.slips, begun)
         return jnp.concatenate([of_contacts, of_friction]).astype(self.q.dtype), implied
 

@@ -18,6 +18,7 @@ from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
+from ..parts.modes import CLOSED, OPEN
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.quantities import rates_of
