@@ -21,7 +21,7 @@ from ._types import State as State
 from ._version import __version__ as __version__
 from .bodies import RigidBodySystem as RigidBodySystem
 from .bodies.scene import Scene as Scene
-from .contact_events import ContactEvents as ContactEvents, Event as Event
+from .contacts.events import ContactEvents as ContactEvents, Event as Event
 from .linalg import rotations as rotations
 from .parts import contact as contact, shapes as shapes, terrain as terrain
 from .parts.actuators import Actuator as Actuator, Motor as Motor
@@ -119,7 +119,7 @@ else:
     }
     _SOURCES = {name: source for source, names in _NAMES.items() for name in names.split()}
     # Modules that Python puts here when it imports them, and which are no part of the interface.
-    _INNER = {"TYPE_CHECKING", "bodies", "contact_events", "linalg", "states"}
+    _INNER = {"TYPE_CHECKING", "bodies", "contacts", "linalg", "states"}
     __all__ = sorted(name for name in {*globals(), *_MODULES, *_SOURCES} - _INNER if not name.startswith("_"))
 
     def __getattr__(name: str) -> object:

@@ -18,7 +18,7 @@ from ._arguments import package_for_tables
 from ._compat import changed, steps_of
 from ._results import RESULTS
 from ._types import State
-from .contact_events import ContactEvents, FoundEvents, contact_events
+from .contacts.events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation, accelerations
 from .linalg.arrays import ARRAYS, is_traced
 from .linalg.jitted import jitted

@@ -25,11 +25,13 @@ from ..parts.forces import Gravity
 from ..parts.unilateral import AbstractUnilateralConstraint
 from ..solvers.manifold_term import GapsSeen
 from ..system.catalogue import AbstractSystem
+from ..system.contact_set import ContactNumbers, ContactSet
 from ..system.design_variables import DesignVariables, variables_in_range
-from ..system.equation import Contacts, Frictions, Ranks
+from ..system.equation import Ranks
 from ..system.quantities import Measure, view_of_motion
 from ..system.structures import of_structure
 from .constraint_set import ConstraintSet
+from .contact_rows import contact_set
 from .describe import describe_scene
 from .elementary import ElementaryRows, elementary_rows, half_turned, is_elementary
 from .field_jacobian import motion_jacobian
@@ -101,7 +103,7 @@ class RigidBodySystem(AbstractSystem):
     **Fields:** the groups of `bodies` and of other parts, `free_joints` those of joints without rows; `gravity`
     [m/s²] or None; `guess`, the state given with the bodies; `length` [m], the scene's size; `body_names`; `ranks`;
     `implied` rows; `elimination`, the order in which the joints are eliminated, or None; `design`; of a system that is
-    `prepared` for a motion, the rows of joints by their `elements`.
+    `prepared` for a motion, the rows of joints by their `elements`; the `contacts` and dry friction among the rows.
     """
 
     bodies: tuple[BodyGroup, ...]
@@ -124,6 +126,10 @@ class RigidBodySystem(AbstractSystem):
     tendons: tuple[CoordinateGroup, ...] = ()
     free_joints: tuple[CoordinateGroup, ...] = ()
     elements: ElementaryRows | None = None
+    contacts: ContactSet = eqx.field(static=True, init=False)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __post_init__(self):
+        self.contacts = contact_set(self.constraints, self.velocity_constraints)
 
     # Sizes and names
 
@@ -307,53 +313,15 @@ class RigidBodySystem(AbstractSystem):
         return tuple((name, k) for names, rows in groups for name in names for k in rows)
 
     @property
-    def contacts(self):
-        rows, names, modes, by_poisson, first = [], [], [], [], 0
-        restitution, peaks = ([jnp.zeros(0, self.length.dtype)] for _ in range(2))
-        for g in self.constraints:
-            count = len(g.group.names) * g.rows
-            if isinstance(g.group.part, AbstractUnilateralConstraint):
-                names += g.group.names
-                rows += range(first, first + count)
-                modes += self.layout.pose_index[g.group.body_index[:, -1], 0].tolist()
-                by_poisson += [g.group.part.impact_law == "poisson"] * len(g.group.names)
-                restitution.append(g.group.part.restitution)
-                peaks.append(g.group.part.peak)
-            first += count
-        frictions = self._dry_frictions(names)
-        if not names and frictions is None:
-            return None
-        numbers = jnp.concatenate(restitution), jnp.concatenate(peaks)
-        return Contacts(tuple(names), tuple(rows), tuple(modes), tuple(by_poisson), *numbers, frictions)
-
-    def _dry_frictions(self, contacts):
-        names, rows, modes, of_contacts, releases, pairs, first = [], [], [], [], [], [], self.position_rows
-        for g in self.velocity_constraints:
-            count = len(g.group.names) * g.rows
-            if g.joints:
-                pairs += range(len(names), len(names) + count, 2) if g.rows == 2 else ()
-                names += [name for name in g.group.names for _ in range(g.rows)]
-                rows += range(first, first + count)
-                modes += self.layout.pose_index[g.group.body_index[:, -g.rows :].reshape(-1), 0].tolist()
-                numbers = [contacts.index(name) if name in contacts else -1 for name in g.joints]
-                of_contacts += [k for k in numbers for _ in range(g.rows)]
-                releases += [g.group.part.static_coefficient is not None] * count
-            first += count
-        if not names:
-            return None
-        parts = [(g.group.part, g.rows) for g in self.frictions]
-        coefficient, limit = (
-            jnp.concatenate([_of_rows(getattr(p, own), n) for p, n in parts]) for own in ("coefficient", "limit")
-        )
-        return Frictions(
-            names=tuple(names),
-            rows=tuple(rows),
-            modes=tuple(modes),
-            contacts=tuple(of_contacts),
-            releases=tuple(releases),
-            pairs=tuple(pairs),
-            coefficient=coefficient,
-            limit=limit,
+    def contact_numbers(self):
+        contacts = [g.group.part for g in self.constraints if isinstance(g.group.part, AbstractUnilateralConstraint)]
+        frictions = [(g.group.part, g.rows) for g in self.frictions]
+        joined = lambda values: jnp.concatenate([*values, jnp.zeros(0, self.length.dtype)])
+        return ContactNumbers(
+            restitution=joined(part.restitution for part in contacts),
+            peaks=joined(part.peak for part in contacts),
+            coefficient=joined(_of_rows(part.coefficient, rows) for part, rows in frictions),
+            limit=joined(_of_rows(part.limit, rows) for part, rows in frictions),
         )
 
     @property

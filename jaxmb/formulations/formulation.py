@@ -177,8 +177,8 @@ def _friction(system, t, q, u, inertia, force, jacobian, gamma, formulation):
     start, influence = unchecked_take(multipliers[0], rows), -udot[1:]
     # Newton's method evaluates the law again and again, but only for other multipliers.
     law = with_rest_computed(lambda own: friction_force(system, t, q, u, own), start)
-    contacts = () if system.contacts is None else system.contacts.rows
-    return find_multipliers(law, influence, start, np.isin(rows, contacts))
+    contacts = system.contacts
+    return find_multipliers(law, influence, start, np.isin(rows, contacts.rows[: contacts.n]))
 
 
 def friction_coupling(

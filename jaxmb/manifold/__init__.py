@@ -9,8 +9,8 @@ elimination. Joint friction costs O(n³) in the number n of constraint rows with
 matrices for friction, servos and internal states.
 """
 
+from ..contacts.guards import contact_guards as contact_guards
 from .baumgarte import Baumgarte as Baumgarte
-from .contact_guards import contact_guards as contact_guards
 from .default import Unconstrained as Unconstrained, default_manifold as default_manifold
 from .impulse import after_jumps as after_jumps, find_jumps as find_jumps, next_number as next_number
 from .internal_states import (

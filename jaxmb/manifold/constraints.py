@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
+from ..linalg.pushed import dense, push
 from ..system import AbstractEquation
 
 
@@ -254,16 +255,3 @@ def push_accelerations(
     equations = lambda system, t, q, u: _equations(system, t, q, u, out.udot, multipliers)
     rows, forces = push(equations, at, along)
     return here.cancel_residuals(system, (t, q, u), multipliers, forces, rows)
-
-
-def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:
-    """The tangent of a function's value, zeros where it does not depend on what moves."""
-    value, tangent = eqx.filter_jvp(function, at, along)
-    if isinstance(value, tuple):
-        return tuple(dense(*both) for both in zip(tangent, value, strict=True))
-    return dense(tangent, value)
-
-
-def dense(tangent: Float[Array, "*n"] | None, like: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """A tangent, zeros for None."""
-    return jnp.zeros_like(like) if tangent is None else tangent

@@ -11,6 +11,8 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Coordinates, Scalar, State
+from ..contacts.guards import ContactGuards
+from ..contacts.impacting import Event
 from ..system import AbstractEquation
 from .orthogonal_projection import project_velocities
 
@@ -65,6 +67,20 @@ def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
     """
     u, failed = project_velocities(system, t, y.q, y.u, system.inertia(t, y.q, y.u))
     return dataclasses.replace(y, u=jnp.where(failed, jnp.nan, u))
+
+
+def found_at_jump(guards: ContactGuards | None, t: Scalar, y: State) -> Event | None:
+    """The event of contacts that close or open at a jump; None without contacts."""
+    return None if guards is None else guards.event(t, y)
+
+
+def after_jump(
+    system: AbstractEquation, guards: ContactGuards | None, t: Scalar, y: State, found: Event | None = None
+) -> State:
+    """The state after prescribed rates have jumped, or contacts closed or opened; `guards` are None without contacts,
+    and `found` is the event where it is known.
+    """
+    return after_impulse(system, t, y) if guards is None else guards.impact(t, y, found=found).after
 
 
 class Jump(NamedTuple):

@@ -16,8 +16,7 @@ from .._types import State
 from ..solvers import AbstractManifoldTerm, Block
 from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractSystem
-from ..system.gaps import mode_places
-from .contact_guards import after_jump, found_at_jump
+from .impulse import after_jump, found_at_jump
 
 
 def with_internal_states(term: Any) -> Any:
@@ -107,11 +106,11 @@ class StatefulTerm(AbstractManifoldTerm):
         return self.term.gaps
 
     def found_at_jump(self, t, y, args):
-        return found_at_jump(self, t, y)
+        return found_at_jump(self.guards, t, y)
 
     def after_jump(self, t, y, found, args):
         if self.guards is not None:
-            return after_jump(self, t, y, found)
+            return after_jump(self.system, self.guards, t, y, found)
         after = self.term.after_jump(t, _mechanical(y), found, args)
         return State(after.q, after.u, y.z)
 
@@ -159,9 +158,9 @@ def counted_components(system: AbstractSystem) -> tuple[int, ...] | None:
     """The indices of the components of a raveled state whose sizes and errors count: all but the modes of contacts and
     dry friction, which have none; None for all.
     """
-    if system.contacts is None:
+    if not system.contacts:
         return None
-    modes = np.isin(np.arange(system.nq), mode_places(system))
+    modes = np.isin(np.arange(system.nq), system.contacts.places)
     along = system.held_velocities(modes)
     assert along is not None, "a mode is no part of a rotation"
     uncounted = np.concatenate([modes, along, np.zeros(system.nz, bool)])

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._types import Scalar, State
+from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, accelerations
 from ..linalg.arrays import as_array, namespace
 from ..solvers.manifold_term import AbstractVectorField
@@ -32,11 +33,13 @@ _MULTIPLIERS, _NULL_SPACE = Multipliers(), NullSpace()
 class AbstractManifold(eqx.Module):
     """A policy that turns a system into a term, and a solver into one that respects the constraints.
 
-    `restores` says whether every step ends on the constraints, `takes_impulses` whether velocities follow a jump of
-    prescribed rates, `uses_charts` whether independent coordinates are chosen.
+    `restores` says whether every step ends on the constraints, `newton_tol` up to which size of the last Newton
+    correction of positions, where it is given, `takes_impulses` whether velocities follow a jump of prescribed rates,
+    `uses_charts` whether independent coordinates are chosen.
     """
 
     restores: AbstractVar[bool]
+    newton_tol: ClassVar[float | None] = None
     takes_impulses: ClassVar[bool] = True
     uses_charts: ClassVar[bool] = False
 
@@ -62,9 +65,14 @@ class AbstractManifold(eqx.Module):
         **Arguments:** `interpolated`: whether states between steps are among those that are saved.
         """
 
-    def contact_tolerance(self, system: AbstractEquation, rtol: Scalar) -> Any:
-        """The gaps that count as closed, relative to the system's size; None without contacts."""
-        return contact_tolerance(system, None, rtol)
+    def contact_tolerance(self, system: AbstractEquation, rtol: Scalar) -> ContactTolerance | None:
+        """What counts as zero where contacts close: gaps up to a thousandth of the tolerance of integration, and up to
+        a given tolerance of positions, relative to the system's size; None without contacts.
+        """
+        if not system.contacts:
+            return None
+        touch = newton_tolerance(None, rtol)
+        return ContactTolerance(touch if self.newton_tol is None else namespace(touch).maximum(touch, self.newton_tol))
 
     def statistics(self, solver_state: Any) -> dict[str, Array]:
         """Counts of the policy's work, from the final state of the solver."""
@@ -126,13 +134,3 @@ def newton_tolerance(given: float | None, rtol: Scalar) -> Any:
     if given is not None:
         return as_array(given, dtype)
     return namespace(rtol).clip(1e-3 * rtol, 64 * float(jnp.finfo(dtype).eps), 1e-6)
-
-
-def contact_tolerance(system: AbstractEquation, newton_tol: float | None, rtol: Scalar) -> Any:
-    """The gaps that count as closed, relative to the system's size: those up to a thousandth of the tolerance of
-    integration, and up to a given tolerance of positions; None without contacts.
-    """
-    if system.contacts is None:
-        return None
-    least = newton_tolerance(None, rtol)
-    return least if newton_tol is None else namespace(least).maximum(least, newton_tol)

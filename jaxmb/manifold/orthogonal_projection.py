@@ -21,9 +21,10 @@ from ..linalg.elimination import full_pivot, solve_positive
 from ..linalg.inertia import AbstractInertia, DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, solve_linear
+from ..linalg.pushed import push
 from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
-from .constraints import AbstractConstraints, RestoredState, push
+from .constraints import AbstractConstraints, RestoredState
 from .manifold import normalize_state
 
 _ITERATIONS = 8

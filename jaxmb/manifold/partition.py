@@ -26,6 +26,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._compat import cond_of_lanes
 from .._results import RESULTS
 from .._types import Coordinates, Scalar, State, Velocities
+from ..contacts.guards import contact_guards
+from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation, Partitioned
 from ..formulations.formulation import check_mass, row_levels, solve_constrained
 from ..formulations.friction import solve_coupled
@@ -50,9 +52,9 @@ from .constraints import (
     restore,
     solved,
 )
-from .contact_guards import after_jump, contact_guards, found_at_jump
 from .diagnosis import diagnose
-from .manifold import AbstractManifold, VectorField, contact_tolerance, newton_tolerance
+from .impulse import after_jump, found_at_jump
+from .manifold import AbstractManifold, VectorField, newton_tolerance
 from .orthogonal_projection import project_normalized
 
 # Largest number of Newton iterations for positions.
@@ -408,7 +410,7 @@ class Partition(AbstractManifold):
     """
 
     max_influence: float = eqx.field(static=True, default=_GROWTH)
-    newton_tol: float | None = eqx.field(static=True, default=None)
+    newton_tol: float | None = eqx.field(static=True, default=None)  # pyright: ignore[reportIncompatibleVariableOverride]
     restores: ClassVar[bool] = True
     uses_charts: ClassVar[bool] = True
 
@@ -423,17 +425,14 @@ class Partition(AbstractManifold):
                 "manifold=Projection() with it."
             )
         check_mass(system, formulation)
-        tol, touch = newton_tolerance(self.newton_tol, rtol), self.contact_tolerance(system, rtol)
-        return PartitionTerm(system, formulation, self.max_influence, tol, touch), solver
+        tolerances = newton_tolerance(self.newton_tol, rtol), self.contact_tolerance(system, rtol)
+        return PartitionTerm(system, formulation, self.max_influence, *tolerances), solver
 
     def default_formulation(self, system):
         return _PARTITIONED
 
     def correction(self, interpolated):
         return project_normalized if interpolated else None
-
-    def contact_tolerance(self, system, rtol):
-        return contact_tolerance(system, self.newton_tol, rtol)
 
     def statistics(self, solver_state):
         return {"newton_iterations": solver_state.chart.newton, "charts": solver_state.chart.charts}
@@ -515,13 +514,13 @@ class Chart(eqx.Module):
 
 
 class PartitionTerm(AbstractManifoldTerm):
-    """A constrained system as a term with charts; `touch`: the gaps that count as closed, None without contacts."""
+    """A constrained system as a term with charts; `at_contact`: what counts as zero there, None without contacts."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
     max_influence: float = eqx.field(static=True)
     newton_tol: Float[Array, ""]
-    touch: Float[Array, ""] | None = None
+    at_contact: ContactTolerance | None = None
 
     def vf(self, t, y, args):
         return VectorField(self.system, self.formulation)(t, y, args)
@@ -624,20 +623,20 @@ class PartitionTerm(AbstractManifoldTerm):
 
     @property
     def guards(self):
-        return contact_guards(self.system, self.formulation, self.touch)
+        return contact_guards(self.system, self.formulation, self.at_contact)
 
     @property
     def gaps(self):
         return compliant_gaps(self.system)
 
     def found_at_jump(self, t, y, args):
-        return found_at_jump(self, t, y)
+        return found_at_jump(self.guards, t, y)
 
     def after_jump(self, t, y, found, args):
-        return after_jump(self, t, y, found)
+        return after_jump(self.system, self.guards, t, y, found)
 
     def chart_after_jump(self, chart):
-        if self.system.contacts is None:
+        if not self.system.contacts:
             return chart
         # Contacts that close or open make the chart one of other rows.
         return dataclasses.replace(chart, quality=jnp.full_like(chart.quality, jnp.inf))

@@ -11,6 +11,8 @@ from jaxtyping import Array, Float
 
 from .._compat import WrappedSolver, direction_of, inner_term
 from .._types import State
+from ..contacts.guards import ContactGuards, contact_guards
+from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass, solve_constrained
 from ..formulations.multipliers import FactoredMultipliers
@@ -28,10 +30,9 @@ from ..system import AbstractEquation
 from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
 from .compliant_gaps import compliant_gaps
 from .constraints import RestoredState, SolvedState, rates_along, restore, solved
-from .contact_guards import ContactGuards, after_jump, contact_guards, found_at_jump
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
-from .impulse import after_impulse
-from .manifold import AbstractManifold, VectorField, contact_tolerance, newton_tolerance, normalize_state
+from .impulse import after_jump, found_at_jump
+from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (
     ProjectorConstraints,
     project_in_metric,
@@ -81,7 +82,7 @@ class Projection(AbstractManifold):
     integration.
     """
 
-    newton_tol: float | None = eqx.field(static=True, default=None)
+    newton_tol: float | None = eqx.field(static=True, default=None)  # pyright: ignore[reportIncompatibleVariableOverride]
     restores: ClassVar[bool] = True
 
     def prepare(self, system, formulation, solver, rtol):
@@ -107,9 +108,6 @@ class Projection(AbstractManifold):
 
     def correction(self, interpolated):
         return _returned if interpolated else None
-
-    def contact_tolerance(self, system, rtol):
-        return contact_tolerance(system, self.newton_tol, rtol)
 
     def statistics(self, solver_state):
         # The states of Runge–Kutta methods have no charts.
@@ -164,13 +162,13 @@ def _check_multistep(system, formulation, solver):
 
 class ProjectionTerm(AbstractManifoldTerm):
     """A constrained system whose states are projected in the metric of the mass matrix. Its chart is the number of
-    Newton iterations so far. `touch`: the gaps that count as closed, None without contacts.
+    Newton iterations so far. `at_contact`: what counts as zero there, None without contacts.
     """
 
     system: AbstractEquation
     formulation: AbstractFormulation
     newton_tol: Float[Array, ""]
-    touch: Float[Array, ""] | None = None
+    at_contact: ContactTolerance | None = None
 
     def vf(self, t, y, args):
         return VectorField(self.system, self.formulation)(t, y, args)
@@ -249,17 +247,17 @@ class ProjectionTerm(AbstractManifoldTerm):
 
     @property
     def guards(self):
-        return contact_guards(self.system, self.formulation, self.touch)
+        return contact_guards(self.system, self.formulation, self.at_contact)
 
     @property
     def gaps(self):
         return compliant_gaps(self.system)
 
     def found_at_jump(self, t, y, args):
-        return found_at_jump(self, t, y)
+        return found_at_jump(self.guards, t, y)
 
     def after_jump(self, t, y, found, args):
-        return after_jump(self, t, y, found)
+        return after_jump(self.system, self.guards, t, y, found)
 
     def controlled(self, chart):
         return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
@@ -289,7 +287,7 @@ class ProjectedSolver(WrappedSolver):
         system, direction = inner_term(terms).vector_field.system, direction_of(terms)
         before = y0
         if made_jump is not False:
-            after = lambda y: self._after_jump(system, t0 * direction, y)
+            after = lambda y: after_jump(system, self.guards, t0 * direction, y)
             y0 = cond_of_jumps(self.guards)(made_jump, after, lambda y: y, y0)
         first, last = t0, t1
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
@@ -309,8 +307,3 @@ class ProjectedSolver(WrappedSolver):
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate
             error = crossing(self.guards, direction, error, (first, last), (before, y0, y1), at, made_jump)
         return y1, error, dense_info, solver_state, result
-
-    def _after_jump(self, system, t, y):
-        if self.guards is None:
-            return after_impulse(system, t, y)
-        return self.guards.impact(t, y).after

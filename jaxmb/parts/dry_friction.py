@@ -10,7 +10,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..linalg.complementarity import slip_direction
 from ..linalg.rotations import norm
 from ..linalg.sums import unchecked_take
 from . import fields
@@ -24,11 +23,9 @@ from .base import (
     Wrenches,
 )
 from .coordinate_parts import AbstractOfJoints, is_length
+from .modes import STICK, kind_of, slip_direction
 from .space import AbstractSpace, rate_of
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
-
-# The mode of friction that sticks, as `jaxmb.system` numbers modes; 1 and -1 are those of slip in either direction.
-_STICK = 2
 
 
 class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
@@ -122,7 +119,7 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     def residual(self, space, poses, velocities, t):
         del t
         slip, modes = self._slip(space, poses, velocities), velocities[-self.rows :, 0]
-        return jnp.where(jnp.round(self._modes(poses)) == _STICK, slip, modes)
+        return jnp.where(kind_of(self._modes(poses)) == STICK, slip, modes)
 
     def wrenches(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: float

@@ -11,7 +11,6 @@ from typing import ClassVar, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
@@ -19,12 +18,10 @@ from . import fields
 from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate, Velocities
 from .coordinate_parts import AbstractScalarPart
 from .forces import over_ground
+from .modes import CLOSED, kind_of
 from .shapes import Box, Ground, marked_ball, wheel
 from .space import AbstractSpace, both_points, separation
 from .terrain import AbstractTerrain, distance
-
-# The mode of a contact that is closed, as `jaxmb.system` numbers modes.
-_CLOSED = 1
 
 
 class AbstractUnilateralConstraint(AbstractInertialConstraint):
@@ -81,8 +78,8 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     def residual(self, space, poses, t):
         del t
         mode = poses[-1, 0]
-        kind = lax.stop_gradient(jnp.round(mode))
-        return jnp.where(kind == _CLOSED, self.gap(space, poses[:-1]), mode - kind)[None]
+        kind = kind_of(mode)
+        return jnp.where(kind == CLOSED, self.gap(space, poses[:-1]), mode - kind)[None]
 
 
 class Stop(AbstractScalarPart, AbstractUnilateralConstraint):

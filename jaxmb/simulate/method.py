@@ -57,7 +57,7 @@ class Method(NamedTuple):
         **Arguments:** `jumps`: whether a run restarts at jumps of inputs, or at those that the user announces.
         """
         jumps = jumps and system.velocity_rows > 0
-        if not jumps and system.contacts is None:
+        if not jumps and not system.contacts:
             return
         if not (self.policy.takes_impulses and system.positive_definite_mass):
             needs = "jumps, or inputs that jump, a constrained system" if jumps else "contacts a system"

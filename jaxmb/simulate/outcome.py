@@ -16,7 +16,6 @@ from ..manifold import find_jumps
 from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
 from ..states.refusals import LostRank, lost_rank, violated_joints
-from ..system.gaps import counts, gaps, names_of
 from .span import Span
 
 # Gaps below this fraction of the system's size are named where contacts have no solution.
@@ -82,9 +81,10 @@ def about_friction(system, coupling) -> str:
 def about_contacts(system, outcome: Outcome) -> str:
     """Which bodies touch where no forces of contacts and friction are possible."""
     q = system.normalize(outcome.y.q)
-    touch = np.asarray(gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
-    touch = np.append(touch, [True] * counts(system)[1])
-    names = ", ".join(dict.fromkeys(repr(name) for name, own in zip(names_of(system), touch, strict=True) if own))
+    contacts = system.contacts
+    touch = np.asarray(contacts.gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
+    touch = np.append(touch, [True] * contacts.m)
+    names = ", ".join(dict.fromkeys(repr(name) for name, at in zip(contacts.names, touch, strict=True) if at))
     return f"{RESULTS[RESULTS.contacts_undetermined]} These are {names}, at t = {float(outcome.t):.6g}."
 
 

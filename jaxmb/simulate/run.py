@@ -12,8 +12,8 @@ from jax import lax
 
 from .._arguments import check_kind
 from .._results import RESULTS
+from ..contacts.impact import NO_SECOND_DERIVATIVES
 from ..linalg.arrays import derivatives_of, is_traced
-from ..manifold.impact import NO_SECOND_DERIVATIVES
 from ..solvers import Adams, Hermite
 from ..states.arguments import check_precision
 from ..states.consistency import consistent
@@ -265,7 +265,7 @@ def _settled(problem, asked):
         saves = padded(saves, span.t0, span.t1)
     taken = derivatives_of(problem) if traced else None
     orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
-    if max(orders, default=0) > 1 and system.contacts is not None:
+    if max(orders, default=0) > 1 and system.contacts:
         raise ValueError(NO_SECOND_DERIVATIVES)
     # Where values are known, so is after it how many steps a motion took.
     known = not traced or (taken is not None and taken.known)
@@ -273,7 +273,7 @@ def _settled(problem, asked):
     rooms = [asked.max_steps]
     if asked.adjoint is None:
         rooms = rooms_for(asked.max_steps, problem.saveat, state, traced, tries)
-    if span.is_backward() and system.contacts is not None:
+    if span.is_backward() and system.contacts:
         raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {asked.t0} and {asked.t1}.")
     problem = problem._replace(
         saveat=saves,

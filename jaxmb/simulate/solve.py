@@ -11,7 +11,7 @@ from jax import lax
 from .._compat import with_values
 from .._results import RESULTS
 from .._types import State
-from ..contact_events import FoundEvents
+from ..contacts.events import FoundEvents
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..manifold import contact_guards
@@ -54,7 +54,7 @@ class Problem(NamedTuple):
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
         """Those of `diffrax.diffeqsolve`."""
         system, method = self.system, self.method
-        contacts, gaps = system.contacts is not None, method.watches_gaps(system)
+        contacts, gaps = bool(system.contacts), method.watches_gaps(system)
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
         return {
             "y0": y0,

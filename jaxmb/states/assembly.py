@@ -18,9 +18,9 @@ from .._types import Coordinates, Scalar, State, VectorLike
 from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
+from ..parts.modes import CLOSED, OPEN
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
-from ..system.gaps import CLOSED, OPEN
 from ..system.quantities import rates_of
 from .arguments import (
     check_system,
@@ -154,13 +154,11 @@ def configuration(
     hold; an error if not, with `throw` and where nothing is traced.
     """
     q, fixed = prescribe("coordinate", system.coordinate_names() if fix else {}, {} if fix is None else fix, guess)
-    if system.contacts is not None:
-        if not is_traced(q):
-            _check_modes(system, q, fixed)
-        # A contact that is open determines its own mode.
-        fixed[np.array(system.contacts.modes, int)] = False
     if not is_traced(q):
+        _check_modes(system, q, fixed)
         _check_finite(q, "coordinates")
+    # A contact that is open determines its own mode.
+    fixed[list(system.contacts.contact_places)] = False
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
     if not system.coordinate_rows:
         return q, fixed, jnp.array(True)
@@ -195,7 +193,7 @@ def _velocities(system, t, q, u, fixed):
 
 
 def _check_modes(system, q, fixed):
-    for name, k in zip(system.contacts.names, system.contacts.modes, strict=True):
+    for name, k in zip(system.contacts.contact_names, system.contacts.contact_places, strict=True):
         if fixed[k] and q[k] not in (OPEN, CLOSED):
             raise ValueError(f"Coordinate '{name}.mode' is 1 to close the contact, or 0 to open it; got {q[k]:g}.")
 

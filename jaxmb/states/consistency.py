@@ -14,7 +14,6 @@ from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..system import AbstractSystem, parameters, with_parameters
-from ..system.gaps import contacts_of, gaps
 from ..system.residuals import row_sizes, violations
 
 # The largest violation of states that count as consistent, relative to the system's size and to the largest velocity;
@@ -42,8 +41,8 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
         return nan_where(jnp.array(True), state, (system, t, state))
     positions, velocities, overlaps = map(np.asarray, rows)
     if np.any(overlaps):
-        names = [name for name, off in zip(contacts_of(system).names, overlaps, strict=True) if off]
-        depths = -np.asarray(gaps(system, t, state.q))[overlaps]
+        names = [name for name, off in zip(system.contacts.contact_names, overlaps, strict=True) if off]
+        depths = -np.asarray(system.contacts.gaps(system, t, state.q))[overlaps]
         listing = ", ".join(f"{name} by {depth:.3g}" for name, depth in zip(names, depths, strict=True))
         raise ValueError(
             "The state is beyond contacts, with bodies inside each other, joints beyond their stops or ropes too long, "
@@ -97,7 +96,7 @@ def _violated(system, t, y) -> Any:
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
     near = system.closing()
     positions, velocities = violations(near, t, y, row_sizes(near, t, y))
-    depths = jnp.zeros(0, y.q.dtype) if system.contacts is None else -gaps(system, t, y.q) / system.length
+    depths = -system.contacts.gaps(system, t, y.q) / system.length
     return (positions > tol) | near.half_turned(y.q), velocities > tol, depths > tol
 
 

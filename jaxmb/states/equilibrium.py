@@ -26,7 +26,6 @@ from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
-from ..system.gaps import are_open, contacts_of
 from ..system.quantities import directions
 from .arguments import check_system, checked_guess, checked_time, holding, split_coordinates, split_internal_states
 from .assembly import configuration
@@ -298,9 +297,10 @@ def _balanced(
 
 def _against(system, t, q, multipliers, implied):
     """Which open contacts are overlapped, and which closed ones pull."""
-    if system.contacts is None:
+    contacts = system.contacts
+    if not contacts:
         return (jnp.zeros(0, bool),) * 2
-    alone = jnp.diag(implied)[np.array(system.contacts.rows, int)] <= tolerance(q.dtype) ** 0.5
+    alone = contacts.at_rows(jnp.diag(implied))[: contacts.n] <= tolerance(q.dtype) ** 0.5
     return contacts_against(system, t, q, jnp.zeros(system.nu, q.dtype), multipliers, alone)
 
 
@@ -318,7 +318,7 @@ def _on_host(system, t, start, held, stable):
     except np.linalg.LinAlgError:
         return None
     against = (np.zeros(0, bool),) * 2
-    if ok and system.contacts is not None:
+    if ok and system.contacts:
         against = _against_alone(system, time, q, local.multipliers, local.implied)
     return jax.device_put(q), local.force, falling, jax.device_put(np.asarray(ok)), *against
 
@@ -440,13 +440,10 @@ def _only_unstable(system, falling):
 
 def _not_found(system, q, unbalanced):
     listed = _largest(system, unbalanced, 1e-6)
-    opens = [name for name, is_open in zip(_contact_names(system), are_open(system, q), strict=True) if is_open]
+    contacts = system.contacts
+    opens = [name for name, is_open in zip(contacts.contact_names, contacts.modes(q).open, strict=True) if is_open]
     closing = f", or close a contact, such as fix={{'{opens[0]}.mode': 1}}" if opens else ""
     return (
         f"No static equilibrium was found: residual forces along {listed or 'nothing'}, in N and N m. Hold such a "
         f"coordinate with fix, remove the force that drives it, or give a guess nearer to the equilibrium{closing}."
     )
-
-
-def _contact_names(system):
-    return () if system.contacts is None else contacts_of(system).names

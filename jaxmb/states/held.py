@@ -6,7 +6,6 @@ from jaxtyping import Array, Bool, Float
 
 from .._types import Coordinates, Scalar, Velocities
 from ..system import AbstractSystem
-from ..system.gaps import are_open, contacts_of, gaps
 from .closest import tolerance
 
 
@@ -23,19 +22,19 @@ def contacts_against(
     **Arguments:** the `multipliers` of all rows; which contacts are `alone`: of those that imply each other only the
     sum of the forces is known.
     """
-    is_open = are_open(system, q)
+    contacts, is_open = system.contacts, system.contacts.modes(q).open
     if not is_open.size:
         return is_open, is_open
     tol = tolerance(q.dtype) ** 0.5
     largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, q, u)))
-    overlaps = is_open & (gaps(system, t, q) < -tol * system.length)
-    pulls = ~is_open & alone & (multipliers[np.array(contacts_of(system).rows, int)] < -tol * largest)
+    overlaps = is_open & (contacts.gaps(system, t, q) < -tol * system.length)
+    pulls = ~is_open & alone & (contacts.at_rows(multipliers)[: contacts.n] < -tol * largest)
     return overlaps, pulls
 
 
 def about_contacts(what: str, system: AbstractSystem, overlapped: Array, pulled: Array) -> tuple[str, str]:
     """That `what` is found only where contacts do not hold, and what to fix instead, as an argument of a call."""
-    names, overlaps, pulls = np.array(contacts_of(system).names), np.asarray(overlapped), np.asarray(pulled)
+    names, overlaps, pulls = np.array(system.contacts.contact_names), np.asarray(overlapped), np.asarray(pulled)
     texts = []
     if np.any(overlaps):
         own = names[overlaps]

@@ -63,9 +63,7 @@ def count_rows(system: AbstractEquation) -> str:
 def count_independent(system: AbstractEquation) -> str:
     """The numbers of coordinates and velocities that the constraints leave free."""
     # A mode of friction is no coordinate that moves.
-    frictions = None if system.contacts is None else system.contacts.frictions
-    modes = 0 if frictions is None else len(frictions.names)
-    coordinates = system.nq - system.coordinate_rank - modes
+    coordinates = system.nq - system.coordinate_rank - system.contacts.m
     velocities = system.nu - system.velocity_rank
     return f"{counted(coordinates, 'coordinate')}, {counted(velocities, 'velocity', 'velocities')}"
 

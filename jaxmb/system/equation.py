@@ -25,6 +25,7 @@ from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..solvers import AbstractFieldJacobian
 from ..solvers.manifold_term import GapsSeen
+from .contact_set import ContactNumbers, ContactSet
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -39,49 +40,6 @@ class Ranks(eqx.Module):
     coordinate: int = eqx.field(static=True)
     velocity: int = eqx.field(static=True)
     acceleration: int = eqx.field(static=True)
-
-
-class Frictions(eqx.Module):
-    """The dry friction of a system, which sticks or slips.
-
-    Each direction of slip has a row of A and a coordinate of its own, its mode, as a contact has. The row says
-    `slip = 0` where it sticks.
-
-    **Fields:** for each direction the `names`; the number of its row of A, among those of velocities, in `rows`; the
-    index of its mode in q, `modes`; the number of its contact in `contacts`, -1 in a joint; the `coefficient` of slip,
-    and the `limit`, that of stick; `releases`: whether these differ, so that accelerations jump where slip begins.
-    `pairs`: the numbers of the first directions of those friction that has two, one after the other. Static.
-    """
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    rows: tuple[int, ...] = eqx.field(static=True)
-    modes: tuple[int, ...] = eqx.field(static=True)
-    contacts: tuple[int, ...] = eqx.field(static=True)
-    releases: tuple[bool, ...] = eqx.field(static=True)
-    pairs: tuple[int, ...] = eqx.field(static=True)
-    coefficient: Float[Array, "frictions"]
-    limit: Float[Array, "frictions"]
-
-
-class Contacts(eqx.Module):
-    """The unilateral constraints of a system, gaps that stay non-negative, and its dry friction.
-
-    Each has a row of A and a coordinate of its own, its mode. The row says `gap = 0` where the contact is closed, and
-    otherwise that the mode stays what it is. So the number and the rank of rows never change, and the mode, which no
-    force acts on, is a number of the state like any other.
-
-    **Fields:** their `names`; for each the number of its `rows` of A, among those of positions, and the index of its
-    mode in q, `modes`; whether its impacts are `by_poisson`, or by Newton's law; coefficients of `restitution`;
-    the `peaks` of gaps that rise to a kink and fall again, infinite for others; the `frictions`, None without any.
-    """
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    rows: tuple[int, ...] = eqx.field(static=True)
-    modes: tuple[int, ...] = eqx.field(static=True)
-    by_poisson: tuple[bool, ...] = eqx.field(static=True)
-    restitution: Float[Array, "contacts"]
-    peaks: Float[Array, "contacts"]
-    frictions: Frictions | None = None
 
 
 class AbstractEquation(eqx.Module):
@@ -100,6 +58,7 @@ class AbstractEquation(eqx.Module):
     - `positive_definite_mass`: whether M is positive definite for all velocities, also those that violate constraints.
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
     - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
+    - `contacts`: the unilateral constraints and dry friction. Static.
     """
 
     nq: AbstractVar[int]
@@ -111,6 +70,7 @@ class AbstractEquation(eqx.Module):
     linear: ClassVar[bool] = True
     drift_free: ClassVar[bool] = True
     elimination: ClassVar[JointOrder | None] = None
+    contacts: ClassVar[ContactSet] = ContactSet()
 
     # Sizes
 
@@ -306,9 +266,9 @@ class AbstractEquation(eqx.Module):
     # Unilateral constraints
 
     @property
-    def contacts(self) -> Contacts | None:
-        """The unilateral constraints and dry friction; None without any."""
-        return None
+    def contact_numbers(self) -> ContactNumbers:
+        """The numbers of `contacts`, which are parameters."""
+        return ContactNumbers(*[jnp.zeros(0)] * 4)
 
     def friction_reactions(
         self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]

@@ -69,7 +69,7 @@ print(found)
 """
     modules = {name for name, is_module in printed(code).items() if is_module}
     assert modules > MODULES
-    assert not modules & {"bodies", "contact_events", "linalg", "states"}
+    assert not modules & {"bodies", "contacts", "linalg", "states"}
     assert not modules & {"simulate", "identify", "linearise", "optimise", "robust", "root_locus", "sweep", "floquet"}
 
 

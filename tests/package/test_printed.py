@@ -11,7 +11,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar, report
 from jaxmb._printed import Printed
-from jaxmb.contact_events import ContactEvents
+from jaxmb.contacts.events import ContactEvents
 from jaxmb.studies.linear.floquet import Floquet
 
 

@@ -8,7 +8,7 @@ from every_contact import CONTACTS, system_of
 
 import jaxmb as mb
 from jaxmb.formulations import Multipliers, accelerations
-from jaxmb.system import gaps as of
+from jaxmb.parts.modes import CLOSED, OPEN
 from jaxmb.system.residuals import displaced
 
 
@@ -18,23 +18,24 @@ def test_gap_and_its_derivatives(name):
     system = system_of(name)
     state = mb.assemble(system)
     t, q, u = jnp.zeros(()), state.q, state.u
+    of = system.contacts
     gap = of.gaps(system, t, q)
-    assert gap.shape == (1,) and gap[0] > 0 and system.contacts.names == ("c",)
+    assert gap.shape == (1,) and gap[0] > 0 and of.names == of.contact_names == ("c",)
 
     @jax.jit
     def ahead(s):
         q_s = displaced(system, t, q, s * u)
-        return of.gaps(system, t, q_s)[0], of.direction_rates(system, t, q_s, u)[0]
+        return of.gaps(system, t, q_s)[0], of.rates(system, t, q_s, u)[0]
 
     h = 1e-5
     slope = [(a - b) / (2 * h) for a, b in zip(ahead(h), ahead(-h), strict=True)]
-    np.testing.assert_allclose(of.direction_rates(system, t, q, u)[0], slope[0], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(of.rates(system, t, q, u)[0], slope[0], rtol=1e-7, atol=1e-9)
     none = jnp.zeros_like(u)
-    np.testing.assert_allclose(of.direction_accelerations(system, t, q, u, none)[0], slope[1], rtol=1e-6, atol=1e-8)
-    gradient = of.direction_gradients(system, t, q, u)
-    np.testing.assert_allclose(gradient @ u, of.direction_rates(system, t, q, u), rtol=1e-12, atol=1e-15)
-    closed = of.with_modes(system, q, of.CLOSED)
-    rows = system.jacobian(t, closed, u)[np.array(system.contacts.rows)]
+    np.testing.assert_allclose(of.accelerations(system, t, q, u, none)[0], slope[1], rtol=1e-6, atol=1e-8)
+    gradient = of.gradients(system, t, q, u)
+    np.testing.assert_allclose(gradient @ u, of.rates(system, t, q, u), rtol=1e-12, atol=1e-15)
+    closed = of.with_modes(q, CLOSED)
+    rows = system.jacobian(t, closed, u)[np.array(of.rows)]
     np.testing.assert_allclose(rows, gradient, rtol=1e-12, atol=1e-14)
 
 
@@ -44,14 +45,15 @@ def test_an_open_contact_does_nothing_and_a_closed_one_pushes_or_pulls(name):
     state = mb.assemble(system)
     # Balls that fall side by side would neither push nor pull.
     t, u = jnp.zeros(()), jnp.linspace(0.5, -0.7, state.u.size)
-    at = lambda mode: accelerations(system, Multipliers(), t, of.with_modes(system, state.q, mode), u)
-    (free, none), (held, forces) = at(of.OPEN), at(of.CLOSED)
-    (row,) = system.contacts.rows
+    of = system.contacts
+    at = lambda mode: accelerations(system, Multipliers(), t, of.with_modes(state.q, mode), u)
+    (free, none), (held, forces) = at(OPEN), at(CLOSED)
+    (row,) = of.rows
     assert none[row] == 0
-    left = of.direction_accelerations(system, t, state.q, u, held)
+    left = of.accelerations(system, t, state.q, u, held)
     np.testing.assert_allclose(left, 0.0, atol=1e-12)
     assert abs(forces[row]) > 1e-3
-    assert (forces[row] > 0) == (of.direction_accelerations(system, t, state.q, u, free)[0] < 0)
+    assert (forces[row] > 0) == (of.accelerations(system, t, state.q, u, free)[0] < 0)
 
 
 @pytest.mark.parametrize("name", CONTACTS)
@@ -60,7 +62,7 @@ def test_words_and_numbers(name):
     text = str(system.describe())
     assert "contacts" in text and "where closed 1 row each" in text
     assert "c.mode" in system.coordinate_names() and "c.restitution" in mb.parameters(system)
-    assert mb.with_parameters(system, {"c.restitution": 0.5}).contacts.restitution == 0.5
+    assert mb.with_parameters(system, {"c.restitution": 0.5}).contact_numbers.restitution == 0.5
 
 
 def test_one_of_two_balls_may_be_a_point():

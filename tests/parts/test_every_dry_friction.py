@@ -9,7 +9,7 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import terrain
-from jaxmb.system import gaps as of
+from jaxmb.parts.modes import FREE, STICK
 
 # The velocities of the bodies are any: those in the closest state are used.
 pytestmark = pytest.mark.filterwarnings("ignore:The velocities given with the bodies")
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:The velocities given with the bo
 
 def state_of(system):
     """A state with velocities, in which contacts are closed."""
-    return mb.assemble(system, fix={"joint.mode": 1} if system.contacts.names else {})
+    return mb.assemble(system, fix={"joint.mode": 1} if system.contacts.n else {})
 
 
 @pytest.mark.parametrize("name", FRICTIONS)
@@ -25,17 +25,17 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     system = friction_scene(name)
     state = state_of(system)
     t, q, u = jnp.zeros(()), state.q, state.u
-    modes, directions = of.modes_of(system, q), of.counts(system)[1]
-    at = lambda mode: of.with_modes(system, q, modes.at[-directions:].set(mode))
-    slip = np.asarray(of.direction_rates(system, t, q, u)[-directions:])
+    of, directions = system.contacts, system.contacts.m
+    at = lambda mode: of.with_modes(q, of.modes(q).numbers.at[-directions:].set(mode))
+    slip = np.asarray(of.rates(system, t, q, u)[-directions:])
     speed = np.linalg.norm(slip)
     assert directions == (2 if "ball" in name or name in ("sleeve", "face") else 1) and speed > 1e-3
 
     # Where it sticks, its rows are those of the slip.
-    udot, multipliers = accelerations(system, Multipliers(), t, at(of.STICK), u)
-    np.testing.assert_allclose(of.direction_accelerations(system, t, q, u, udot)[-directions:], 0.0, atol=1e-11)
-    rows = np.array(system.contacts.frictions.rows)
-    moves = of.direction_gradients(system, t, q, u)[-directions:] @ u
+    udot, multipliers = accelerations(system, Multipliers(), t, at(STICK), u)
+    np.testing.assert_allclose(of.accelerations(system, t, q, u, udot)[-directions:], 0.0, atol=1e-11)
+    rows = np.array(of.rows)[of.n :]
+    moves = of.gradients(system, t, q, u)[-directions:] @ u
     belt = FRICTIONS[name][2].speed
     np.testing.assert_allclose(moves, slip if belt is None else slip + belt, rtol=1e-11)
     touching = ("pin", "two discs", "point on a plane that moves", "two balls", "ball on a plane that moves")
@@ -51,9 +51,9 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     times, states = t[None], mb.State(at(mode)[None], u[None])
     reaction = system.reaction("joint", times, states, multipliers[None])
     normal = np.linalg.norm(reaction.force[0])
-    if system.contacts.names:
+    if of.n:
         # That of a contact has a sign, so that the law is smooth where an iteration passes through zero.
-        normal = normal * np.sign(multipliers[system.contacts.rows[0]])
+        normal = normal * np.sign(multipliers[of.rows[0]])
     power = jnp.dot(system.nonideal_force(t, at(mode), u, multipliers), u)
     np.testing.assert_allclose(power, -0.3 * normal * np.dot(slip, moves) / speed, rtol=1e-10)
     reactions = system.friction_reactions(t, q, u, multipliers)
@@ -63,7 +63,7 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     np.testing.assert_allclose(residual, force, atol=1e-10)
 
     # And otherwise nothing.
-    assert jnp.all(system.nonideal_force(t, at(of.FREE), u, multipliers) == 0)
+    assert jnp.all(system.nonideal_force(t, at(FREE), u, multipliers) == 0)
 
 
 @pytest.mark.parametrize("name", ["ball on a slope", "ball on an edge"])
@@ -71,10 +71,10 @@ def test_the_direction_of_slip_has_a_sense_at_rest_and_beyond(name):
     """Slip that has begun has the direction of its modes; that of slip which has passed through zero does not jump."""
     system = friction_scene(name)
     state = state_of(system)
-    t, q, u = jnp.zeros(()), state.q, state.u
-    slip = np.asarray(of.direction_rates(system, t, q, u)[-2:])
-    at = lambda mode: of.with_modes(system, q, of.modes_of(system, q).at[-2:].set(mode))
-    rows = of.direction_gradients(system, t, q, u)[-2:]
+    t, q, u, of = jnp.zeros(()), state.q, state.u, system.contacts
+    slip = np.asarray(of.rates(system, t, q, u)[-2:])
+    at = lambda mode: of.with_modes(q, of.modes(q).numbers.at[-2:].set(mode))
+    rows = of.gradients(system, t, q, u)[-2:]
 
     def direction(mode):
         _, multipliers = accelerations(system, Multipliers(), t, at(mode), u)
@@ -97,10 +97,10 @@ def test_words_and_numbers():
     assert "rub.mode" in system.coordinate_names()
     assert {"rub.coefficient", "rub.static_coefficient", "rub.radius"} <= set(mb.parameters(system))
     changed = mb.with_parameters(system, {"rub.coefficient": 0.1, "rub.static_coefficient": 0.2})
-    assert changed.contacts.frictions.coefficient == 0.1 and changed.contacts.frictions.limit == 0.2
+    assert changed.contact_numbers.coefficient == 0.1 and changed.contact_numbers.limit == 0.2
     # Without a coefficient of stick that of slip holds.
     changed = mb.with_parameters(friction_scene("slide"), {"rub.coefficient": 0.1})
-    assert changed.contacts.frictions.limit == 0.1
+    assert changed.contact_numbers.limit == 0.1
 
 
 BODY = planar.Body("a", mass=1.0, inertia=1.0)

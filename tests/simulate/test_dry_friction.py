@@ -10,11 +10,11 @@ from scipy.integrate import quad, solve_ivp
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.contacts.impact import impact
+from jaxmb.contacts.tolerance import ContactTolerance
 from jaxmb.manifold import Projection
-from jaxmb.manifold.impact import impact
 from jaxmb.parts import terrain
 from jaxmb.solvers import Adams, Hermite
-from jaxmb.system.gaps import direction_rates
 
 G = 9.81
 DOWN = mb.Gravity((0.0, -G))
@@ -317,7 +317,7 @@ def test_impulses_and_energies_change_as_their_differences(spin):
     def event(x):
         changed = mb.with_parameters(system, {"rub.coefficient": x[0], "floor.restitution": x[1], "disc.mass": x[2]})
         y = mb.State(state.q.at[1].add(x[3]), state.u.at[:3].set(jnp.stack([x[4], -2.0, x[5]])))
-        found = impact(changed, method, jnp.asarray(1e-3), jnp.zeros(()), y, dated=True)
+        found = impact(changed, method, ContactTolerance(jnp.asarray(1e-3)), jnp.zeros(()), y, dated=True)
         return jnp.concatenate([found.impulses, jnp.stack([found.energy, found.late])])
 
     at, h = jnp.array([0.2, 0.4, 1.5, 0.0, 1.0, spin]), 1e-6
@@ -477,11 +477,12 @@ def test_an_impact_gives_no_energy_back():
     @jax.jit
     def after(p, step):
         own = mb.with_parameters(system, p)
-        return impact(own, motion.formulation, found.touch, t, mb.State(q, u * (1 + step))).after.u
+        tolerance, y = ContactTolerance(found.touch), mb.State(q, u * (1 + step))
+        return impact(own, motion.formulation, tolerance, t, y).after.u
 
     given = {name: mb.parameters(system)[name] for name in ("lower.mass", "rub.coefficient", "floor.restitution")}
     u_after = after(given, 0.0)
-    rate = lambda u: direction_rates(system, t, q, u)[0]
+    rate = lambda u: system.contacts.rates(system, t, q, u)[0]
     # Less than the whole rebound, of which the energy would be more than before.
     assert 0 < rate(u_after) < 0.9 * -rate(u) * (1 - 1e-3)
     for name in given:
@@ -518,7 +519,8 @@ def test_the_time_of_release_has_a_derivative_in_a_contact():
 
         def after(limit, rounding=rounding):
             own = mb.with_parameters(system, {"rub.static_coefficient": limit})
-            return impact(own, motion.formulation, found.touch, t, mb.State(q, u.at[1].add(rounding))).after.u[0]
+            tolerance, y = ContactTolerance(found.touch), mb.State(q, u.at[1].add(rounding))
+            return impact(own, motion.formulation, tolerance, t, y).after.u[0]
 
         slope = jax.jvp(after, (jnp.asarray(0.3),), (jnp.asarray(1.0),))[1]
         np.testing.assert_allclose(slope, -slower * later, rtol=1e-7)

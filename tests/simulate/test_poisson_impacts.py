@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxmb as mb
 from jaxmb import planar, spatial, terrain
-from jaxmb.manifold.impact import impact
-from jaxmb.system.gaps import mode_places
+from jaxmb.contacts.impact import impact
+from jaxmb.contacts.tolerance import ContactTolerance
 
 HALF, TALL, MASS = 0.3, 0.2, 2.0
 INERTIA = MASS * (HALF**2 + TALL**2) / 3
@@ -37,12 +37,13 @@ def block(restitution, coefficient, laws=("poisson", "poisson"), angle=0.0):
 def struck(system):
     """The event at the scene's own position, as a function of parameters and of the velocity of the body."""
     state = mb.assemble(system)
-    count = system.nu - len(mode_places(system))
+    count = system.nu - len(system.contacts.places)
 
     def event(p, u):
         own = mb.with_parameters(system, p)
         y = mb.State(state.q, jnp.concatenate([u, state.u[count:]]))
-        return impact(own, mb.formulations.Multipliers(), jnp.asarray(1e-9), jnp.zeros(()), y)
+        tolerance = ContactTolerance(jnp.asarray(1e-9))
+        return impact(own, mb.formulations.Multipliers(), tolerance, jnp.zeros(()), y)
 
     return event
 

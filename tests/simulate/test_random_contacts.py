@@ -96,6 +96,6 @@ def test_random_motions(name):
         size = np.ptp(energy) + 1.0
         assert np.max(np.diff(energy)) <= 1e-7 * size
         assert np.min(motion.events.kinetic_energy_lost, initial=0.0) >= -1e-9 * size
-        gaps = [motion[part].gap for part in own.contacts.names if "stop" not in part]
+        gaps = [motion[part].gap for part in own.contacts.contact_names if "stop" not in part]
         assert np.min(gaps) >= -1e-10 * float(system.length)
     assert failed <= MEMBERS // 20

@@ -96,7 +96,7 @@ LONG = [pytest.param(make, marks=pytest.mark.long) for make in (screwed, rolling
 def test_states_of_any_constraints_are_those_of_programs(make):
     system, t, key = make(), jnp.asarray(0.3), jax.random.key(7)
     none, still = np.zeros(system.nq, bool), np.zeros(system.nu, bool)
-    if system.contacts is None:
+    if not system.contacts:
         guess = np.array(system.guess.q + 0.03 * jax.random.normal(key, (system.nq,)))
     else:
         guess = np.array(system.guess.q)

@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxmb as mb
 from jaxmb import planar, terrain
-from jaxmb.contact_events import FoundEvents
+from jaxmb.contacts.events import FoundEvents
 
 
 def motion_of(system, ts, q, u):

@@ -13,7 +13,6 @@ from ...parts.names import names_arguments
 from ...states.arguments import check_system, checked_guess, checked_time
 from ...states.consistency import consistent
 from ...system import AbstractSystem, parameters
-from ...system.gaps import are_open, contacts_of
 from ...system.quantities import component_names, directions
 from .linear_equations import LinearEquations, linear_equations
 from .linearisation import Linearisation
@@ -84,12 +83,12 @@ def linearise(
     seen = {name: value.shape for name, value in system.quantities().items()}
     chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
     state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
-    if system.contacts is not None and system.contacts.frictions is not None:
-        names = ", ".join(dict.fromkeys(system.contacts.frictions.names))
+    if system.contacts.m:
+        names = ", ".join(system.contacts.friction_names)
         raise ValueError(f"linearise: {names} may stick or slip, which no linear equation describes. Remove it.")
-    opens = are_open(system, state.q)
+    opens = system.contacts.modes(state.q).open
     if not is_traced(opens) and not np.all(opens):
-        closed = [name for name, is_open in zip(contacts_of(system).names, opens, strict=True) if not is_open]
+        closed = [name for name, is_open in zip(system.contacts.contact_names, opens, strict=True) if not is_open]
         raise ValueError(
             f"linearise: {', '.join(closed)} may open, which no linear equation describes. Replace closed contacts by "
             "joints."

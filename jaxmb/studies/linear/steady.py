@@ -80,8 +80,8 @@ def steady_motion(
     """
     check_system("steady_motion", system)
     check_no_states("steady_motion", system)
-    if system.contacts is not None and system.contacts.frictions is not None:
-        names = ", ".join(dict.fromkeys(system.contacts.frictions.names))
+    if system.contacts.m:
+        names = ", ".join(system.contacts.friction_names)
         raise ValueError(
             f"steady_motion: {names} may stick or slip, and the search knows neither. Remove it, or use smooth "
             "`Friction`."
@@ -197,9 +197,9 @@ def _search(
     carrier = _carrier(system, solution, system.rates(t, state.q, state.u), advancing)
     (field, multipliers), carried = vector_field(system, t, state), carrier.field(state)
     against = None
-    if system.contacts is not None:
+    if system.contacts:
         own = lax.stop_gradient((system, t, state.q, state.u, multipliers))
-        against = contacts_against(*own, alone=jnp.ones(len(system.contacts.names), bool))
+        against = contacts_against(*own, alone=jnp.ones(system.contacts.n, bool))
     remaining = jnp.concatenate([field.q - carried.q, field.u - carried.u])
     # An array without entries that a program returns makes XLA lose the types of its LAPACK calls (jaxlib 0.10.2).
     return _Found(state, remaining, left, solved, solved & same, against)

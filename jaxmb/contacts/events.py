@@ -1,5 +1,6 @@
 """Impacts, contacts that close and open, and friction that sticks and slips, along a motion."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,21 +10,23 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from ._arguments import package_for_tables
-from ._printed import preformatted
-from ._types import State
-from .formulations import AbstractFormulation
-from .linalg.arrays import is_traced
-from .linalg.jitted import jitted
-from .manifold import contact_guards
-from .system import AbstractSystem
-from .system.gaps import CLOSED, FREE, OPEN, STICK, counts, names_of
-from .system.structures import of_structure
+from .._arguments import package_for_tables
+from .._printed import preformatted
+from .._types import State
+from ..formulations import AbstractFormulation
+from ..linalg.arrays import is_traced
+from ..linalg.jitted import jitted
+from ..parts.modes import CLOSED, FREE, OPEN, STICK
+from ..system import AbstractSystem
+from .guards import ContactGuards
+from .tolerance import ContactTolerance
 
 # Impulses of contacts that are this small beside another one at the same time are none.
 _ROUNDING = 1e-12
 # So many impacts are computed together.
 _TOGETHER = 8
+# What happens to a contact that was open before an event, and is open after it.
+_KINDS = {(True, True): "impact", (True, False): "close", (False, True): "open", (False, False): "impulse"}
 
 
 class FoundEvents(NamedTuple):
@@ -139,52 +142,39 @@ class ContactEvents(eqx.Module):
                 "The events of one motion are a table, those of a batch or under jit are arrays: see the fields of "
                 "ContactEvents."
             )
-        times, impulses, lost, before, after, rest = map(
-            np.asarray, (self.times, self.impulses, self.kinetic_energy_lost, self.before, self.after, self.rest)
-        )
-        rows = []
-        for k in np.flatnonzero(np.isfinite(times)):
-            of_contacts = impulses[k, : self.contacts]
-            strikes = np.any(of_contacts[before[k, : self.contacts] == OPEN] > 0)
-            # Contacts that stay closed may have impulses of rounding errors.
-            least = _ROUNDING * np.max(of_contacts, initial=0.0) if strikes else np.inf
-            for i, name in enumerate(self.names):
-                if i >= self.contacts:
-                    if self.names.index(name) < i:
-                        continue  # the second direction: the row of the first one has both
-                    own = slice(i, i + self.names.count(name))
-                    changed = before[k, i] != after[k, i]
-                    impulse = float(impulses[k, i] if own.stop == i + 1 else np.linalg.norm(impulses[k, own]))
-                    struck = impulse != 0
-                    kind = "stick" if after[k, i] == STICK else "slip" if after[k, i] != FREE else "impact"
-                    if struck or (changed and after[k, i] != FREE):
-                        kind = kind if changed else "impact"
-                        rows.append(Event(float(times[k]), name, kind, impulse, float(lost[k])))
-                    continue
-                was_open, is_open = before[k, i] == OPEN, after[k, i] == OPEN
-                impulse = float(impulses[k, i])
-                struck = impulse > (0.0 if was_open else least)
-                kind = "close" if was_open and not is_open else "open" if is_open and not was_open else "impact"
-                kind = "impulse" if struck and not (was_open or is_open) else kind
-                if struck or was_open != is_open:
-                    rows.append(Event(float(times[k]), name, kind, impulse, float(lost[k])))
-                if rest[k, i] > 0 and after[k, i] == CLOSED:
-                    rows.append(Event(float(times[k] + rest[k, i]), name, "rest", 0.0, 0.0))
+        known = jax.tree.map(np.asarray, self)
+        rows = [row for k in np.flatnonzero(np.isfinite(known.times)) for row in known._at(k)]
         return sorted(rows, key=lambda event: event.time)
+
+    def _at(self, k: int) -> Iterator[Event]:
+        """The parts that take part in one event, of known numbers."""
+        time, lost = float(self.times[k]), float(self.kinetic_energy_lost[k])
+        impulses, were_open, are_open = self.impulses[k], self.before[k] == OPEN, self.after[k] == OPEN
+        of_contacts = impulses[: self.contacts]
+        strikes = np.any(of_contacts[were_open[: self.contacts]] > 0)
+        # Contacts that stay closed may have impulses of rounding errors.
+        least = _ROUNDING * np.max(of_contacts, initial=0.0) if strikes else np.inf
+        for i, name in enumerate(self.names[: self.contacts]):
+            was_open, is_open = bool(were_open[i]), bool(are_open[i])
+            if impulses[i] > (0.0 if was_open else least) or was_open != is_open:
+                yield Event(time, name, _KINDS[was_open, is_open], float(impulses[i]), lost)
+            if self.rest[k, i] > 0 and self.after[k, i] == CLOSED:
+                yield Event(time + float(self.rest[k, i]), name, "rest", 0.0, 0.0)
+        for name in dict.fromkeys(self.names[self.contacts :]):
+            # Of friction in two directions both have a row.
+            i, of_both = self.names.index(name), impulses[self.names.index(name) :][: self.names.count(name)]
+            impulse = float(np.linalg.norm(of_both) if of_both.size > 1 else of_both[0])
+            after, changed = self.after[k, i], self.before[k, i] != self.after[k, i]
+            if impulse != 0 or (changed and after != FREE):
+                kind = "stick" if after == STICK else "slip" if after != FREE else "impact"
+                yield Event(time, name, kind if changed else "impact", impulse, lost)
 
 
 def contact_events(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> ContactEvents:
     """The events of a run, or of a batch of runs, from what is noted of them."""
     evaluated = _evaluated if is_traced((system, formulation, found)) else _happened
-    return ContactEvents(**_parts(system), **dict(zip(_NUMBERS, evaluated(system, formulation, found), strict=True)))
-
-
-_NUMBERS = ("times", "impulses", "kinetic_energy_lost", "before", "after", "rest")
-
-
-@of_structure
-def _parts(system):
-    return {"names": names_of(system), "contacts": counts(system)[0]}
+    contacts = system.contacts
+    return ContactEvents(contacts.names, contacts.n, *evaluated(system, formulation, found))
 
 
 def _happened(system, formulation, found):
@@ -215,8 +205,7 @@ def _happened(system, formulation, found):
 def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> Any:
     if found.times.ndim > 1:
         return eqx.filter_vmap(_evaluated)(system, formulation, found)
-    guards = contact_guards(system, formulation, found.touch)
-    assert guards is not None, "a system without contacts has no events"
+    guards = ContactGuards(system, formulation, ContactTolerance(found.touch))
     nq, nu = system.nq, system.nu
     # Behind the last event a state is needed that has no failure, nor its derivative.
     guess = system.guess

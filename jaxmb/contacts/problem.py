@@ -1,6 +1,6 @@
 """The laws of contacts and dry friction at a state, for impulses and for forces."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,23 +8,16 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..linalg.complementarity import (
-    Answers,
-    Dry,
-    frictional,
-    laws_of,
-    of_pairs,
-    placed_pairs,
-    positive_components,
-    slip_direction,
-    solved_components,
-)
+from ..linalg.complementarity import positive_components, solved_components
 from ..linalg.elimination import solve
+from ..linalg.pairs import sizes_of
 from ..linalg.rotations import norm
-from ..system.gaps import BEGUN, CLOSED, FORWARD, FREE, IMPLIED_STICK, STICK
+from ..parts.modes import Modes
+from ..system.contact_set import ContactSet
+from .dry_laws import Answers, Dry, laws_of
+from .friction import frictional
+from .tolerance import REST
 
-# Rates below this fraction of what adds up in them, and squares of gradients, are zero.
-REST = 1e-9
 # Friction that sticks slips from this fraction below its limit on: an event at which it still held would be followed by
 # the same one at once.
 _REACHED = 1e-7
@@ -52,66 +45,42 @@ class Problem(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The laws of `n` contacts and `m` dry `frictions` at a state, with the `influence` of their forces, and
-    `_coefficients`.
+    """The laws of some `contacts` and their dry friction at a state, with the `influence` of their forces, and the
+    coefficients of slip and stick, as multiples of these.
     """
 
     influence: Float[Array, "n_m n_m"]
-    frictions: Any
-    n: int
-    m: int
+    contacts: ContactSet
     coefficient: Float[Array, "m"]
     limit: Float[Array, "m"]
 
-    def of_modes(self, modes, rates) -> Answers:
+    def of_modes(self, modes: Modes, rates: Float[Array, "n_m"]) -> Answers:
         """Which laws hold in some modes, and at some rates of gaps and slips."""
-        dry, slip = modes[self.n :], rates[self.n :]
-        slips = jnp.where(jnp.abs(dry) == FORWARD, dry, FREE)
-        if self.pairs:
-            own = of_pairs(self.pairs)
-            slips = placed_pairs(self.pairs, jax.vmap(slip_direction)(dry[own], slip[own]), slips)
-        return Answers(modes[: self.n] == CLOSED, dry == STICK, slips, jnp.array(True), dry == IMPLIED_STICK)
-
-    @property
-    def pairs(self) -> tuple[int, ...]:
-        """The numbers of the first directions of those friction that has two."""
-        return self.frictions.pairs if self.m else ()
+        slips = modes.slips(rates[self.contacts.n :])
+        return Answers(modes.closed, modes.sticks, slips, jnp.array(True), modes.implied_stick)
 
     def sizes(self, values):
         """The sizes of what friction in one direction has, and of both where it has two."""
-        return sizes_of(self.pairs, values)
-
-    @property
-    def are_pairs(self) -> np.ndarray:
-        """Which laws are of friction in two directions."""
-        return np.isin(np.arange(self.m), of_pairs(self.pairs))
-
-    def begun(self, ended):
-        """The length of the modes of slip, which begins where it had ended."""
-        return jnp.where(self.are_pairs & ended, BEGUN, 1.0)
-
-    @property
-    def of_joints(self) -> np.ndarray:
-        """Which friction is that of a joint, whose normal force is the size of its reaction."""
-        return np.array(self.frictions.contacts if self.m else (), int) < 0
+        return sizes_of(self.contacts.pairs, values)
 
     def of_impulses(self, approach, touching, reactions) -> Problem:
         """The impulses of contacts that are `touching`; `approach`: the rates before it, with those of restitution.
 
-        Friction in joints has no impulse.
+        Friction in joints has no impulse, and asks for no `reactions`, which are zeros of their shape.
         """
-        none, may = jnp.zeros(self.m, approach.dtype), self._may(touching) & ~self.of_joints
+        reactions = jax.tree.map(jnp.zeros_like, reactions)
+        none, may = jnp.zeros(self.contacts.m, approach.dtype), self._may(touching) & ~self.contacts.in_joints
         return Problem(approach, jnp.concatenate([touching, may]), self.coefficient, none, none, reactions)
 
     def of_expansion(self, free, again, touching, reactions) -> Problem:
         """The impulses in an expansion, those of contacts besides what they push `again` at least; `free`: the rates at
         the end of compression.
         """
-        bound = jnp.zeros(self.m, free.dtype)
-        if self.m:
-            pushes = jnp.where(self.of_joints, 0.0, again[np.array(self.frictions.contacts)])
+        bound = jnp.zeros(self.contacts.m, free.dtype)
+        if self.contacts.m:
+            pushes = jnp.where(self.contacts.in_joints, 0.0, again[np.array(self.contacts.contact_of)])
             bound = self.coefficient * pushes
-        problem = self.of_impulses(free + self.influence[:, : self.n] @ again, touching, reactions)
+        problem = self.of_impulses(free + self.influence[:, : self.contacts.n] @ again, touching, reactions)
         return problem._replace(bound=bound)
 
     def of_forces(self, opening, reactions, staying, slips, modes, forces) -> Problem:
@@ -120,19 +89,19 @@ class Laws(NamedTuple):
         joints depend.
         """
         # Friction that has just reached its limit is beyond it, up to what the search for the laws that hold resolves.
-        limit = self.limit * jnp.where(modes[self.n :] == STICK, 1 - _REACHED, 1 + _HELD)
+        limit = self.limit * jnp.where(modes.sticks, 1 - _REACHED, 1 + _HELD)
         coefficient = jnp.where(self.sizes(slips) == 0, limit, self.coefficient)
-        bounds = jnp.zeros(self.m, opening.dtype)
+        bounds = jnp.zeros(self.contacts.m, opening.dtype)
         if reactions is not None:
             normal = norm(reactions[0] + jnp.tensordot(forces, reactions[1:], 1))
-            bounds = jnp.where(self.of_joints, coefficient * normal, 0.0)
+            bounds = jnp.where(self.contacts.in_joints, coefficient * normal, 0.0)
         among = jnp.concatenate([staying, self._may(staying)])
         return Problem(opening, among, coefficient, slips, bounds, reactions)
 
     def answers(self, problem: Problem) -> Answers:
         """Which laws hold."""
         free, among = problem.free, problem.among
-        if self.m:
+        if self.contacts.m:
             dry = self._dry(problem.coefficient, problem.slips, problem.bound)
             return frictional(self.influence, free, dry, among)
         both, none = among[:, None] & among[None, :], free[:0]
@@ -143,17 +112,17 @@ class Laws(NamedTuple):
     def solved(self, problem: Problem, answers: Answers):
         """The impulses or forces of laws that hold."""
         free, reactions = problem.free, problem.reactions
-        if not self.m:
+        if not self.contacts.m:
             return solved_components(self.influence, free, answers.closed)
-        none = jnp.zeros(self.m, free.dtype)
+        none = jnp.zeros(self.contacts.m, free.dtype)
         # The normal forces of joints are found below.
-        bound = jnp.where(self.of_joints, 0.0, problem.bound)
+        bound = jnp.where(self.contacts.in_joints, 0.0, problem.bound)
         matrix, right = laws_of(self.influence, free, self._dry(self.coefficient, none, bound), answers)
         # Others are zero to all digits.
         act = jnp.concatenate([answers.closed, answers.sticks | (answers.slips != 0)])
         if reactions is None:
             return jnp.where(act, solve(matrix, right), 0.0)
-        factor = jnp.where(self.of_joints & ~answers.sticks, self.coefficient * answers.slips, 0.0)
+        factor = jnp.where(self.contacts.in_joints & ~answers.sticks, self.coefficient * answers.slips, 0.0)
 
         def correct(_, forces):
             # Newton's method: the size of a reaction is not linear.
@@ -161,20 +130,20 @@ class Laws(NamedTuple):
             normal = norm(reaction)
             along = reaction / jnp.where(normal > 0, normal, 1.0)[:, None]
             slope = jnp.einsum("kmd,md->mk", reactions[1:], along)
-            own = matrix + jnp.pad(factor[:, None] * slope, ((self.n, 0), (0, 0)))
-            return solve(own, right + jnp.pad(factor * (slope @ forces - normal), (self.n, 0)))
+            coupled = matrix + jnp.pad(factor[:, None] * slope, ((self.contacts.n, 0), (0, 0)))
+            return solve(coupled, right + jnp.pad(factor * (slope @ forces - normal), (self.contacts.n, 0)))
 
         linear = solve(matrix, right)
         return jnp.where(act, lax.fori_loop(0, _CORRECTIONS, correct, linear), 0.0)
 
     def _may(self, staying):
         """Which friction may have a force."""
-        if not self.m:
+        if not self.contacts.m:
             return jnp.zeros(0, bool)
-        return jnp.stack([staying[k] if k >= 0 else jnp.array(True) for k in self.frictions.contacts])
+        return jnp.stack([staying[k] if k >= 0 else jnp.array(True) for k in self.contacts.contact_of])
 
     def _dry(self, coefficient, slips, bound) -> Dry:
-        return Dry(self.frictions.contacts, self.pairs, coefficient, slips, bound)
+        return Dry(self.contacts.contact_of, self.contacts.pairs, coefficient, slips, bound)
 
 
 def is_implied(influence, closed):
@@ -186,11 +155,3 @@ def is_implied(influence, closed):
     matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))
     left = influence - columns.T @ solve(matrix, columns)
     return jnp.diag(left) <= REST * jnp.diag(influence)
-
-
-def sizes_of(pairs: tuple[int, ...], values: Float[Array, "m"]) -> Float[Array, "m"]:
-    """The sizes of what friction in one direction has, and of both where it has two."""
-    if not pairs:
-        return jnp.abs(values)
-    size = norm(values[of_pairs(pairs)])
-    return placed_pairs(pairs, jnp.stack([size, size], axis=1), jnp.abs(values))

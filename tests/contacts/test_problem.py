@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmb.linalg.complementarity import Dry
-from jaxmb.manifold.contact_laws import Laws
-from jaxmb.system.gaps import FREE, STICK
+from jaxmb.contacts.problem import Laws
+from jaxmb.parts.modes import FREE, STICK
+from jaxmb.system.contact_set import ContactSet
 
 NORMAL, COEFFICIENT = 10.0, 0.3
 
@@ -21,11 +21,11 @@ def found():
     @jax.jit
     def answers(mode, load):
         one, none = jnp.ones(1), jnp.zeros(0)
-        joint = Dry((-1,), (), COEFFICIENT * one, 0 * one, 0 * one)
-        laws = Laws(jnp.eye(1), joint, 0, 1, COEFFICIENT * one, COEFFICIENT * one)
+        joint = ContactSet(names=("rub",), rows=(0,), places=(0,), contact_of=(-1,), releases=(False,))
+        laws = Laws(jnp.eye(1), joint, COEFFICIENT * one, COEFFICIENT * one)
         reactions = jnp.array([[[0.0, NORMAL]], [[0.0, 0.0]]])
         opening = load * COEFFICIENT * NORMAL * one
-        return laws.answers(laws.of_forces(opening, reactions, none > 0, 0 * one, mode * one, 0 * one))
+        return laws.answers(laws.of_forces(opening, reactions, none > 0, 0 * one, joint.as_modes(mode * one), 0 * one))
 
     return answers
 

@@ -6,67 +6,48 @@ import numpy as np
 
 from ..formulations import Multipliers, accelerations
 from ..linalg.elimination import solve
+from ..linalg.pairs import sizes_of
 from ..linalg.rotations import norm
-from ..linalg.sums import unchecked_take
-from ..system.gaps import (
-    STICK,
-    bound,
-    contacts_of,
-    counts,
-    direction_gradients,
-    direction_rows,
-    frictions_of,
-    modes_of,
-    with_modes,
-)
-from .contact_laws import sizes_of
 
-# Slip in two directions, which has none at rest, ends at this multiple of it per second: errors of integration, that
-# are larger than it, turn slower ones.
-_SLOW = 1e4
 # Forces of several contacts that stick are as small as they can be up to this fraction of them.
 _YIELD = 1e-10
 
 
 def largest_force(system, t, y, multipliers):
-    """What forces are compared with."""
+    """The size that forces are compared with."""
     largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, y.q, y.u)))
     return largest + jnp.finfo(largest.dtype).tiny
 
 
-def stick_reserve(system, t, q, u, multipliers):
-    """By how much the forces [N] of friction that sticks are within their limits."""
-    frictions = frictions_of(system)
-    normal = norm(system.friction_reactions(t, q, u, multipliers))
-    forces = unchecked_take(multipliers, np.array(frictions.rows))
-    if len(frictions.pairs) > 1:
+def reserves(system, t, q, u, multipliers):
+    """The forces [N] of contacts, and by how much those of friction that sticks are within their limits."""
+    contacts = system.contacts
+    forces, n = contacts.at_rows(multipliers), contacts.n
+    if not contacts.m:
+        return forces
+    normal, dry = norm(system.friction_reactions(t, q, u, multipliers)), forces[n:]
+    if len(contacts.pairs) > 1:
         # Those that are not determined are as small as they can be.
-        n = counts(system)[0]
-        stick = modes_of(system, q)[n:] >= STICK
-        gradients = jnp.where(stick[:, None], direction_gradients(system, t, q, u)[n:], 0.0)
+        stick = contacts.modes(q).held
+        gradients = jnp.where(stick[:, None], contacts.gradients(system, t, q, u)[n:], 0.0)
         gram = gradients @ gradients.T
         size = _YIELD * jnp.max(jnp.diag(gram)) + jnp.finfo(gram.dtype).tiny
-        shared = solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ forces)
-        forces = jnp.where(stick, shared, forces)
-    return frictions.limit * normal - sizes_of(frictions.pairs, forces)
+        shared = solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ dry)
+        dry = jnp.where(stick, shared, dry)
+    return jnp.concatenate([forces[:n], system.contact_numbers.limit * normal - sizes_of(contacts.pairs, dry)])
 
 
 def friction_coefficients(system, t, q, u):
     """Coefficients of friction and limits of stick, as multiples of the force along the gap of a contact, which is the
     normal force where the gap grows by one metre a metre.
     """
-    frictions, contacts = frictions_of(system), contacts_of(system)
-    unit = np.isin(np.arange(system.acceleration_rows), contacts.rows).astype(q.dtype)
-    if min(frictions.contacts) < 0 and not contacts.rows:
-        return frictions.coefficient, frictions.limit
-    sizes = norm(system.friction_reactions(t, bound(system, q), u, jnp.asarray(unit)))
-    sizes = jnp.where(np.array(frictions.contacts) < 0, 1.0, sizes)
-    return frictions.coefficient * sizes, frictions.limit * sizes
-
-
-def slow_slip(system, touch, u):
-    """The velocity [m/s] up to which slip in two directions has ended; `touch` [m, rad]."""
-    return _SLOW * touch * (1 + jnp.max(jnp.abs(u) / system.velocity_scale()))
+    contacts, numbers = system.contacts, system.contact_numbers
+    if contacts.in_joints.all():
+        return numbers.coefficient, numbers.limit
+    unit = np.isin(np.arange(system.acceleration_rows), contacts.rows[: contacts.n]).astype(q.dtype)
+    sizes = norm(system.friction_reactions(t, contacts.bound(q), u, jnp.asarray(unit)))
+    sizes = jnp.where(contacts.in_joints, 1.0, sizes)
+    return numbers.coefficient * sizes, numbers.limit * sizes
 
 
 def contact_forces(system, t, q, u):
@@ -82,8 +63,8 @@ def directions(system, t, q, u):
     """The rows of A of contacts that are closed, and of friction that sticks; A with the other rows that bind
     velocities, which are selected.
     """
-    numbers = direction_rows(system)
-    jacobian = system.structured_jacobian(t, bound(system, q), u)
+    numbers = system.contacts.rows
+    jacobian = system.structured_jacobian(t, system.contacts.bound(q), u)
     unit = np.eye(system.acceleration_rows)[list(numbers)]
     rows = jax.vmap(jacobian.transpose_product)(jnp.asarray(unit, q.dtype))
     others = tuple(k for k in range(system.velocity_rows) if k not in numbers)
@@ -96,10 +77,11 @@ def free_accelerations(system, formulation, projector, t, q, u):
 
     **Arguments:** the `projector` on the other constraints.
     """
-    residual = system.acceleration_residual(t, bound(system, q), u, jnp.zeros_like(u))
+    contacts = system.contacts
+    residual = system.acceleration_residual(t, contacts.bound(q), u, jnp.zeros_like(u))
     if system.ideal_without_friction:
         udot, multipliers = projector.solve(system.force(t, q, u), -residual)
     else:
-        udot, multipliers = accelerations(system, formulation, t, with_modes(system, q, 0.0), u)
+        udot, multipliers = accelerations(system, formulation, t, contacts.with_modes(q, 0.0), u)
     along = projector.jacobian.product(udot) + residual
-    return udot, multipliers, along[np.array(direction_rows(system))]
+    return udot, multipliers, contacts.at_rows(along)

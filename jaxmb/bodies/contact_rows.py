@@ -1,0 +1,46 @@
+"""Where the rows and the modes of contacts and dry friction are among those of a scene."""
+
+from collections.abc import Sequence
+
+from ..parts.unilateral import AbstractUnilateralConstraint
+from ..system.contact_set import ContactSet
+from .groups import AbstractConstraintGroup, ConstraintGroup, VelocityConstraintGroup
+
+
+def contact_set(
+    constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[VelocityConstraintGroup]
+) -> ContactSet:
+    """The contacts and the dry friction among all groups of constraints on positions, and on velocities."""
+    contacts = [g for g in constraints if isinstance(g.group.part, AbstractUnilateralConstraint)]
+    frictions = [g for g in velocity_constraints if g.joints]
+    if not contacts and not frictions:
+        return ContactSet()
+    first_row, rows = {}, 0
+    for g in (*constraints, *velocity_constraints):
+        first_row[id(g)] = rows
+        rows += _count(g)
+    names = [name for g in contacts for name in g.group.names]
+    contact_of, pairs = [], []
+    for g in frictions:
+        pairs += range(len(contact_of), len(contact_of) + _count(g), 2) if g.rows == 2 else ()
+        contact_of += [names.index(name) if name in names else -1 for name in g.joints for _ in range(g.rows)]
+    laws = (*contacts, *frictions)
+    return ContactSet(
+        names=tuple(name for g in laws for name in g.group.names for _ in range(g.rows)),
+        rows=tuple(first_row[id(g)] + k for g in laws for k in range(_count(g))),
+        places=tuple(place for g in laws for place in _places(g)),
+        by_poisson=tuple(g.group.part.impact_law == "poisson" for g in contacts for _ in g.group.names),
+        contact_of=tuple(contact_of),
+        releases=tuple(g.group.part.static_coefficient is not None for g in frictions for _ in range(_count(g))),
+        pairs=tuple(pairs),
+    )
+
+
+def _count(group: AbstractConstraintGroup) -> int:
+    return len(group.group.names) * group.rows
+
+
+def _places(group: AbstractConstraintGroup) -> list[int]:
+    """Where the modes of stacked parts are in q: each part has one for each of its rows, behind its bodies."""
+    modes = group.group.body_index[:, -group.rows :].reshape(-1)
+    return group.group.layout.pose_index[modes, 0].tolist()

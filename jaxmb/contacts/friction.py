@@ -1,0 +1,227 @@
+"""Which contacts are closed, and which dry friction sticks or slips, also in two directions, in which the force is in a
+circular cone.
+
+Source, for the direction of slip: P. Alart and A. Curnier, "A mixed formulation for frictional contact problems prone
+to Newton like solution methods", Computer Methods in Applied Mechanics and Engineering 92, 1991.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..linalg.complementarity import independent_components
+from ..linalg.elimination import solve
+from ..linalg.pairs import for_both, of_pairs, placed_pairs
+from ..linalg.rotations import norm
+from .dry_laws import Answers, Dry, in_lines, laws_of
+
+# Directions of slip are found when they change by less than this, in this many rounds at most, each with this many
+# steps of Newton's method.
+_TURN, _TURNS, _CORRECTIONS = 1e-7, 60, 2
+# The least limit of a force across its direction, as a fraction of that along it.
+_ACROSS = 0.01
+# Where a force of friction in two directions has not the direction of slip, up to this fraction, there is no solution.
+_ASIDE = 1e-8
+# Several contacts that stick share forces that are not determined as if they yielded by this fraction of `W`.
+_YIELD = 1e-8
+
+
+def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, among: Bool[Array, "n_m"]) -> Answers:
+    """Which of some contacts with dry friction are closed, stick and slip; without derivative.
+
+    **Arguments:** `W x + b`: accelerations or velocities along the normals and the slips, with their forces or
+    impulses x; `among`: those that may have a force.
+    """
+    W, b, among, *numbers = lax.stop_gradient((W, b, among, *dry[2:]))
+    dry = Dry(dry.contact_of, dry.pairs, *numbers)
+    return SlipSearch.of(W, b, dry, among).answers() if dry.pairs else in_lines(W, b, dry, among)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SlipSearch:
+    """The search for the directions of slip of friction in two directions.
+
+    In each round the first law of a pair acts along a direction, the second one across it. Where the direction is
+    found, the force of the second law is zero. Directions `e` are unit vectors, shape (pairs, 2).
+
+    **Fields:** the matrix of the problem, `rigid`, and one with which several contacts that stick yield, `W`; `b`,
+    `dry` and `among` as in `frictional`, where the second law of a pair is among them only if its direction `may` be
+    any; pairs whose contact `touches`; `step`, the inverse of the largest change of a slip by its force; in `turns` the
+    two matrices by which a pair is turned, times the components of its direction.
+    """
+
+    rigid: Float[Array, "n_m n_m"]
+    W: Float[Array, "n_m n_m"]
+    b: Float[Array, "n_m"]
+    dry: Dry
+    among: Bool[Array, "n_m"]
+    touches: Bool[Array, "pairs"]
+    may: Bool[Array, "pairs"]
+    step: Float[Array, "pairs"]
+    turns: Float[np.ndarray, "pairs 2 n_m n_m"]
+
+    @classmethod
+    def of(cls, W, b, dry: Dry, among) -> "SlipSearch":
+        pairs, laws = of_pairs(dry.pairs), np.arange(b.size)
+        n = b.size - len(dry.contact_of)
+        both = n + pairs
+        touches = among[both[:, 0]]
+        may = touches & (dry.slips[pairs] == 0).all(1)
+        of_pair = placed_pairs(dry.pairs, jnp.stack([touches, may], axis=1), among[n:])
+        rigid = W
+        if len(pairs) > 1:
+            W = W + _YIELD * jnp.max(jnp.diag(W)) * jnp.diag(np.isin(laws, both).astype(W.dtype))
+        step = 1 / (W[both[:, 0], both[:, 0]] + W[both[:, 1], both[:, 1]])
+        turns = np.zeros((len(pairs), 2, b.size, b.size), W.dtype)
+        for turn, (i, j) in zip(turns, both, strict=True):
+            turn[0, [i, j], [i, j]], turn[1, [i, j], [j, i]] = 1, (1, -1)
+        return cls(rigid, W, b, dry, jnp.concatenate([among[:n], of_pair]), touches, may, step, turns)
+
+    @property
+    def n(self) -> int:
+        """The number of contacts."""
+        return self.b.size - len(self.dry.contact_of)
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "pairs 2"]:
+        return of_pairs(self.dry.pairs)
+
+    @property
+    def both(self) -> Int[np.ndarray, "pairs 2"]:
+        """The numbers of the laws of each pair, among all."""
+        return self.n + self.pairs
+
+    @property
+    def contact(self) -> Int[np.ndarray, "pairs"]:
+        return np.array(self.dry.contact_of)[self.pairs[:, 0]]
+
+    @property
+    def known(self) -> Float[Array, "pairs 2"]:
+        """The directions of slip that are given."""
+        return self.dry.slips[self.pairs]
+
+    def answers(self) -> Answers:
+        """The laws that hold."""
+        start, m = self.start(), len(self.dry.contact_of)
+        nothing = jnp.zeros(m, self.b.dtype)
+        none = Answers(jnp.zeros(self.n, bool), nothing > 0, nothing, jnp.array(True), nothing > 0)
+        first = start, none, jnp.zeros_like(self.b), jnp.array(jnp.inf, self.b.dtype), jnp.array(0)
+        goes_on = lambda carry: (carry[3] > _TURN) & (carry[4] < _TURNS)
+        _, answers, x, turned, _ = lax.while_loop(goes_on, self.advance, first)
+        found, slides = self.with_slips(answers, self.direction(start, x))
+        if len(self.pairs) > 1:
+            found = with_implied(self.rigid, found)
+        solvable = found.solvable & (turned <= _TURN) & ~jnp.any(slides & self.misses(found, x))
+        return found._replace(solvable=solvable & jnp.all(jnp.isfinite(x)))
+
+    def start(self) -> Float[Array, "pairs 2"]:
+        """The directions that are given, and of others those in which slip goes without forces."""
+        e = jnp.where(self.may[:, None], self.b[self.both], self.known)
+        size = norm(e)[:, None]
+        return jnp.where(size > 0, e / jnp.where(size > 0, size, 1.0), jnp.array([1.0, 0.0], self.b.dtype))
+
+    def advance(self, carry):
+        """One round: the laws that hold along the directions and across them, and Newton's method for both."""
+        e, _, _, _, count = carry
+        # The force across is less and less, so that the square of both is near the circle.
+        answers, *straight = self.in_lines(e, jnp.maximum(0.5**count, _ACROSS))
+
+        def correct(k, found):
+            last = self.direction(*found)
+            e = jnp.where(k == 0, found[0], last)
+            newton = self.corrected(answers, e, found[1])
+            matrix, right = (jnp.where(k == 0, first, other) for first, other in zip(straight, newton, strict=True))
+            return e, solve(matrix, right)
+
+        _, x = lax.fori_loop(0, 1 + _CORRECTIONS, correct, (e, jnp.zeros_like(self.b)))
+        new = self.direction(e, x)
+        # Directions between which the method goes to and fro are halved.
+        between = e + new
+        size = norm(between)
+        halved = (count % 4 == 3) & (size > 0.1)
+        turned = jnp.max(jnp.abs(new - e))
+        new = jnp.where(halved[:, None], between / jnp.where(size > 0, size, 1.0)[:, None], new)
+        return new, answers, x, turned, count + 1
+
+    def in_lines(self, e, across):
+        """The answers where pairs act along directions and across them, where the force has `across` times the limit
+        that it has along; and the equations for the forces.
+        """
+        n, m, dry = self.n, len(self.dry.contact_of), self.dry
+        others = np.diag(~np.isin(np.arange(n + m), self.both)).astype(self.W.dtype)
+        turn = jnp.tensordot(e, self.turns, 2) + others
+        matrix, right = turn @ self.W @ turn.T, turn @ self.b
+        share = jnp.where(np.isin(np.arange(m), self.pairs[:, 1]), across, 1.0)
+        slips = turn[n:, n:] @ dry.slips
+        laws = dry._replace(slips=slips, coefficient=dry.coefficient * share, bound=dry.bound * share)
+        answers = in_lines(matrix, right, laws, self.among)
+        matrix, right = laws_of(matrix, right, laws, answers)
+        return answers, matrix @ turn, right
+
+    def direction(self, e, x):
+        """Where slip goes if the force is the nearest one in the cone to what would end it."""
+        ahead = self.step[:, None] * (self.W @ x + self.b)[self.both] - x[self.both]
+        size = norm(ahead)
+        return jnp.where((self.may & (size > 0))[:, None], ahead / jnp.where(size > 0, size, 1.0)[:, None], e)
+
+    def with_slips(self, answers: Answers, e) -> tuple[Answers, Bool[Array, "pairs"]]:
+        """The answers with the laws of stick and slip of pairs, and which pairs slide in directions to be found."""
+        pairs, dry = self.pairs, self.dry
+        # The last entry is that of friction without a contact.
+        sticks, closed = answers.sticks[pairs].all(1), jnp.concatenate([answers.closed, jnp.ones(1, bool)])
+        pressed = closed[self.contact] | (dry.bound[pairs[:, 0]] > 0)
+        slips = jnp.where(self.may[:, None], e, self.known)
+        slips = jnp.where((self.touches & pressed & ~sticks)[:, None], slips, 0.0)
+        slips = placed_pairs(dry.pairs, slips, answers.slips)
+        both_stick = for_both(dry.pairs, sticks, answers.sticks)
+        return answers._replace(sticks=both_stick, slips=slips), self.may & pressed & ~sticks
+
+    def corrected(self, answers: Answers, e, x):
+        """The equations of a step of Newton's method for the directions of slip and the forces."""
+        dry, both = self.dry, self.both
+        laws, slides = self.with_slips(answers, e)
+        matrix, right = laws_of(self.W, self.b, dry, laws)
+        # Along the direction the force is that of slip. Across, force and slip are zero together.
+        across = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
+        along = jnp.einsum("pi,pik->pk", e, matrix[both])
+        turned, asked = self.across(e, across, x)
+        rows = e[:, :, None] * along[:, None] + across[:, :, None] * turned[:, None]
+        asked = e * jnp.sum(e * right[both], axis=1)[:, None] + across * asked[:, None]
+        both_slide = for_both(dry.pairs, slides, jnp.zeros(len(dry.contact_of), bool))
+        are_slides = jnp.concatenate([jnp.zeros(self.n, bool), both_slide])
+        rows = placed_pairs(dry.pairs, rows, matrix[self.n :], first=self.n)
+        asked = placed_pairs(dry.pairs, asked, right[self.n :], first=self.n)
+        return jnp.where(are_slides[:, None], rows, matrix), jnp.where(are_slides, asked, right)
+
+    def across(self, e, across, x):
+        """The equations of forces and slips across the directions."""
+        first, both = self.pairs[:, 0], self.both
+        push = jnp.where(self.contact >= 0, jnp.maximum(x[self.contact], 0.0), 0.0)
+        load = self.dry.bound[first] + self.dry.coefficient[first] * push
+        speed = jnp.abs(jnp.sum(e * (self.W @ x + self.b)[both], axis=1))
+        size = load / self.step + speed + jnp.finfo(self.b.dtype).tiny
+        one = np.eye(self.b.size, dtype=self.b.dtype)
+        turned = (load / size)[:, None] * jnp.einsum("pi,pik->pk", across, self.W[both])
+        turned = turned + (speed / size)[:, None] * jnp.einsum("pi,pik->pk", across, one[both])
+        return turned, -load / size * jnp.sum(across * self.b[both], axis=1)
+
+    def misses(self, found: Answers, x) -> Bool[Array, "pairs"]:
+        """Pairs whose force has not the direction of slip, or is not against it."""
+        e, both = found.slips[self.pairs], self.both
+        rates = (self.W @ x + self.b)[both]
+        aside, back = jnp.abs(e[:, 0] * x[both[:, 1]] - e[:, 1] * x[both[:, 0]]), jnp.sum(e * rates, axis=1)
+        return (aside > _ASIDE * jnp.max(jnp.abs(x))) | (back < -_ASIDE * jnp.max(jnp.abs(self.b)))
+
+
+def with_implied(W: Float[Array, "n_m n_m"], answers: Answers) -> Answers:
+    """With as many laws of stick as are independent of each other and of the contacts."""
+    n, sticks = answers.closed.size, answers.sticks
+    closed = jnp.concatenate([answers.closed, jnp.zeros_like(sticks)])
+    columns = jnp.where(closed[:, None], W, 0.0)
+    matrix = jnp.where(closed[:, None] & closed[None, :], W, jnp.eye(W.shape[0], dtype=W.dtype))
+    left = (W - columns.T @ solve(matrix, columns))[n:, n:]
+    independent = independent_components(left, sticks)
+    return answers._replace(sticks=independent, implied=sticks & ~independent)

@@ -1,0 +1,131 @@
+"""When events of contacts and dry friction are: gaps, forces and slips that become zero along a motion."""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jax import lax
+
+from .._compat import cond_of_any_lane
+from .._types import Scalar, State
+from ..formulations import AbstractFormulation
+from ..linalg.pairs import for_first, of_pairs, placed_pairs
+from ..linalg.rotations import norm
+from ..parts.modes import BEGUN
+from ..solvers import AbstractGuards
+from ..system import AbstractEquation
+from .forces import contact_forces, largest_force, reserves
+from .impact import Impact, impact
+from .impacting import Event, find_event
+from .tolerance import REST, ContactTolerance
+
+# Slip in two directions that begins has the direction of its modes up to this multiple of what is slow.
+_SEEN = 4
+# Rates of gaps are zero below this many units in the last place of the largest velocity.
+_RATE = 64
+
+
+class ContactGuards(AbstractGuards):
+    """The gaps of open contacts, in units of the system's size, and the forces of closed ones, relative to the largest
+    forces; slips in units of the size per second, and what the forces of stick are below their limits.
+
+    A gap g with a kink at its peak p counts as g (1 - g / 2p), which is smooth and the same near zero.
+    """
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+    tolerance: ContactTolerance
+
+    @property
+    def touch(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.tolerance.touch
+
+    @property
+    def near(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.tolerance.near
+
+    def values(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        contacts, q = system.contacts, system.normalize(y.q)
+        t, modes = jnp.asarray(t, q.dtype), contacts.modes(q)
+        gap = contacts.gaps(system, t, q)
+        free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers.peaks), system.length)
+        acts = self.forces(y)
+        if contacts.m:
+            rates = contacts.rates(system, t, q, y.u)[contacts.n :]
+            slips = jnp.where(modes.slides, modes.of_friction * rates, system.length)
+            free = jnp.concatenate([free, self._in_plane(slips, modes, rates, y.u)])
+
+        def forces(_):
+            here = system.at(y)
+            _, multipliers = contact_forces(here, t, q, y.u)
+            largest = largest_force(here, t, dataclasses.replace(y, q=q), multipliers)
+            return reserves(here, t, q, y.u, multipliers) / largest
+
+        held = cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free)
+        return jnp.where(acts, held, free / system.length)
+
+    def _in_plane(self, slips, modes, rates, u):
+        """With the guards of slip in two directions: that it has not turned by more than 60 degrees from its modes, nor
+        is slow; where it has begun, that it is neither back at rest nor faster.
+        """
+        system, pairs = self.system, modes.pairs
+        if not pairs:
+            return slips
+        in_plane, rates = modes.in_plane, rates[of_pairs(pairs)]
+        slow, speed = self.tolerance.in_metres(system).slow(system, u), norm(rates)
+        along, begun, slides = jnp.sum(in_plane.modes * rates, axis=1), in_plane.begun, in_plane.slides
+        turned = jnp.where(begun, along / BEGUN, jnp.where(slides, along - 0.5 * speed, system.length))
+        fast = jnp.where(begun, _SEEN * slow - speed, jnp.where(slides, speed - slow, system.length))
+        return placed_pairs(pairs, jnp.stack([turned, fast], axis=1), slips)
+
+    def event(self, t: Scalar, y: State) -> Event:
+        """The numbers of the event at a state, without derivatives."""
+        return find_event(self.system.at(y), self.formulation, self.tolerance, t, y)
+
+    def impact(self, t: Scalar, y: State, dated: bool = False, found: Event | None = None) -> Impact:
+        """The event at a state; see `impact`."""
+        return impact(self.system.at(y), self.formulation, self.tolerance, t, y, dated, found)
+
+    def changed(self, before, after):
+        system, before, after = lax.stop_gradient((self.system, before, after))
+        kinds = lambda y: system.contacts.modes(system.normalize(y.q)).kinds
+        # Velocities change by rounding errors where impulses are none.
+        scale, change = system.velocity_scale(), jnp.abs(after.u - before.u)
+        sizes = jnp.abs(after.u) + jnp.abs(before.u)
+        least = REST * sizes + _RATE * jnp.finfo(sizes.dtype).eps * jnp.max(sizes / scale) * scale
+        return jnp.any(kinds(before) != kinds(after)) | ~jnp.all(change <= least)
+
+    def forces(self, y):
+        modes = self.system.contacts.modes(self.system.normalize(y.q))
+        return jnp.concatenate([modes.closed, modes.held])
+
+    def begins(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        contacts = system.contacts
+        if not contacts.m:
+            return None
+        q = system.normalize(y.q)
+        modes, rates = contacts.modes(q), contacts.rates(system, jnp.asarray(t, q.dtype), q, y.u)[contacts.n :]
+        begins = modes.slides & (modes.of_friction * rates <= self.touch * system.length)
+        if contacts.pairs:
+            begins = for_first(contacts.pairs, modes.in_plane.begun, begins)
+        return jnp.pad(begins, (contacts.n, 0))
+
+    def rates(self, t, y):
+        system, y = lax.stop_gradient((self.system, y))
+        contacts, q = system.contacts, system.normalize(y.q)
+        t = jnp.asarray(t, q.dtype)
+        slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers.peaks
+        rates = contacts.rates(system, t, q, y.u)[: contacts.n] * slopes / system.length
+        # Of bodies that move side by side rates are rounding errors, at which nothing closes.
+        least = _RATE * jnp.finfo(rates.dtype).eps * jnp.max(jnp.abs(y.u) / system.velocity_scale())
+        rates = jnp.where(jnp.abs(rates) > least, rates, 0.0)
+        rates = jnp.where(contacts.modes(q).open, rates, jnp.inf)
+        return jnp.pad(rates, (0, contacts.m), constant_values=jnp.inf)
+
+
+def contact_guards(
+    system: AbstractEquation, formulation: AbstractFormulation, tolerance: ContactTolerance | None
+) -> ContactGuards | None:
+    """The guards of a system's contacts; None without a tolerance, which a system without contacts has not."""
+    return None if tolerance is None else ContactGuards(system, formulation, tolerance)

@@ -1,0 +1,190 @@
+"""Impacts, loss of contact, stick and slip: the state after an event of contacts and dry friction.
+
+In an impact the impulses `Λ ≥ 0` of all contacts that touch change the velocities, `M (u⁺ − u⁻) = Aᵀ Λ`. By Newton's
+law a gap that closed at a rate v opens at least at `restitution` times v; where it opens faster its impulse is zero. By
+Poisson's law an impact has two phases: at the end of compression no gap closes any more, and in the expansion each
+contact pushes `restitution` times as much again, or more where its gap would close. With friction Λ is that along slips
+as well, in each phase at most `coefficient` times that of the contact, and against the slip that remains at its end.
+Contacts that do not open then stay closed where their forces push: `λ ≥ 0`, the second derivative of the gap `≥ 0`, and
+one of them zero; friction where slip has ended sticks as long as its force is within its limit. These are linear
+complementarity problems, over the constraints that are always there.
+
+Sources: J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", in: Nonsmooth Mechanics and
+Applications, Springer, 1988; Ch. Glocker, "Set-Valued Force Laws", Springer, 2001; for Poisson's law F. Pfeiffer and
+Ch. Glocker, "Multibody Dynamics with Unilateral Contacts", Wiley, 1996, chapter 8. The derivative of the state after an
+event by that before it is the saltation matrix: P. C. Müller, "Calculation of Lyapunov exponents for dynamic systems
+with discontinuities", Chaos, Solitons & Fractals 5, 1995.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._types import Scalar, State
+from ..formulations import AbstractFormulation
+from ..linalg.pairs import of_pairs
+from ..linalg.pushed import dense, push
+from ..linalg.sums import with_entries
+from ..system import AbstractEquation
+from .forces import contact_forces, largest_force, reserves
+from .impacting import Event, find_event
+from .phases import Phases
+from .tolerance import ContactTolerance
+
+NO_SECOND_DERIVATIVES = (
+    "Second derivatives through impacts are not supported: their times and states have first derivatives only."
+)
+
+# An event is found to this fraction of its time, and more exactly.
+_AT_ONCE = 1e-10
+
+
+class Impact(NamedTuple):
+    """An event of contacts.
+
+    Where contacts and friction are listed together, contacts come first.
+
+    **Fields:** the state `after` it, at the time that was asked for; the event is `late` after that; `impulses` of
+    contacts and friction; `modes` before and after it; `rest`: the time from the event until the last of infinitely
+    many bounces that are left out, zero for contacts without any; the `energy` lost; whether it is `solvable`.
+    """
+
+    after: State
+    late: Float[Array, ""]
+    impulses: Float[Array, "laws"]
+    modes: tuple[Float[Array, "laws"], Float[Array, "laws"]]
+    rest: Float[Array, "contacts"]
+    energy: Float[Array, ""]
+    solvable: Bool[Array, ""]
+
+
+@eqx.filter_jit
+def impact(
+    system: AbstractEquation,
+    formulation: AbstractFormulation,
+    tolerance: ContactTolerance,
+    t: Scalar,
+    y: State,
+    dated: bool = False,
+    found: Event | None = None,
+) -> Impact:
+    """The event of contacts that are about to close, or to open, at a state.
+
+    The first gap that closes is zero later by a small time τ. The state moves on by τ, changes, and moves back by τ
+    with the new equations. So the state after it is right to the second power of τ, and the derivative is that of a
+    motion whose event time depends on the state. `late`, `impulses` and the `energy` have derivatives as well, `rest`
+    has none. There is no second derivative.
+
+    **Arguments:** `system`: with the internal states of `y`; `dated`: whether `late` has its derivative also where the
+    state after the event does not depend on it, as where a contact opens; `found`: the event, where it is known.
+    """
+    t, touch = jnp.asarray(t, y.q.dtype), jnp.asarray(tolerance.touch, y.q.dtype)
+    found = find_event(system, formulation, tolerance, t, y) if found is None else found
+    after, event = _impact(system, t, y, found, ContactTolerance(touch), dated)
+    old, new = (system.contacts.as_modes(numbers).kinds for numbers in event.modes)
+    return Impact(after, event.late, event.impulses, (old, new), event.rest, event.energy, event.solvable)
+
+
+@eqx.filter_custom_jvp
+def _impact(system, t, y, event, tolerance, dated):
+    del tolerance, dated
+    q = system.contacts.with_modes(y.q, event.modes[1])
+    # The state moves on before the event, and back after it, each at the mean velocity.
+    before = system.rates(t, y.q, event.at - 0.5 * event.late * event.before)
+    after = system.rates(t, q, event.u - 0.5 * event.late * event.after)
+    z = y.z
+    if z is not None:
+        z = z + event.late * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
+    # Without a solution the motion ends here, at infinite velocities; they are not a number where forces are none.
+    nowhere = jnp.where(jnp.all(jnp.isfinite(event.before)), jnp.inf, jnp.nan)
+    u = jnp.where(event.solvable, event.u - event.late * event.after, nowhere)
+    return State(q + event.late * (before - after), u, z), event
+
+
+@_impact.def_jvp
+def _impact_jvp(primals, tangents):
+    system, t, y, _, tolerance, dated = primals
+    dsystem, dt, dy, *_ = tangents
+    after, event = _impact(*primals)
+    system, t, y, event = _without_second_derivative((system, t, y, event))
+    contacts = system.contacts
+    dq, du, dt = dense(dy.q, y.q), dense(dy.u, y.u), dense(dt, t)
+
+    # The time of the event changes, and so do time and state there, with the equations before it.
+    dlate = _later(event, (system, t, y.q, y.u), (dsystem, dt, dq, du))
+    if dated or any(contacts.releases):
+        dlate = dlate + _release(system, tolerance, event, (t, y), (dsystem, dt, dy))
+    q = contacts.with_modes(y.q, event.modes[1])
+    rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
+    dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
+
+    impulses, change = Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du).changes()
+    at, along = (system, t, y.q), (dsystem, dt, dq)
+    kinetic = lambda system, t, q, u: 0.5 * jnp.dot(u, system.inertia(t, q, u).product(u))
+    energy = push(kinetic, (*at, event.at), (*along, du)) - push(kinetic, (*at, event.u), (*along, change))
+    dq, du = dq - dlate * rates[1], change - dlate * event.after
+    dq = jnp.where(np.isin(np.arange(system.nq), contacts.places), 0.0, dq)
+    dz = None
+    if y.z is not None:
+        jump = system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u)
+        dz = dense(dy.z, y.z) + dlate * jump
+    devent = jax.tree.map(lambda _: None, event)._replace(late=dlate, impulses=impulses, energy=energy)
+    return (after, event), (State(dq, du, dz), devent)
+
+
+def _later(event: Event, at, along):
+    """The derivative of the time at which a gap, or a slip, is zero."""
+    (system, t, q, _), contacts = at, at[0].contacts
+    zero, rate = push(contacts.gaps, at[:3], along[:3]), contacts.rates(system, t, q, event.at)
+    if contacts.m:
+        slip = push(contacts.rates, at, along)[contacts.n :]
+        slowing = contacts.accelerations(system, t, q, event.at, event.before)[contacts.n :]
+        both = of_pairs(contacts.pairs)
+        if both.size:
+            # Slip in two directions ends where it is zero along its modes.
+            modes = contacts.as_modes(event.modes[0]).of_friction[both]
+            slip = with_entries(slip, both[:, 0], jnp.sum(modes * slip[both], axis=1))
+            slowing = with_entries(slowing, both[:, 0], jnp.sum(modes * slowing[both], axis=1))
+        zero, rate = jnp.concatenate([zero, slip]), jnp.concatenate([rate[: contacts.n], slowing])
+    return jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
+
+
+def _release(system, tolerance, event, at, along):
+    """The derivative of the time at which a force reaches its limit: that of a contact that opens, which is zero, or of
+    friction that sticks, where slip begins at the event.
+    """
+    (t, y), (dsystem, dt, dy) = at, along
+    before, after = map(system.contacts.as_modes, event.modes)
+    released = jnp.concatenate([before.closed & after.open, before.sticks & ~after.sticks])
+
+    def reserve(system, t, y):
+        """By how much the forces are within their limits, and what they are compared with."""
+        _, multipliers = contact_forces(system, t, y.q, y.u)
+        return reserves(system, t, y.q, y.u, multipliers), largest_force(system, t, y, multipliers)
+
+    left, largest = reserve(system, t, y)
+    k = jnp.argmin(jnp.where(released, jnp.abs(left), jnp.inf))
+    least = lambda system, t, y: reserve(system, t, y)[0][k]
+    z = None if y.z is None else system.state_rates(t, y.q, y.u)
+    motion = State(system.rates(t, y.q, y.u), event.before, z)
+    value = push(least, (system, t, y), (dsystem, dt, dy))
+    rate = eqx.filter_jvp(lambda t, y: least(system, t, y), (t, y), (jnp.ones_like(t), motion))[1]
+    # What an impact opens, or sets in motion, is not at its limit before. Where forces balance there may be none to
+    # compare with: then the time to the limit is, with the time itself.
+    is_zero = jnp.abs(left[k]) <= jnp.maximum(tolerance.near * largest, _AT_ONCE * jnp.abs(rate * t))
+    at_limit = jnp.any(released) & ~event.hits & is_zero & (rate < 0)
+    return jnp.where(at_limit, -value / jnp.where(at_limit, rate, 1.0), 0.0)
+
+
+@eqx.filter_custom_jvp
+def _without_second_derivative(x):
+    return x
+
+
+@_without_second_derivative.def_jvp
+def _without_jvp(primals, tangents):
+    raise ValueError(NO_SECOND_DERIVATIVES)

@@ -1,0 +1,529 @@
+"""An event of contacts and dry friction at a state: its time, impulses, forces, and what holds after it."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..formulations import AbstractFormulation
+from ..linalg.arrays import add_up
+from ..linalg.complementarity import independent_components, solved_components
+from ..linalg.inertia import AbstractInertia
+from ..linalg.pairs import for_first, of_pairs
+from ..linalg.rotations import norm
+from ..parts.modes import Modes, modes_of_contacts, modes_of_friction
+from ..solvers.events import Bracket, narrowed
+from ..system import AbstractEquation
+from ..system.contact_set import ContactSet
+from ..system.residuals import velocity_rows
+from .dry_laws import Answers
+from .forces import directions, free_accelerations, friction_coefficients
+from .problem import Laws, Problem, is_implied
+from .tolerance import REST, ContactTolerance
+
+# The normal forces of joints, which depend on the friction in them, decide on what stays closed and sticks in this many
+# rounds of impulses and forces; without such friction low bounces do in a second one.
+_ROUNDS = 4
+# Rebounds at which no energy is gained are found in this many trials, to this fraction of what adds up in it.
+_TRIALS, _GAIN = 40, 1e-12
+
+
+class Event(NamedTuple):
+    """The numbers of an event, by which its derivative is found as well.
+
+    **Fields:** the time until then, `late`, and which gap or slip is `first` to be zero, none where `hits` is false;
+    accelerations before and after; velocities before (`at`) and after (`u`); contacts and friction that are `held`:
+    the rates of gaps are those of the impact, slips are zero; contacts that are `low`: they would bounce lower than can
+    be seen; the direction in which friction `slips` in the impact, zero without; the `share` of the rebounds at which
+    no energy is gained; the `compression` of an impact by Poisson's law, after which `held` and `slips` are those of
+    the expansion; see `Impact` for the others.
+    """
+
+    late: Float[Array, ""]
+    first: Any
+    hits: Any
+    before: Float[Array, "nu"]
+    after: Float[Array, "nu"]
+    at: Float[Array, "nu"]
+    u: Float[Array, "nu"]
+    held: Bool[Array, "laws"]
+    low: Bool[Array, "contacts"]
+    slips: Float[Array, "frictions"]
+    impulses: Float[Array, "laws"]
+    modes: tuple[Float[Array, "laws"], Float[Array, "laws"]]
+    rest: Float[Array, "contacts"]
+    energy: Float[Array, ""]
+    solvable: Bool[Array, ""]
+    share: Float[Array, ""]
+    compression: "Phase | None"
+
+
+class Phase(NamedTuple):
+    """The compression of an impact by Poisson's law, with the velocities at its end; see `Event`."""
+
+    u: Float[Array, "nu"]
+    held: Bool[Array, "laws"]
+    slips: Float[Array, "frictions"]
+    impulses: Float[Array, "laws"]
+
+
+class When(NamedTuple):
+    """When the event is, see `Event`, with the velocities `u` then, before it, the rates `at` of gaps and slips, and
+    which contacts are `touching`.
+    """
+
+    late: Float[Array, ""]
+    first: Any
+    hits: Any
+    before: Float[Array, "nu"]
+    u: Float[Array, "nu"]
+    at: Float[Array, "laws"]
+    touching: Bool[Array, "contacts"]
+
+
+class Trial(NamedTuple):
+    """The search for the largest `share` of the rebounds at which an impact gives no energy back: it is in the
+    `bracket`, of what is gained; whether it goes on `again`.
+    """
+
+    share: Float[Array, ""]
+    bracket: Bracket
+    again: Bool[Array, ""]
+
+
+def next_trial(trial: Trial, gained, size, k) -> Trial:
+    """What is tried next, after `k` trials; before the first one the whole rebound was, and gained some energy."""
+    first = k == 0
+    again = jnp.where(first, gained > REST * size, trial.again & (jnp.abs(gained) > _GAIN * size))
+    bracket, share = narrowed(trial.bracket, trial.share, gained, k % 3 == 2)
+    # Without a rebound energy is lost.
+    share = jnp.where(again, jnp.where(first, 0.0, share), trial.share)
+    new = Trial(share, bracket, again)
+    return jax.tree.map(lambda old, new: jnp.where(k < 0, old, new), trial, new)
+
+
+# Compiled inside the whole program, so that it is traced once.
+@eqx.filter_jit
+def find_event(system, formulation, tolerance: ContactTolerance, t, y) -> Event:
+    """An event at a state, without derivatives; the tolerance is in units of the system's size."""
+    touch, t = (jnp.asarray(x, y.q.dtype) for x in (tolerance.touch, t))
+    system, touch, t, y = lax.stop_gradient((system, touch, t, y))
+    return Impacting.at(system, formulation, ContactTolerance(touch).in_metres(system), t, y).event()
+
+
+class Struck(NamedTuple):
+    """An impact in one round, from the laws that hold in it, `answers`, and its `impulses`.
+
+    **Fields:** the velocities `u` after it, and the `rate` of gaps and slips; the accelerations `udot` there without
+    contacts and friction; contacts that are `resting`, and friction whose slip has `ended`; twice the energy that the
+    impulses have `gained`, and the sizes that add up in it; the `share` of the rebounds.
+    """
+
+    answers: Answers
+    impulses: Float[Array, "laws"]
+    u: Float[Array, "nu"]
+    rate: Float[Array, "laws"]
+    udot: Float[Array, "nu"]
+    resting: Bool[Array, "contacts"]
+    ended: Bool[Array, "frictions"]
+    gained: tuple[Float[Array, ""], Float[Array, ""]]
+    share: Float[Array, ""]
+
+
+class Round(NamedTuple):
+    """The state of an event after some impulses and forces have been found.
+
+    **Fields:** the `problem` of the impulses or forces that are to be found next; `when` the event is; contacts that
+    bounce too `low` to be seen, and for how long (`rest`); the impact as it is `struck`; the laws that hold with the
+    `forces` after it, `answers`; whether all problems have been `solvable`; in how many `rounds` what stays closed and
+    sticks is known; the `trial` of a share of the rebounds; by Poisson's law the `compression`, and the impulses with
+    which contacts have `pushed` then and push again at least.
+    """
+
+    problem: Problem
+    when: When
+    low: Bool[Array, "contacts"]
+    rest: Float[Array, "contacts"]
+    struck: Struck
+    answers: Answers
+    forces: Float[Array, "laws"]
+    solvable: Bool[Array, ""]
+    rounds: Int[Array, ""]
+    trial: Trial
+    compression: Phase | None
+    pushed: Float[Array, "laws"] | None
+
+
+class Moves(NamedTuple):
+    """How velocities respond to impulses along the directions of contacts and friction, where the other constraints
+    hold.
+
+    **Fields:** `rows`, the derivatives of the rates of gaps and slips by velocities; the `projector` on the other
+    constraints; `by_unit`, the changes of velocities by unit impulses, and the impulses that the other constraints
+    answer with, `answers`; the change that these ask for themselves, `jump`.
+    """
+
+    rows: Float[Array, "laws nu"]
+    projector: Any
+    by_unit: Float[Array, "laws nu"]
+    answers: Float[Array, "laws acceleration_rows"]
+    jump: Float[Array, "nu"]
+
+    @classmethod
+    def at(cls, system, t, q, u, inertia: AbstractInertia, unmet) -> "Moves":
+        """The moves at a state, whose velocities leave the rates of all rows `unmet`."""
+        rows, jacobian = directions(system, t, q, u)
+        projector = jacobian.projector(inertia)
+        # The last one is without an impulse.
+        impulses = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
+        asked = jnp.concatenate([jnp.zeros((len(rows), unmet.size), q.dtype), -unmet[None]])
+        moves, answers = jax.vmap(projector.solve)(impulses, asked)
+        return cls(rows, projector, moves[:-1], answers[:-1], moves[-1])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Impacting:
+    """An event at a state: in each round first impulses are found, in one phase or in the two of Poisson's law, and
+    then the forces after them.
+
+    The first impulse is none, and the forces after it are those before the event, which tell when it is.
+
+    **Fields:** `tolerance` [m, rad]; t, q and the velocities `u`; the `inertia` and the `modes` there; the `gap`s, and
+    the `rates` of gaps and slips; the `moves`; the `laws`; the velocity up to which slip in a plane has ended, `slow`.
+    """
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+    tolerance: ContactTolerance
+    t: Float[Array, ""]
+    q: Float[Array, "nq"]
+    u: Float[Array, "nu"]
+    inertia: AbstractInertia
+    modes: Modes
+    gap: Float[Array, "contacts"]
+    rates: Float[Array, "laws"]
+    moves: Moves
+    laws: Laws
+    slow: Float[Array, ""]
+
+    @classmethod
+    def at(cls, system, formulation, tolerance: ContactTolerance, t, y) -> "Impacting":
+        contacts, q, u = system.contacts, y.q, y.u
+        inertia = system.inertia(t, contacts.with_modes(q, 0.0), u)
+        unmet = velocity_rows(system, t, contacts.bound(q), u)
+        moves = Moves.at(system, t, q, u, inertia, unmet)
+        laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(system, t, q, u))
+        gap, rates = contacts.gaps(system, t, q), contacts.at_rows(unmet)
+        known = inertia, contacts.modes(q), gap, rates, moves, laws, tolerance.slow(system, u)
+        return cls(system, formulation, tolerance, t, q, u, *known)
+
+    @property
+    def contacts(self) -> ContactSet:
+        return self.system.contacts
+
+    @property
+    def influence(self) -> Float[Array, "laws laws"]:
+        """The changes of the rates of gaps and slips by unit impulses."""
+        return self.laws.influence
+
+    @property
+    def phases(self) -> int:
+        """The number of phases of an impact."""
+        return 2 if any(self.contacts.by_poisson) else 1
+
+    @property
+    def turns(self) -> int:
+        """The number of problems in a round."""
+        return self.phases + 1
+
+    def rates_at(self, u):
+        """The rates of gaps and slips at other velocities."""
+        return self.rates + self.moves.rows @ (u - self.u)
+
+    def sizes_of_rates(self, *velocities):
+        """The sizes that add up in the rates at some velocities."""
+        return jnp.abs(self.moves.rows) @ add_up(map(jnp.abs, velocities))
+
+    def accelerated(self, u):
+        """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
+        that have friction, without forces along these and by a unit of each.
+        """
+        system, t, q = self.system, self.t, self.q
+        udot, multipliers, opening = free_accelerations(system, self.formulation, self.moves.projector, t, q, u)
+        if not self.contacts.in_joints.any():
+            return udot, opening, None
+        reactions = lambda multipliers: system.friction_reactions(t, q, u, multipliers)
+        return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], self.moves.answers]))
+
+    # When the event is
+
+    def at_event(self, before, curve) -> When:
+        """The first of the zeros that are next, with accelerations until then, and those along the directions."""
+        n, system = self.contacts.n, self.system
+        until, about_to = self.zeros(curve)
+        # A zero that is far off in time, since rates are rounding errors, is none.
+        speed = jnp.max(jnp.maximum(jnp.abs(self.u), jnp.abs(before)) / system.velocity_scale()) * system.length
+        about_to = about_to & (jnp.abs(until) * speed <= self.tolerance.far)
+        first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
+        hits = about_to[first]
+        late = jnp.where(hits, until[first], 0.0)
+        closes = about_to[:n] & (np.arange(n) == first)
+        touching = self.modes.shut | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
+        at = self.u + late * before
+        return When(late, first, hits, before, at, self.rates_at(at), touching)
+
+    def zeros(self, curve):
+        """The times until gaps and slips are zero, and which are about to be; `curve`: their second derivatives, and
+        accelerations.
+        """
+        n, gap, closing = self.contacts.n, self.gap, self.rates[: self.contacts.n]
+        about_to = self.modes.open & (gap <= self.tolerance.near) & (closing < 0)
+        # The first zero of a parabola.
+        root = jnp.sqrt(jnp.maximum(closing**2 - 2 * curve[:n] * gap, 0.0))
+        until = 2 * gap / (root + jnp.where(about_to, -closing, 1.0))
+        if not self.contacts.m:
+            return until, about_to
+        slides, slip, slowing = self.slips(self.rates[n:], curve[n:])
+        least = jnp.where(self.contacts.in_pairs, 2 * self.slow, self.tolerance.near)
+        ends = slides & (slip <= least) & (slowing < 0)
+        until = jnp.concatenate([until, -slip / jnp.where(ends, slowing, 1.0)])
+        return until, jnp.concatenate([about_to, ends])
+
+    def slips(self, rates, curve):
+        """Which friction may come to rest, how fast it slips, and how fast that changes, along its modes; of friction
+        in two directions the first number says it.
+        """
+        modes, pairs = self.modes, self.contacts.pairs
+        single = modes.slides, modes.of_friction * rates, modes.of_friction * curve
+        if not pairs:
+            return single
+        in_plane, both = modes.in_plane, of_pairs(pairs)
+        along = in_plane.modes / jnp.where(in_plane.size > 0, in_plane.size, 1.0)[:, None]
+        may = in_plane.slips & (norm(rates[both]) <= 2 * self.slow)
+        of_both = may, jnp.sum(along * rates[both], axis=1), jnp.sum(along * curve[both], axis=1)
+        return tuple(for_first(pairs, *values) for values in zip(of_both, single, strict=True))
+
+    # The turns of a round
+
+    def bounces(self, when: When):
+        """The rates at which gaps would open by Newton's law."""
+        return self.system.contact_numbers.restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
+
+    def impulse_of(self, when: When, low, share, reactions) -> Problem:
+        """The problem of the impulses, where contacts that are `low` do not bounce, and others with a share of the
+        whole rebound; by Poisson's law none does at the end of compression.
+        """
+        back = jnp.where(low | np.array(self.contacts.by_poisson, bool), 0.0, share * self.bounces(when))
+        approach = when.at + self.moves.rows @ self.moves.jump - jnp.pad(back, (0, self.contacts.m))
+        if self.contacts.pairs:
+            # Directions of rounding errors have no sense.
+            approach = jnp.where(jnp.abs(approach) <= REST * self.sizes_of_rates(when.u), 0.0, approach)
+        return self.laws.of_impulses(approach, when.touching, reactions)
+
+    def moved(self, k, when: When, impulses):
+        """The velocities after impulses; in the first round there is no event yet."""
+        return when.u + jnp.where(k < self.turns, 0.0, self.moves.jump) + impulses @ self.moves.by_unit
+
+    def expand(self, k, before: Round, answers, impulses) -> Round:
+        """The end of the compression, and the impulses that are asked for besides those with which contacts push again
+        in the expansion.
+        """
+        when = before.when
+        again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]
+        pushes = np.array(self.contacts.by_poisson, bool) & ~before.low
+        again = jnp.where(pushes, before.trial.share * again, 0.0)
+        u = self.moved(k, when, impulses)
+        free = before.problem.free + self.influence @ impulses
+        free = jnp.where(jnp.abs(free) <= REST * self.sizes_of_rates(u, when.u), 0.0, free)
+        held = jnp.concatenate([answers.closed, answers.sticks])
+        return before._replace(
+            problem=self.laws.of_expansion(free, again, when.touching, before.problem.reactions),
+            compression=Phase(u, held, answers.slips, impulses),
+            pushed=impulses + jnp.pad(again, (0, self.contacts.m)),
+            solvable=answers.solvable,
+        )
+
+    def strike(self, k, before: Round, answers, impulses) -> Round:
+        """The velocities after an impulse, and the forces that are asked for there."""
+        when, n, solvable = before.when, self.contacts.n, answers.solvable
+        if before.pushed is not None:
+            impulses, solvable = before.pushed + impulses, solvable & before.solvable
+        after = self.moved(k, when, impulses)
+        rate = self.rates_at(after)
+        gained = jnp.dot(impulses, when.at + rate)
+        size = jnp.dot(jnp.abs(impulses), jnp.abs(when.at) + jnp.abs(rate))
+        udot, opening, reactions = self.accelerated(after)
+        sizes = self.sizes_of_rates(after, when.u)
+        resting = when.touching & ((rate[:n] <= REST * sizes[:n]) | before.low)
+        ended, slips = self.slips_left(rate[n:], sizes[n:])
+        struck = Struck(answers, impulses, after, rate, udot, resting, ended, (gained, size), before.trial.share)
+        forces = self.laws.of_forces(opening, reactions, resting, slips, self.modes, before.forces)
+        return before._replace(problem=forces, struck=struck, solvable=solvable)
+
+    def slips_left(self, rate, sizes):
+        """Which friction no longer slips, and the directions in which other friction does."""
+        # Slip that is not to be seen has ended.
+        speed = self.laws.sizes(rate)
+        least = jnp.where(self.contacts.in_pairs, 2 * self.slow, self.tolerance.near)
+        ended = (speed <= REST * self.laws.sizes(sizes)) | (speed <= least)
+        return ended, jnp.where(ended, 0.0, rate / jnp.where(ended, 1.0, speed))
+
+    def begin(self, k, before: Round, answers, forces) -> Round:
+        """The time of the event, by the equations before it, and its impulses."""
+        del k, answers
+        udot, curve = before.struck.udot + forces @ self.moves.by_unit, before.problem.free + self.influence @ forces
+        when = self.at_event(udot, curve)
+        problem = self.impulse_of(when, before.low, before.trial.share, before.problem.reactions)
+        return before._replace(problem=problem, when=when)
+
+    def settle(self, k, before: Round, answers, forces) -> Round:
+        """The laws that hold after an impact with their forces, and the impulses that are asked for in a further round,
+        in which other contacts may bounce too low to be seen.
+        """
+        struck, curve = before.struck, before.problem.free + self.influence @ forces
+        low, rest = self.low_bounces(before, curve[: self.contacts.n], k == 2 * self.turns - 1)
+        # Where nothing bounces low, and no force depends on others, a second round would find the same.
+        rounds = before.rounds if self.contacts.in_joints.any() else jnp.where(jnp.any(low), 2, 1)
+        trial = next_trial(before.trial, *struck.gained, k // self.turns - rounds)
+        return before._replace(
+            problem=self.impulse_of(before.when, low, trial.share, before.problem.reactions),
+            rounds=rounds,
+            trial=trial,
+            low=low,
+            rest=rest,
+            answers=answers,
+            forces=forces,
+            solvable=before.solvable & answers.solvable,
+        )
+
+    def low_bounces(self, before: Round, curve, is_first):
+        """Contacts that would open in the first round by less than can be seen, before they close again, and the times
+        until they rest; `curve`: the second derivatives of the gaps.
+        """
+        when, struck, restitution = before.when, before.struck, self.system.contact_numbers.restitution
+        rate, bounce = struck.rate[: self.contacts.n], self.bounces(when)
+        falls = jnp.where(curve < 0, -curve, 1.0)
+        opens = rate**2 <= 2 * falls * self.tolerance.bounce
+        low = when.touching & ~struck.resting & (curve < 0) & opens & (restitution < 1)
+        low = jnp.where(is_first, low, before.low)
+        # Each bounce takes `restitution` times the time of the one before.
+        ratio = jnp.where(low & (bounce > 0), restitution, 0.0)
+        rest = jnp.where(low & (bounce > 0), 2 * rate / (falls * (1 - ratio)), 0.0)
+        return low, jnp.where(is_first, rest, before.rest)
+
+    # The rounds
+
+    def start(self) -> Round:
+        """Before the first round."""
+        n, m, in_joints = self.contacts.n, self.contacts.m, self.contacts.in_joints.any()
+        none, one, yes = jnp.zeros(n + m, self.q.dtype), jnp.ones((), self.q.dtype), jnp.array(True)
+        no, idle = Answers(none[:n] > 0, none[n:] > 0, none[n:], yes, none[n:] > 0), none[:n] > 0
+        reactions = jax.tree.map(jnp.zeros_like, jax.eval_shape(self.accelerated, self.u)[2])
+        return Round(
+            problem=self.laws.of_impulses(none, idle, reactions),
+            when=When(0 * one, jnp.argmin(none), ~yes, self.u, self.u, self.rates, idle),
+            low=idle,
+            rest=none[:n],
+            struck=Struck(no, none, self.u, none, self.u, idle, none[n:] > 0, (one, one), one),
+            answers=no,
+            forces=none,
+            solvable=yes,
+            rounds=jnp.array(_ROUNDS if in_joints else 1),
+            trial=Trial(one, Bracket(0 * one, one, 0 * one, one, jnp.array(0)), ~yes),
+            compression=Phase(self.u, none > 0, none[n:], none) if self.phases == 2 else None,
+            pushed=none if self.phases == 2 else None,
+        )
+
+    def goes_on(self, carry):
+        """Whether a round is not at its end, or another one follows."""
+        k, last = carry
+        more = k // self.turns - 1 - last.rounds
+        return (k % self.turns != 0) | (more < 0) | (last.trial.again & (more < _TRIALS))
+
+    def advance(self, carry):
+        """The next turn; the program that finds impulses or forces is compiled once."""
+        k, last = carry
+        turns = self.turns
+        answers, known = self.laws.answers(last.problem), self.laws.of_modes(self.modes, self.rates)
+        answers = jax.tree.map(lambda known, found: jnp.where(k == turns - 1, known, found), known, answers)
+        found = self.laws.solved(last.problem, answers)
+        turn = k % turns
+        which = jnp.where((turn == turns - 1) & (k >= turns), turns, turn)
+        does = [self.expand, self.strike, self.begin, self.settle][2 - self.phases :]
+        return k + 1, lax.switch(which, does, k, last, answers, found)
+
+    def event(self) -> Event:
+        """The event, after all rounds."""
+        _, settled = lax.while_loop(self.goes_on, self.advance, (jnp.array(0), self.start()))
+        when, struck = settled.when, settled.struck
+        modes, implied = self.new_modes(settled)
+        held, lost = self.lost(settled, implied)
+        after = struck.u + lost @ self.moves.by_unit
+        kinetic = lambda u: jnp.dot(u, self.inertia.product(u))
+        return Event(
+            late=when.late,
+            first=when.first,
+            hits=when.hits,
+            before=when.before,
+            after=struck.udot + settled.forces @ self.moves.by_unit,
+            at=when.u,
+            u=after,
+            held=held,
+            low=settled.low,
+            slips=struck.answers.slips,
+            impulses=self.seen(struck.impulses, self.sizes_of_rates(after, when.u)),
+            modes=(self.modes.numbers, modes),
+            rest=jnp.pad(settled.rest, (0, self.contacts.m)),
+            energy=0.5 * (kinetic(when.u) - kinetic(after)),
+            solvable=settled.solvable,
+            share=struck.share,
+            compression=self.compressed(settled.compression),
+        )
+
+    def seen(self, impulses, sizes):
+        """The impulses, of which those of rounding errors are none."""
+        return jnp.where(jnp.abs(jnp.diag(self.influence) * impulses) <= REST * sizes, 0.0, impulses)
+
+    def independent(self, laws):
+        """As many of some laws as are independent of each other."""
+        return laws & independent_components(self.influence, laws)
+
+    def compressed(self, phase: Phase | None) -> Phase | None:
+        return None if phase is None else phase._replace(held=self.independent(phase.held))
+
+    def new_modes(self, settled: Round):
+        """The modes after the event, and contacts that are closed while others imply them."""
+        n, struck, last = self.contacts.n, settled.struck, settled.answers
+        implied = struck.resting & ~last.closed & is_implied(self.influence[:n, :n], last.closed)
+        of_contacts = modes_of_contacts(last.closed, implied)
+        begun = struck.ended & self.contacts.in_pairs
+        of_friction = modes_of_friction(last.sticks, last.implied, last.slips, begun)
+        return jnp.concatenate([of_contacts, of_friction]).astype(self.q.dtype), implied
+
+    def lost(self, settled: Round, implied):
+        """Which laws hold the velocities after the event, and the impulses that take from these what only rounding
+        errors, low bounces and slips that have ended leave.
+        """
+        n, m, struck, last = self.contacts.n, self.contacts.m, settled.struck, settled.answers
+        staying, rate, held = struck.resting, struck.rate, struck.answers.closed | settled.low
+        if m:
+            # Slips that have ended are zero to all digits. Slip in two directions begins at rest.
+            rests = last.sticks | (self.contacts.in_pairs & struck.ended & (last.slips != 0))
+            held = jnp.concatenate([held | last.closed, rests | struck.answers.sticks])
+            left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(rests, rate[n:], 0.0)])
+            cancelled = held & jnp.concatenate([staying, rests])
+        else:
+            left, cancelled = jnp.where(staying, rate, 0.0), held & settled.low
+        held = self.independent(held)
+        cancelled = held & cancelled
+        if m:
+            # Bodies that move side by side would come nearer, at a rate that is too small beside slips to close their
+            # contact, and each step would end with an event.
+            drifts = jnp.pad(staying & ~held[:n] & ~implied & (rate[:n] < 0), (0, m))
+            cancelled = self.independent(cancelled | drifts)
+        return held, jnp.where(cancelled, solved_components(self.influence, left, cancelled), 0.0)

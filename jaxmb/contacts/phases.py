@@ -1,0 +1,173 @@
+"""The derivatives of the impulses of an impact, and of the velocities after them, by those before it.
+
+Of `M (u⁺ − u⁻) = Aᵀ Λ` and the rates of gaps that are held, and slips that end, each phase has one linear system.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..linalg.elimination import solve
+from ..linalg.pairs import of_pairs
+from ..linalg.pushed import push
+from ..linalg.rotations import norm
+from ..linalg.sums import with_entries
+from ..system.contact_set import ContactSet
+from ..system.residuals import velocity_rows
+from .forces import directions, friction_coefficients
+from .impacting import Event, Phase
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Phases:
+    """The linear equations of the phases of an impact.
+
+    **Fields:** system, t and q `at` the `event`, their `tangents`, and that of the velocities before it, `du`; the
+    `rows` of A of contacts and friction, the `projector` on the other constraints, and the changes of velocities,
+    `moves`, by unit impulses; contacts that `rebound` by Newton's law; the `coefficients` of friction and their
+    derivatives.
+    """
+
+    event: Event
+    at: tuple[Any, Float[Array, ""], Float[Array, "nq"]]
+    tangents: tuple[Any, ...]
+    du: Float[Array, "nu"]
+    rows: Float[Array, "laws nu"]
+    projector: Any
+    moves: Float[Array, "laws nu"]
+    rebound: Bool[Array, "contacts"]
+    coefficients: tuple[Float[Array, "frictions"], Float[Array, "frictions"]]
+
+    @classmethod
+    def of(cls, event: Event, at, tangents, du) -> "Phases":
+        system, t, q = at
+        contacts = system.contacts
+        rows, jacobian = directions(system, t, q, event.u)
+        projector = jacobian.projector(system.inertia(t, contacts.with_modes(q, 0.0), event.u))
+        moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
+        rebound = ~event.low & ~np.array(contacts.by_poisson, bool)
+        known = change = jnp.zeros(0, q.dtype)
+        if contacts.m:
+            coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
+            known, change = coefficients(*at), push(coefficients, at, tangents)
+        return cls(event, at, tangents, du, rows, projector, moves, rebound, (known, change))
+
+    @property
+    def contacts(self) -> ContactSet:
+        return self.at[0].contacts
+
+    def changes(self) -> tuple[Float[Array, "laws"], Float[Array, "nu"]]:
+        """The derivatives of all impulses, and of the velocities after them."""
+        event, contacts, at = self.event, self.contacts, self.at
+        # By the share of the rebounds velocities and impulses change as well.
+        rates = contacts.rates(*at, event.at)
+        bounce = _restitution(at[0]) * jnp.maximum(-rates[: contacts.n], 0.0)
+        bounce = jnp.pad(jnp.where(self.rebound, bounce, 0.0), (0, contacts.m))
+        impulses, change, by_share = (self.in_one if event.compression is None else self.in_two)(bounce)
+
+        # The share is that at which no energy is gained.
+        both = rates + contacts.rates(*at, event.u)
+        changed = push(contacts.rates, (*at, event.at), (*self.tangents, self.du))
+        changed = changed + push(contacts.rates, (*at, event.u), (*self.tangents, change))
+        gained = jnp.dot(impulses, both) + jnp.dot(event.impulses, changed)
+        slope = jnp.dot(by_share, both) + jnp.dot(event.impulses, self.rows @ (by_share @ self.moves))
+        less = event.share < 1
+        less = jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * by_share
+        return impulses + less, change + less @ self.moves
+
+    def in_one(self, bounce):
+        """The derivatives of the impulses and of the velocities at a fixed share of the rebounds, and of the impulses
+        by that share, which asks for the rates `bounce`.
+        """
+        event = self.event
+        last = Phase(event.u, event.held, event.slips, event.impulses)
+        none = jnp.zeros(self.contacts.n, event.u.dtype)
+        impulses, change, matrix = self.solved(event.at, self.du, last, none)
+        return impulses, change, solve(matrix, jnp.where(event.held, bounce, 0.0))
+
+    def in_two(self, bounce):
+        """The same of an impact by Poisson's law."""
+        event, compression, (system, *_) = self.event, self.event.compression, self.at
+        assert compression is not None
+        n, m = self.contacts.n, self.contacts.m
+        none = jnp.zeros(n, event.u.dtype)
+        first, between, matrix = self.solved(event.at, self.du, compression, none)
+        first_by_share = solve(matrix, jnp.where(compression.held, bounce, 0.0))
+        pushes = ~event.low & np.array(self.contacts.by_poisson, bool)
+        again = lambda system, impulses: jnp.where(pushes, event.share * _restitution(system) * impulses[:n], 0.0)
+        normal = push(again, (system, compression.impulses), (self.tangents[0], first))
+        last = Phase(event.u, event.held, event.slips, event.impulses - compression.impulses)
+        second, change, matrix = self.solved(compression.u, between, last, normal)
+        normal = _restitution(system) * (compression.impulses + event.share * first_by_share)[:n]
+        normal = jnp.where(pushes, normal, 0.0)
+        closing = bounce - self.rows @ (first_by_share @ self.moves)
+        by_share = solve(matrix, jnp.where(event.held, closing, jnp.pad(normal, (0, m))))
+        return first + second, change, first_by_share + by_share
+
+    def solved(self, before, dbefore, phase: Phase, normal):
+        """The derivatives of the impulses of a phase and of the velocities at its end, and the matrix of the equations
+        for the first; see `equations`.
+        """
+        plain, matrix, right = self.equations(before, dbefore, phase, normal)
+        impulses = solve(matrix, right)
+        return impulses, plain + impulses @ self.moves, matrix
+
+    def equations(self, before, dbefore, phase: Phase, normal):
+        """The velocities at the end of a phase without a change of its impulses, and the linear equations for that
+        change.
+
+        **Arguments:** the velocities `before` the phase, and their derivative; the changes of the impulses along the
+        `normal` of contacts that are not held.
+        """
+        event, (system, t, q), contacts = self.event, self.at, self.contacts
+        rows, n = np.array(contacts.rows), contacts.n
+        asked = self.projector.jacobian.product(phase.u - before)
+        _, multipliers = self.projector.solve(phase.impulses @ self.rows, asked)
+        multipliers = with_entries(multipliers, rows, phase.impulses)
+
+        def unmet(system, t, q, first, u):
+            """The rates that are left, and the momentum that is not balanced."""
+            rates = velocity_rows(system, t, q, phase.u)
+            bounce = _restitution(system) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
+            bounce = jnp.where(phase.held[:n] & self.rebound, event.share * bounce, 0.0)
+            rates = rates.at[rows[:n]].add(-bounce)
+            momentum = system.inertia(t, q, u).product(phase.u - u)
+            return rates, momentum - system.constraint_force(t, q, phase.u, multipliers)
+
+        point = system, t, contacts.bound(q), event.at, before
+        rates, forces = push(unmet, point, (*self.tangents, self.du, dbefore))
+        # Rows of modes ask for nothing.
+        plain, _ = self.projector.solve(-forces, jnp.where(np.isin(np.arange(rates.size), rows), 0.0, -rates))
+        asked = -(rates[rows] + self.rows @ plain)
+        law, right = jnp.eye(rows.size, dtype=q.dtype), jnp.pad(normal, (0, contacts.m))
+        if contacts.m:
+            law, right = self.friction_laws(plain, phase, law, right)
+        matrix = jnp.where(phase.held[:, None], self.rows @ self.moves.T, law)
+        return plain, matrix, jnp.where(phase.held, asked, right)
+
+    def friction_laws(self, plain, phase: Phase, law, right):
+        """The equations with those of friction that slips, whose impulses are in proportion to those of contacts."""
+        contacts, (known, change) = self.contacts, self.coefficients
+        n, contact_of = contacts.n, np.array(contacts.contact_of)
+        pushed = jnp.where(contacts.in_joints, 0.0, phase.impulses[contact_of])
+        right = jnp.concatenate([right[:n], -change * phase.slips * pushed])
+        for k in np.flatnonzero(~contacts.in_joints):
+            law = law.at[n + k, contact_of[k]].set(known[k] * phase.slips[k])
+        rates = lambda system, t, q: contacts.rates(system, t, q, phase.u)
+        for both in of_pairs(contacts.pairs):
+            # The direction of slip changes with the velocity after the impact.
+            k, laws, slips = both[0], n + both, phase.slips[both]
+            turned, last, speed = push(rates, self.at, self.tangents)[laws], rates(*self.at)[laws], norm(slips)
+            across = jnp.eye(2, dtype=law.dtype) - jnp.outer(slips, slips)
+            by = known[k] * pushed[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
+            law = law.at[laws].add(by @ self.rows[laws] @ self.moves.T, unique_indices=True)
+            right = right.at[laws].add(-by @ (turned + self.rows[laws] @ plain), unique_indices=True)
+        return law, right
+
+
+def _restitution(system):
+    return system.contact_numbers.restitution

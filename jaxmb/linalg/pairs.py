@@ -1,0 +1,43 @@
+"""Numbers of which some belong together in pairs, the components of vectors in planes; a pair is named by the place of
+its first number, and follows it.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .rotations import norm
+
+
+def of_pairs(pairs: tuple[int, ...]) -> np.ndarray:
+    """The places of both numbers of each pair, shape (pairs, 2)."""
+    return np.array(pairs, int)[:, None] + np.arange(2)
+
+
+def placed_pairs(pairs: tuple[int, ...], values: Array, others: Array, first: int = 0) -> Array:
+    """Values of each number of `pairs`, shape (pairs, 2, …), among those of `others`, whose places they take; before
+    them `first` zeros.
+    """
+    # A gather, which is compiled in less time than a scatter.
+    m, paired = len(others), of_pairs(pairs).reshape(-1)
+    place = np.zeros(m, int)
+    place[paired] = np.arange(paired.size)
+    taken = values.reshape(-1, *values.shape[2:])[place]
+    mask = np.isin(np.arange(m), paired).reshape(-1, *(1,) * (values.ndim - 2))
+    placed = jnp.where(mask, taken, others)
+    return jnp.concatenate([jnp.zeros((first, *placed.shape[1:]), placed.dtype), placed]) if first else placed
+
+
+def for_both(pairs: tuple[int, ...], values: Array, others: Array) -> Array:
+    """The same of one value for both numbers of each pair."""
+    return placed_pairs(pairs, jnp.stack([values, values], axis=1), others)
+
+
+def for_first(pairs: tuple[int, ...], values: Array, others: Array) -> Array:
+    """The same of a value for the first number of each pair, and zero for the second one."""
+    return placed_pairs(pairs, jnp.stack([values, jnp.zeros_like(values)], axis=1), others)
+
+
+def sizes_of(pairs: tuple[int, ...], values: Float[Array, "m"]) -> Float[Array, "m"]:
+    """The size of each number, and for both numbers of a pair that of their vector."""
+    return for_both(pairs, norm(values[of_pairs(pairs)]), jnp.abs(values)) if pairs else jnp.abs(values)

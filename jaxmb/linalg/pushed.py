@@ -1,0 +1,20 @@
+"""Tangents of values as arrays, zeros where a value does not depend on what moves."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:
+    """The tangent of a function's value, zeros where it does not depend on what moves."""
+    value, tangent = eqx.filter_jvp(function, at, along)
+    if isinstance(value, tuple):
+        return tuple(dense(*both) for both in zip(tangent, value, strict=True))
+    return dense(tangent, value)
+
+
+def dense(tangent: Float[Array, "*n"] | None, like: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """A tangent, zeros for None."""
+    return jnp.zeros_like(like) if tangent is None else tangent

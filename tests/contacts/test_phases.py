@@ -1,0 +1,45 @@
+"""The equations of the phases of an impact: their solution is the change of the impulses with the velocities."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+from jaxmb.contacts.impacting import find_event
+from jaxmb.contacts.phases import Phases
+from jaxmb.contacts.tolerance import ContactTolerance
+from jaxmb.parts import terrain
+
+RADIUS = 0.1
+
+
+@pytest.mark.parametrize("spin", [0.0, -40.0], ids=["slip ends", "slip goes on"])
+@pytest.mark.parametrize("law", ["newton", "poisson"])
+def test_changes_are_those_of_another_impact(law, spin):
+    disc = planar.Body("disc", mass=1.5, inertia=0.01, position=(0.0, RADIUS))
+    floor = mb.RigidContact("floor", "disc", terrain=terrain.Flat(), radius=RADIUS, restitution=0.4, impact_law=law)
+    rub = mb.DryFriction("rub", "floor", coefficient=0.2)
+    system = mb.Scene([disc], joints=[floor], forces=[rub, mb.Gravity((0.0, -9.81))]).compile()
+    t, q, method = jnp.zeros(()), system.guess.q, mb.formulations.Multipliers()
+    u = jnp.zeros(system.nu).at[:3].set(jnp.array([1.0, -2.0, spin]))
+    tolerance = ContactTolerance(jnp.asarray(1e-9))
+
+    @jax.jit
+    def event(u):
+        return find_event(system, method, tolerance, t, mb.State(q, u))
+
+    @jax.jit
+    def changes(u, du):
+        still = jax.tree.map(jnp.zeros_like, eqx.filter((system, t, q), eqx.is_inexact_array))
+        return Phases.of(event(u), (system, t, q), still, du).changes()
+
+    h = 1e-6
+    for k in range(3):
+        du = jnp.zeros_like(u).at[k].set(1.0)
+        ahead, back = event(u + h * du), event(u - h * du)
+        impulses, after = changes(u, du)
+        np.testing.assert_allclose(impulses, (ahead.impulses - back.impulses) / (2 * h), atol=1e-7)
+        np.testing.assert_allclose(after, (ahead.u - back.u) / (2 * h), atol=1e-7)

@@ -1,0 +1,86 @@
+"""Modes of contacts and dry friction: their numbers, the laws that they say, and the direction of slip."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmb.parts.modes import (
+    BEGUN,
+    CLOSED,
+    FORWARD,
+    FREE,
+    IMPLIED,
+    IMPLIED_STICK,
+    OPEN,
+    STICK,
+    Modes,
+    modes_of_contacts,
+    modes_of_friction,
+    slip_direction,
+)
+
+# Friction in one direction, then one in two directions.
+ALONG = np.array([0.6, -0.8])
+
+
+def modes_of(contacts, single, both):
+    return Modes.of(jnp.array([*contacts, *single, *both], float), len(contacts), (len(single),))
+
+
+def test_modes_of_contacts_and_of_friction_in_one_direction():
+    """Rounding errors of the numbers do not count."""
+    modes = modes_of([OPEN + 1e-9, CLOSED - 1e-9, IMPLIED], [-FORWARD + 1e-9], [FREE, FREE])
+    np.testing.assert_array_equal(modes.open, [True, False, False])
+    np.testing.assert_array_equal(modes.shut, [False, True, True])
+    np.testing.assert_array_equal(modes.closed, [False, True, False])
+    np.testing.assert_array_equal(modes.slides, [True, False, False])
+    np.testing.assert_array_equal(modes.slips(jnp.ones(3)), [-1, 0, 0])
+    np.testing.assert_array_equal(modes.kinds, [0, 1, 2, -1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    "mode, sticks, held, begun, slides, kind",
+    [
+        ([FREE, FREE], False, False, False, False, FREE),
+        (BEGUN * ALONG, False, False, True, False, FORWARD),
+        (ALONG, False, False, False, True, FORWARD),
+        ([STICK, STICK], True, True, False, False, STICK),
+        ([IMPLIED_STICK, IMPLIED_STICK], False, True, False, False, STICK),
+    ],
+    ids=["free", "begun", "slides", "sticks", "implied"],
+)
+def test_modes_of_friction_in_two_directions(mode, sticks, held, begun, slides, kind):
+    modes = modes_of([OPEN], [FREE], mode)
+    np.testing.assert_array_equal(modes.sticks, [False, sticks, sticks])
+    np.testing.assert_array_equal(modes.held, [False, held, held])
+    in_plane = modes.in_plane
+    assert (in_plane.begun, in_plane.slides, in_plane.slips) == (begun, slides, begun or slides)
+    np.testing.assert_array_equal(modes.kinds, [OPEN, FREE, kind, kind])
+
+
+def test_the_direction_of_slip():
+    """That of the slip, on the side of the modes; that of the modes where slip has begun, or there is none."""
+    slip, none = 3.0 * jnp.array([0.8, 0.6]), jnp.zeros(2)
+    direction = lambda mode, slip: slip_direction(jnp.asarray(mode, float), slip)
+    np.testing.assert_allclose(direction([1.0, 0.0], slip), [0.8, 0.6], rtol=1e-15)
+    np.testing.assert_allclose(direction([-1.0, 0.0], slip), [-0.8, -0.6], rtol=1e-15)
+    np.testing.assert_allclose(direction(BEGUN * ALONG, slip), ALONG, rtol=1e-15)
+    np.testing.assert_allclose(direction(ALONG, none), ALONG, rtol=1e-15)
+    for mode in (FREE, STICK, IMPLIED_STICK):
+        np.testing.assert_array_equal(direction([mode, mode], slip), 0.0)
+        np.testing.assert_array_equal(direction([mode], slip[:1]), 0.0)
+    np.testing.assert_array_equal(direction([-FORWARD], slip[:1]), [-1.0])
+
+
+def test_laws_are_coded_as_they_are_read():
+    yes, no = jnp.array([True, False, False, False]), jnp.array([False, True, False, False])
+    of_contacts = modes_of_contacts(yes, no)
+    np.testing.assert_array_equal(of_contacts, [CLOSED, IMPLIED, OPEN, OPEN])
+    slips = jnp.array([0.0, 0.0, *ALONG])
+    begun = jnp.array([False, False, True, True])
+    of_friction = modes_of_friction(yes, no, slips, begun)
+    modes = Modes.of(jnp.concatenate([of_contacts, of_friction]), 4, (2,))
+    np.testing.assert_array_equal(modes.sticks, yes)
+    np.testing.assert_array_equal(modes.implied_stick, no)
+    np.testing.assert_allclose(modes.slips(jnp.zeros(4)), slips, rtol=1e-15)
+    assert modes.in_plane.begun
