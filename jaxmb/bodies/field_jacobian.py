@@ -32,20 +32,17 @@ def contributions(
     displacements along velocities and to the velocities. Each part contributes a block for each pair of its bodies,
     the one that the wrench acts on first; the gyroscopic moments of bodies follow.
     """
-    poses, velocities = system.prepared_poses(q), system.all_velocities(u)
+    now = system.kinematics(t, q, u)
     size = system.layout.space.velocity_size
     stiffness, damping = [], []
-    for g in system.forces:
-        both = g.derivatives(t, poses, velocities)
+    for g in system.forces.groups:
+        both = g.derivatives(now)
         for parts, blocks in zip((stiffness, damping), both, strict=True):
             parts.append(_by_pairs(blocks))
-    row = 0
-    for g in system.joints:
-        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
-        row += own.size
-        stiffness.append(_by_pairs(g.wrench_derivatives(t, poses, velocities, own)))
+    for g, of_group in system.constraints.of_groups(multipliers):
+        stiffness.append(_by_pairs(g.wrench_derivatives(now, of_group)))
         damping.append(jnp.zeros_like(stiffness[-1]))
-    gyroscopic = system.gyroscopic_damping(u)
+    gyroscopic = system.bodies.gyroscopic_damping(u)
     stiffness.append(jnp.zeros_like(gyroscopic))
     damping.append(gyroscopic)
     join = lambda blocks: jnp.concatenate([own.reshape(-1, size, size) for own in blocks])
@@ -212,7 +209,7 @@ def motion_jacobian(system: Any, t: Scalar, y: State) -> MotionJacobian:
         free = inertia.solve(system.force(t, q, u))
         multipliers = -projector.multipliers(system.acceleration_residual(t, q, u, free))
     stiffness, damping = contributions(system, t, q, u, multipliers)
-    moves = jax.vmap(layout.space.moves)(system.prepared_poses(q)[:-1])[:, :, : layout.space.pose_size]
+    moves = jax.vmap(layout.space.moves)(system.bodies.prepared_poses(q)[:-1])[:, :, : layout.space.pose_size]
     return MotionJacobian(
         order.sums(stiffness),
         order.sums(damping),

@@ -42,6 +42,29 @@ class Layout:
         return all(self.rotates) and not self.scalars
 
     @functools.cached_property
+    def turning(self) -> list[int]:
+        """The numbers of the bodies that have Euler parameters: in space all that rotate."""
+        return [k for k, rotates in enumerate(self.rotates) if rotates and self.space.dimension == 3]
+
+    @functools.cached_property
+    def coordinate_lengths(self) -> np.ndarray:
+        """Which coordinates are lengths, shape (nq,)."""
+        return self._lengths(self.pose_index, self.nq)
+
+    @functools.cached_property
+    def velocity_lengths(self) -> np.ndarray:
+        """Which velocities are rates of lengths, shape (nu,)."""
+        return self._lengths(self.velocity_index, self.nu)
+
+    def _lengths(self, index, size):
+        translation = np.zeros(size, bool)
+        translation[index[: self.bodies, : self.space.dimension]] = True
+        for scalar, (first, *_) in zip(self.scalars, index[self.bodies : -1], strict=True):
+            if first < size:
+                translation[first] = scalar.is_length
+        return translation
+
+    @functools.cached_property
     def pose_index(self) -> np.ndarray:
         """Index of every pose entry, shape (ground + 1, pose size), into the coordinates followed by the ground's
         pose.

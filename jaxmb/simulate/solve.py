@@ -176,7 +176,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     tracing_begins()
     problem.check_impulses()
     system, policy, times = problem.system, problem.policy, problem.times
-    valid = system.parameters_in_range() if problem.traced else True
+    valid = system.parameter_table.in_range() if problem.traced else True
     term, solver = problem.assembled(system)
     consistent = is_consistent(system, times["t0"], problem.state) if policy.restores else True
     start = problem.state
@@ -345,7 +345,7 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     """
     system = problem.system.prepared()
     result = problem.policy.diagnose(system, t, y, evidence, result, stuck)
-    if not system.friction_parts:
+    if not system.friction_rows.size:
         return result, None
     return diagnose_friction(system, problem.method, t, y, result, stuck)
 
