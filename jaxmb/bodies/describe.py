@@ -10,11 +10,11 @@ from ..system.design_variables import description_rows
 
 def describe_scene(system: Any) -> Description:
     """Describe a compiled scene; from its static structure alone, so it works on traced systems as well."""
-    count, kinds = system.layout.bodies, {}
+    kinds = {}
     for g in system.bodies.groups:
         kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
     is_contact = lambda g: isinstance(g.group.part, AbstractUnilateralConstraint)
-    constraints, forces, tendons = system.constraints, system.forces, system.bodies.tendons
+    constraints, forces = system.constraints, system.forces
     plain = [g for g in constraints.position if not isinstance(g.group.part, AbstractInertialConstraint)]
     contacts = [g for g in constraints.inertial if is_contact(g)]
     joints = [
@@ -24,23 +24,6 @@ def describe_scene(system: Any) -> Description:
         ([g for g in constraints.velocity if not g.joints], ", between velocities"),
         (constraints.servos, ", a program of a Servo"),
     ]
-    grubler = system.nu - system.velocity_rows
-    normalizations = len(system.layout.turning)
-    counts = system.bodies.invariant_rows - normalizations
-    facts = [
-        ("scene", f"{'spatial' if system.spatial else 'planar'}, {counted(count, 'body', 'bodies')}"),
-        ("velocities", str(system.nu)),
-        ("constraint rows", count_rows(system)),
-        ("degrees of freedom", f"{system.nu - system.velocity_rank} by rank, {grubler} by Grübler's count of rows"),
-        ("independent", count_independent(system)),
-    ]
-    if normalizations:
-        with_them = f"{system.nq}, with {counted(normalizations, 'normalisation')}"
-        with_them += f" and {counted(counts, 'count')} of turns" * (counts > 0)
-        with_them += f"; rank of all {counted(system.coordinate_rows, 'row')}"
-        facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
-    if system.nz:
-        facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))
     kind = lambda g: g.group.part.kind
     rows = lambda g: f"{counted(g.rows, 'row')} each"
     plainly = lambda groups: [(kind(g), shorten(g.group.names), "") for g in groups]
@@ -60,7 +43,7 @@ def describe_scene(system: Any) -> Description:
             *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in constraints.nonideal),
             *plainly(forces.groups),
         ],
-        "tendons": plainly(tendons),
+        "tendons": plainly(system.bodies.tendons),
         "frames": plainly(system.frames),
         "design variables": description_rows(system.design),
     }
@@ -71,7 +54,28 @@ def describe_scene(system: Any) -> Description:
         left_out.append("force elements" + " besides gravity" * bool(gravity) + ": there are none")
     redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
     tables = {title: tuple(rows) for title, rows in tables.items()}
-    return Description(tuple(facts), tables, remarks(system, left_out, redundant))
+    return Description(tuple(_facts(system)), tables, remarks(system, left_out, redundant))
+
+
+def _facts(system) -> list[tuple[str, str]]:
+    count, grubler = system.layout.bodies, system.nu - system.velocity_rows
+    normalizations = len(system.layout.turning)
+    counts = system.bodies.invariant_rows - normalizations
+    facts = [
+        ("scene", f"{'spatial' if system.spatial else 'planar'}, {counted(count, 'body', 'bodies')}"),
+        ("velocities", str(system.nu)),
+        ("constraint rows", count_rows(system)),
+        ("degrees of freedom", f"{system.nu - system.velocity_rank} by rank, {grubler} by Grübler's count of rows"),
+        ("independent", count_independent(system)),
+    ]
+    if normalizations:
+        with_them = f"{system.nq}, with {counted(normalizations, 'normalisation')}"
+        with_them += f" and {counted(counts, 'count')} of turns" * (counts > 0)
+        with_them += f"; rank of all {counted(system.coordinate_rows, 'row')}"
+        facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
+    if system.nz:
+        facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))
+    return facts
 
 
 def _left_out_by_elimination(system) -> list[str]:

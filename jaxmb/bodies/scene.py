@@ -40,6 +40,7 @@ from ..parts.frames import AbstractFrame, frames_by_name
 from ..parts.names import check_arguments, unknown
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
+from ..parts.space import AbstractSpace
 from ..parts.spatial.kinematics import SPACE
 from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.description import Description
@@ -176,19 +177,8 @@ class Scene(eqx.Module):
         for body in self.bodies:
             _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
-        joints = {part.name: part for part in self.joints}
-        links = [part for part in (*self.joints, *self.forces) if isinstance(part, AbstractLink)]
-        scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
-        layout = Layout(space, tuple(body.rotates for body in self.bodies), sum(scalars.values(), ()))
-        index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: layout.ground}
-        numbers = iter(range(layout.bodies, layout.ground))
-        of_parts = {name: tuple(itertools.islice(numbers, len(own))) for name, own in scalars.items()}
-        zeros = as_parameter(np.zeros(len(layout.scalars)))
-        moving = [k for k, own in enumerate(layout.scalars) if own.moves]
-        guess = State(
-            jax.device_put(np.concatenate([*(_call(body, "pose") for body in self.bodies), zeros])),
-            jax.device_put(np.concatenate([*(_call(body, "velocities") for body in self.bodies), zeros[moving]])),
-        )
+        layout, index, of_parts = _placed(self, space)
+        guess = _given_state(self, layout)
         if is_traced(guess):
             raise ValueError(_TRACED)
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
@@ -241,6 +231,29 @@ class Scene(eqx.Module):
             elimination=None,
         )
         return with_structure(_with_initial_scalars(system))
+
+
+def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int], dict[str, tuple[int, ...]]]:
+    """The layout of bodies and scalar coordinates; the numbers of the bodies and of the ground by name, and of the
+    scalar coordinates of parts.
+    """
+    joints = {part.name: part for part in scene.joints}
+    links = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractLink)]
+    scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
+    layout = Layout(space, tuple(body.rotates for body in scene.bodies), sum(scalars.values(), ()))
+    index = {body.name: k for k, body in enumerate(scene.bodies)} | {GROUND: layout.ground}
+    numbers = iter(range(layout.bodies, layout.ground))
+    return layout, index, {name: tuple(itertools.islice(numbers, len(own))) for name, own in scalars.items()}
+
+
+def _given_state(scene: Scene, layout: Layout) -> State:
+    """The poses and velocities of the bodies, and zeros for scalar coordinates."""
+    zeros = as_parameter(np.zeros(len(layout.scalars)))
+    moving = [k for k, own in enumerate(layout.scalars) if own.moves]
+    return State(
+        jax.device_put(np.concatenate([*(_call(body, "pose") for body in scene.bodies), zeros])),
+        jax.device_put(np.concatenate([*(_call(body, "velocities") for body in scene.bodies), zeros[moving]])),
+    )
 
 
 def _with_initial_scalars(system: RigidBodySystem) -> RigidBodySystem:
