@@ -100,7 +100,9 @@ class BodySet(eqx.Module):
         """Coordinates in space with Euler parameters of length one, and with counts of turns."""
         q = self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
         for g in self.turn_counts:
-            q = q.at[self._places(g)].add(-self._unmet_counts(g, q))
+            # A count of turns does not depend on the time.
+            unmet = g.residual(jnp.zeros((), q.dtype), self.prepared_poses(q))
+            q = q.at[self._places(g)].add(-unmet)
         return q
 
     @property
@@ -111,10 +113,6 @@ class BodySet(eqx.Module):
     def _places(self, group):
         """Where the counts of turns of stacked tendons stand in q, shape (parts, rows)."""
         return self.layout.pose_index[group.group.body_index[:, -group.rows :], 0]
-
-    def _unmet_counts(self, group, q):
-        # A count of turns does not depend on the time.
-        return group.residual(jnp.zeros((), q.dtype), self.prepared_poses(q))
 
     # Invariants of the coordinates: counts of turns, and Euler parameters of length one
 
@@ -169,11 +167,10 @@ class BodySet(eqx.Module):
 
     def inertia(self, of_scalars: Sequence[tuple[np.ndarray, Array]]) -> AbstractInertia:
         """M, with the inertias `of_scalars`, each with the numbers of the coordinates."""
-        spatial = self.layout.space.dimension == 3
-        if spatial and self.layout.uniform:
+        if self.layout.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.moments_of_inertia)
         mass = self._masses_of_coordinates(of_scalars)
-        if spatial:
+        if self.layout.spatial:
             points = np.array([not rotates for rotates in self.layout.rotates])[:, None, None]
             # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular; a scalar
             # coordinate as well.
@@ -230,7 +227,7 @@ class BodySet(eqx.Module):
         coordinates.
         """
         size = self.layout.space.velocity_size
-        if self.layout.space.dimension == 2:
+        if not self.layout.spatial:
             return jnp.zeros((self.layout.ground, size, size), u.dtype)
         moment = lambda J, w: -cross(w, J @ w)
         own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, self.velocities(u)[:, 3:])
@@ -247,7 +244,7 @@ class BodySet(eqx.Module):
     def angular_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "*d"]:
         """Angular momentum [kg m²/s] about the world origin."""
         poses, velocities = self.poses(q), self.velocities(u)
-        if self.layout.space.dimension == 2:
+        if not self.layout.spatial:
             x, v = poses[:, :2], velocities[:, :2]
             orbital = self.mass * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])
             return jnp.sum(orbital + self.moments_of_inertia * velocities[:, 2])

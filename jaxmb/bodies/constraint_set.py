@@ -7,12 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
 from ..linalg.sums import unchecked_take
 from ..parts.base import AbstractInertialConstraint
-from .elementary import ElementaryRows, elementary_rows, is_elementary
+from .elementary import ElementaryRows, elementary_rows, half_turned, is_elementary
 from .groups import (
     AbstractConstraintGroup,
     Acting,
@@ -117,6 +117,15 @@ class ConstraintSet(eqx.Module):
         of_group = lambda g: g.acceleration(now, accelerations)
         return joined(self._pieces(self.groups, of_elements, of_group), now.poses.dtype)
 
+    def half_turned(self, poses: BodyPoses) -> Bool[Array, "position_rows"]:
+        """Which rows of elementary joints vanish at these poses with the joint turned away from where it closes."""
+        known, found = self._is_elementary(self.position), half_turned(self.position, poses)
+        return found if known.all() else jnp.zeros(known.size, bool).at[np.flatnonzero(known)].set(found)
+
+    def _is_elementary(self, groups):
+        """Which rows of some groups are rows of elementary joints."""
+        return np.concatenate([np.full(g.row_count, is_elementary(g)) for g in groups])
+
     # Jacobians
 
     def blocks(
@@ -163,7 +172,7 @@ class ConstraintSet(eqx.Module):
         """Wrenches of all rows, `Aᵀ λ`."""
         out: list[Acting] = []
         if self.elements is not None:
-            known = np.concatenate([np.full(g.row_count, is_elementary(g)) for g in self.groups])
+            known = self._is_elementary(self.groups)
             of_elements = multipliers if known.all() else unchecked_take(multipliers, np.flatnonzero(known))
             wrenches = self.elements.wrenches(now.poses, of_elements)
             out.append((wrenches[:, None], np.arange(self.elements.places.ground)[:, None]))

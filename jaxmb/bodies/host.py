@@ -60,10 +60,6 @@ class HostScene(AbstractHost):
         self.linear, self.velocity_rows = system.linear, system.velocity_rows
         self.coordinate_scale, self.velocity_scale = system.known_scales()
 
-    @property
-    def _spatial(self):
-        return self._layout.space.dimension == 3
-
     def _poses(self, q) -> Any:
         """Poses of the bodies, of scalar coordinates and the ground."""
         return np.append(q, self._layout.space.ground)[self._layout.pose_index]
@@ -72,7 +68,7 @@ class HostScene(AbstractHost):
         return self._prepare(self._poses(q))
 
     def _prepare(self, poses):
-        if not self._spatial:
+        if not self._layout.spatial:
             angle = poses[:, 2:]
             return np.concatenate([poses, np.cos(angle), np.sin(angle)], axis=1)
         turned: Any = poses[:, 3:]
@@ -82,7 +78,7 @@ class HostScene(AbstractHost):
         """Rates of prepared poses along unit rates of poses."""
         poses = self._poses(q)
         size = poses.shape[1]
-        if self._spatial:
+        if self._layout.spatial:
             # Matrices are quadratic in Euler parameters, so that these differences are exact.
             return np.stack([0.5 * (self._prepare(poses + x) - self._prepare(poses - x)) for x in np.eye(size)], axis=1)
         moves = np.tile(np.eye(size, size + 2), (len(poses), 1, 1))
@@ -91,7 +87,7 @@ class HostScene(AbstractHost):
 
     def _rates(self, q, of_bodies):
         """The rates of poses of all bodies at these velocities."""
-        if not self._spatial:
+        if not self._layout.spatial:
             return of_bodies
         poses = self._poses(q)
         turned: Any = zip(poses[:, 3:], of_bodies[:, 3:], strict=True)
@@ -143,7 +139,7 @@ class HostScene(AbstractHost):
 
     def _along_velocities(self, q, group, blocks):
         """Derivatives along velocities, from those along poses."""
-        if not (self._spatial and group.of_poses):
+        if not (self._layout.spatial and group.of_poses):
             return blocks
         units = np.eye(self._layout.space.velocity_size)
         moved = [self._rates(q, np.tile(unit, (self._layout.ground + 1, 1))) for unit in units]
@@ -154,7 +150,11 @@ class HostScene(AbstractHost):
         known = None
         if self._elements is not None:
             prepared = self._prepared(q)
-            known = self._elements.jacobian_of_poses(prepared) if self._spatial else self._elements.jacobian(prepared)
+            known = (
+                self._elements.jacobian_of_poses(prepared)
+                if self._layout.spatial
+                else self._elements.jacobian(prepared)
+            )
         own = self._joined(self._groups[: self._positions], known, (x.blocks for x in self._of_others(q)))
         rows = np.append(_flat(own), 0.0)[self._of_poses]
         of_lengths = np.zeros((len(self._layout.turning), q.size))

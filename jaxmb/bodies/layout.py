@@ -31,6 +31,11 @@ class Layout:
         """The number of the ground: that of bodies and scalar coordinates."""
         return len(self.rotates) + len(self.scalars)
 
+    @property
+    def spatial(self) -> bool:
+        """Whether bodies move in space, not in a plane."""
+        return self.space.dimension == 3
+
     def is_place(self, numbers: Sequence[int]) -> np.ndarray:
         """Which of some numbers are those of bodies or of the ground, and not of scalar coordinates."""
         own = np.array(numbers)
@@ -44,7 +49,7 @@ class Layout:
     @functools.cached_property
     def turning(self) -> list[int]:
         """The numbers of the bodies that have Euler parameters: in space all that rotate."""
-        return [k for k, rotates in enumerate(self.rotates) if rotates and self.space.dimension == 3]
+        return [k for k, rotates in enumerate(self.rotates) if rotates and self.spatial]
 
     @functools.cached_property
     def coordinate_lengths(self) -> np.ndarray:

@@ -22,7 +22,6 @@ from .body_set import BodySet
 from .catalogue import SceneCatalogue
 from .constraint_set import ConstraintSet
 from .describe import describe_scene
-from .elementary import half_turned, is_elementary
 from .field_jacobian import motion_jacobian
 from .force_set import ForceSet
 from .groups import ConstraintGroup, CoordinateGroup, FrameGroup, Kinematics
@@ -91,7 +90,7 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def spatial(self) -> bool:
-        return self.layout.space.dimension == 3
+        return self.layout.spatial
 
     @property
     def body_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -369,12 +368,9 @@ class RigidBodySystem(AbstractSystem):
         return self.prepared() if self.spatial else self
 
     def half_turned(self, q):
-        groups = self.constraints.position
         if self.constraints.elements is None:
             return False
-        known = np.concatenate([np.full(g.row_count, is_elementary(g)) for g in groups])
-        found = half_turned(groups, self.bodies.prepared_poses(q))
-        return found if known.all() else jnp.zeros(known.size, bool).at[np.flatnonzero(known)].set(found)
+        return self.constraints.half_turned(self.bodies.prepared_poses(q))
 
     def on_host(self, t):
         return None if is_traced((self, t)) else host_scene(self, t)
