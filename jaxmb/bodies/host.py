@@ -149,12 +149,8 @@ class HostScene(AbstractHost):
     def coordinate_jacobian(self, q):
         known = None
         if self._elements is not None:
-            prepared = self._prepared(q)
-            known = (
-                self._elements.jacobian_of_poses(prepared)
-                if self._layout.spatial
-                else self._elements.jacobian(prepared)
-            )
+            derivative = self._elements.jacobian_of_poses if self._layout.spatial else self._elements.jacobian
+            known = derivative(self._prepared(q))
         own = self._joined(self._groups[: self._positions], known, (x.blocks for x in self._of_others(q)))
         rows = np.append(_flat(own), 0.0)[self._of_poses]
         of_lengths = np.zeros((len(self._layout.turning), q.size))

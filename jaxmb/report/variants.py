@@ -23,7 +23,7 @@ from ..system import AbstractSystem, parameters, with_parameters
 _LENGTH = {"m": 1, "N": 1, "Pa": -1, "kg": 0, "s": 0, "1": 0}
 
 
-def units(system: AbstractSystem) -> dict[str, str | None]:
+def units(system: Any) -> dict[str, str | None]:
     """The units of all parameters by name; None where it is not declared, or a user's function gives it."""
     out: dict[str, str | None] = dict.fromkeys(parameters(system))
     for g in _groups(system):
@@ -32,8 +32,8 @@ def units(system: AbstractSystem) -> dict[str, str | None]:
             if " or " in known:
                 known = g.group.part.unit(field, known)
             out |= {f"{name}.{field}": known or None for name in g.group.names}
-    gravity = f"{getattr(system, 'gravity_name', '')}.acceleration"
-    return out | ({gravity: "m/s²"} if gravity in out else {})
+    weights = system.forces.gravity_part if system.body_names else ()
+    return out | {f"{weight.name}.acceleration": "m/s²" for weight in weights}
 
 
 def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State]:

@@ -86,7 +86,7 @@ def test_the_weights_are_one_vector_by_name(linkage):
     for name, net in NETS.items():
         assert eqx.tree_equal(found[name], net)
     # Two drags differ in nothing but their weights, and are computed together.
-    assert len(linkage.forces) == 2
+    assert len(linkage.forces.groups) == 2
     other = {"friction.net": network(2), "drag_c.net": Ratio(jnp.array([0.7, 0.9]))}
     changed = mb.with_parameters(linkage, other)
     assert all(eqx.tree_equal(mb.modules(changed)[name], net) for name, net in (NETS | other).items())
