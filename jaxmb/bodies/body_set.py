@@ -198,14 +198,14 @@ class BodySet(eqx.Module):
         inertias = unchecked_take(jnp.concatenate([*(inertia for _, inertia in of_scalars), ones]), order)
         return jnp.concatenate([self.mass, inertias])
 
-    def wrenches(self, u: Velocities, gravity: Float[Array, "d"] | None) -> list[Acting]:
+    def wrenches(self, now: Kinematics, gravity: Float[Array, "d"] | None) -> list[Acting]:
         """Gravity and the gyroscopic moment `−ω × J ω`, together; empty where there is neither."""
         size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
         parts = []
         if gravity is not None:
             parts.append(jnp.pad(self.mass[:, None] * gravity[None, :], ((0, 0), (0, size - dimension))))
         if self.layout.turning:
-            omega = self.velocities(u)[:, 3:]
+            omega = now.velocities[: self.layout.bodies, 3:]
             moment = -jax.vmap(lambda J, w: cross(w, J @ w))(self.moments_of_inertia, omega)
             parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
         if not parts:
@@ -222,15 +222,16 @@ class BodySet(eqx.Module):
         of_bodies = placed_sums(bodies, self.layout.ground)(entries).reshape(-1)
         return of_bodies if self.layout.uniform else unchecked_take(of_bodies, self.layout.velocity_place)
 
-    def gyroscopic_damping(self, u: Velocities) -> Float[Array, "ground v v"]:
+    def gyroscopic_damping(self, now: Kinematics) -> Float[Array, "ground v v"]:
         """The derivative of each body's gyroscopic moment with respect to its own velocity; zeros for scalar
         coordinates.
         """
         size = self.layout.space.velocity_size
         if not self.layout.spatial:
-            return jnp.zeros((self.layout.ground, size, size), u.dtype)
+            return jnp.zeros((self.layout.ground, size, size), now.poses.dtype)
         moment = lambda J, w: -cross(w, J @ w)
-        own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, self.velocities(u)[:, 3:])
+        omega = now.velocities[: self.layout.bodies, 3:]
+        own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, omega)
         return jnp.pad(own, ((0, len(self.layout.scalars)), (3, 0), (3, 0)))
 
     def potential_energy(self, q: Coordinates, gravity: Float[Array, "d"]) -> Float[Array, ""]:

@@ -191,8 +191,9 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def force(self, t, q, u):
-        wrenches = self.forces.wrenches(self.kinematics(t, q, u))
-        return self.bodies.generalized_force([*wrenches, *self.bodies.wrenches(u, self.forces.gravity)], u)
+        now = self.kinematics(t, q, u)
+        wrenches = [*self.forces.wrenches(now), *self.bodies.wrenches(now, self.forces.gravity)]
+        return self.bodies.generalized_force(wrenches, u)
 
     @eqx.filter_jit
     def potential_energy(self, t, q):
