@@ -100,7 +100,7 @@ class HostScene(AbstractHost):
         u = self._given if u is None else u
         key = q.tobytes(), u.tobytes()
         if self._last is None or self._last[0] != key:
-            of_bodies = np.append(u, 0.0)[self._layout.velocity_index]
+            of_bodies: Any = np.append(u, 0.0)[self._layout.velocity_index]
             now = Kinematics(self._t, self._prepared(q), of_bodies)
             self._last = key, _rows(self._others, now, self._moves(q))
         return self._last[1]
