@@ -29,6 +29,9 @@ BodyPoses: TypeAlias = Float[Array, "b_ground p"]
 BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 
 
+# Of more parts than this with functions of time only a combination is looked at.
+_MOST_OF_TIME = 32
+
 # Wrenches of some parts, shape (parts, k, v), and the numbers of the bodies that they act on, shape (parts, k).
 Acting: TypeAlias = tuple[Float[Array, "parts k v"], np.ndarray]
 
@@ -233,9 +236,20 @@ class AbstractGroup(eqx.Module):
         others = jax.tree.map(lambda leaf: leaf[member][None], dataclasses.replace(self, group=None))
         return dataclasses.replace(others, group=self.group.only(member))
 
-    def given_in_time(self, now: Kinematics) -> Float[Array, "parts *shape"]:
-        """What functions of time give in parts that have them, while nothing moves."""
-        return self._of_motion("given_in_time", now)
+    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
+        """The parts' own coordinates, by name within the part."""
+        return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
+
+    def given_in_time(self, now: Kinematics) -> Float[Array, "n"]:
+        """The values of functions of time in parts that have them, while nothing moves; of many parts a combination,
+        with weights that let no two of them cancel.
+        """
+        given = self._of_motion("given_in_time", now)
+        parts = given.shape[0]
+        if parts <= _MOST_OF_TIME:
+            return given.ravel()
+        weights = np.random.default_rng(0).uniform(1.0, 2.0, parts).astype(given.dtype)
+        return weights @ given.reshape(parts, -1)
 
     @property
     def _space(self):
@@ -276,10 +290,6 @@ class CoordinateGroup(AbstractGroup):
     @property
     def rows(self) -> int:
         return 0
-
-    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
-        """Their coordinates, by name within the part."""
-        return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
 
 
 class FrameGroup(AbstractGroup):
@@ -366,10 +376,6 @@ class ConstraintGroup(AbstractConstraintGroup):
 
     def residual(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts rows"]:
         return self._map(lambda at, x: self._residual(at, t, x), poses)
-
-    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
-        """The joints' own coordinates, by name within the joint."""
-        return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
 
     def along(self, t: Scalar, poses: BodyPoses, moves: Float[Array, "b_ground n p"]) -> Float[Array, "parts rows k n"]:
         """Derivatives along `n` motions of every body, one at a time."""

@@ -35,8 +35,6 @@ from .parameters import SceneParameters
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
 # velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
 _LEAST_VELOCITIES = 40
-# Of more parts than this with functions of time only a combination is looked at.
-_MOST_OF_TIME = 32
 
 
 class Implied(NamedTuple):
@@ -430,8 +428,7 @@ class RigidBodySystem(AbstractSystem):
 
     def given_in_time(self, t, q, u):
         now = self.kinematics(t, q, u)
-        given = [g.given_in_time(now) for g in self._acting if g.group.part.of_time]
-        return jnp.concatenate([_combined(own).ravel() for own in given])
+        return jnp.concatenate([g.given_in_time(now) for g in self._acting if g.group.part.of_time])
 
     @property
     def _acting(self):
@@ -441,10 +438,3 @@ class RigidBodySystem(AbstractSystem):
 def _of_rows(values: Array, count: int) -> Array:
     """The numbers of parts, once for each of their rows."""
     return values if count == 1 else jnp.repeat(values, count, axis=0)
-
-
-def _combined(of_parts):
-    """What some parts give, or one combination of many, with weights that let no two of them cancel."""
-    parts = of_parts.shape[0]
-    weights = np.random.default_rng(0).uniform(1.0, 2.0, parts).astype(of_parts.dtype)
-    return of_parts if parts <= _MOST_OF_TIME else weights @ of_parts.reshape(parts, -1)
