@@ -192,7 +192,7 @@ class BodySet(eqx.Module):
         """
         if not self.layout.scalars:
             return self.mass
-        still = [k for k, own in enumerate(self.layout.scalars, self.layout.bodies) if not own.moves]
+        still = [k for k, scalar in enumerate(self.layout.scalars, self.layout.bodies) if not scalar.moves]
         order = np.argsort(np.concatenate([*(numbers for numbers, _ in of_scalars), still]).astype(int))
         ones = jnp.ones(len(still), self.mass.dtype)
         inertias = unchecked_take(jnp.concatenate([*(inertia for _, inertia in of_scalars), ones]), order)
@@ -231,8 +231,8 @@ class BodySet(eqx.Module):
             return jnp.zeros((self.layout.ground, size, size), now.poses.dtype)
         moment = lambda J, w: -cross(w, J @ w)
         omega = now.velocities[: self.layout.bodies, 3:]
-        own = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, omega)
-        return jnp.pad(own, ((0, len(self.layout.scalars)), (3, 0), (3, 0)))
+        blocks = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, omega)
+        return jnp.pad(blocks, ((0, len(self.layout.scalars)), (3, 0), (3, 0)))
 
     def potential_energy(self, q: Coordinates, gravity: Float[Array, "d"]) -> Float[Array, ""]:
         """Potential energy [J] in a field of gravity."""

@@ -1,5 +1,7 @@
 """The motions, quantities and forces of a compiled scene by name."""
 
+import itertools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -71,11 +73,10 @@ def _values_of_parts(system, t, q, u):
     """Residuals of positions and of accelerations, wrenches, and rates of internal states, by part."""
     constraints, forces = system.constraints, system.forces
     position, acceleration, wrenches, rates = _values(system, t, q, u)
-    each = lambda groups, values: [
-        pair for g, own in zip(groups, values, strict=True) for pair in zip(g.group.names, np.asarray(own), strict=True)
-    ]
+    named = lambda g, values: zip(g.group.names, np.asarray(values), strict=True)
+    each = lambda groups, of_groups: itertools.chain(*map(named, groups, of_groups))
     return {
-        "residual": [*each(constraints.position, position), *each(constraints.groups, acceleration)],
+        "residual": (*each(constraints.position, position), *each(constraints.groups, acceleration)),
         "force": each(forces.groups, wrenches),
         "rate": [(name, np.asarray(rates)[index]) for name, index in forces.state_names().items()],
     }

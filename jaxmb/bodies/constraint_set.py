@@ -99,21 +99,20 @@ class ConstraintSet(eqx.Module):
 
     def residual(self, t: Scalar, poses: BodyPoses) -> Float[Array, "position_rows"]:
         """Position residuals."""
-        return joined(
-            self._pieces(self.position, lambda own: own.residual(poses), lambda g: g.residual(t, poses)), poses.dtype
-        )
+        pieces = self._pieces(self.position, lambda elements: elements.residual(poses), lambda g: g.residual(t, poses))
+        return joined(pieces, poses.dtype)
 
     def velocity_residual(self, now: Kinematics) -> Float[Array, "velocity_rows"]:
         """Rates of position residuals, and velocity residuals."""
         groups = (*self.position, *self.velocity)
-        of_elements = lambda own: own.velocity(now.poses, now.velocities)
+        of_elements = lambda elements: elements.velocity(now.poses, now.velocities)
         return joined(self._pieces(groups, of_elements, lambda g: g.velocity(now)), now.poses.dtype)
 
     def acceleration_residual(
         self, now: Kinematics, accelerations: BodyVelocities
     ) -> Float[Array, "acceleration_rows"]:
         """The time derivatives of the same, and residuals of servos."""
-        of_elements = lambda own: own.acceleration(now.poses, now.velocities, accelerations)
+        of_elements = lambda elements: elements.acceleration(now.poses, now.velocities, accelerations)
         of_group = lambda g: g.acceleration(now, accelerations)
         return joined(self._pieces(self.groups, of_elements, of_group), now.poses.dtype)
 
@@ -135,7 +134,7 @@ class ConstraintSet(eqx.Module):
         default of all groups.
         """
         groups = self.groups if groups is None else groups
-        pieces = self._pieces(groups, lambda own: own.jacobian(now.poses), lambda g: g.jacobian(now))
+        pieces = self._pieces(groups, lambda elements: elements.jacobian(now.poses), lambda g: g.jacobian(now))
         return joined([*pieces, jnp.zeros(1, now.poses.dtype)], now.poses.dtype)
 
     def jacobian(
@@ -159,7 +158,7 @@ class ConstraintSet(eqx.Module):
         if self.elements is None or not all(map(is_elementary, groups)):
             moves = jax.vmap(along)(poses[:, : space.pose_size])
         of_group: Any = lambda g: g.along(t, poses, moves)
-        blocks = self._pieces(groups, lambda own: own.jacobian_of_poses(poses), of_group)
+        blocks = self._pieces(groups, lambda elements: elements.jacobian_of_poses(poses), of_group)
         return self._assembled(joined([*blocks, jnp.zeros(1, poses.dtype)], poses.dtype), groups, of_poses=True)
 
     def _assembled(self, blocks, groups, *, of_poses):
@@ -203,21 +202,21 @@ class ConstraintSet(eqx.Module):
         take = lambda g: unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints))
         of_joints = [jnp.sum(take(g), axis=1) for g in laws]
         # Scalar coordinates that a law has beyond those of its joint take no reaction.
-        more = [len(g.group.bodies[0]) - own.shape[1] for g, own in zip(laws, of_joints, strict=True)]
-        return [jnp.pad(own, ((0, 0), (0, k), (0, 0))) for own, k in zip(of_joints, more, strict=True)]
+        more = [len(g.group.bodies[0]) - reaction.shape[1] for g, reaction in zip(laws, of_joints, strict=True)]
+        return [jnp.pad(reaction, ((0, 0), (0, k), (0, 0))) for reaction, k in zip(of_joints, more, strict=True)]
 
     def nonideal_wrenches(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
     ) -> list[Acting]:
         """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
         reactions = self.reactions(laws, now, multipliers)
-        return [(g.wrenches(now, own), g.group.body_index) for g, own in zip(laws, reactions, strict=True)]
+        return [(g.wrenches(now, reaction), g.group.body_index) for g, reaction in zip(laws, reactions, strict=True)]
 
     def of_groups(self, multipliers: Float[Array, "rows"]) -> list[tuple[Any, Float[Array, "parts rows"]]]:
         """The groups with the multipliers of their parts."""
         ends = np.cumsum([g.row_count for g in self.groups])
         pieces = jnp.split(multipliers, ends[:-1]) if self.groups else []
-        return [(g, own.reshape(-1, g.rows)) for g, own in zip(self.groups, pieces, strict=True)]
+        return [(g, piece.reshape(-1, g.rows)) for g, piece in zip(self.groups, pieces, strict=True)]
 
     def _pieces(
         self,

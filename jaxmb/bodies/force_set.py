@@ -87,7 +87,7 @@ class ForceSet(eqx.Module):
         return tuple(out)
 
     def _in_parts(self, states) -> list[Array]:
-        return [entry(self.groups[own.group].group.part, own.keys) for own in states]
+        return [entry(self.groups[state.group].group.part, state.keys) for state in states]
 
     def initial_states(self) -> Float[Array, "nz"] | None:
         """The values that the parts were given; None without internal states.
@@ -109,31 +109,31 @@ class ForceSet(eqx.Module):
             return self
         before = self._in_parts(states)
         if z is None:
-            values = [jax.device_put(np.full_like(own, np.nan)) for own in before]
+            values = [jax.device_put(np.full_like(x, np.nan)) for x in before]
         else:
-            values = [z[own.start : own.stop].reshape(x.shape) for own, x in zip(states, before, strict=True)]
-        return eqx.tree_at(lambda own: own._in_parts(states), self, values)
+            values = [z[state.start : state.stop].reshape(x.shape) for state, x in zip(states, before, strict=True)]
+        return eqx.tree_at(lambda forces: forces._in_parts(states), self, values)
 
     def state_rates(self, now: Kinematics) -> Float[Array, "nz"]:
         """ż of parts that have their internal states."""
-        rates = {g: self.groups[g].state_rates(now) for g in dict.fromkeys(own.group for own in self.states)}
-        return joined([rates[own.group][own.name] for own in self.states], now.poses.dtype)
+        rates = {g: self.groups[g].state_rates(now) for g in dict.fromkeys(state.group for state in self.states)}
+        return joined([rates[state.group][state.name] for state in self.states], now.poses.dtype)
 
     def state_scale(self, dtype: Any) -> Float[Array, "nz"]:
         """The typical size of every internal state."""
         out = []
-        for own in self.states:
-            sizes = self.groups[own.group].group.map(lambda at: at(0.0).state_sizes()).get(own.name)
-            size = jnp.ones(len(own.members), dtype) if sizes is None else jnp.asarray(sizes, dtype)
-            out.append(jnp.repeat(size, own.size))
+        for state in self.states:
+            sizes = self.groups[state.group].group.map(lambda at: at(0.0).state_sizes()).get(state.name)
+            size = jnp.ones(len(state.members), dtype) if sizes is None else jnp.asarray(sizes, dtype)
+            out.append(jnp.repeat(size, state.size))
         return joined(out, dtype)
 
     def state_names(self) -> dict[str, list[int]]:
         """Indices in z by name, `"motor.torque"`."""
-        starts = ((name, first, own.size) for own in self.states for name, first in own.of_parts().items())
+        starts = ((name, first, state.size) for state in self.states for name, first in state.of_parts().items())
         return {name: list(range(first, first + size)) for name, first, size in starts}
 
     def state_measures(self) -> dict[str, Measure]:
         """The internal states as quantities, by name."""
-        starts = ((name, first, own.shape) for own in self.states for name, first in own.of_parts().items())
+        starts = ((name, first, state.shape) for state in self.states for name, first in state.of_parts().items())
         return {name: Measure(shape, entries_along, ("z", np.array(first), shape)) for name, first, shape in starts}

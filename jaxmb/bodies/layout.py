@@ -38,8 +38,8 @@ class Layout:
 
     def is_place(self, numbers: Sequence[int]) -> np.ndarray:
         """Which of some numbers are those of bodies or of the ground, and not of scalar coordinates."""
-        own = np.array(numbers)
-        return (own < self.bodies) | (own == self.ground)
+        index = np.array(numbers)
+        return (index < self.bodies) | (index == self.ground)
 
     @property
     def uniform(self) -> bool:

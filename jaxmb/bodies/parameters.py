@@ -56,9 +56,9 @@ def stacked_numbers(groups: Mapping[str, Sequence[Any]]) -> Iterator[StackedNumb
             sources = [((), stacked.part, stacked.names)]
             sources += [(keys, entry(stacked.part, keys), names) for keys, names in stacked.inner]
             for prefix, part, names in sources:
-                own = [((*prefix, *keys), ".".join(shown), declared) for keys, shown, declared in paths(part)]
+                numbers = [((*prefix, *keys), ".".join(shown), declared) for keys, shown, declared in paths(part)]
                 for k, name in enumerate(names):
-                    for keys, field, declared in own:
+                    for keys, field, declared in numbers:
                         yield StackedNumber(f"{name}.{field}", path, g, keys, k, declared)
 
 
@@ -112,7 +112,7 @@ class SceneParameters(ParameterTable):
     def in_range(self):
         ok: Any = True
         outer = [*self.system.forces.gravity_part, *(group.part() for group in self._all_groups)]
-        inner = [part for own in outer for _, part in inner_parts(own)]
+        inner = [part for part_of in outer for _, part in inner_parts(part_of)]
         for part in (*outer, *inner):
             for keys, _, declared in paths(part):
                 value = entry(part, keys)
@@ -136,10 +136,10 @@ class SceneParameters(ParameterTable):
         # The rates of inputs count in constraints, or in velocities that forces depend on.
         out: dict[str, tuple[AbstractSignal, bool]] = {}
         for path, groups in self._groups.items():
-            for own in (own for g in groups for each in g.group.inputs for own in each.alone()):
-                (name,) = own.names
-                _, counts = out.get(name, (own.signal, False))
-                out[name] = own.signal, counts or path in _BIND or own.moves
+            for single in (single for g in groups for each in g.group.inputs for single in each.alone()):
+                (name,) = single.names
+                _, counts = out.get(name, (single.signal, False))
+                out[name] = single.signal, counts or path in _BIND or single.moves
         return out
 
     def with_signals(self, signals):
@@ -189,8 +189,8 @@ def _inputs(
         varying.add(number.name)
         # All numbers of a joint place the coordinate that other parts measure.
         moves = places or number.keys[0] == "joints" or number.keys[0] in part.moving
-        own = Input(signal, (number.name,), number.keys, (number.member,), moves)
-        new.setdefault((number.path, number.group), []).append(own)
+        driven = Input(signal, (number.name,), number.keys, (number.member,), moves)
+        new.setdefault((number.path, number.group), []).append(driven)
     for name in signals:
         if name not in varying:
             raise ValueError(
@@ -201,6 +201,6 @@ def _inputs(
 
 
 def _with_inputs(group, inputs):
-    names = {own.names for own in inputs}
-    kept = (own for each in group.group.inputs for own in each.alone() if own.names not in names)
+    names = {single.names for single in inputs}
+    kept = (single for each in group.group.inputs for single in each.alone() if single.names not in names)
     return dataclasses.replace(group, group=dataclasses.replace(group.group, inputs=together([*kept, *inputs])))

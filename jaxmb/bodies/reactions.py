@@ -29,7 +29,7 @@ class Place(NamedTuple):
 
 def places(groups: Sequence[AbstractGroup], name: str) -> tuple[Place, ...]:
     """Where the parts of a name stand: the components of a part in several groups or more than once in one."""
-    found = ((g, k) for g, own in enumerate(groups) for k, other in enumerate(own.group.names) if other == name)
+    found = ((g, k) for g, group in enumerate(groups) for k, other in enumerate(group.group.names) if other == name)
     return tuple(_place(g, k, groups[g].group) for g, k in found)
 
 
@@ -57,8 +57,8 @@ def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
     fields = {"force": (d,), "moment": () if d == 2 else (3,)}
     found = {name: JointPlaces.of(system.constraints, name) for name in names}
     return {
-        f"{name}.{field}": Measure(shape, _field_of_reaction, (field, own), of_forces=True)
-        for name, own in found.items()
+        f"{name}.{field}": Measure(shape, _field_of_reaction, (field, joint), of_forces=True)
+        for name, joint in found.items()
         for field, shape in fields.items()
     }
 

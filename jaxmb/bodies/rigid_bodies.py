@@ -182,7 +182,7 @@ class RigidBodySystem(AbstractSystem):
     def known_scales(self) -> tuple[Float[np.ndarray, "nq"], Float[np.ndarray, "nu"]]:
         """The scales of coordinates and velocities of a system that is not traced: NumPy, also within a trace."""
         lengths = self.layout.coordinate_lengths, self.layout.velocity_lengths
-        of_coordinates, of_velocities = (np.where(own, np.asarray(self.length), 1.0) for own in lengths)
+        of_coordinates, of_velocities = (np.where(is_length, np.asarray(self.length), 1.0) for is_length in lengths)
         return of_coordinates, of_velocities
 
     # Forces. Each kernel is a compiled function, so that it is traced once for all its uses in a program.
@@ -201,7 +201,7 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def state_ends(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return tuple(own.stop for own in self.forces.states)
+        return tuple(state.stop for state in self.forces.states)
 
     def state_names(self):
         return self.forces.state_names()

@@ -29,7 +29,7 @@ class DrivenParameters(eqx.Module):
         """The values at a time."""
         if len(self.names) == 1:
             return [self.signal(t)]
-        values = jax.vmap(lambda own: own(t))(self.signal)
+        values = jax.vmap(lambda signal: signal(t))(self.signal)
         return [values[k] for k in range(len(self.names))]
 
 
@@ -37,18 +37,18 @@ class LagrangianParameters(ParameterTable):
     """The parameters of a Lagrangian system."""
 
     def modules(self):
-        is_module = lambda own: isinstance(own, eqx.Module)
-        return {name: own.like for name, own in self.system.parameters.items() if is_module(own)}
+        is_module = lambda value: isinstance(value, eqx.Module)
+        return {name: value.like for name, value in self.system.parameters.items() if is_module(value)}
 
     @property
     def signals(self):
-        each = ((own, of_each(own.signal, len(own.names))) for own in self.system.inputs)
-        return {name: (x, own.binds) for own, alone in each for name, x in zip(own.names, alone, strict=True)}
+        each = ((driven, of_each(driven.signal, len(driven.names))) for driven in self.system.inputs)
+        return {name: (x, driven.binds) for driven, alone in each for name, x in zip(driven.names, alone, strict=True)}
 
     def with_signals(self, signals):
         system = self.system
         inputs = _together(self.signals | _inputs_of(system, signals))
-        drift_free = system.drift_free and not any(own.binds for own in inputs)
+        drift_free = system.drift_free and not any(driven.binds for driven in inputs)
         same = {field.name: getattr(system, field.name) for field in dataclasses.fields(system)}
         return with_values(type(system), same | {"inputs": inputs, "drift_free": drift_free})
 
@@ -57,7 +57,7 @@ def _together(inputs: Mapping[str, tuple[AbstractSignal, bool]]) -> tuple[Driven
     """Inputs by name with inputs of one kind together."""
     out = []
     for binds in (True, False):
-        names = [name for name, own in inputs.items() if own[1] == binds]
+        names = [name for name, signal in inputs.items() if signal[1] == binds]
         kinds = of_one_kind([inputs[name][0] for name in names])
         out += [DrivenParameters(tuple(names[k] for k in numbers), signal, binds) for numbers, signal in kinds]
     return tuple(out)

@@ -137,7 +137,7 @@ def _rate_along(system, index, ts, ys, solved):
 @view_of_motion
 def _forces_along(system, rows, ts, ys, multipliers):
     multipliers = jnp.where(rows[None, :], multipliers, jnp.zeros_like(multipliers))
-    return jax.vmap(lambda t, y, own: system.constraint_force(t, y.q, y.u, own))(ts, ys, multipliers)
+    return jax.vmap(lambda t, y, forces: system.constraint_force(t, y.q, y.u, forces))(ts, ys, multipliers)
 
 
 @view_of_motion
