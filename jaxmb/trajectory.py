@@ -158,8 +158,8 @@ class Trajectory(eqx.Module):
         return f"{text}\nNames: {_listed(names)}{own}"
 
     def __getitem__(self, name: str) -> Any:
-        if name in self.system.motion_names():
-            return self.system.motion(name, self.ys)
+        if name in self.system.catalogue.motion_names():
+            return self.system.catalogue.motion(name, self.ys)
         if name in self:
             return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
         if name in self._force_names():
@@ -176,12 +176,12 @@ class Trajectory(eqx.Module):
         return super().__getattribute__(name)
 
     def _force_names(self) -> tuple[str, ...]:
-        return self.system.force_names() if self.system.body_names else ()
+        return self.system.catalogue.force_names() if self.system.body_names else ()
 
     def __iter__(self) -> Iterator[str]:
         """The names that `trajectory[name]` takes."""
         parts = (known.split(".")[0] for known in self.system.quantities())
-        return iter(dict.fromkeys((*self.system.motion_names(), *parts)))
+        return iter(dict.fromkeys((*self.system.catalogue.motion_names(), *parts)))
 
     def get(self, name: str, default: Any = None) -> Any:
         """`trajectory[name]`, or the default if there is no such name."""
@@ -290,7 +290,7 @@ class Trajectory(eqx.Module):
     @property
     def rates(self) -> Float[Array, "times nq"]:
         """q̇ of every coordinate."""
-        return self.system.rates_along(self.ts, self.ys)
+        return self.system.catalogue.rates_along(self.ts, self.ys)
 
     @property
     def accelerations(self) -> Float[Array, "times nu"]:
@@ -315,18 +315,18 @@ class Trajectory(eqx.Module):
         `reactions["A"].force` [N], shape (times, d), in world axes, acts on the last of the joint's bodies that is not
         the ground; `.moment` [N m] about the joint's point; `.multipliers`.
         """
-        return _ByName("joint", self.system.joint_names(), self._reaction)
+        return _ByName("joint", self.system.catalogue.joint_names(), self._reaction)
 
     def _reaction(self, name):
-        return self.system.reaction(name, self.ts, self.ys, self.multipliers)
+        return self.system.catalogue.reaction(name, self.ts, self.ys, self.multipliers)
 
     @property
     def constraint_forces(self) -> Mapping[str, Array]:
         """Generalized forces `Aᵀ λ` of the constraints by name, shape (times, nu)."""
-        return _ByName("joint", self.system.constraint_names(), self._constraint_force)
+        return _ByName("joint", self.system.catalogue.constraint_names(), self._constraint_force)
 
     def _constraint_force(self, name):
-        return self.system.generalized_constraint_force(name, self.ts, self.ys, self.multipliers)
+        return self.system.catalogue.constraint_force(name, self.ts, self.ys, self.multipliers)
 
     @property
     def forces(self) -> Mapping[str, Array]:
@@ -336,11 +336,11 @@ class Trajectory(eqx.Module):
         Friction in a joint is among them under its own name, on the bodies of the joint: the reaction of the joint is
         without it.
         """
-        return _ByName("force", self.system.force_names(), self._wrenches)
+        return _ByName("force", self.system.catalogue.force_names(), self._wrenches)
 
     def _wrenches(self, name):
         multipliers = None if self.system.ideal else self.multipliers
-        return self.system.applied_wrenches(name, self.ts, self.ys, multipliers)
+        return self.system.catalogue.applied_wrenches(name, self.ts, self.ys, multipliers)
 
     @property
     @_view

@@ -1,139 +1,239 @@
-"""The rows of the constraints of a scene, group by group, or of all elementary joints together."""
+"""The constraints of a scene: the rows of position constraints, velocity constraints and servos, in this order."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
 from ..linalg.sums import unchecked_take
-from .elementary import ElementaryRows, is_elementary
-from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities, NonIdealGroup
+from ..parts.base import AbstractInertialConstraint
+from .elementary import ElementaryRows, elementary_rows, half_turned, is_elementary
+from .groups import (
+    AbstractConstraintGroup,
+    Acting,
+    BodyPoses,
+    BodyVelocities,
+    ConstraintGroup,
+    Kinematics,
+    NonIdealGroup,
+    VelocityConstraintGroup,
+    joined,
+)
+from .layout import Layout
 
 
 class ConstraintSet(eqx.Module):
-    """Groups of constraints, one after the other, whose rows are numbered through.
+    """Groups of constraints, whose rows are numbered through, and the laws of their joints.
 
-    **Fields:** `elements`: the rows of the groups that consist of elementary joints, None where all rows are computed
-    group by group.
+    **Fields:** groups of `position` constraints, of `velocity` constraints, which include dry friction, and of
+    `servos`; groups of `nonideal` laws; the `layout` of the bodies; `elements`: the rows of the position groups that
+    consist of elementary joints, None where all rows are computed group by group.
     """
 
-    groups: tuple[AbstractConstraintGroup, ...]
-    elements: ElementaryRows | None
+    position: tuple[ConstraintGroup, ...]
+    velocity: tuple[VelocityConstraintGroup, ...]
+    servos: tuple[ConstraintGroup, ...]
+    nonideal: tuple[NonIdealGroup, ...]
+    layout: Layout = eqx.field(static=True)
+    elements: ElementaryRows | None = None
 
-    def residual(self, t: Scalar, poses: BodyPoses) -> list[Array]:
-        """Position residuals, in pieces that follow each other."""
-        return self._rows(lambda own: own.residual(poses), lambda g: g.residual(t, poses))
+    # Groups and their rows
 
-    def velocity(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> list[Array]:
-        """Velocity residuals, and rates of position residuals."""
-        return self._rows(lambda own: own.velocity(poses, velocities), lambda g: g.velocity(t, poses, velocities))
+    @property
+    def groups(self) -> tuple[AbstractConstraintGroup, ...]:
+        """All groups, in the order of the rows of A."""
+        return (*self.position, *self.velocity, *self.servos)
 
-    def acceleration(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, accelerations: BodyVelocities
-    ) -> list[Array]:
-        """The time derivatives of `velocity`."""
-        return self._rows(
-            lambda own: own.acceleration(poses, velocities, accelerations),
-            lambda g: g.acceleration(t, poses, velocities, accelerations),
-        )
+    @property
+    def frictions(self) -> tuple[VelocityConstraintGroup, ...]:
+        """The groups of dry friction."""
+        return tuple(g for g in self.velocity if g.joints)
 
-    def jacobian(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> list[Array]:
-        """Derivatives with respect to the velocities of the bodies of each row."""
-        return self._rows(lambda own: own.jacobian(poses), lambda g: g.jacobian(t, poses, velocities))
+    @property
+    def laws(self) -> tuple[NonIdealGroup, ...]:
+        """The groups of non-ideal laws, with those of dry friction that slips."""
+        return (*self.nonideal, *(g.law for g in self.frictions))
+
+    @property
+    def inertial(self) -> tuple[ConstraintGroup, ...]:
+        """The groups of parts that have scalar coordinates."""
+        return tuple(g for g in self.position if isinstance(g.group.part, AbstractInertialConstraint))
+
+    @property
+    def scalar_inertias(self) -> list[tuple[np.ndarray, Array]]:
+        """The numbers of scalar coordinates that move, and their inertias, group by group."""
+        # The mode of friction has a velocity that no force changes.
+        modes = [
+            (g.group.body_index[:, k], jnp.ones_like(g.group.part.coefficient))
+            for g in self.frictions
+            for k in range(-g.rows, 0)
+        ]
+        return [*((g.group.body_index[:, -1], g.group.part.inertia) for g in self.inertial), *modes]
+
+    @property
+    def rows(self) -> tuple[tuple[str, int], ...]:
+        """Name and number within its part of every row of A."""
+        return tuple((name, k) for g in self.groups for name in g.group.names for k in range(g.rows))
+
+    @property
+    def linear(self) -> bool:
+        """Whether the rows are linear in velocities up to a constant term."""
+        return all(g.group.part.linear for g in self.velocity)
+
+    @property
+    def drift_free(self) -> bool:
+        """Whether that term is zero."""
+        return not any(g.rheonomic for g in self.position) and all(g.homogeneous for g in self.velocity)
+
+    def prepared(self) -> "ConstraintSet":
+        """The same, with the rows of elementary joints together."""
+        elements = elementary_rows(self.position, self.layout.ground)
+        return ConstraintSet(self.position, self.velocity, self.servos, self.nonideal, self.layout, elements)
+
+    # Residuals
+
+    def residual(self, t: Scalar, poses: BodyPoses) -> Float[Array, "position_rows"]:
+        """Position residuals."""
+        pieces = self._pieces(self.position, lambda elements: elements.residual(poses), lambda g: g.residual(t, poses))
+        return joined(pieces, poses.dtype)
+
+    def velocity_residual(self, now: Kinematics) -> Float[Array, "velocity_rows"]:
+        """Rates of position residuals, and velocity residuals."""
+        groups = (*self.position, *self.velocity)
+        of_elements = lambda elements: elements.velocity(now.poses, now.velocities)
+        return joined(self._pieces(groups, of_elements, lambda g: g.velocity(now)), now.poses.dtype)
+
+    def acceleration_residual(
+        self, now: Kinematics, accelerations: BodyVelocities
+    ) -> Float[Array, "acceleration_rows"]:
+        """The time derivatives of the same, and residuals of servos."""
+        of_elements = lambda elements: elements.acceleration(now.poses, now.velocities, accelerations)
+        of_group = lambda g: g.acceleration(now, accelerations)
+        return joined(self._pieces(self.groups, of_elements, of_group), now.poses.dtype)
+
+    def half_turned(self, poses: BodyPoses) -> Bool[Array, "position_rows"]:
+        """Which rows of elementary joints vanish at these poses with the joint turned away from where it closes."""
+        known, found = self._is_elementary(self.position), half_turned(self.position, poses)
+        return found if known.all() else jnp.zeros(known.size, bool).at[np.flatnonzero(known)].set(found)
+
+    def _is_elementary(self, groups):
+        """Which rows of some groups are rows of elementary joints."""
+        return np.concatenate([np.full(g.row_count, is_elementary(g)) for g in groups])
+
+    # Jacobians
+
+    def blocks(
+        self, now: Kinematics, groups: Sequence[AbstractConstraintGroup] | None = None
+    ) -> Float[Array, "entries"]:
+        """Derivatives with respect to the velocities of the bodies of each row, group by group, followed by a zero; by
+        default of all groups.
+        """
+        groups = self.groups if groups is None else groups
+        pieces = self._pieces(groups, lambda elements: elements.jacobian(now.poses), lambda g: g.jacobian(now))
+        return joined([*pieces, jnp.zeros(1, now.poses.dtype)], now.poses.dtype)
+
+    def jacobian(
+        self, now: Kinematics, groups: Sequence[AbstractConstraintGroup] | None = None
+    ) -> Float[Array, "rows nu"]:
+        """The rows of A of some groups, by default of all."""
+        groups = self.groups if groups is None else groups
+        return self._assembled(self.blocks(now, groups), groups, of_poses=False)
 
     def jacobian_of_poses(
-        self, t: Scalar, poses: BodyPoses, moves: Callable[[], Float[Array, "b_ground n p"]]
-    ) -> list[Array]:
-        """Derivatives with respect to the poses of the bodies of each row; `moves`: the rates of prepared poses along
-        unit rates of poses.
-        """
-        return self._rows(lambda own: own.jacobian_of_poses(poses), lambda g: g.along(t, poses, moves()))
+        self, t: Scalar, poses: BodyPoses, counts: Sequence[ConstraintGroup]
+    ) -> Float[Array, "rows nq"]:
+        """Derivatives of position residuals, and of `counts` of turns, with respect to the coordinates."""
+        space, moves = self.layout.space, None
 
-    def wrenches(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, multipliers: Float[Array, "rows"]
-    ) -> tuple[list[Float[Array, "_ k v"]], list[np.ndarray]]:
-        """Wrenches of all rows, `Aᵀ λ`, and the bodies that they act on, (_, k)."""
-        wrenches, bodies = [], []
+        def along(x):
+            units = jnp.eye(space.pose_size, dtype=poses.dtype)
+            return jax.vmap(lambda dx: jax.jvp(space.prepare, (x,), (dx,))[1])(units)
+
+        groups = (*self.position, *counts)
+        if self.elements is None or not all(map(is_elementary, groups)):
+            moves = jax.vmap(along)(poses[:, : space.pose_size])
+        of_group: Any = lambda g: g.along(t, poses, moves)
+        blocks = self._pieces(groups, lambda elements: elements.jacobian_of_poses(poses), of_group)
+        return self._assembled(joined([*blocks, jnp.zeros(1, poses.dtype)], poses.dtype), groups, of_poses=True)
+
+    def _assembled(self, blocks, groups, *, of_poses):
+        source = self.layout.jacobian_source([(g.group.body_index, g.rows) for g in groups], of_poses=of_poses)
+        return unchecked_take(blocks, source)
+
+    # Forces
+
+    def wrenches(self, now: Kinematics, multipliers: Float[Array, "rows"]) -> list[Acting]:
+        """Wrenches of all rows, `Aᵀ λ`."""
+        out: list[Acting] = []
         if self.elements is not None:
-            known = np.concatenate([np.full(count, is_elementary(g)) for g, count in self._counts])
-            own = multipliers if known.all() else unchecked_take(multipliers, np.flatnonzero(known))
-            wrenches.append(self.elements.wrenches(poses, own)[:, None])
-            bodies.append(np.arange(self.elements.places.ground)[:, None])
-        for g, own in self._of_groups(multipliers):
-            if self.elements is None or not is_elementary(g):
-                wrenches.append(g.wrenches(t, poses, velocities, own))
-                bodies.append(g.group.body_index)
-        return wrenches, bodies
+            known = self._is_elementary(self.groups)
+            of_elements = multipliers if known.all() else unchecked_take(multipliers, np.flatnonzero(known))
+            wrenches = self.elements.wrenches(now.poses, of_elements)
+            out.append((wrenches[:, None], np.arange(self.elements.places.ground)[:, None]))
+        others = [pair for pair in self.of_groups(multipliers) if self.elements is None or not is_elementary(pair[0])]
+        return [*out, *((g.wrenches(now, of_group), g.group.body_index) for g, of_group in others)]
 
     def reactions(
-        self,
-        laws: Sequence[NonIdealGroup],
-        t: Scalar,
-        poses: BodyPoses,
-        velocities: BodyVelocities,
-        multipliers: Float[Array, "rows"],
+        self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
     ) -> list[Float[Array, "parts k v"]]:
         """The wrenches of the joints of non-ideal laws on the bodies of these, law group by law group."""
         named, wrenches, bodies = {name for g in laws for name in g.joints}, [], []
-        known = None if self.elements is None else self.elements.jacobian(poses)
+        known = None if self.elements is None else self.elements.jacobian(now.poses)
         first = 0
-        for g, own in self._of_groups(multipliers):
+        for g, of_group in self.of_groups(multipliers):
             # From the matrix A, which the equation needs as well.
             if known is not None and is_elementary(g):
-                blocks = lambda known=known, at=first, n=own.size: known[at : at + n]
-                first += own.size
+                blocks = lambda known=known, at=first, n=of_group.size: known[at : at + n]
+                first += of_group.size
             else:
-                blocks = lambda g=g: g.jacobian(t, poses, velocities)
+                blocks = lambda g=g: g.jacobian(now)
             if named.isdisjoint(g.group.names):
                 continue
-            of_parts = blocks().reshape(*own.shape, len(g.group.bodies[0]), -1)
-            wrenches.append(jnp.sum(own[..., None, None] * of_parts, axis=1).reshape(-1))
+            of_parts = blocks().reshape(*of_group.shape, len(g.group.bodies[0]), -1)
+            wrenches.append(jnp.sum(of_group[..., None, None] * of_parts, axis=1).reshape(-1))
             bodies.append((g.group.names, g.group.bodies))
-        reactions = jnp.concatenate([*wrenches, jnp.zeros(1, poses.dtype)])
+        reactions = jnp.concatenate([*wrenches, jnp.zeros(1, now.poses.dtype)])
         # A joint may be made of several constraints, all between the same bodies.
-        take = lambda g: unchecked_take(reactions, g.group.layout.reaction_source(bodies, g.joints))
+        take = lambda g: unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints))
         of_joints = [jnp.sum(take(g), axis=1) for g in laws]
         # Scalar coordinates that a law has beyond those of its joint take no reaction.
-        more = [len(g.group.bodies[0]) - own.shape[1] for g, own in zip(laws, of_joints, strict=True)]
-        return [jnp.pad(own, ((0, 0), (0, k), (0, 0))) for own, k in zip(of_joints, more, strict=True)]
+        more = [len(g.group.bodies[0]) - reaction.shape[1] for g, reaction in zip(laws, of_joints, strict=True)]
+        return [jnp.pad(reaction, ((0, 0), (0, k), (0, 0))) for reaction, k in zip(of_joints, more, strict=True)]
 
     def nonideal_wrenches(
-        self,
-        laws: Sequence[NonIdealGroup],
-        t: Scalar,
-        poses: BodyPoses,
-        velocities: BodyVelocities,
-        multipliers: Float[Array, "rows"],
-    ) -> list[Float[Array, "parts k v"]]:
+        self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
+    ) -> list[Acting]:
         """Wrenches of non-ideal laws on the bodies of their joints, group by group."""
-        reactions = self.reactions(laws, t, poses, velocities, multipliers)
-        return [g.wrenches(t, poses, velocities, own) for g, own in zip(laws, reactions, strict=True)]
+        reactions = self.reactions(laws, now, multipliers)
+        return [(g.wrenches(now, reaction), g.group.body_index) for g, reaction in zip(laws, reactions, strict=True)]
 
-    @property
-    def _counts(self):
-        """The groups with the numbers of their rows."""
-        return [(g, len(g.group.names) * g.rows) for g in self.groups]
-
-    def _of_groups(self, multipliers: Float[Array, "rows"]) -> list[tuple[Any, Float[Array, "parts rows"]]]:
+    def of_groups(self, multipliers: Float[Array, "rows"]) -> list[tuple[Any, Float[Array, "parts rows"]]]:
         """The groups with the multipliers of their parts."""
-        ends = np.cumsum([count for _, count in self._counts])
+        ends = np.cumsum([g.row_count for g in self.groups])
         pieces = jnp.split(multipliers, ends[:-1]) if self.groups else []
-        return [(g, own.reshape(-1, g.rows)) for g, own in zip(self.groups, pieces, strict=True)]
+        return [(g, piece.reshape(-1, g.rows)) for g, piece in zip(self.groups, pieces, strict=True)]
 
-    def _rows(self, of_elements: Callable[[ElementaryRows], Array], of_group: Callable[[Any], Array]) -> list[Array]:
+    def _pieces(
+        self,
+        groups: Sequence[AbstractConstraintGroup],
+        of_elements: Callable[[ElementaryRows], Array],
+        of_group: Callable[[Any], Array],
+    ) -> list[Array]:
+        """Values of rows, in pieces that follow each other."""
         if self.elements is None:
-            return [of_group(g) for g in self.groups]
+            return [of_group(g) for g in groups]
         known, out, first = of_elements(self.elements), [], 0
-        if all(map(is_elementary, self.groups)):
+        if all(map(is_elementary, groups)):
             return [known]
-        for g, count in self._counts:
+        for g in groups:
             if is_elementary(g):
-                out.append(known[first : first + count])
-                first += count
+                out.append(known[first : first + g.row_count])
+                first += g.row_count
             else:
                 out.append(of_group(g))
         return out

@@ -10,21 +10,57 @@ from ..system.design_variables import description_rows
 
 def describe_scene(system: Any) -> Description:
     """Describe a compiled scene; from its static structure alone, so it works on traced systems as well."""
-    count, kinds = system.layout.bodies, {}
-    for g in system.bodies:
+    kinds = {}
+    for g in system.bodies.groups:
         kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
     is_contact = lambda g: isinstance(g.group.part, AbstractUnilateralConstraint)
-    plain = [g for g in system.constraints if not isinstance(g.group.part, AbstractInertialConstraint)]
+    constraints, forces = system.constraints, system.forces
+    plain = [g for g in constraints.position if not isinstance(g.group.part, AbstractInertialConstraint)]
+    contacts = [g for g in constraints.inertial if is_contact(g)]
     joints = [
         (plain, ""),
-        ([g for g in system.inertial if not is_contact(g)], ", each with a velocity of its own"),
+        ([g for g in constraints.inertial if not is_contact(g)], ", each with a velocity of its own"),
         (system.free_joints, ", which have coordinates only"),
-        ([g for g in system.velocity_constraints if not g.joints], ", between velocities"),
-        (system.servos, ", a program of a Servo"),
+        ([g for g in constraints.velocity if not g.joints], ", between velocities"),
+        (constraints.servos, ", a program of a Servo"),
     ]
-    grubler = system.nu - system.velocity_rows
-    counts = sum(len(g.group.names) * g.group.rows for g in system.tendons)
-    normalizations = system.coordinate_rows - system.position_rows - counts
+    kind = lambda g: g.group.part.kind
+    rows = lambda g: f"{counted(g.rows, 'row')} each"
+    plainly = lambda groups: [(kind(g), shorten(g.group.names), "") for g in groups]
+    gravity = [("Gravity", gravity.name, "") for gravity in forces.gravity_part]
+    tables = {
+        "bodies": [(kind, shorten(names), "") for kind, names in kinds.items() if names],
+        "joints": [(kind(g), shorten(g.group.names), rows(g) + note) for gs, note in joints for g in gs],
+        "contacts": [
+            *((kind(g), shorten(g.group.names), "where closed 1 row each") for g in contacts),
+            *(
+                (kind(g), shorten(g.group.names), f"of {shorten(g.joints)}, where it sticks {rows(g)}")
+                for g in constraints.frictions
+            ),
+        ],
+        "forces": [
+            *gravity,
+            *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in constraints.nonideal),
+            *plainly(forces.groups),
+        ],
+        "tendons": plainly(system.bodies.tendons),
+        "frames": plainly(system.frames),
+        "design variables": description_rows(system.design),
+    }
+    left_out = _left_out_by_elimination(system)
+    if not system.spatial:
+        left_out.append("Euler parameters and gyroscopic moments: the scene is planar")
+    if not forces.groups and not constraints.nonideal:
+        left_out.append("force elements" + " besides gravity" * bool(gravity) + ": there are none")
+    redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
+    tables = {title: tuple(rows) for title, rows in tables.items()}
+    return Description(tuple(_facts(system)), tables, remarks(system, left_out, redundant))
+
+
+def _facts(system) -> list[tuple[str, str]]:
+    count, grubler = system.layout.bodies, system.nu - system.velocity_rows
+    normalizations = len(system.layout.turning)
+    counts = system.bodies.invariant_rows - normalizations
     facts = [
         ("scene", f"{'spatial' if system.spatial else 'planar'}, {counted(count, 'body', 'bodies')}"),
         ("velocities", str(system.nu)),
@@ -39,34 +75,15 @@ def describe_scene(system: Any) -> Description:
         facts.insert(2, ("coordinates", f"{with_them} is {system.coordinate_rank}"))
     if system.nz:
         facts.append(("internal states", f"{system.nz}: {shorten(system.state_names())}"))
-    kind, frictions = lambda g: g.group.part.kind, system.frictions
-    rows = lambda g: f"{counted(g.rows, 'row')} each"
-    plainly = lambda groups: [(kind(g), shorten(g.group.names), "") for g in groups]
-    gravity = [] if system.gravity is None else [("Gravity", system.gravity_name, "")]
-    tables = {
-        "bodies": [(kind, shorten(names), "") for kind, names in kinds.items() if names],
-        "joints": [(kind(g), shorten(g.group.names), rows(g) + note) for gs, note in joints for g in gs],
-        "contacts": [
-            *((kind(g), shorten(g.group.names), "where closed 1 row each") for g in system.inertial if is_contact(g)),
-            *(
-                (kind(g), shorten(g.group.names), f"of {shorten(g.joints)}, where it sticks {rows(g)}")
-                for g in frictions
-            ),
-        ],
-        "forces": [
-            *gravity,
-            *((kind(g), shorten(g.group.names), f"of {shorten(g.joints)}") for g in system.nonideal),
-            *plainly(system.forces),
-        ],
-        "tendons": plainly(system.tendons),
-        "frames": plainly(system.frames),
-        "design variables": description_rows(system.design),
-    }
-    left_out = system.left_out_by_elimination()
-    if not system.spatial:
-        left_out.append("Euler parameters and gyroscopic moments: the scene is planar")
-    if not system.forces and not system.nonideal:
-        left_out.append("force elements" + " besides gravity" * bool(gravity) + ": there are none")
-    redundant = [f"row {item.row} of {item.name} is implied by {', '.join(item.by)}" for item in system.implied]
-    tables = {title: tuple(rows) for title, rows in tables.items()}
-    return Description(tuple(facts), tables, remarks(system, left_out, redundant))
+    return facts
+
+
+def _left_out_by_elimination(system) -> list[str]:
+    """The dense matrices that an elimination in blocks makes unnecessary."""
+    order, out = system.elimination, []
+    if order is not None:
+        out.append(f"the dense Jacobian and charts, with Adams: {order}")
+    if system.implicit_in_blocks:
+        joined = f"{system.layout.bodies} bodies" + " with the joints" * (order is not None)
+        out.append(f"the dense Newton matrix, with Hermite: sparse elimination of {joined}")
+    return out

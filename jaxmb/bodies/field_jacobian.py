@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from .._types import Coordinates, Scalar, State, Velocities
+from .._types import Scalar, State
 from ..linalg.block_elimination import BlockFactor, eliminate_blocks
 from ..linalg.block_jacobian import BlockJacobian
 from ..linalg.blocks import transpose_vector_products, vector_products
@@ -21,31 +21,28 @@ from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.sums import unchecked_take
 from ..solvers import AbstractFieldJacobian, AbstractResolvent
+from .groups import Kinematics
 from .layout import Layout
 from .motion_graph import MotionOrder, motion_order
 
 
 def contributions(
-    system: Any, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "m"]
+    system: Any, now: Kinematics, multipliers: Float[Array, "m"]
 ) -> tuple[Float[Array, "e v v"], Float[Array, "e v v"]]:
     """K and D: derivatives of the wrenches of forces and of constraints with given multipliers, with respect to
     displacements along velocities and to the velocities. Each part contributes a block for each pair of its bodies,
     the one that the wrench acts on first; the gyroscopic moments of bodies follow.
     """
-    poses, velocities = system.prepared_poses(q), system.all_velocities(u)
     size = system.layout.space.velocity_size
     stiffness, damping = [], []
-    for g in system.forces:
-        both = g.derivatives(t, poses, velocities)
+    for g in system.forces.groups:
+        both = g.derivatives(now)
         for parts, blocks in zip((stiffness, damping), both, strict=True):
             parts.append(_by_pairs(blocks))
-    row = 0
-    for g in system.joints:
-        own = multipliers[row : row + len(g.group.names) * g.rows].reshape(-1, g.rows)
-        row += own.size
-        stiffness.append(_by_pairs(g.wrench_derivatives(t, poses, velocities, own)))
+    for g, of_group in system.constraints.of_groups(multipliers):
+        stiffness.append(_by_pairs(g.wrench_derivatives(now, of_group)))
         damping.append(jnp.zeros_like(stiffness[-1]))
-    gyroscopic = system.gyroscopic_damping(u)
+    gyroscopic = system.bodies.gyroscopic_damping(now)
     stiffness.append(jnp.zeros_like(gyroscopic))
     damping.append(gyroscopic)
     join = lambda blocks: jnp.concatenate([own.reshape(-1, size, size) for own in blocks])
@@ -211,8 +208,9 @@ def motion_jacobian(system: Any, t: Scalar, y: State) -> MotionJacobian:
         projector = rows.projector(inertia)
         free = inertia.solve(system.force(t, q, u))
         multipliers = -projector.multipliers(system.acceleration_residual(t, q, u, free))
-    stiffness, damping = contributions(system, t, q, u, multipliers)
-    moves = jax.vmap(layout.space.moves)(system.prepared_poses(q)[:-1])[:, :, : layout.space.pose_size]
+    now = system.kinematics(t, q, u)
+    stiffness, damping = contributions(system, now, multipliers)
+    moves = jax.vmap(layout.space.moves)(now.poses[:-1])[:, :, : layout.space.pose_size]
     return MotionJacobian(
         order.sums(stiffness),
         order.sums(damping),

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Self, TypeAlias
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import equinox as eqx
 import jax
@@ -27,6 +27,23 @@ from .layout import Layout
 # Prepared poses, and velocities or accelerations, of all bodies, scalar coordinates and the ground, in this order.
 BodyPoses: TypeAlias = Float[Array, "b_ground p"]
 BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
+
+
+# Of more parts than this with functions of time only a combination is looked at.
+_MOST_OF_TIME = 32
+
+# Wrenches of some parts, shape (parts, k, v), and the numbers of the bodies that they act on, shape (parts, k).
+Acting: TypeAlias = tuple[Float[Array, "parts k v"], np.ndarray]
+
+
+class Kinematics(NamedTuple):
+    """A scene in motion at an instant: the time `t` [s], and prepared `poses` and `velocities` of all bodies, scalar
+    coordinates and the ground.
+    """
+
+    t: Scalar
+    poses: BodyPoses
+    velocities: BodyVelocities
 
 
 class Input(eqx.Module):
@@ -219,15 +236,38 @@ class AbstractGroup(eqx.Module):
         others = jax.tree.map(lambda leaf: leaf[member][None], dataclasses.replace(self, group=None))
         return dataclasses.replace(others, group=self.group.only(member))
 
-    def given_in_time(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts *shape"]:
-        """What functions of time give in parts that have them, while nothing moves."""
-        space, kernel = self.group.layout.space, self.group.kernel("given_in_time")
+    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
+        """The parts' own coordinates, by name within the part."""
+        return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
+
+    def given_in_time(self, now: Kinematics) -> Float[Array, "n"]:
+        """The values of functions of time in parts that have them, while nothing moves; of many parts a combination,
+        with weights that let no two of them cancel.
+        """
+        given = self._of_motion("given_in_time", now)
+        parts = given.shape[0]
+        if parts <= _MOST_OF_TIME:
+            return given.ravel()
+        weights = np.random.default_rng(0).uniform(1.0, 2.0, parts).astype(given.dtype)
+        return weights @ given.reshape(parts, -1)
+
+    @property
+    def _space(self):
+        return self.group.layout.space
+
+    def _map(self, kernel, *of_bodies, more=()):
+        """`kernel(at, …)` of every part, with the rows of its bodies, and with `more` per part."""
+        return self.group.map(kernel, *map(self.group.gather, of_bodies), *more)
+
+    def _of_motion(self, name, now):
+        """A kernel of every part, as a function of its pose and velocity and of time."""
+        kernel = self.group.kernel(name)
 
         def single(at, x, v):
-            part = at(t)
-            return kernel(part, *part.seen(space, x, v), t)
+            part = at(now.t)
+            return kernel(part, *part.seen(self._space, x, v), now.t)
 
-        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+        return self._map(single, now.poses, now.velocities)
 
 
 class BodyGroup(AbstractGroup):
@@ -251,53 +291,43 @@ class CoordinateGroup(AbstractGroup):
     def rows(self) -> int:
         return 0
 
-    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
-        """Their coordinates, by name within the part."""
-        return self.group.map(lambda at, x: self.group.coordinates(at(t), x), self.group.gather(poses))
-
 
 class FrameGroup(AbstractGroup):
     """Stacked frames."""
 
     def poses(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts p"]:
         """Prepared poses of the frames."""
-        space = self.group.layout.space
-        return self.group.map(lambda at, x: at(t).pose(space, x[0]), self.group.gather(poses))
+        return self._map(lambda at, x: at(t).pose(self._space, x[0]), poses)
 
-    def velocities(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts v"]:
+    def velocities(self, now: Kinematics) -> Float[Array, "parts v"]:
         """Velocities of the frames."""
-        space = self.group.layout.space
-        own = self.group.gather(poses), self.group.gather(velocities)
-        return self.group.map(lambda at, x, v: at(t).velocity(space, x[0], v[0]), *own)
+        single = lambda at, x, v: at(now.t).velocity(self._space, x[0], v[0])
+        return self._map(single, now.poses, now.velocities)
 
 
 class AbstractConstraintGroup(AbstractGroup):
     """Kernels of stacked constraints."""
 
     @abc.abstractmethod
-    def velocity(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts rows"]:
+    def velocity(self, now: Kinematics) -> Float[Array, "parts rows"]:
         """Residuals of the velocity constraints, or rates of the position constraints."""
 
     @abc.abstractmethod
-    def jacobian(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts rows k v"]:
+    def jacobian(self, now: Kinematics) -> Float[Array, "parts rows k v"]:
         """Derivative with respect to velocities, body by body."""
 
     @abc.abstractmethod
-    def wrenches(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, multipliers: Float[Array, "parts rows"]
-    ) -> Float[Array, "parts k v"]:
+    def wrenches(self, now: Kinematics, multipliers: Float[Array, "parts rows"]) -> Float[Array, "parts k v"]:
         """Wrenches of the constraints on their bodies, `Aᵀ λ` body by body."""
 
     @abc.abstractmethod
     def wrench_derivatives(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, multipliers: Float[Array, "parts rows"]
+        self, now: Kinematics, multipliers: Float[Array, "parts rows"]
     ) -> Float[Array, "parts k v k v"]:
         """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies."""
 
     @abc.abstractmethod
-    def acceleration(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, accelerations: BodyVelocities
-    ) -> Float[Array, "parts rows"]:
+    def acceleration(self, now: Kinematics, accelerations: BodyVelocities) -> Float[Array, "parts rows"]:
         """The time derivative of `velocity`."""
 
     @property
@@ -310,12 +340,9 @@ class AbstractConstraintGroup(AbstractGroup):
         return self.group.rows
 
     @property
-    def _space(self):
-        return self.group.layout.space
-
-    def _map(self, kernel, *of_bodies, more=()):
-        """`kernel(at, …)` of every part, with the rows of its bodies, and with `more` per part."""
-        return self.group.map(kernel, *map(self.group.gather, of_bodies), *more)
+    def row_count(self) -> int:
+        """The number of rows of all parts."""
+        return len(self.group.names) * self.rows
 
 
 class ConstraintGroup(AbstractConstraintGroup):
@@ -350,10 +377,6 @@ class ConstraintGroup(AbstractConstraintGroup):
     def residual(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts rows"]:
         return self._map(lambda at, x: self._residual(at, t, x), poses)
 
-    def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
-        """The joints' own coordinates, by name within the joint."""
-        return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
-
     def along(self, t: Scalar, poses: BodyPoses, moves: Float[Array, "b_ground n p"]) -> Float[Array, "parts rows k n"]:
         """Derivatives along `n` motions of every body, one at a time."""
 
@@ -369,28 +392,26 @@ class ConstraintGroup(AbstractConstraintGroup):
 
         return self._map(single, poses, moves)
 
-    def jacobian(self, t, poses, velocities):
-        del velocities
-        moves = jax.vmap(self._space.moves)(poses)
-        return self.along(t, poses, moves)
+    def jacobian(self, now):
+        return self.along(now.t, now.poses, jax.vmap(self._space.moves)(now.poses))
 
-    def velocity(self, t, poses, velocities):
-        return self._map(lambda at, x, xdot: self._rate(at, t, x, xdot), poses, self._rates(poses, velocities))
+    def velocity(self, now):
+        rates = self._rates(now.poses, now.velocities)
+        return self._map(lambda at, x, xdot: self._rate(at, now.t, x, xdot), now.poses, rates)
 
-    def wrenches(self, t, poses, velocities, multipliers):
-        del velocities
-        return self._map(functools.partial(self._wrench, t), poses, more=(multipliers,))
+    def wrenches(self, now, multipliers):
+        return self._map(functools.partial(self._wrench, now.t), now.poses, more=(multipliers,))
 
     def _wrench(self, t, at, x, multipliers):
         _, pull = jax.vjp(lambda x: self._residual(at, t, x), x)
         return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
 
-    def wrench_derivatives(self, t, poses, velocities, multipliers):
-        del velocities
-        single = lambda at, x, own: along_moves(self._space, lambda x: self._wrench(t, at, x, own), x)
-        return self._map(single, poses, more=(multipliers,))
+    def wrench_derivatives(self, now, multipliers):
+        single = lambda at, x, own: along_moves(self._space, lambda x: self._wrench(now.t, at, x, own), x)
+        return self._map(single, now.poses, more=(multipliers,))
 
-    def acceleration(self, t, poses, velocities, accelerations):
+    def acceleration(self, now, accelerations):
+        t, poses, velocities = now
         rates = self._rates(poses, velocities)
         _, second = jax.jvp(self._rates, (poses, velocities), (rates, accelerations))
 
@@ -401,7 +422,7 @@ class ConstraintGroup(AbstractConstraintGroup):
         out = self._map(single, poses, rates, second)
         if self.damping is None or self.stiffness is None:
             return out
-        rate, value = self.velocity(t, poses, velocities), self.residual(t, poses)
+        rate, value = self.velocity(now), self.residual(t, poses)
         return out + self.damping[:, None] * rate + self.stiffness[:, None] * value
 
     def _rates(self, poses, velocities):
@@ -436,24 +457,26 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
         part, space = at(t), self._space
         return self.group.kernel("residual")(part, *part.seen(space, x, v), t)
 
-    def velocity(self, t, poses, velocities):
-        return self._map(lambda at, x, v: self._residual(at, t, x, v), poses, velocities)
+    def velocity(self, now):
+        return self._map(lambda at, x, v: self._residual(at, now.t, x, v), now.poses, now.velocities)
 
-    def jacobian(self, t, poses, velocities):
-        single = lambda at, x, v: jax.jacfwd(lambda w: self._residual(at, t, x, w))(v)
-        return self._map(single, poses, velocities)
+    def jacobian(self, now):
+        single = lambda at, x, v: jax.jacfwd(lambda w: self._residual(at, now.t, x, w))(v)
+        return self._map(single, now.poses, now.velocities)
 
-    def wrenches(self, t, poses, velocities, multipliers):
-        return self._map(functools.partial(self._wrench, t), poses, velocities, more=(multipliers,))
+    def wrenches(self, now, multipliers):
+        return self._map(functools.partial(self._wrench, now.t), now.poses, now.velocities, more=(multipliers,))
 
     def _wrench(self, t, at, x, v, multipliers):
         return jax.vjp(lambda w: self._residual(at, t, x, w), v)[1](multipliers)[0]
 
-    def wrench_derivatives(self, t, poses, velocities, multipliers):
-        single = lambda at, x, v, own: along_moves(self._space, lambda x: self._wrench(t, at, x, v, own), x)
-        return self._map(single, poses, velocities, more=(multipliers,))
+    def wrench_derivatives(self, now, multipliers):
+        single = lambda at, x, v, own: along_moves(self._space, lambda x: self._wrench(now.t, at, x, v, own), x)
+        return self._map(single, now.poses, now.velocities, more=(multipliers,))
 
-    def acceleration(self, t, poses, velocities, accelerations):
+    def acceleration(self, now, accelerations):
+        t, poses, velocities = now
+
         def single(at, x, xdot, v, a):
             residual = lambda t, x, v: self._residual(at, t, x, v)
             return jax.jvp(residual, (t, x, v), (jnp.ones_like(t), xdot, a))[1]
@@ -472,22 +495,21 @@ def servo_group(group: Group) -> ConstraintGroup:
 class ForceGroup(AbstractGroup):
     """Kernels of stacked forces."""
 
-    def wrenches(self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "parts k v"]:
-        single = lambda at, x, v: self._wrenches(at, t, x, v)
-        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+    def wrenches(self, now: Kinematics) -> Float[Array, "parts k v"]:
+        return self._map(lambda at, x, v: self._wrenches(at, now.t, x, v), now.poses, now.velocities)
 
     def _wrenches(self, at, t, x, v):
-        part, space = at(t), self.group.layout.space
-        wrenches = self.group.kernel("wrenches")(part, *part.seen(space, x, v), t)
-        return part.wrenches_on_bodies(space, x, wrenches)
+        part = at(t)
+        wrenches = self.group.kernel("wrenches")(part, *part.seen(self._space, x, v), t)
+        return part.wrenches_on_bodies(self._space, x, wrenches)
 
     def gaps(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities
+        self, now: Kinematics
     ) -> tuple[
         Float[Array, "parts gaps"], Float[Array, "parts gaps"], Float[Array, "parts gaps"], Float[Array, "parts"]
     ]:
         """Gaps, their rates, the widths in which forces set in, and the pace of each part."""
-        space = self.group.layout.space
+        space, t = self._space, now.t
 
         def single(at, x, v):
             gaps = lambda t, x: self.group.kernel("gaps")(at(t), at(t).seen_poses(space, x), t)
@@ -496,44 +518,32 @@ class ForceGroup(AbstractGroup):
             width = jnp.broadcast_to(jnp.asarray(part.gap_width, gap.dtype), gap.shape)
             return gap, rate, width, self.group.kernel("gap_pace")(part, *part.seen(space, x, v), t)
 
-        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+        return self._map(single, now.poses, now.velocities)
 
-    def state_rates(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities
-    ) -> dict[str, Float[Array, "parts *shape"]]:
+    def state_rates(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
         """Rates of the parts' internal states, by the name of the field."""
-        space = self.group.layout.space
+        return self._of_motion("state_rates", now)
 
-        def single(at, x, v):
-            part = at(t)
-            return self.group.kernel("state_rates")(part, *part.seen(space, x, v), t)
-
-        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
-
-    def derivatives(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities
-    ) -> tuple[Float[Array, "parts k v k v"], Float[Array, "parts k v k v"]]:
+    def derivatives(self, now: Kinematics) -> tuple[Float[Array, "parts k v k v"], Float[Array, "parts k v k v"]]:
         """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies, and to the
         velocities.
         """
-        space = self.group.layout.space
 
         def single(at, x, v):
-            of_positions = along_moves(space, lambda x: self._wrenches(at, t, x, v), x)
-            return of_positions, jax.jacfwd(lambda v: self._wrenches(at, t, x, v))(v)
+            of_positions = along_moves(self._space, lambda x: self._wrenches(at, now.t, x, v), x)
+            return of_positions, jax.jacfwd(lambda v: self._wrenches(at, now.t, x, v))(v)
 
-        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities))
+        return self._map(single, now.poses, now.velocities)
 
     def energy(self, t: Scalar, poses: BodyPoses) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)
-        space = self.group.layout.space
 
         def single(at, x):
             part = at(t)
-            return self.group.kernel("energy")(part, part.seen_poses(space, x), t)
+            return self.group.kernel("energy")(part, part.seen_poses(self._space, x), t)
 
-        return jnp.sum(self.group.map(single, self.group.gather(poses)))
+        return jnp.sum(self._map(single, poses))
 
 
 class NonIdealGroup(AbstractGroup):
@@ -541,19 +551,16 @@ class NonIdealGroup(AbstractGroup):
 
     joints: tuple[str, ...] = eqx.field(static=True)
 
-    def wrenches(
-        self, t: Scalar, poses: BodyPoses, velocities: BodyVelocities, reactions: Float[Array, "parts k v"]
-    ) -> Float[Array, "parts k v"]:
+    def wrenches(self, now: Kinematics, reactions: Float[Array, "parts k v"]) -> Float[Array, "parts k v"]:
         """Wrenches of the laws on the bodies of their joints; `reactions`: those of the joints."""
-        space = self.group.layout.space
+        space, kernel = self._space, self.group.kernel("wrenches")
 
         def single(at, x, v, own):
-            part = at(t)
+            part = at(now.t)
             seen = *part.seen(space, x, v), part.seen_wrenches(space, x, own)
-            wrenches = self.group.kernel("wrenches")(part, *seen, t)
-            return part.wrenches_on_bodies(space, x, wrenches)
+            return part.wrenches_on_bodies(space, x, kernel(part, *seen, now.t))
 
-        return self.group.map(single, self.group.gather(poses), self.group.gather(velocities), reactions)
+        return self._map(single, now.poses, now.velocities, more=(reactions,))
 
 
 def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:
@@ -564,3 +571,8 @@ def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Flo
     along = jnp.eye(k, dtype=x.dtype)[:, None, :, None] * moves[:, :, None, :]
     columns = jax.vmap(push, out_axes=-1)(along.reshape(k * size, *x.shape))
     return columns.reshape(*columns.shape[:-1], k, size)
+
+
+def joined(pieces: Sequence[Array], dtype: Any) -> Float[Array, "n"]:
+    """Arrays in one vector."""
+    return jnp.concatenate([piece.reshape(-1) for piece in pieces]) if pieces else jnp.zeros(0, dtype)

@@ -15,6 +15,7 @@ from ..linalg.jitted import on_host
 from ..parts.elements import on_bodies
 from ..states.on_host import MOST, AbstractHost
 from .elementary import HostRows, Listed, is_elementary, stacked
+from .groups import Kinematics
 
 
 class _Rows(NamedTuple):
@@ -28,12 +29,12 @@ class _Rows(NamedTuple):
 
 
 @on_host
-def _rows(groups: tuple[Any, ...], t: Any, poses: Any, velocities: Any, moves: Any) -> list[_Rows]:
-    out = []
+def _rows(groups: tuple[Any, ...], now: Kinematics, moves: Any) -> list[_Rows]:
+    out, (t, poses, _) = [], now
     for g in groups:
         if not g.of_poses:
-            values = g.velocity(t, poses, velocities)
-            out.append(_Rows(values, values, g.jacobian(t, poses, velocities)))
+            values = g.velocity(now)
+            out.append(_Rows(values, values, g.jacobian(now)))
             continue
         values, drift = g.residual(t, poses), jnp.zeros(0, poses.dtype)
         if g.rheonomic:
@@ -46,8 +47,8 @@ class HostScene(AbstractHost):
     """The constraints of a system of rigid bodies; made by `host_scene`."""
 
     def __init__(self, system: Any, t: Any):
-        self._layout, self._groups, self._given = system.layout, system.joints, np.asarray(system.guess.u)
-        self._t, self._positions = np.asarray(t, system.guess.q.dtype), len(system.constraints)
+        self._layout, self._groups, self._given = system.layout, system.constraints.groups, np.asarray(system.guess.u)
+        self._t, self._positions = np.asarray(t, system.guess.q.dtype), len(system.constraints.position)
         self._elements, self._along = _elements(system)
         self._known = [_is_known(g) for g in self._groups]
         self._others = tuple(g for g, known in zip(self._groups, self._known, strict=True) if not known)
@@ -55,14 +56,9 @@ class HostScene(AbstractHost):
         places = [(g.group.body_index, g.rows) for g in self._groups]
         self._of_poses = self._layout.jacobian_source(places[: self._positions], of_poses=True)
         self._of_velocities = self._layout.jacobian_source(places, of_poses=False)
-        self._rotating = [k for k, rotates in enumerate(self._layout.rotates) if rotates and self._spatial]
         self.analytic = not self._others
         self.linear, self.velocity_rows = system.linear, system.velocity_rows
         self.coordinate_scale, self.velocity_scale = system.known_scales()
-
-    @property
-    def _spatial(self):
-        return self._layout.space.dimension == 3
 
     def _poses(self, q) -> Any:
         """Poses of the bodies, of scalar coordinates and the ground."""
@@ -72,7 +68,7 @@ class HostScene(AbstractHost):
         return self._prepare(self._poses(q))
 
     def _prepare(self, poses):
-        if not self._spatial:
+        if not self._layout.spatial:
             angle = poses[:, 2:]
             return np.concatenate([poses, np.cos(angle), np.sin(angle)], axis=1)
         turned: Any = poses[:, 3:]
@@ -82,7 +78,7 @@ class HostScene(AbstractHost):
         """Rates of prepared poses along unit rates of poses."""
         poses = self._poses(q)
         size = poses.shape[1]
-        if self._spatial:
+        if self._layout.spatial:
             # Matrices are quadratic in Euler parameters, so that these differences are exact.
             return np.stack([0.5 * (self._prepare(poses + x) - self._prepare(poses - x)) for x in np.eye(size)], axis=1)
         moves = np.tile(np.eye(size, size + 2), (len(poses), 1, 1))
@@ -91,7 +87,7 @@ class HostScene(AbstractHost):
 
     def _rates(self, q, of_bodies):
         """The rates of poses of all bodies at these velocities."""
-        if not self._spatial:
+        if not self._layout.spatial:
             return of_bodies
         poses = self._poses(q)
         turned: Any = zip(poses[:, 3:], of_bodies[:, 3:], strict=True)
@@ -104,8 +100,9 @@ class HostScene(AbstractHost):
         u = self._given if u is None else u
         key = q.tobytes(), u.tobytes()
         if self._last is None or self._last[0] != key:
-            of_bodies = np.append(u, 0.0)[self._layout.velocity_index]
-            self._last = key, _rows(self._others, self._t, self._prepared(q), of_bodies, self._moves(q))
+            of_bodies: Any = np.append(u, 0.0)[self._layout.velocity_index]
+            now = Kinematics(self._t, self._prepared(q), of_bodies)
+            self._last = key, _rows(self._others, now, self._moves(q))
         return self._last[1]
 
     def _joined(self, groups, of_elements: Any, of_others: Iterable[Any]) -> list[Any]:
@@ -115,9 +112,8 @@ class HostScene(AbstractHost):
             if not known:
                 out.append(next(others))
                 continue
-            count = len(g.group.names) * g.rows
-            out.append(of_elements[first : first + count])
-            first += count
+            out.append(of_elements[first : first + g.row_count])
+            first += g.row_count
         return out
 
     def residual(self, q):
@@ -143,7 +139,7 @@ class HostScene(AbstractHost):
 
     def _along_velocities(self, q, group, blocks):
         """Derivatives along velocities, from those along poses."""
-        if not (self._spatial and group.of_poses):
+        if not (self._layout.spatial and group.of_poses):
             return blocks
         units = np.eye(self._layout.space.velocity_size)
         moved = [self._rates(q, np.tile(unit, (self._layout.ground + 1, 1))) for unit in units]
@@ -153,13 +149,13 @@ class HostScene(AbstractHost):
     def coordinate_jacobian(self, q):
         known = None
         if self._elements is not None:
-            prepared = self._prepared(q)
-            known = self._elements.jacobian_of_poses(prepared) if self._spatial else self._elements.jacobian(prepared)
+            derivative = self._elements.jacobian_of_poses if self._layout.spatial else self._elements.jacobian
+            known = derivative(self._prepared(q))
         own = self._joined(self._groups[: self._positions], known, (x.blocks for x in self._of_others(q)))
         rows = np.append(_flat(own), 0.0)[self._of_poses]
-        of_lengths = np.zeros((len(self._rotating), q.size))
-        places = self._layout.pose_index[self._rotating, 3:]
-        of_lengths[np.arange(len(self._rotating))[:, None], places] = q[places]
+        of_lengths = np.zeros((len(self._layout.turning), q.size))
+        places = self._layout.pose_index[self._layout.turning, 3:]
+        of_lengths[np.arange(len(self._layout.turning))[:, None], places] = q[places]
         return np.concatenate([rows, of_lengths])
 
     def velocity_rows_at(self, q, u):
@@ -176,14 +172,14 @@ class HostScene(AbstractHost):
         return _flat(unmet)[: self.velocity_rows], jacobian[: self.velocity_rows]
 
     def _euler(self, q):
-        return q[self._layout.pose_index[self._rotating, 3:]] if self._rotating else np.zeros((0, 4))
+        return q[self._layout.pose_index[self._layout.turning, 3:]] if self._layout.turning else np.zeros((0, 4))
 
     def normalize(self, q):
         """The coordinates with Euler parameters of length one."""
         q = q.copy()
-        if self._rotating:
+        if self._layout.turning:
             p = self._euler(q)
-            q[self._layout.pose_index[self._rotating, 3:]] = p / np.linalg.norm(p, axis=1, keepdims=True)
+            q[self._layout.pose_index[self._layout.turning, 3:]] = p / np.linalg.norm(p, axis=1, keepdims=True)
         return q
 
     def along(self, q, step):
@@ -214,7 +210,7 @@ def _flat(pieces):
 def host_scene(system: Any, t: Any) -> HostScene | None:
     """The constraints of a system in NumPy; None where there are none, or many."""
     small = 0 < system.acceleration_rows <= MOST and system.nq <= MOST and system.guess.q.dtype == np.float64
-    return HostScene(system, t) if small and not system.turn_counts else None
+    return HostScene(system, t) if small and not system.bodies.turn_counts else None
 
 
 def _is_known(group):
@@ -226,7 +222,7 @@ def _elements(system) -> tuple[HostRows | None, list[tuple[np.ndarray, Any, Any]
     of joints and the directions.
     """
     space, listed, along, first = system.layout.space, [], [], 0
-    for g in filter(_is_known, system.constraints):
+    for g in filter(_is_known, system.constraints.position):
         own = g.group
         numbers, structure = jax.tree.flatten(own.part)
         numbers = [np.asarray(x) for x in numbers]

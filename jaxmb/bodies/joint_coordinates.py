@@ -72,7 +72,7 @@ def _of_joint(system, place, ts, ys, solved):
 
     def with_rate(t, q, u):
         """The coordinate and its rate."""
-        value = lambda t, q: system.joint_coordinate(coordinate, t, q)
+        value = lambda t, q: system.catalogue.joint_coordinate(coordinate, t, q)
         return jax.jvp(value, (t, q), (jnp.ones_like(t), system.rates(t, q, u)))
 
     def acceleration(t, q, u, udot):

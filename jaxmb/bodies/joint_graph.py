@@ -53,13 +53,13 @@ def joint_order(system: Any, left_out: tuple[int, ...] = (), absolute: frozenset
     **Arguments:** `left_out`: rows of A that are not eliminated, such as those that others imply; `absolute`: numbers
     of parts that bind bodies to the world, not only to each other.
     """
-    parts = tuple((g.group.bodies, g.rows) for g in system.joints)
+    parts = tuple((g.group.bodies, g.rows) for g in system.constraints.groups)
     return _joint_order(system.layout, parts, left_out, absolute)
 
 
 def joint_order_with_more(system: Any, before: Any, order: JointOrder) -> JointOrder:
     """The order of elimination of a scene that has more position constraints, after those of one with a known order."""
-    parts = lambda own: sum(len(g.group.names) for g in own.constraints)
+    parts = lambda own: sum(len(g.group.names) for g in own.constraints.position)
     more, rows = parts(system) - parts(before), system.position_rows - before.position_rows
     left_out = tuple(row if row < before.position_rows else row + rows for row in order.left_out)
     absolute = frozenset(part if part < parts(before) else part + more for part in order.absolute)

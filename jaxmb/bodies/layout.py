@@ -31,15 +31,43 @@ class Layout:
         """The number of the ground: that of bodies and scalar coordinates."""
         return len(self.rotates) + len(self.scalars)
 
+    @property
+    def spatial(self) -> bool:
+        """Whether bodies move in space, not in a plane."""
+        return self.space.dimension == 3
+
     def is_place(self, numbers: Sequence[int]) -> np.ndarray:
         """Which of some numbers are those of bodies or of the ground, and not of scalar coordinates."""
-        own = np.array(numbers)
-        return (own < self.bodies) | (own == self.ground)
+        index = np.array(numbers)
+        return (index < self.bodies) | (index == self.ground)
 
     @property
     def uniform(self) -> bool:
         """Whether there are only bodies that rotate, so that poses are a plain reshape of the coordinates."""
         return all(self.rotates) and not self.scalars
+
+    @functools.cached_property
+    def turning(self) -> list[int]:
+        """The numbers of the bodies that have Euler parameters: in space all that rotate."""
+        return [k for k, rotates in enumerate(self.rotates) if rotates and self.spatial]
+
+    @functools.cached_property
+    def coordinate_lengths(self) -> np.ndarray:
+        """Which coordinates are lengths, shape (nq,)."""
+        return self._lengths(self.pose_index, self.nq)
+
+    @functools.cached_property
+    def velocity_lengths(self) -> np.ndarray:
+        """Which velocities are rates of lengths, shape (nu,)."""
+        return self._lengths(self.velocity_index, self.nu)
+
+    def _lengths(self, index, size):
+        translation = np.zeros(size, bool)
+        translation[index[: self.bodies, : self.space.dimension]] = True
+        for scalar, (first, *_) in zip(self.scalars, index[self.bodies : -1], strict=True):
+            if first < size:
+                translation[first] = scalar.is_length
+        return translation
 
     @functools.cached_property
     def pose_index(self) -> np.ndarray:

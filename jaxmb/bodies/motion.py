@@ -151,10 +151,10 @@ def _fields(system, frame, t, y, acceleration):
     d = layout.space.dimension
 
     def rates(t, q, u):
-        velocities = frame.velocities(t, system.prepared_poses(q), system.all_velocities(u))[0]
+        velocities = frame.velocities(system.kinematics(t, q, u))[0]
         return velocities[:d], velocities[2] if d == 2 else velocities[3:]
 
-    pose = frame.poses(t, system.prepared_poses(y.q))[0]
+    pose = frame.poses(t, system.bodies.prepared_poses(y.q))[0]
     velocity, angular_velocity = rates(t, y.q, y.u)
     out = {"position": pose[:d], "velocity": velocity, "angular_velocity": angular_velocity}
     out |= {"angle": pose[2]} if d == 2 else {"orientation": pose[3:7]}
@@ -162,7 +162,8 @@ def _fields(system, frame, t, y, acceleration):
         t = jnp.asarray(t, y.q.dtype)
         along = (jnp.ones_like(t), system.rates(t, y.q, y.u), acceleration)
         _, (linear, angular) = jax.jvp(rates, (t, y.q, y.u), along)
-        felt = linear if system.gravity is None else linear - system.gravity
+        gravity = system.forces.gravity
+        felt = linear if gravity is None else linear - gravity
         specific = layout.space.body_direction(pose, felt)
         out |= {"acceleration": linear, "angular_acceleration": angular, "specific_force": specific}
     return out

@@ -64,7 +64,7 @@ def motion_order(system: Any) -> MotionOrder:
     joints = system.elimination
     if joints is None and system.velocity_rows > 0:
         joints = joint_order(system)
-    acting = tuple(g.group.bodies for g in (*system.forces, *system.joints))
+    acting = tuple(g.group.bodies for g in (*system.forces.groups, *system.constraints.groups))
     return _motion_order(system.layout, acting, joints)
 
 

@@ -1,30 +1,46 @@
 """Parameters of stacked parts by name, `"part.field"` and `"part.field.field"`: their arrays, checks, and inputs."""
 
 import dataclasses
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
 
 from ..linalg.arrays import is_traced
 from ..parts.base import AbstractPart
 from ..parts.fields import Declaration, entry, in_range, inner_parts, paths
 from ..parts.series import AbstractSignal
-from ..system.catalogue import ParameterPath
+from ..system.design_variables import variables_in_range
+from ..system.parameter_table import ParameterTable
+from ..system.structures import of_structure
 from .groups import Input, together
+
+# The paths to the groups of a system; of constraints that bind positions, and of all constraints.
+_BIND_POSITIONS = "constraints.position"
+_BIND = (_BIND_POSITIONS, "constraints.velocity", "constraints.servos")
+_GROUPS = (
+    "bodies.groups",
+    *_BIND,
+    "forces.groups",
+    "constraints.nonideal",
+    "frames",
+    "bodies.tendons",
+    "free_joints",
+)
 
 
 class StackedNumber(NamedTuple):
-    """A parameter in a group of stacked parts: `keys` lead to it in group number `group` of the system's field `kind`,
+    """A parameter in a group of stacked parts: `keys` lead to it in group number `group` at a `path` in the system,
     `member` is the number of its part.
     """
 
     name: str
-    kind: str
+    path: str
     group: int
     keys: tuple[str, ...]
     member: int
@@ -32,129 +48,139 @@ class StackedNumber(NamedTuple):
 
 
 def stacked_numbers(groups: Mapping[str, Sequence[Any]]) -> Iterator[StackedNumber]:
-    """Every parameter of some groups, which are given by the name of the system's field that holds them."""
-    for kind, of_kind in groups.items():
-        for g, group in enumerate(of_kind):
+    """Every parameter of some groups, which are given by their paths."""
+    for path, of_path in groups.items():
+        for g, group in enumerate(of_path):
             # Numbers of another part that these parts hold keep the name of that part.
             stacked = group.group
             sources = [((), stacked.part, stacked.names)]
             sources += [(keys, entry(stacked.part, keys), names) for keys, names in stacked.inner]
             for prefix, part, names in sources:
-                own = [((*prefix, *keys), ".".join(shown), declared) for keys, shown, declared in paths(part)]
+                numbers = [((*prefix, *keys), ".".join(shown), declared) for keys, shown, declared in paths(part)]
                 for k, name in enumerate(names):
-                    for keys, field, declared in own:
-                        yield StackedNumber(f"{name}.{field}", kind, g, keys, k, declared)
+                    for keys, field, declared in numbers:
+                        yield StackedNumber(f"{name}.{field}", path, g, keys, k, declared)
 
 
-def parameter_paths(
-    gravity: str | None, groups: Mapping[str, Sequence[Any]], servos: Sequence[Any]
-) -> dict[str, list[ParameterPath]]:
-    """Paths to every parameter of a scene.
+class SceneParameters(ParameterTable):
+    """The parameters of a compiled scene, `"part.field"`."""
 
-    **Arguments:** `gravity`: its name, or None; `groups` of stacked parts, by the name of the system's field that holds
-    them; `servos`: groups of servos, which also have gains.
-    """
-    out: dict[str, list[ParameterPath]] = {}
-    for number in stacked_numbers(groups):
-        where = _accessor(number.kind, number.group, number.keys)
-        out.setdefault(number.name, []).append((where, number.member))
-    for g, group in enumerate(servos):
-        for k, name in enumerate(group.group.names):
-            out.setdefault(f"{name}.damping", []).append((lambda s, g=g: s.servos[g].damping, k))
-            out.setdefault(f"{name}.stiffness", []).append((lambda s, g=g: s.servos[g].stiffness, k))
-    if gravity is not None:
-        out[f"{gravity}.acceleration"] = [(lambda s: s.gravity, None)]
-    return out
+    @property
+    def _groups(self) -> dict[str, tuple[Any, ...]]:
+        return {path: attrgetter(path)(self.system) for path in _GROUPS}
+
+    @property
+    def _all_groups(self) -> Iterator[Any]:
+        return itertools.chain(*self._groups.values())
+
+    @of_structure
+    def paths(self):
+        forces, out = self.system.forces, {}
+        for number in stacked_numbers(self._groups):
+            where = _accessor(number.path, number.group, number.keys)
+            out.setdefault(number.name, []).append((where, number.member))
+        for g, group in enumerate(self.system.constraints.servos):
+            for k, name in enumerate(group.group.names):
+                for gain in ("damping", "stiffness"):
+                    where = lambda s, g=g, gain=gain: getattr(s.constraints.servos[g], gain)
+                    out.setdefault(f"{name}.{gain}", []).append((where, k))
+        if forces.gravity is not None:
+            out[f"{forces.gravity_name}.acceleration"] = [(lambda s: s.forces.gravity, None)]
+        return out
+
+    def modules(self):
+        groups = self._groups
+        numbers = (number for number in stacked_numbers(groups) if number.declared.kind == "module")
+        part = lambda number: groups[number.path][number.group].group.part
+        return {number.name: entry(part(number), number.keys[:-1]).like for number in numbers}
+
+    def positive(self):
+        signs = ("positive", "positive definite")
+        return frozenset(number.name for number in stacked_numbers(self._groups) if number.declared.sign in signs)
+
+    def check(self, names):
+        parts, dimension = {name.split(".")[0] for name in names}, self.system.layout.space.dimension
+        for gravity in self.system.forces.gravity_part:
+            if gravity.name in parts and not is_traced(gravity):
+                gravity.check(dimension)
+        for group in self._all_groups:
+            for k, name in enumerate(group.group.names):
+                if name in parts and not is_traced(group):
+                    single = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], group)
+                    single.part(name).check(dimension)
+
+    def in_range(self):
+        ok: Any = True
+        outer = [*self.system.forces.gravity_part, *(group.part() for group in self._all_groups)]
+        inner = [part for part_of in outer for _, part in inner_parts(part_of)]
+        for part in (*outer, *inner):
+            for keys, _, declared in paths(part):
+                value = entry(part, keys)
+                if is_traced(value):
+                    ok = ok & in_range(declared, value)
+            agree = part.numbers_agree() if isinstance(part, AbstractPart) else True
+            if is_traced(agree):
+                ok = ok & jnp.all(agree)
+        return ok & variables_in_range(self.system.design)
+
+    def with_frames_of(self, before):
+        pairs = zip(self.system.bodies.groups, before.bodies.groups, strict=True)
+        moved = [(group, group.group.part.mass_centre, old.group.part.mass_centre) for group, old in pairs]
+        changed = [(group, new - old) for group, new, old in moved if new is not None and new is not old]
+        if not changed:
+            return self.system
+        return dataclasses.replace(self.system, guess=self.system.bodies.shifted(self.system.guess, changed))
+
+    @property
+    def signals(self):
+        # The rates of inputs count in constraints, or in velocities that forces depend on.
+        out: dict[str, tuple[AbstractSignal, bool]] = {}
+        for path, groups in self._groups.items():
+            for single in (single for g in groups for each in g.group.inputs for single in each.alone()):
+                (name,) = single.names
+                _, counts = out.get(name, (single.signal, False))
+                out[name] = single.signal, counts or path in _BIND or single.moves
+        return out
+
+    def with_signals(self, signals):
+        system, groups = self.system, self._groups
+        inputs = _inputs(groups, signals)
+        new = {
+            path: tuple(_with_inputs(g, inputs.get((path, k), ())) for k, g in enumerate(of_path))
+            for path, of_path in groups.items()
+            if of_path
+        }
+        return eqx.tree_at(lambda s: [attrgetter(path)(s) for path in new], system, list(new.values()))
 
 
-def module_structures(groups: Mapping[str, Sequence[Any]]) -> dict[str, eqx.Module]:
-    """The modules whose weights are parameters, by name, with shapes in place of the weights."""
-    numbers = (number for number in stacked_numbers(groups) if number.declared.kind == "module")
-    part = lambda number: groups[number.kind][number.group].group.part
-    return {number.name: entry(part(number), number.keys[:-1]).like for number in numbers}
+def _accessor(path: str, group: int, keys: tuple[str, ...]):
+    return lambda system: entry(attrgetter(path)(system)[group].group.part, keys)
 
 
-def positive_parameters(groups: Mapping[str, Sequence[Any]]) -> Iterator[str]:
-    """Names of the parameters that parts declare to be positive, or positive definite."""
-    for number in stacked_numbers(groups):
-        if number.declared.sign in ("positive", "positive definite"):
-            yield number.name
-
-
-def _accessor(kind: str, group: int, keys: tuple[str, ...]):
-    return lambda system: entry(getattr(system, kind)[group].group.part, keys)
-
-
-def check_parts(groups: Iterable[Any], names: Collection[str], dimension: int) -> None:
-    """Raise a `ValueError` that names the part and the field if no scene would be compiled with these numbers.
-
-    **Arguments:** `groups` of stacked parts; `names` of the parts to check. Parts with traced numbers are left to
-    `are_in_range`.
-    """
-    for group in groups:
-        for k, name in enumerate(group.group.names):
-            if name in names and not is_traced(group):
-                single = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], group)
-                single.part(name).check(dimension)
-
-
-def are_in_range(parts: Iterable[Any]) -> bool | Bool[Array, ""]:
-    """Whether all numbers of some parts that are traced are as the parts declare them; True if none are traced."""
-    ok: Any = True
-    for own in (own for part in parts for own in (part, *(inner for _, inner in inner_parts(part)))):
-        for keys, _, declared in paths(own):
-            value = entry(own, keys)
-            if is_traced(value):
-                ok = ok & in_range(declared, value)
-        agree = own.numbers_agree() if isinstance(own, AbstractPart) else True
-        if is_traced(agree):
-            ok = ok & jnp.all(agree)
-    return ok
-
-
-# Groups whose numbers bind positions, and those whose numbers bind positions, velocities or accelerations.
-_BIND_POSITIONS = ("constraints",)
-_BIND = (*_BIND_POSITIONS, "velocity_constraints", "servos")
-
-
-def signals_of(groups: Mapping[str, Sequence[Any]]) -> dict[str, tuple[AbstractSignal, bool]]:
-    """The inputs of some groups by name, and whether their rates count: in constraints, or in velocities that forces
-    depend on.
-
-    **Arguments:** `groups`, by the name of the system's field that holds them.
-    """
-    out: dict[str, tuple[AbstractSignal, bool]] = {}
-    for kind, of_kind in groups.items():
-        for own in (own for g in of_kind for each in g.group.inputs for own in each.alone()):
-            (name,) = own.names
-            _, counts = out.get(name, (own.signal, False))
-            out[name] = own.signal, counts or kind in _BIND or own.moves
-    return out
-
-
-def with_signals(
+def _inputs(
     groups: Mapping[str, Sequence[Any]], signals: Mapping[str, AbstractSignal]
-) -> dict[str, tuple[Any, ...]]:
-    """Groups with some numbers as functions of time.
+) -> dict[tuple[str, int], list[Input]]:
+    """Numbers that are functions of time, by the path and the number of their group.
 
     **Raises:** `ValueError` for a number that must be constant, and for one that jumps where positions depend on it.
     """
     new: dict[tuple[str, int], list[Input]] = {}
     varying, of_frames = set(), {number.name for number in stacked_numbers({"frames": groups["frames"]})}
-    laws = {joint: name for g in groups["nonideal"] for joint, name in zip(g.joints, g.group.names, strict=True)}
+    nonideal = groups["constraints.nonideal"]
+    laws = {joint: name for g in nonideal for joint, name in zip(g.joints, g.group.names, strict=True)}
     for number in stacked_numbers(groups):
         signal = signals.get(number.name)
-        constant = number.declared.constant or number.kind in ("bodies", "frames") or number.name in of_frames
+        constant = number.declared.constant or number.path in ("bodies.groups", "frames") or number.name in of_frames
         if signal is None or constant:
             continue
-        if number.kind in _BIND_POSITIONS and not signal.continuous:
+        if number.path == _BIND_POSITIONS and not signal.continuous:
             raise ValueError(
                 f"A position constraint depends on {number.name!r}, so it must not jump: use interpolation='linear' or "
                 "'cubic' instead of 'held'."
             )
-        part, declared = groups[number.kind][number.group].group.part, number.declared
+        part, declared = groups[number.path][number.group].group.part, number.declared
         places = declared.is_point or declared.is_direction or declared.is_attitude
-        law = laws.get(number.name.split(".")[0]) if places and number.kind == "constraints" else None
+        law = laws.get(number.name.split(".")[0]) if places and number.path == _BIND_POSITIONS else None
         if law is not None or not part.may_vary(number.keys):
             raise ValueError(
                 f"{number.name!r} cannot be an input: {repr(law) if law else f'a {part.kind}'} takes velocities of "
@@ -163,21 +189,18 @@ def with_signals(
         varying.add(number.name)
         # All numbers of a joint place the coordinate that other parts measure.
         moves = places or number.keys[0] == "joints" or number.keys[0] in part.moving
-        own = Input(signal, (number.name,), number.keys, (number.member,), moves)
-        new.setdefault((number.kind, number.group), []).append(own)
+        driven = Input(signal, (number.name,), number.keys, (number.member,), moves)
+        new.setdefault((number.path, number.group), []).append(driven)
     for name in signals:
         if name not in varying:
             raise ValueError(
                 f"{name!r} must be constant: masses, moments of inertia, frames, gravity and the gains of servos "
                 "cannot be inputs."
             )
-    return {
-        kind: tuple(_with_inputs(g, new.get((kind, k), ())) for k, g in enumerate(of_kind))
-        for kind, of_kind in groups.items()
-    }
+    return new
 
 
 def _with_inputs(group, inputs):
-    names = {own.names for own in inputs}
-    kept = (own for each in group.group.inputs for own in each.alone() if own.names not in names)
+    names = {single.names for single in inputs}
+    kept = (single for each in group.group.inputs for single in each.alone() if single.names not in names)
     return dataclasses.replace(group, group=dataclasses.replace(group.group, inputs=together([*kept, *inputs])))

@@ -38,20 +38,22 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in _shapes(part, space, width)
     ]
     # The friction of a joint acts where the joint does.
-    of_laws = {law: joint for g in system.laws for law, joint in zip(g.group.names, g.joints, strict=True)}
+    of_laws = {law: joint for g in system.constraints.laws for law, joint in zip(g.group.names, g.joints, strict=True)}
     mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)
     if not system.spatial:
         moments = moments[:, None, None] * np.diag([0.5, 0.5, 1.0])
     return Picture(
         planar=not system.spatial,
-        up=_up(space, None if system.gravity is None else np.asarray(system.gravity)),
+        up=_up(space, None if system.forces.gravity is None else np.asarray(system.forces.gravity)),
         width=width,
         positions=dict(zip(names, position, strict=True)),
         orientations=dict(zip(names, orientation, strict=True)),
         parts=parts | {law: parts[joint] for law, joint in of_laws.items()},
         shapes=shapes,
         paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()},
-        centres={name: np.asarray(space.in_space(own)) for g in system.bodies for name, own in _centres(g.group)},
+        centres={
+            name: np.asarray(space.in_space(own)) for g in system.bodies.groups for name, own in _centres(g.group)
+        },
         inertias={name: (float(m), J) for name, m, J in zip(names, mass, moments, strict=False)},
     )
 
@@ -106,7 +108,7 @@ def _paths(system, group, ts, ys) -> dict[str, Line]:
 
 @eqx.filter_jit
 def _placements(system, ys):
-    poses = jax.vmap(system.prepared_poses)(ys.q)
+    poses = jax.vmap(system.bodies.prepared_poses)(ys.q)
     position, orientation = jax.vmap(jax.vmap(system.layout.space.placement))(poses)
     return jnp.swapaxes(position, 0, 1), jnp.swapaxes(orientation, 0, 1)
 
@@ -116,7 +118,7 @@ def _world_paths(system, group, ts, ys):
     """World points of the lines of the parts, shape (times, parts, points, d), or None."""
 
     def at_time(t, y):
-        poses = group.gather(system.prepared_poses(y.q))
+        poses = group.gather(system.bodies.prepared_poses(y.q))
         space = system.layout.space
         return group.map(lambda at, x: at(t).path(space, at(t).seen_poses(space, x)), poses)
 

@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from .._types import Scalar
+from .._types import State
+from ..linalg.arrays import add_up
 from ..linalg.rotations import cross
-from ..system.quantities import Reaction
-from .groups import AbstractConstraintGroup, AbstractGroup, BodyPoses, BodyVelocities, Group, NonIdealGroup
+from ..system.quantities import Measure, Reaction, view_of_motion
+from .constraint_set import ConstraintSet
+from .groups import AbstractGroup, Group
 
 
 class Place(NamedTuple):
@@ -27,7 +29,7 @@ class Place(NamedTuple):
 
 def places(groups: Sequence[AbstractGroup], name: str) -> tuple[Place, ...]:
     """Where the parts of a name stand: the components of a part in several groups or more than once in one."""
-    found = ((g, k) for g, own in enumerate(groups) for k, other in enumerate(own.group.names) if other == name)
+    found = ((g, k) for g, group in enumerate(groups) for k, other in enumerate(group.group.names) if other == name)
     return tuple(_place(g, k, groups[g].group) for g, k in found)
 
 
@@ -38,37 +40,94 @@ def _place(number: int, member: int, group: Group) -> Place:
     return Place(number, np.array(member), last, tuple(layout.is_place(bodies).tolist()))
 
 
-def reaction(
-    joints: Sequence[AbstractConstraintGroup],
-    places: Sequence[Place],
-    t: Scalar,
-    poses: BodyPoses,
-    velocities: BodyVelocities,
-    multipliers: Float[Array, "rows"],
-) -> Reaction:
-    """Reaction of one joint at one state, from the multipliers of the rows of all joints."""
-    counts = [len(own.group.names) * own.rows for own in joints]
+class JointPlaces(NamedTuple):
+    """Where the constraints of a joint stand among all constraints, and its dry friction among all dry friction."""
+
+    constraints: tuple[Place, ...]
+    frictions: tuple[Place, ...]
+
+    @classmethod
+    def of(cls, constraints: ConstraintSet, name: str) -> "JointPlaces":
+        return cls(places(constraints.groups, name), places(constraints.frictions, name))
+
+
+def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
+    """The forces and moments of joints."""
+    d = system.layout.space.dimension
+    fields = {"force": (d,), "moment": () if d == 2 else (3,)}
+    found = {name: JointPlaces.of(system.constraints, name) for name in names}
+    return {
+        f"{name}.{field}": Measure(shape, _field_of_reaction, (field, joint), of_forces=True)
+        for name, joint in found.items()
+        for field, shape in fields.items()
+    }
+
+
+@view_of_motion
+def _field_of_reaction(system, place, ts, ys, solved):
+    field, joint = place
+    return getattr(reactions(system, joint, ts, ys, solved.multipliers), field)
+
+
+@view_of_motion
+def reactions(system: Any, place: JointPlaces, ts: Any, ys: State, multipliers: Any) -> Reaction:
+    """Reactions of a joint along a motion, from the multipliers of the rows of all joints."""
+
+    def single(t, y, multipliers):
+        now = system.kinematics(t, y.q, y.u)
+        out = _reaction(system.constraints, place.constraints, now, multipliers)
+        slips = [system.constraints.frictions[at.group].law for at in place.frictions]
+        if not slips:
+            return out
+        wrenches = system.constraints.nonideal_wrenches(slips, now, multipliers)
+        return _with_slip(out, slips, place.frictions, now, wrenches)
+
+    return jax.vmap(single)(ts, ys, multipliers)
+
+
+@view_of_motion
+def applied_wrenches(system: Any, place: Any, ts: Any, ys: State, multipliers: Any) -> Array:
+    """Wrenches of a force element, or of a non-ideal law, along a motion; `place`: where it stands among forces, and
+    among laws.
+    """
+    of_forces, of_laws = place
+
+    def single(t, y, multipliers):
+        now = system.kinematics(t, y.q, y.u)
+        if of_laws:
+            laws = [system.constraints.nonideal[at.group] for at in of_laws]
+            wrenches = system.constraints.nonideal_wrenches(laws, now, multipliers)
+            found = [values[at.member] for (values, _), at in zip(wrenches, of_laws, strict=True)]
+        else:
+            alone = [system.at(y).forces.groups[at.group].only(at.member) for at in of_forces]
+            found = [group.wrenches(now)[0] for group in alone]
+        # A force element may have several components.
+        return add_up(values[np.array(at.on_bodies)] for values, at in zip(found, of_laws or of_forces, strict=True))
+
+    return jax.vmap(single)(ts, ys, multipliers)
+
+
+def _reaction(constraints, places, now, multipliers) -> Reaction:
+    """Reaction of one joint at one state."""
+    of_groups = constraints.of_groups(multipliers)
     force, moment, found = 0.0, 0.0, []
     for place in places:
-        group, first = joints[place.group], sum(counts[: place.group])
-        values = multipliers[first : first + counts[place.group]].reshape(-1, group.rows)[place.member]
-        alone = group.only(place.member)
-        wrenches = jnp.einsum("r,rkv->kv", values, alone.jacobian(t, poses, velocities)[0])
-        f, m = _on_last_body(alone.group, place, poses, wrenches)
+        group, values = of_groups[place.group]
+        alone, values = group.only(place.member), values[place.member]
+        wrenches = jnp.einsum("r,rkv->kv", values, alone.jacobian(now)[0])
+        f, m = _on_last_body(alone.group, place, now.poses, wrenches)
         force, moment = force + f, moment + m
         found.append(values)
     return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(found))
 
 
-def with_slip(
-    stick: Reaction, laws: Sequence[NonIdealGroup], places: Sequence[Place], poses: BodyPoses, wrenches: Sequence[Array]
-) -> Reaction:
-    """The reaction of dry friction, that of stick and that of slip together, of which one is zero; of each place the
-    group of its law, and the wrenches of this group.
+def _with_slip(stick, laws, places, now, wrenches) -> Reaction:
+    """The reaction of dry friction, of stick and of slip together, of which one is zero; of each place the group of its
+    law, and the wrenches of this group.
     """
     force, moment = stick.force, stick.moment
-    for place, law, own in zip(places, laws, wrenches, strict=True):
-        f, m = _on_last_body(law.group.only(place.member), place, poses, own[place.member])
+    for place, law, (values, _) in zip(places, laws, wrenches, strict=True):
+        f, m = _on_last_body(law.group.only(place.member), place, now.poses, values[place.member])
         force, moment = force + f, moment + m
     return Reaction(force, moment, stick.multipliers)
 

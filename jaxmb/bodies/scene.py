@@ -1,5 +1,6 @@
 """A scene: named bodies, joints and forces, checked and compiled into a system."""
 
+import dataclasses
 import inspect
 import itertools
 from collections.abc import Mapping, Sequence
@@ -39,10 +40,14 @@ from ..parts.frames import AbstractFrame, frames_by_name
 from ..parts.names import check_arguments, unknown
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
+from ..parts.space import AbstractSpace
 from ..parts.spatial.kinematics import SPACE
 from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.description import Description
 from ..system.equation import Ranks
+from .body_set import BodySet
+from .constraint_set import ConstraintSet
+from .force_set import ForceSet
 from .groups import (
     BodyGroup,
     ConstraintGroup,
@@ -172,19 +177,8 @@ class Scene(eqx.Module):
         for body in self.bodies:
             _call(body, "check")
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
-        joints = {part.name: part for part in self.joints}
-        links = [part for part in (*self.joints, *self.forces) if isinstance(part, AbstractLink)]
-        scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
-        layout = Layout(space, tuple(body.rotates for body in self.bodies), sum(scalars.values(), ()))
-        index = {body.name: k for k, body in enumerate(self.bodies)} | {GROUND: layout.ground}
-        numbers = iter(range(layout.bodies, layout.ground))
-        of_parts = {name: tuple(itertools.islice(numbers, len(own))) for name, own in scalars.items()}
-        zeros = as_parameter(np.zeros(len(layout.scalars)))
-        moving = [k for k, own in enumerate(layout.scalars) if own.moves]
-        guess = State(
-            jax.device_put(np.concatenate([*(_call(body, "pose") for body in self.bodies), zeros])),
-            jax.device_put(np.concatenate([*(_call(body, "velocities") for body in self.bodies), zeros[moving]])),
-        )
+        layout, index, of_parts = _placed(self, space)
+        guess = _given_state(self, layout)
         if is_traced(guess):
             raise ValueError(_TRACED)
         given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
@@ -208,27 +202,79 @@ class Scene(eqx.Module):
         of_joint = {law.name: law.joint for law, _ in laws}
         of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractDryFriction)}
         constraints = kind(AbstractConstraint)
-        system = RigidBodySystem(
-            bodies=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(self.bodies)], layout))),
+        forces = ForceSet(
+            groups=tuple(map(ForceGroup, kind(AbstractForce))),
             gravity=None if gravity is None else jax.device_put(gravity.acceleration),
-            constraints=tuple(ConstraintGroup(own) for own in constraints if own.rows),
-            velocity_constraints=tuple(map(between_velocities, kind(AbstractVelocityConstraint))),
-            servos=tuple(map(servo_group, kind(Servo, _check_program))),
-            nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
-            forces=tuple(map(ForceGroup, kind(AbstractForce))),
-            tendons=tuple(map(CoordinateGroup, kind(AbstractTendon, None))),
-            free_joints=tuple(CoordinateGroup(own) for own in constraints if not own.rows),
-            frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
-            guess=guess,
-            length=_length([own for part, _ in parts for own in (part, *_held(part))], guess, layout),
-            layout=layout,
-            body_names=tuple(body.name for body in self.bodies),
             gravity_name="" if gravity is None else gravity.name,
+        )
+        system = RigidBodySystem(
+            bodies=BodySet(
+                groups=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(self.bodies)], layout))),
+                tendons=tuple(map(CoordinateGroup, kind(AbstractTendon, None))),
+                names=tuple(body.name for body in self.bodies),
+                layout=layout,
+            ),
+            constraints=ConstraintSet(
+                position=tuple(ConstraintGroup(own) for own in constraints if own.rows),
+                velocity=tuple(map(between_velocities, kind(AbstractVelocityConstraint))),
+                servos=tuple(map(servo_group, kind(Servo, _check_program))),
+                nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
+                layout=layout,
+            ),
+            forces=forces.with_states(None),
+            frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
+            free_joints=tuple(CoordinateGroup(own) for own in constraints if not own.rows),
+            guess=dataclasses.replace(guess, z=forces.initial_states()),
+            length=_length([own for part, _ in parts for own in (part, *_held(part))], guess, layout),
             ranks=Ranks(0, 0, 0, 0),
             implied=(),
             elimination=None,
         )
-        return with_structure(system.with_initial_states().with_initial_scalars())
+        return with_structure(_with_initial_scalars(system))
+
+
+def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int], dict[str, tuple[int, ...]]]:
+    """The layout of bodies and scalar coordinates; the numbers of the bodies and of the ground by name, and of the
+    scalar coordinates of parts.
+    """
+    joints = {part.name: part for part in scene.joints}
+    links = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractLink)]
+    scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
+    layout = Layout(space, tuple(body.rotates for body in scene.bodies), sum(scalars.values(), ()))
+    index = {body.name: k for k, body in enumerate(scene.bodies)} | {GROUND: layout.ground}
+    numbers = iter(range(layout.bodies, layout.ground))
+    return layout, index, {name: tuple(itertools.islice(numbers, len(own))) for name, own in scalars.items()}
+
+
+def _given_state(scene: Scene, layout: Layout) -> State:
+    """The poses and velocities of the bodies, and zeros for scalar coordinates."""
+    zeros = as_parameter(np.zeros(len(layout.scalars)))
+    moving = [k for k, own in enumerate(layout.scalars) if own.moves]
+    return State(
+        jax.device_put(np.concatenate([*(_call(body, "pose") for body in scene.bodies), zeros])),
+        jax.device_put(np.concatenate([*(_call(body, "velocities") for body in scene.bodies), zeros[moving]])),
+    )
+
+
+def _with_initial_scalars(system: RigidBodySystem) -> RigidBodySystem:
+    """The system with the scalar coordinates and their rates in its guess that satisfy their constraints there."""
+    if not system.layout.scalars:
+        return system
+    q, u = jax.device_put(_scalars(system))
+    return dataclasses.replace(system, guess=dataclasses.replace(system.guess, q=q, u=u))
+
+
+@on_host
+def _scalars(system):
+    guess, layout = system.guess, system.layout
+    t, q, u = jnp.zeros((), guess.q.dtype), system.normalize(guess.q), guess.u
+    for g in system.constraints.inertial:
+        scalars = g.group.body_index[:, -1]
+        unmet = g.residual(t, system.bodies.prepared_poses(q))[:, 0]
+        q = q.at[layout.pose_index[scalars, 0]].add(-unmet)
+        unmet = g.velocity(system.kinematics(t, q, u))[:, 0]
+        u = u.at[layout.velocity_index[scalars, 0]].add(-unmet)
+    return q, u
 
 
 def _settled(scene: Scene, known: KnownParts, layout: Layout):

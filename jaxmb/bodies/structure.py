@@ -90,7 +90,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
 
 def _parts(system):
     """Bodies, first row and number of rows of every part."""
-    groups = [(g.group.bodies, g.rows) for g in system.joints]
+    groups = [(g.group.bodies, g.rows) for g in system.constraints.groups]
     sizes = [(own, rows) for bodies, rows in groups for own in bodies]
     starts = itertools.accumulate((rows for _, rows in sizes), initial=0)
     return [JointRows(own, first, rows) for (own, rows), first in zip(sizes, starts, strict=False)]
@@ -136,8 +136,8 @@ def _met(system):
 def _evaluated(system, t, q):
     """At coordinates on the constraints or near them, and the given velocities."""
     u = system.guess.u
-    poses, velocities = system.prepared_poses(q), system.all_velocities(u)
-    return _Evaluation(system.position_residual(t, q), [g.jacobian(t, poses, velocities) for g in system.joints])
+    now = system.kinematics(t, q, u)
+    return _Evaluation(system.position_residual(t, q), [g.jacobian(now) for g in system.constraints.groups])
 
 
 def _of_host(on_host, q):
@@ -147,7 +147,7 @@ def _of_host(on_host, q):
 def _row_norms(system, blocks):
     """The norm of each row of A, its columns multiplied by the scales of velocities."""
     of_bodies = np.append(system.known_scales()[1], 0.0)[system.layout.velocity_index]
-    own = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.joints]
+    own = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.constraints.groups]
     sizes = [np.sqrt(np.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, own, strict=True)]
     return np.concatenate([size.reshape(-1) for size in sizes])
 
@@ -205,7 +205,7 @@ def _check_contradictions(system, q, shares):
 
     **Arguments:** `shares` of kept rows in those that are dropped.
     """
-    if not shares or not system.linear or (system.drift_free and not system.servos):
+    if not shares or not system.linear or (system.drift_free and not system.constraints.servos):
         return
     for what, asked in zip(("velocities", "accelerations"), map(np.asarray, _asked(system, q)), strict=True):
         least = 1e-6 * max(np.max(np.abs(asked), initial=0.0), 1e-6)
@@ -263,7 +263,7 @@ def _connected(system, parts):
     driver.
     """
     ground = system.layout.ground
-    rheonomic = [moving for g in system.constraints for moving in [g.rheonomic] * len(g.group.bodies)]
+    rheonomic = [moving for g in system.constraints.position for moving in [g.rheonomic] * len(g.group.bodies)]
     moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]
     first = connected(ground, filter(None, moving))
     bodies, of_parts, driven = ([[] for _ in first] for _ in range(3))
@@ -280,13 +280,13 @@ def _bodies_of_joints(system):
     """Names of the bodies of each joint, without the ground."""
     known = system.body_names
     bodies = lambda own: tuple(known[k] for k in own if k < len(known))
-    groups = [g.group for g in system.joints]
+    groups = [g.group for g in system.constraints.groups]
     return {name: bodies(own) for g in groups for name, own in zip(g.names, g.bodies, strict=True)}
 
 
 def _check_determined(system, implied):
     """Refuse friction laws of joints whose reaction is indeterminate."""
-    for g in system.laws:
+    for g in system.constraints.laws:
         for name, joint in zip(g.group.names, g.joints, strict=True):
             others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
             if others:

@@ -126,7 +126,7 @@ def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
         return
     random = np.random.default_rng(0)
     measured, sigma = {}, {}
-    for place in system.position_quantities():
+    for place in system.catalogue.position_quantities():
         exact = np.asarray(trajectory.quantity(place))[own]
         noise = _NOISE * np.ptp(exact)
         if noise > 0:
@@ -164,7 +164,7 @@ def _most_sensitive(mechanism: Mechanism, ts) -> str | None:
         changed = with_parameters(system, values)
         start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
         motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-8, throw=False)
-        return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.position_quantities()])
+        return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.catalogue.position_quantities()])
 
     # For a choice differences do, whose program compiles in a third of the time of one of derivatives.
     factors = 1 + _CHANGE * np.eye(len(known) + 1, len(known), -1)

@@ -53,7 +53,7 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     tree = spanning_tree(system, (system.guess if state is None else state).q, notes)
     root = ElementTree.Element("mujoco", model="scene")
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
-    gravity = np.zeros(3) if system.gravity is None else np.asarray(system.gravity)
+    gravity = np.zeros(3) if system.forces.gravity is None else np.asarray(system.forces.gravity)
     ElementTree.SubElement(root, "option", gravity=numbers(gravity))
     world = ElementTree.SubElement(root, "worldbody")
     elements = {GROUND: world}

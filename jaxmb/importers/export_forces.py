@@ -24,15 +24,15 @@ def write_forces(
 ) -> None:
     """Write the forces, inertias of joints, tendons and frames of a system."""
     writer = _Writer(tree, elements, sections, notes)
-    for part in parts_of(system, system.tendons, tree):
+    for part in parts_of(system, system.bodies.tendons, tree):
         writer.tendon(part)
-    for part in parts_of(system, system.forces, tree):
+    for part in parts_of(system, system.forces.groups, tree):
         if notes.leaves_out("forces", part.name):
             continue
         write = getattr(writer, f"write_{part.kind}", None)
         if write is None or write(part) is False:
             notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
-    for part in parts_of(system, system.constraints, tree):
+    for part in parts_of(system, system.constraints.position, tree):
         if not isinstance(part.part, AbstractInertialConstraint) or notes.leaves_out("joints", part.name):
             continue
         if isinstance(part.part, AbstractUnilateralConstraint):

@@ -152,14 +152,14 @@ def _acts_on(group, part, k):
 def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree:
     """The tree of a system's bodies. Joints are taken in their order, those that cannot close a loop before others."""
     poses = np.asarray(system.poses(q))
-    scalars = np.asarray(system.prepared_poses(q))[len(poses) : -1, 0]
+    scalars = np.asarray(system.bodies.prepared_poses(q))[len(poses) : -1, 0]
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
-    groups = (*system.constraints, *system.free_joints, *system.tendons, *system.forces, *system.frames)
+    groups = (*system.measured, *system.forces.groups, *system.frames)
     names = {*system.body_names, *(name for group in groups for name in group.group.names)}
     tree = Tree(places, scalars, names, _bodies(system, names, notes))
     parts = [
         p
-        for p in parts_of(system, (*system.constraints, *system.free_joints), tree)
+        for p in parts_of(system, (*system.constraints.position, *system.free_joints), tree)
         if not isinstance(p.part, AbstractInertialConstraint) and not notes.leaves_out("joints", p.name)
     ]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
@@ -178,7 +178,8 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
             tree.nodes.append(TreeBody(body, parent, _oriented(part, tree, body)))
         reached.add(body)
         left.remove(body)
-    for velocity in (*system.velocity_constraints, *system.servos, *system.nonideal):
+    constraints = system.constraints
+    for velocity in (*constraints.velocity, *constraints.servos, *constraints.nonideal):
         for name in velocity.group.names:
             if not notes.leaves_out("joints", name):
                 notes.refused.append(f"{velocity.group.part.kind} {name!r} cannot be expressed.")

@@ -3,25 +3,26 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._captured import Captured
 from .._types import Coordinates, Scalar, State, Velocities
-from ..parts.series import AbstractSignal, of_each
 from ..system import AbstractSystem, DenseInertia, DiagonalInertia
-from ..system.catalogue import ParameterPath
 from ..system.description import Description, count_independent, count_rows, counted, remarks, shorten
 from ..system.design_variables import DesignVariables, description_rows
 from ..system.equation import Ranks
+from ..system.parameter_table import ParameterPath
 from .constraints import AbstractCoordinateConstraint
 from .kinematics import AbstractKinematics, Parameters
 from .nonideal import AbstractNonIdealForce
+from .parameters import DrivenParameters, LagrangianParameters
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -39,23 +40,6 @@ class AbstractEquations(eqx.Module):
     @abc.abstractmethod
     def force(self, system: "AbstractLagrangian", t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nu"]:
         """`F(t, q, u)`."""
-
-
-class DrivenParameters(eqx.Module):
-    """Parameters that are functions of time, several of one kind together, and whether constraints or the meaning of
-    velocities depend on them.
-    """
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    signal: AbstractSignal
-    binds: bool = eqx.field(static=True)
-
-    def at(self, t: Scalar) -> Sequence[Array]:
-        """The values at a time."""
-        if len(self.names) == 1:
-            return [self.signal(t)]
-        values = jax.vmap(lambda own: own(t))(self.signal)
-        return [values[k] for k in range(len(self.names))]
 
 
 class AbstractLagrangian(AbstractSystem):
@@ -115,8 +99,9 @@ class AbstractLagrangian(AbstractSystem):
         return not self.nonideal
 
     @property
-    def friction_parts(self) -> frozenset[str]:
-        return frozenset(law.constraint for law in self.nonideal if law.of_multipliers)
+    def friction_rows(self):
+        parts = {law.constraint for law in self.nonideal if law.of_multipliers}
+        return np.array([k for k, (name, _) in enumerate(self.rows) if name in parts], int)
 
     @property
     def rates_are_velocities(self) -> bool:
@@ -136,22 +121,17 @@ class AbstractLagrangian(AbstractSystem):
         return {f"u{k}": [k] for k in range(self.nu)}
 
     def parameter_paths(self) -> dict[str, list[ParameterPath]]:
-        modules = self.module_structures()
+        modules = self.parameter_table.modules()
         return {name: [(_parameter(name, name in modules), None)] for name in self.parameters}
 
-    def module_structures(self):
-        is_module = lambda own: isinstance(own, eqx.Module)
-        return {name: own.like for name, own in self.parameters.items() if is_module(own)}
+    @property
+    def parameter_table(self):
+        return LagrangianParameters(self)
 
     def parameters_at(self, t: Scalar) -> Parameters:
         """The parameters at a time, the last argument of every function."""
         driven = ((name, x) for own in self.inputs for name, x in zip(own.names, own.at(t), strict=True))
         return self.parameters | {name: jnp.asarray(x, self.parameters[name].dtype) for name, x in driven}
-
-    @property
-    def signals(self):
-        each = ((own, of_each(own.signal, len(own.names))) for own in self.inputs)
-        return {name: (x, own.binds) for own, alone in each for name, x in zip(own.names, alone, strict=True)}
 
     def kernel(self, own: Any, name: str) -> Callable[..., Array]:
         """A method of a constraint, of a non-ideal force or of the kinematics."""

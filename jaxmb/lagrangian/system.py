@@ -9,19 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._compat import with_values
 from .._types import State, VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
 from ..parts.module_weights import ModuleWeights, as_weights
-from ..parts.series import AbstractSignal, of_one_kind
 from ..states.on_host import MOST
 from ..system.equation import Ranks
 from .constraints import check_names
-from .dataflow import depends
 from .host import HostLagrangian
 from .kinematics import AbstractKinematics, Rates
-from .model import AbstractEquations, AbstractLagrangian, DrivenParameters, Projected, Unanalysed
+from .model import AbstractEquations, AbstractLagrangian, Projected, Unanalysed
 from .nonideal import AbstractNonIdealForce
 from .structure import constraint_sizes, find_structure, with_programs
 
@@ -138,49 +135,6 @@ class LagrangianSystem(AbstractLagrangian):
         known = not is_traced((self, t)) and self.guess.q.dtype == np.float64
         small = 0 < self.acceleration_rows <= MOST and self.nq <= MOST
         return HostLagrangian(self, t) if known and small else None
-
-    def with_signals(self, signals):
-        inputs = _together(self.signals | _inputs_of(self, signals))
-        drift_free = self.drift_free and not any(own.binds for own in inputs)
-        same = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return with_values(type(self), same | {"inputs": inputs, "drift_free": drift_free})
-
-
-def _together(inputs: Mapping[str, tuple[AbstractSignal, bool]]) -> tuple[DrivenParameters, ...]:
-    """Inputs by name with those of one kind together."""
-    out = []
-    for binds in (True, False):
-        names = [name for name, own in inputs.items() if own[1] == binds]
-        kinds = of_one_kind([inputs[name][0] for name in names])
-        out += [DrivenParameters(tuple(names[k] for k in numbers), signal, binds) for numbers, signal in kinds]
-    return tuple(out)
-
-
-def _inputs_of(
-    system: AbstractLagrangian, signals: Mapping[str, AbstractSignal]
-) -> dict[str, tuple[AbstractSignal, bool]]:
-    """Signals as inputs of a system, by name, and whether constraints depend on them.
-
-    **Raises:** `ValueError` for a value that jumps and that position constraints or rates of the coordinates depend on.
-    """
-    q, u = system.guess.q, system.guess.u
-    t = jnp.zeros((), q.dtype)
-    with_number = lambda name, x: eqx.tree_at(lambda s: s.parameters[name], system, x)
-    out = {}
-    modules = system.module_structures()
-    for name, signal in signals.items():
-        if name in modules:
-            raise ValueError(f"{name!r} is a module, whose weights are not a function of time.")
-        number = (system.parameters[name],)
-        reaches = lambda kernel, name=name, number=number: depends(lambda x: kernel(with_number(name, x)), number, 0)
-        of_rates = reaches(lambda s: s.rates(t, q, u))
-        if not signal.continuous and (of_rates or reaches(lambda s: s.position_residual(t, q))):
-            raise ValueError(
-                f"A position constraint or the rates of coordinates depend on {name!r}, so it must not jump: use "
-                "interpolation='linear' or 'cubic' instead of 'held'."
-            )
-        out[name] = signal, of_rates or reaches(lambda s: s.acceleration_residual(t, q, u, u))
-    return out
 
 
 def _number(name: str, value: Any) -> Array | ModuleWeights:

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..planar import DraftGear
 from ..system import AbstractInertia, AbstractSystem, DenseInertia
-from ..system.catalogue import ParameterPath
 from ..system.description import Description, count_independent, remarks, shorten
 from ..system.design_variables import DesignVariables, description_rows
+from ..system.parameter_table import ParameterPath, ParameterTable
 
 
 class RelativeInertia(AbstractInertia):
@@ -57,6 +57,11 @@ def forces_along(f: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
 
 def _scaled(by, v):
     return (by if v.ndim == 1 else by[:, None]) * v
+
+
+class _TrainParameters(ParameterTable):
+    def positive(self):
+        return frozenset(f"car{k + 1}.mass" for k in range(self.system.nq))
 
 
 class RelativeTrain(AbstractSystem):
@@ -112,8 +117,9 @@ class RelativeTrain(AbstractSystem):
                     paths[f"coupler{k + 1}.{name}"] = [(_gear(name), k)]
         return paths
 
-    def positive_parameters(self):
-        return frozenset(f"car{k + 1}.mass" for k in range(self.nq))
+    @property
+    def parameter_table(self):
+        return _TrainParameters(self)
 
     def inertia(self, t, q, u):
         return RelativeInertia(self.mass)

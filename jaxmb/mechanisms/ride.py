@@ -51,7 +51,7 @@ def wheel_loads(trajectory: Trajectory) -> Float[Array, "times wheels"]:
     """Vertical forces [N] of the ground, or of the shoes of a track, on the wheels, those of the leading carrier first,
     damping included.
     """
-    rims = [name for name in trajectory.system.force_names() if name.endswith("_rim") and "wheel" in name]
+    rims = [name for name in trajectory.system.catalogue.force_names() if name.endswith("_rim") and "wheel" in name]
     if rims:
         return jnp.stack([trajectory.forces[name][..., 0, 1] for name in rims], axis=-1)
     return trajectory.forces["road"][:, :, 1]

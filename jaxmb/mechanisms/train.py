@@ -209,16 +209,14 @@ def coupler_forces(trajectory) -> jax.Array:
     system = trajectory.system
 
     def of_forces(t, y):
-        poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
-        wrenches = [g.wrenches(t, poses, velocities) for g in system.forces if "coupler1" in g.group.names]
+        now = system.kinematics(t, y.q, y.u)
+        wrenches = [g.wrenches(now) for g in system.forces.groups if "coupler1" in g.group.names]
         return wrenches[0][:, 1, 0] if wrenches else jnp.zeros(0, y.q.dtype)
 
     def of_joints(t, y, multipliers):
-        (group,) = system.constraints
-        poses, velocities = system.prepared_poses(y.q), system.all_velocities(y.u)
-        own = multipliers.reshape(-1, group.rows)
-        return group.wrenches(t, poses, velocities, own)[:, 1, 0]
+        ((wrenches, _),) = system.constraints.wrenches(system.kinematics(t, y.q, y.u), multipliers)
+        return wrenches[:, 1, 0]
 
-    if not system.constraints:
+    if not system.constraints.groups:
         return jax.vmap(of_forces)(trajectory.ts, trajectory.ys)
     return jax.vmap(of_joints)(trajectory.ts, trajectory.ys, trajectory.multipliers)

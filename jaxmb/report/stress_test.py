@@ -213,7 +213,7 @@ def _stiffness(base: _Base) -> Iterator[_Trial]:
 
 
 def _masses(base: _Base) -> Iterator[_Trial]:
-    body = base.mechanism.system.motion_names()[0]
+    body = base.mechanism.system.catalogue.motion_names()[0]
     masses = _inertial(base, [body])
     if not masses:
         raise _NotHereError("left out, there is no body whose mass is a parameter")
@@ -222,7 +222,7 @@ def _masses(base: _Base) -> Iterator[_Trial]:
 
 
 def _alternating_masses(base: _Base) -> Iterator[_Trial]:
-    every_other = _inertial(base, base.mechanism.system.motion_names()[1::2])
+    every_other = _inertial(base, base.mechanism.system.catalogue.motion_names()[1::2])
     if not every_other:
         raise _NotHereError("left out, there are no two bodies whose masses are parameters")
     yield from _scaled(base, every_other, 10.0 ** np.array([-8, -6, -3, 3, 6, 8]))
@@ -268,10 +268,9 @@ def _doubled(base: _Base) -> Iterator[_Trial]:
     if not (own.system.body_names and own.system.velocity_rows):
         raise _NotHereError("left out, there are no joints of bodies")
     yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=(base.truth,))
-    if getattr(own.system.joints[0].group.part, "point_a", None) is None:
-        raise _NotHereError(
-            f"a nearly redundant one is left out, {own.system.joints[0].group.names[0]!r} has no points of two bodies"
-        )
+    joint = own.system.constraints.groups[0].group
+    if getattr(joint.part, "point_a", None) is None:
+        raise _NotHereError(f"a nearly redundant one is left out, {joint.names[0]!r} has no points of two bodies")
     off = 1e-6 * float(own.system.length)
     yield base.trial("1e-06 off", build=lambda: _with(base, doubled(own.system, own.state, off)))
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._types import State
+from ..bodies.constraint_set import ConstraintSet
 from ..bodies.groups import ConstraintGroup, ForceGroup, Group, VelocityConstraintGroup, stack
 from ..bodies.structure import with_structure
 from ..parts.base import AbstractConstraint, AbstractVelocityConstraint
@@ -22,7 +23,7 @@ from ..system import AbstractSystem, parameters, with_parameters
 _LENGTH = {"m": 1, "N": 1, "Pa": -1, "kg": 0, "s": 0, "1": 0}
 
 
-def units(system: AbstractSystem) -> dict[str, str | None]:
+def units(system: Any) -> dict[str, str | None]:
     """The units of all parameters by name; None where it is not declared, or a user's function gives it."""
     out: dict[str, str | None] = dict.fromkeys(parameters(system))
     for g in _groups(system):
@@ -31,8 +32,8 @@ def units(system: AbstractSystem) -> dict[str, str | None]:
             if " or " in known:
                 known = g.group.part.unit(field, known)
             out |= {f"{name}.{field}": known or None for name in g.group.names}
-    gravity = f"{getattr(system, 'gravity_name', '')}.acceleration"
-    return out | ({gravity: "m/s²"} if gravity in out else {})
+    weights = system.forces.gravity_part if system.body_names else ()
+    return out | {f"{weight.name}.acceleration": "m/s²" for weight in weights}
 
 
 def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State]:
@@ -88,8 +89,9 @@ def _has_function(part: Any) -> bool:
 
 
 def _groups(system: Any) -> Iterator[Any]:
-    for field in ("bodies", "constraints", "velocity_constraints", "servos", "nonideal", "forces"):
-        yield from getattr(system, field, ()) if system.body_names else ()
+    if system.body_names:
+        yield from (*system.bodies.groups, *system.constraints.groups, *system.constraints.nonideal)
+        yield from system.forces.groups
 
 
 def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSystem:
@@ -98,15 +100,15 @@ def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSy
     **Raises:** `ValueError` for a scene without joints, and where the scene with both does not compile.
     """
     joint = _first_joint(system)
-    kind = "constraints" if isinstance(joint.part, AbstractConstraint) else "velocity_constraints"
+    kind = "position" if isinstance(joint.part, AbstractConstraint) else "velocity"
     part = jax.tree.map(lambda x: x[:1], joint.part)
     if shift is not None:
         part = eqx.tree_at(lambda p: p.point_a, part, part.point_a + shift)
     both = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), joint.part, part)
     names, bodies = (*joint.names, f"{joint.names[0]} again"), (*joint.bodies, joint.bodies[0])
-    groups = getattr(system, kind)
+    groups = getattr(system.constraints, kind)
     first = dataclasses.replace(groups[0], group=Group(both, names, bodies, joint.layout))
-    return _compiled(system, state, **{kind: (first, *groups[1:])})
+    return _compiled(system, state, dataclasses.replace(system.constraints, **{kind: (first, *groups[1:])}))
 
 
 def in_time(system: Any, state: State) -> AbstractSystem:
@@ -116,7 +118,8 @@ def in_time(system: Any, state: State) -> AbstractSystem:
         raise ValueError(f"{joint.names[0]!r} is no constraint between positions")
     part = _InTime("", (), joint.part, jnp.zeros(len(joint.names)))
     first = ConstraintGroup(Group(part, joint.names, joint.bodies, joint.layout))
-    return _compiled(system, state, constraints=(first, *system.constraints[1:]))
+    position = (first, *system.constraints.position[1:])
+    return _compiled(system, state, dataclasses.replace(system.constraints, position=position))
 
 
 def nonholonomic(system: Any, state: State) -> AbstractSystem:
@@ -126,7 +129,8 @@ def nonholonomic(system: Any, state: State) -> AbstractSystem:
         raise ValueError(f"{joint.names[0]!r} is no constraint between positions")
     part = _Rate("", (), jax.tree.map(lambda x: x[:1], joint.part))
     own = Group(part, (f"rate of {joint.names[0]}",), joint.bodies[:1], joint.layout)
-    return _compiled(system, state, velocity_constraints=(*system.velocity_constraints, VelocityConstraintGroup(own)))
+    velocity = (*system.constraints.velocity, VelocityConstraintGroup(own))
+    return _compiled(system, state, dataclasses.replace(system.constraints, velocity=velocity))
 
 
 def with_damper(system: Any, state: State) -> AbstractSystem:
@@ -137,17 +141,18 @@ def with_damper(system: Any, state: State) -> AbstractSystem:
     origin = np.zeros(layout.space.dimension)
     part = Damper("a damper of zero", "ground", system.body_names[0], damping=0.0, point_a=origin, point_b=origin)
     own = stack([(part, (layout.ground, 0))], layout)
-    return _compiled(system, state, forces=(*system.forces, *map(ForceGroup, own)))
+    forces = dataclasses.replace(system.forces, groups=(*system.forces.groups, *map(ForceGroup, own)))
+    return with_structure(dataclasses.replace(system, guess=state, forces=forces))
 
 
 def _first_joint(system: Any) -> Group:
     if not (system.body_names and system.velocity_rows):
         raise ValueError("there are no joints of bodies")
-    return system.joints[0].group
+    return system.constraints.groups[0].group
 
 
-def _compiled(system: Any, state: State, **groups: Any) -> AbstractSystem:
-    return with_structure(dataclasses.replace(system, guess=state, **groups))
+def _compiled(system: Any, state: State, constraints: ConstraintSet) -> AbstractSystem:
+    return with_structure(dataclasses.replace(system, guess=state, constraints=constraints))
 
 
 class _InTime(AbstractConstraint):

@@ -91,7 +91,7 @@ def _compiled(event: str, duration_secs: float, **_: Any) -> None:
 
 
 def _motion_of(system: AbstractSystem) -> str:
-    names = system.body_names or tuple(system.motion_names())
+    names = system.body_names or tuple(system.catalogue.motion_names())
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return f"a motion of {', '.join(names[:3])}{more}"
 

@@ -222,7 +222,7 @@ def reason_of_failure(system, result, span: Span, outcome: Outcome) -> str:
     rates = system.rates(t, y.q, y.u)
     ahead = np.append(0.0, np.logspace(-12, -3, 10)) * (np.clip(span.t1, t - 1.0, t + 1.0) - t)
     for step in ahead:
-        wrong = system.not_finite(t + step, y.q + step * rates, y.u)
+        wrong = system.catalogue.not_finite(t + step, y.q + step * rates, y.u)
         if wrong:
             names = f"{' and '.join(wrong)} {'is' if len(wrong) == 1 else 'are'} not finite"
             return f"At t = {float(t + step):.6g} {names}. With `throw=False` the motion up to there is kept."

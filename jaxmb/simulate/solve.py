@@ -86,7 +86,7 @@ class Start(NamedTuple):
     @classmethod
     def of(cls, problem: Problem, term: Any) -> "Start":
         system, span, method = problem.system, problem.span, problem.method
-        y, valid = problem.state, system.parameters_in_range() if problem.traced else True
+        y, valid = problem.state, system.parameter_table.in_range() if problem.traced else True
         consistent = is_consistent(system, span.t0, y) if method.policy.restores else True
         if consistent is not True:
             y = jax.tree.map(lambda x: jnp.where(consistent, x, jnp.nan), y)
@@ -251,6 +251,6 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     """
     system = problem.system.prepared()
     result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck)
-    if not system.friction_parts:
+    if not system.friction_rows.size:
         return result, None
     return diagnose_friction(system, problem.method.formulation, t, y, result, stuck)

@@ -200,7 +200,7 @@ def _check_modes(system, q, fixed):
 
 @jitted
 def _joint_coordinate(system, coordinate, t, q):
-    return system.joint_coordinate(coordinate, t, q)
+    return system.catalogue.joint_coordinate(coordinate, t, q)
 
 
 @jitted

@@ -14,9 +14,9 @@ from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
 from ..parts.names import unknown
-from .catalogue import AbstractSystem
 from .design_variables import DesignVariables, Variable
 from .parameters import System, parameters, with_parameters
+from .system import AbstractSystem
 
 Bounds = tuple[ArrayLike | None, ArrayLike | None]
 

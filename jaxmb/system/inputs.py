@@ -15,8 +15,8 @@ from .._types import Scalar, State
 from ..parts.names import unknown
 from ..parts.series import AbstractSignal, as_signal, of_one_kind, sample_times
 from ..solvers.evaluation import freeze
-from .catalogue import AbstractSystem
 from .parameters import parameters
+from .system import AbstractSystem
 
 System = TypeVar("System", bound=AbstractSystem)
 # How far an input may come and go between two steps, relative to its range.
@@ -66,7 +66,7 @@ def with_inputs(system: System, inputs: Signals) -> System:
                 f"The input {name!r} must have shape {known[name].shape} at each time, as the parameter has; got "
                 f"{shape}."
             )
-    return system.with_signals(signals)
+    return system.parameter_table.with_signals(signals)
 
 
 def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndarray:
@@ -74,7 +74,7 @@ def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndar
 
     **Raises:** `ValueError` that names an input which is not known from `t0` to `t1`.
     """
-    signals = system.signals
+    signals = system.parameter_table.signals
     for name, (signal, _) in signals.items():
         signal.check_interval(name, t0, t1)
     own = [signal.break_times(of_rates=binding) for signal, binding in signals.values()]
@@ -84,7 +84,7 @@ def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndar
 def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
     """Whether an input is not known from `t0` to `t1`, which may be traced; False without inputs."""
     ended: Any = False
-    for numbers, signal in of_one_kind([signal for signal, _ in system.signals.values()]):
+    for numbers, signal in of_one_kind([signal for signal, _ in system.parameter_table.signals.values()]):
         of_signal = lambda signal: signal.is_known(t0, t1)
         known = of_signal(signal) if len(numbers) == 1 else jnp.all(jax.vmap(of_signal)(signal))
         if known is not True:
@@ -101,7 +101,8 @@ def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) 
     of its range between t0 and t1 at most. A series is followed from value to value, a function at 513 times.
     """
     # Where a motion restarts, steps end as well.
-    signals = [signal for signal, binding in system.signals.values() if not signal.break_times(of_rates=binding).size]
+    known = system.parameter_table.signals.values()
+    signals = [signal for signal, binding in known if not signal.break_times(of_rates=binding).size]
     if not signals and not system.of_time:
         return None
     return _turning_times(of_one_kind(signals), system.at(state) if system.of_time else None, state, t0, t1)

@@ -13,7 +13,7 @@ from ..linalg.arrays import is_traced, replaced
 from ..parts.fields import as_jax
 from ..parts.module_weights import weights_of, with_weights
 from ..parts.names import unknown
-from .catalogue import AbstractSystem
+from .system import AbstractSystem
 
 System = TypeVar("System", bound=AbstractSystem)
 
@@ -49,7 +49,7 @@ def modules(system: AbstractSystem) -> dict[str, eqx.Module]:
     **Returns:** the modules with their weights, as `with_parameters` takes them.
     """
     own = parameters(system)
-    return {name: with_weights(like, own[name]) for name, like in system.module_structures().items()}
+    return {name: with_weights(like, own[name]) for name, like in system.parameter_table.modules().items()}
 
 
 def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module]) -> System:
@@ -87,7 +87,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
                     f"{'those' if several else 'that'} instead."
                 )
     given: dict[str, Any] = dict(values)
-    design, before, inputs = [], system, system.input_names()
+    design, before, inputs = [], system, system.parameter_table.input_names()
     # Variables of a design may follow from those of a later one.
     for own in reversed(system.design):
         mine = {name: given.pop(name) for name in own.values if name in given}
@@ -108,10 +108,10 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
             if value.shape != shape:
                 raise ValueError(f"Parameter {name!r} has shape {shape}, got {value.shape}.")
             system = eqx.tree_at(where, system, value if index is None else replaced(old, index, value))
-    system = system.with_frames_of(before)
+    system = system.parameter_table.with_frames_of(before)
     if design:
         system = eqx.tree_at(lambda s: s.design, system, tuple(design))
-    system.check_parameters(given)
+    system.parameter_table.check(given)
     return system
 
 
@@ -122,7 +122,7 @@ def _as_array(system: AbstractSystem, name: str, value: Any) -> Array:
             return as_jax(value)
         except (ValueError, TypeError) as error:
             raise ValueError(f"Parameter {name!r}: {error}.") from None
-    like = system.module_structures().get(name)
+    like = system.parameter_table.modules().get(name)
     if like is None:
         kind = type(value).__name__
         raise ValueError(f"Parameter {name!r} is a number or an array, not the weights of a module; got a {kind}.")

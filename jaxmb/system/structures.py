@@ -14,9 +14,10 @@ _MOST = 64
 
 
 def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], dict[str, Any]]:
-    """A dictionary that depends on the structure of a system, and on no number in it.
+    """A method that gives a dictionary, which depends on the structure of its object's `system`, and on no number in
+    it.
 
-    The function gets the system with zeros in its arrays, and without the axes of a batch. Structures are equal where
+    The method gets the system with zeros in its arrays, and without the axes of a batch. Structures are equal where
     compiled programs are the same, so what is found can never be out of date.
     """
 
@@ -26,8 +27,8 @@ def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], d
         return function(jax.tree.unflatten(structure, map(zeros, leaves)))
 
     @functools.wraps(function)
-    def called(system: Any) -> dict[str, Any]:
-        (leaves, structure), batch = jax.tree.flatten(system), system.length.ndim
+    def called(of: Any) -> dict[str, Any]:
+        (leaves, structure), batch = jax.tree.flatten(of), of.system.length.ndim
         shapes = (jax.ShapeDtypeStruct(x.shape[batch:], x.dtype) if isinstance(x, ARRAYS) else x for x in leaves)
         return dict(found(structure, tuple(shapes)))
 

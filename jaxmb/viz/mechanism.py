@@ -52,7 +52,7 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
         )
     trajectory = one_motion(trajectory, "plot_mechanism", 1)
     check_finite(trajectory)
-    picture = trajectory.system.picture(trajectory.ts, trajectory.ys)
+    picture = trajectory.system.catalogue.picture(trajectory.ts, trajectory.ys)
     shapes = solids(picture, {}, None)
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))

@@ -107,9 +107,9 @@ def _default(system) -> list[str]:
     """The quantities that describe a motion."""
     known = system.quantities()
     # In space a body has no angle, so that those of joints are shown.
-    flat = any(f"{name}.angle" in known for name in system.motion_names())
+    flat = any(f"{name}.angle" in known for name in system.catalogue.motion_names())
     kinds = ("displacement",) if flat else ("angle", "displacement")
-    of_bodies = _quantities(system, system.motion_names())
+    of_bodies = _quantities(system, system.catalogue.motion_names())
     of_bodies = [name for name in of_bodies if flat or _kind(system, name) != _RATES["angle"]]
     of_joints = [name for name in system.joint_coordinates() if _kind(system, name) in kinds]
     return [*of_bodies, *(x for name in of_joints for x in (name, f"{name}_rate"))]

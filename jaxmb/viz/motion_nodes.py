@@ -184,7 +184,7 @@ def motion(
     tint: Color | None,
 ) -> Motion:
     """A motion with its shapes; arguments as in `solids`."""
-    shown = trajectory.system.picture(trajectory.ts, trajectory.ys)
+    shown = trajectory.system.catalogue.picture(trajectory.ts, trajectory.ys)
     return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
 
 

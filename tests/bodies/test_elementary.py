@@ -72,7 +72,7 @@ def largest(x):
 def both(system, state, acceleration):
     """All rows that a motion uses, by elements and by derivatives of the residuals."""
     near, t, (q, u) = system.prepared(), jnp.zeros(()), (state.q, state.u)
-    assert near.elements is not None and system.elements is None
+    assert near.constraints.elements is not None and system.constraints.elements is None
     multipliers = jnp.linspace(-1.0, 2.0, system.acceleration_rows)
     rates = system.rates(t, q, u)
     # Along motions of bodies; the length of Euler parameters may count otherwise, since it does not change.
@@ -114,8 +114,8 @@ def test_rows_of_every_joint_are_those_of_its_residual(where):
         kind(name, *(end.format(k) for end in ends), **given) for k, (name, (kind, given)) in enumerate(JOINTS.items())
     ]
     system = mb.Scene([one for pair in pairs for one in pair], joints=joints, frames=frames).compile()
-    assert all(map(is_elementary, system.constraints))
-    assert {type(g.group.part) for g in system.constraints} == {kind for kind, _ in JOINTS.values()}
+    assert all(map(is_elementary, system.constraints.position))
+    assert {type(g.group.part) for g in system.constraints.position} == {kind for kind, _ in JOINTS.values()}
     for state, acceleration in states_of(system):
         assert_agree(system, state, acceleration)
         check_elements(system, state)
@@ -134,7 +134,7 @@ def test_rows_of_planar_joints_are_those_of_their_residuals():
         planar.Distance("rod", "b8", "b9", point_a=(0.1, 0.2), point_b=(-0.3, 0.4)),
     ]
     system = mb.Scene(own, joints=joints, frames=[frame]).compile()
-    assert all(map(is_elementary, system.constraints))
+    assert all(map(is_elementary, system.constraints.position))
     for state, acceleration in states_of(system):
         assert_agree(system, state, acceleration)
         check_elements(system, state)
@@ -165,7 +165,7 @@ def many():
 @pytest.mark.long
 def test_elementary_joints_stand_among_others():
     system = many().compile()
-    assert not all(map(is_elementary, system.constraints))
+    assert not all(map(is_elementary, system.constraints.position))
     for state, acceleration in states_of(system, 1):
         assert_agree(system, state, acceleration, 1e-12)
         check_elements(system, state)
@@ -219,7 +219,7 @@ def system_with(kind):
 
 def test_a_joint_of_the_users_may_have_elements():
     system = system_with(Hinge)
-    assert all(map(is_elementary, system.constraints))
+    assert all(map(is_elementary, system.constraints.position))
     ((state, acceleration),) = states_of(system, 1)
     assert_agree(system, state, acceleration)
     check_elements(system, state)
@@ -236,7 +236,7 @@ def test_elements_that_differ_from_the_residual_are_refused():
 
 def test_a_newer_residual_counts_alone():
     system = system_with(Loose)
-    assert not any(map(is_elementary, system.constraints)) and system.prepared().elements is None
+    assert not any(map(is_elementary, system.constraints.position)) and system.prepared().constraints.elements is None
 
 
 @pytest.mark.long

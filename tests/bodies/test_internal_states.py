@@ -179,8 +179,8 @@ def test_a_rate_that_is_not_finite_is_named():
     bad = lambda t, measured, states, p: (0.0, {"integral": jnp.sqrt(0.5 - t)})
     system = cart_and_pole_with(bad)
     state = system.guess
-    assert system.with_states(state.z).not_finite(0.4, state.q, state.u) == ()
-    assert system.with_states(state.z).not_finite(0.6, state.q, state.u) == ("the rate of 'pid.integral'",)
+    assert system.with_states(state.z).catalogue.not_finite(0.4, state.q, state.u) == ()
+    assert system.with_states(state.z).catalogue.not_finite(0.6, state.q, state.u) == ("the rate of 'pid.integral'",)
 
 
 def end(system, gains, angle, integral, rtol=1e-10):
@@ -392,7 +392,7 @@ def test_equal_controllers_are_computed_together():
         mb.Controller(f"hold{k}", hold, {"angle": angle(k)}, angle(k), parameters={"gain": 1.0 + k}) for k in range(3)
     ]
     system = mb.Scene(rods, joints=pins, forces=forces).compile()
-    assert len(system.forces) == 1
+    assert len(system.forces.groups) == 1
     angles = 0.1 * np.arange(1, 4)
     state = mb.assemble(system, fix=dict(zip(map(angle, range(3)), angles, strict=True)))
     found, _ = formulations.accelerations(system, formulations.Multipliers(), 0.0, state.q, state.u)

@@ -55,7 +55,7 @@ def test_friction_takes_the_energy():
 
 
 def without_friction(system):
-    return eqx.tree_at(lambda s: s.nonideal, system, ())
+    return eqx.tree_at(lambda s: s.constraints.nonideal, system, ())
 
 
 def test_program_is_reached_as_its_gains_say():

@@ -309,7 +309,7 @@ def test_examples_of_joints(module, name):
     exec(example(cls), scope)
     (joint,) = (own for own in scope.values() if type(own) is cls)
     system, text = scope["system"], inspect.getdoc(cls) or ""
-    assert joint.name in system.constraint_names()
+    assert joint.name in system.catalogue.constraint_names()
     for field in ("body_a", "body_b") if hasattr(joint, "body_a") else ("body",):
         assert f"`{field}`" in text
     expected = (PLANAR if module is planar else SPATIAL)[name]
@@ -318,5 +318,5 @@ def test_examples_of_joints(module, name):
     assert expected or "no coordinates" in text
     for field, value in expected.items():
         assert f"`{field}`" in text
-        found = system.joint_coordinate(own[f"{joint.name}.{field}"], 0.0, system.guess.q)
+        found = system.catalogue.joint_coordinate(own[f"{joint.name}.{field}"], 0.0, system.guess.q)
         np.testing.assert_allclose(found, value, atol=1e-12)

@@ -70,7 +70,7 @@ def test_cars_of_a_train_weigh_something():
     train = mb.mechanisms.get("longitudinal_train").system
     with pytest.raises(ValueError, match=r"'car1.mass' must be positive, got -1"):
         mb.with_parameters(train, {"car1.mass": -1.0})
-    inside = jax.jit(lambda mass: mb.with_parameters(train, {"car1.mass": mass}).parameters_in_range())
+    inside = jax.jit(lambda mass: mb.with_parameters(train, {"car1.mass": mass}).parameter_table.in_range())
     assert inside(1.0) and not inside(-1.0)
 
 
@@ -93,9 +93,9 @@ def test_a_traced_number_out_of_range_is_the_result(rod):
     "value", [np.diag([1.0, 1.0, -1.0]), np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])]
 )
 def test_traced_moments_of_inertia_are_positive_definite(top, value):
-    inside = jax.jit(lambda inertia: mb.with_parameters(top, {"top.inertia": inertia}).parameters_in_range())
+    inside = jax.jit(lambda inertia: mb.with_parameters(top, {"top.inertia": inertia}).parameter_table.in_range())
     assert inside(np.diag(SIZE)) and not inside(value)
-    assert mb.with_parameters(top, {"top.inertia": np.diag(SIZE)}).parameters_in_range() is True
+    assert mb.with_parameters(top, {"top.inertia": np.diag(SIZE)}).parameter_table.in_range() is True
 
 
 TIMES = {

@@ -108,7 +108,7 @@ def at_one_instant(examples, formulation):
         for name in (name for machine in machines for name in machine.outputs):
             body, field = name.rsplit(".", 1)
             if field == "acceleration":
-                moving = system.motion(body, mb.State(state.q[None], udot[None]))
+                moving = system.catalogue.motion(body, mb.State(state.q[None], udot[None]))
                 turning = moving.angular_velocity
                 out[name] = jnp.append(moving.velocity, jnp.zeros(0) if turning is None else turning)
             else:
@@ -218,7 +218,7 @@ def pendulum(seen, *, observe=None, scene=double_pendulum, **options):
         return {name: sol.quantity(name) for name in seen if "." in name} | {
             "energy": sol.energy,
             "spring": sol.forces["spring"],
-            "reaction": sol.reactions["pin"].moment if "pin" in system.constraint_names() else sol.energy,
+            "reaction": sol.reactions["pin"].moment if "pin" in system.catalogue.constraint_names() else sol.energy,
         }
 
     machine = Machine("pendulum", list(mb.parameters(system)), seen, ["initial rate"])

@@ -269,7 +269,7 @@ def test_refused_with_the_part_and_the_cure(case):
 def test_parts_of_one_kind_are_stacked_whatever_their_fields_are_called():
     drags = [Marked(f"mark{k}", f"body{k}", gain=1.0 + k) for k in range(6)]
     system = mb.Scene([body(f"body{k}") for k in range(6)], forces=drags).compile()
-    assert len(system.forces) == 1
+    assert len(system.forces.groups) == 1
     assert float(mb.parameters(system)["mark3.gain"]) == 4.0
 
 

@@ -49,7 +49,7 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     udot, multipliers = accelerations(system, Multipliers(), t, at(mode), u)
     assert np.all(multipliers[rows] == 0)
     times, states = t[None], mb.State(at(mode)[None], u[None])
-    reaction = system.reaction("joint", times, states, multipliers[None])
+    reaction = system.catalogue.reaction("joint", times, states, multipliers[None])
     normal = np.linalg.norm(reaction.force[0])
     if of.n:
         # That of a contact has a sign, so that the law is smooth where an iteration passes through zero.

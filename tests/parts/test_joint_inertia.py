@@ -53,7 +53,7 @@ def rates_of(system, q, u):
     known, t = system.joint_coordinates(), jnp.zeros(())
 
     def single(name):
-        value = lambda q: system.joint_coordinate(known[name], t, q)
+        value = lambda q: system.catalogue.joint_coordinate(known[name], t, q)
         return jax.jvp(value, (q,), (system.rates(t, q, u),))[1]
 
     return jnp.stack([single(name) for name, _ in SIZES.values()])

@@ -65,7 +65,7 @@ def test_a_spring_of_an_angle_is_a_torsional_spring_in_space():
 def test_springs_on_many_joints_are_one_group():
     springs = [mb.JointSpring(f"spring {j}", f"{j}.angle", stiffness=k) for j, k in (("hip", 1.0), ("knee", 2.0))]
     system = pendulums(*springs)
-    assert len(system.forces) == 1 and mb.parameters(system)["spring knee.stiffness"] == 2.0
+    assert len(system.forces.groups) == 1 and mb.parameters(system)["spring knee.stiffness"] == 2.0
 
 
 def test_a_change_of_the_joint_reaches_its_spring():

@@ -86,7 +86,7 @@ def test_the_weights_are_one_vector_by_name(linkage):
     for name, net in NETS.items():
         assert eqx.tree_equal(found[name], net)
     # Two drags differ in nothing but their weights, and are computed together.
-    assert len(linkage.forces) == 2
+    assert len(linkage.forces.groups) == 2
     other = {"friction.net": network(2), "drag_c.net": Ratio(jnp.array([0.7, 0.9]))}
     changed = mb.with_parameters(linkage, other)
     assert all(eqx.tree_equal(mb.modules(changed)[name], net) for name, net in (NETS | other).items())
@@ -103,11 +103,11 @@ def test_the_weights_are_one_vector_by_name(linkage):
 def test_the_law_acts(linkage):
     state = mb.assemble(linkage, rates={"crank.angle": 3.0})
     ys = jax.tree.map(lambda x: x[None], state)
-    of = lambda name: linkage.applied_wrenches(name, jnp.zeros(1), ys, None)[0]
+    of = lambda name: linkage.catalogue.applied_wrenches(name, jnp.zeros(1), ys, None)[0]
     torque = -NETS["friction.net"](jnp.array([3.0]))[0] - 0.2 * 3.0
     np.testing.assert_allclose(of("friction")[-1, 2], torque, rtol=1e-12)
     for name, body in (("drag_b", "coupler"), ("drag_c", "rocker")):
-        v = linkage.motion(body, ys).velocity[0]
+        v = linkage.catalogue.motion(body, ys).velocity[0]
         np.testing.assert_allclose(of(name)[0, :2], -NETS[f"{name}.net"](v @ v) * v, rtol=1e-12)
 
 

@@ -295,7 +295,7 @@ def test_a_batch_equals_the_loop():
 def test_derivatives_three_ways(build, n, t1):
     system = build(n)
     state = mb.assemble(system)
-    force = system.force_names()[-1]
+    force = system.catalogue.force_names()[-1]
     names = ["rod1.mass", f"{force}.stiffness", f"{force}.damping"]
     values = [mb.parameters(system)[name] for name in names]
     weights = jnp.asarray(np.random.default_rng(0).normal(size=system.nq + system.nu))

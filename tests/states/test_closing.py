@@ -78,7 +78,7 @@ def test_a_scene_is_compiled_where_its_axes_agree():
     # The shortest turn that makes the axes parallel leads to the angle zero.
     np.testing.assert_allclose(state.q[3:], [1.0, 0.0, 0.0, 0.0], rtol=0, atol=1e-9)
     angle = system.joint_coordinates()["joint.angle"]
-    np.testing.assert_allclose(system.joint_coordinate(angle, 0.0, state.q), 0.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(system.catalogue.joint_coordinate(angle, 0.0, state.q), 0.0, rtol=0, atol=1e-9)
 
 
 @pytest.mark.long

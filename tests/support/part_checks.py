@@ -139,5 +139,7 @@ def check_every_part_has_cases(module, quantities, *tables):
     assert set(quantities) == set(known)
     systems = [scene() for scene in SCENES.values()]
     dimension = module.Body("a", mass=1.0, inertia=1.0).dimension
-    laws = [g.group.part for own in systems if own.layout.space.dimension == dimension for g in own.nonideal]
+    laws = [
+        g.group.part for own in systems if own.layout.space.dimension == dimension for g in own.constraints.nonideal
+    ]
     assert missing(module, PARTS, *tables, ["Driver"], laws) == set()

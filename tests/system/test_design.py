@@ -105,7 +105,7 @@ def test_studies_take_the_bounds(machine):
 
 
 def test_out_of_bounds_under_a_trace(machine, plain):
-    ok = jax.jit(lambda rod: mb.with_parameters(machine, {"rod": rod}).parameters_in_range())
+    ok = jax.jit(lambda rod: mb.with_parameters(machine, {"rod": rod}).parameter_table.in_range())
     assert bool(ok(3.0)) and bool(ok(9.0)) and not bool(ok(9.1)) and not bool(ok(jnp.nan))
 
 

@@ -288,9 +288,8 @@ def test_the_rate_counts_where_any_part_takes_it():
     cord = mb.Tendon("cord", [("ground", (0.0, 0.0)), ("block", (0.0, 0.0))])
     winch = mb.JointSpring("winch", "cord.length", stiffness=0.0, damping=1.0)
     points = mb.Series(TS, np.stack([np.stack([MOVING(t), [0.0, 0.0]]) for t in TS]))
-    (counts,) = (
-        of_rates for _, of_rates in mb.with_inputs(sliding([winch], [cord]), {"cord.points": points}).signals.values()
-    )
+    moving = mb.with_inputs(sliding([winch], [cord]), {"cord.points": points})
+    (counts,) = (of_rates for _, of_rates in moving.parameter_table.signals.values())
     assert counts
 
 
@@ -745,11 +744,11 @@ def test_inputs_of_all_kinds_side_by_side(driven):
 def test_an_input_in_place_of_one_of_several(driven):
     first = mb.with_inputs(driven, by_motor(4))
     again = mb.with_inputs(first, {"motor2.torque": mb.Series(TS, -SERIES[2]), "motor9.torque": mb.Series(TS, TORQUES)})
-    assert list(again.signals) == [f"motor{k}.torque" for k in (0, 1, 3, 2, 9)]
+    assert list(again.parameter_table.signals) == [f"motor{k}.torque" for k in (0, 1, 3, 2, 9)]
     found = torques(again, TS)
     for k, values in {0: SERIES[0], 1: SERIES[1], 2: -SERIES[2], 3: SERIES[3], 9: TORQUES}.items():
         np.testing.assert_allclose(found[:, k], values, rtol=2e-15)
-        np.testing.assert_array_equal(again.signals[f"motor{k}.torque"][0].values, values)
+        np.testing.assert_array_equal(again.parameter_table.signals[f"motor{k}.torque"][0].values, values)
     with pytest.raises(ValueError, match=r"The series of 'motor0.torque' is known from 0 to 1 s"):
         mb.simulate(again, again.guess, t1=1.5)
     with pytest.raises(ValueError, match=r"'motor3.torque' is an input of this system"):

@@ -142,7 +142,7 @@ def test_quantities_are_chosen_by_name(piston):
 
 def test_a_slide_is_drawn_at_the_body_that_slides(piston):
     """The joint's point is at the origin when the piston is 0.3 m away, and no bar leads back to there."""
-    picture = piston.system.picture(piston.ts, piston.ys)
+    picture = piston.system.catalogue.picture(piston.ts, piston.ys)
     np.testing.assert_allclose(picture.parts["slide"].points[1], 0.0, atol=1e-15)
     ends = picture.paths["slide"].points
     np.testing.assert_allclose(ends[:, 0], 0.0, atol=1e-15)
@@ -151,7 +151,7 @@ def test_a_slide_is_drawn_at_the_body_that_slides(piston):
     assert body == "piston" and np.allclose(sleeve.position, 0.0)
     # A sleeve on the ground stays where it was given.
     fixed = sliding(body_a="piston", body_b="ground", point=(0.5, 0.0))
-    still = fixed.system.picture(fixed.ts, fixed.ys)
+    still = fixed.system.catalogue.picture(fixed.ts, fixed.ys)
     np.testing.assert_allclose(still.parts["slide"].points[1], (0.5, 0.0, 0.0))
 
 

@@ -196,7 +196,7 @@ def test_bodies_on_which_nothing_acts_are_cuboids_of_their_inertia():
     moments = np.array([[2.0, 0.3, 0.1], [0.3, 1.5, -0.2], [0.1, -0.2, 1.2]])
     bodies = [spatial.Body("free", mass=3.0, inertia=moments), spatial.PointMass("mass", mass=1.0)]
     picture = at_rest(mb.Scene(bodies).compile())
-    picture = picture.system.picture(picture.ts, picture.ys)
+    picture = picture.system.catalogue.picture(picture.ts, picture.ys)
     (_, box), (_, ball) = solids(picture, {}, None)
     x, y, z = box.scale
     own = np.diag([y**2 + z**2, z**2 + x**2, x**2 + y**2]) * 3.0 / 12
@@ -216,7 +216,7 @@ def test_wheels_terrain_and_tracks():
     belt = planar.Track("belt", points, pretension=1.0, stiffness=10.0, radii=(0.5, 0.5, 0.5))
     system = mb.Scene([*wheels, third], forces=[touching, belt]).compile()
     still = at_rest(system)
-    line = system.picture(still.ts, still.ys).paths["belt"]
+    line = system.catalogue.picture(still.ts, still.ys).paths["belt"]
     corners = np.array([(0.0, 0.5), (3.0, 0.5), (1.5, 1.5)])
     around = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).sum() + np.pi
     drawn = np.linalg.norm(np.roll(line.points[0], -1, axis=0) - line.points[0], axis=1).sum()
@@ -237,7 +237,7 @@ def test_parts_on_frames_are_drawn_there():
     )
     system = mb.Scene([hull], joints=[hinge], frames=[turned]).compile()
     still = at_rest(system)
-    picture = system.picture(still.ts, still.ys)
+    picture = system.catalogue.picture(still.ts, still.ys)
     ((body, pin),) = picture.shapes
     # A quarter turn about x takes z to −y and y to z.
     assert body == "hull" and np.allclose(pin.position, (0.0, 1.5, 0.0))
@@ -260,7 +260,7 @@ def test_given_shapes_stand_in_the_frame_of_their_body(dimension):
         ),
     }
     picture = at_rest(mb.Scene([bodies[dimension]]).compile())
-    picture = picture.system.picture(picture.ts, picture.ys)
+    picture = picture.system.catalogue.picture(picture.ts, picture.ys)
     given = {"arm": shapes.Box((0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0), orientation=(0.0, 1.0, 0.0, 0.0))}
     ((name, box),) = solids(picture, given, None)
     turn = np.asarray(rot.rotation_matrix(picture.orientations[name][0]))
@@ -397,7 +397,7 @@ def test_every_part_has_its_picture(space):
     for example in SPACES[space]:
         system = built(example)
         still = at_rest(system)
-        picture = system.picture(still.ts, still.ys)
+        picture = system.catalogue.picture(still.ts, still.ys)
         assert all(np.all(np.isfinite(shape.position)) for _, shape in picture.shapes), example.part.name
         for name, line in picture.paths.items():
             assert np.all(np.isfinite(line.points)), name

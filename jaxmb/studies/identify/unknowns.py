@@ -211,7 +211,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
     shared = [name for name in given if "/" not in name and not name.startswith("initial.")]
     local = list(dict.fromkeys((*shared, *experiment.own)))
     channels = channels_of(system, experiment, sensors, sigma, frozenset(local), ts, places)
-    values, positive = parameters(system) | known, system.positive_parameters()
+    values, positive = parameters(system) | known, system.parameter_table.positive()
     by_name = {f"{channel.name}.{key}": (channel, key) for channel in channels for key in SENSOR_FIELDS}
 
     def start_of(name, default):

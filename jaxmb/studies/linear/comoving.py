@@ -110,7 +110,7 @@ class BodyIndex(eqx.Module):
 def body_index(system: AbstractSystem) -> BodyIndex:
     """The entries of every body, those of the attitude only of bodies that have one."""
     q, u = system.coordinate_names(), system.rate_names()
-    names = system.motion_names()
+    names = system.catalogue.motion_names()
     spatial = [f"{name}.orientation" in q for name in names]
     rotates = tuple(s or f"{name}.angle" in q for name, s in zip(names, spatial, strict=True))
     turning = [(name, s) for name, s, r in zip(names, spatial, rotates, strict=True) if r]

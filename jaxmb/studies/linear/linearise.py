@@ -207,7 +207,7 @@ def _moving(system, t, state):
     """Names of the bodies or coordinates that move."""
     speeds = np.abs(np.asarray(system.rates(t, state.q, state.u)))
     names = system.coordinate_names()
-    index = {name: names.get(f"{name}.position", names.get(name, [])) for name in system.motion_names()}
+    index = {name: names.get(f"{name}.position", names.get(name, [])) for name in system.catalogue.motion_names()}
     turning = lambda name: names.get(f"{name}.orientation", names.get(f"{name}.angle", []))
     index = {name: [*own, *turning(name)] for name, own in index.items()}
     return [name for name, own in index.items() if np.any(speeds[own] > 0)] or ["none"]

@@ -1,0 +1,93 @@
+"""The motions, quantities and forces of a compiled scene by name."""
+
+import itertools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ..system.catalogue import Catalogue
+from ..system.structures import of_structure
+from .joint_coordinates import joint_coordinates, joint_measures
+from .motion import body_measures, body_motion, frame_measures, scalar_measures
+from .picture import picture
+from .reactions import JointPlaces, applied_wrenches, places, reaction_measures, reactions
+
+
+class SceneCatalogue(Catalogue):
+    """The names of a compiled scene."""
+
+    def motion_names(self):
+        return self.system.body_names
+
+    def motion(self, name, ys):
+        return body_motion(self.system.layout, self.system.body_names.index(name), ys)
+
+    @of_structure
+    def measures(self):
+        system = self.system
+        out = body_measures(system.layout, system.body_names) | system.forces.state_measures()
+        out |= reaction_measures(system, self.joint_names()) | scalar_measures(system.layout)
+        return out | joint_measures(self.joint_coordinates()) | frame_measures(system.frames, system.layout)
+
+    @of_structure
+    def joint_coordinates(self):
+        return joint_coordinates(self.system.measured, self.system.layout)
+
+    def joint_coordinate(self, coordinate, t, q):
+        alone = self.system.measured[coordinate.group].only(coordinate.member)
+        return alone.coordinates(t, self.system.bodies.prepared_poses(q))[coordinate.field][0]
+
+    def position_quantities(self):
+        return tuple(f"{name}.position" for name in self.system.body_names)
+
+    def joint_names(self):
+        return self.constraint_names()
+
+    def reaction(self, name, ts, ys, multipliers):
+        return reactions(self.system, JointPlaces.of(self.system.constraints, name), ts, ys, multipliers)
+
+    def force_names(self):
+        groups = (*self.system.forces.groups, *self.system.constraints.nonideal)
+        return tuple(dict.fromkeys(name for g in groups for name in g.group.names))
+
+    def applied_wrenches(self, name, ts, ys, multipliers):
+        found = places(self.system.forces.groups, name), places(self.system.constraints.nonideal, name)
+        return applied_wrenches(self.system, found, ts, ys, multipliers)
+
+    def picture(self, ts, ys):
+        acting = (*self.system.constraints.groups, *self.system.forces.groups)
+        return picture(self.system, [g.group for g in acting], ts, ys)
+
+    def not_finite(self, t, q, u):
+        found = [
+            f"the {kind} of {name!r}"
+            for kind, of_kind in _values_of_parts(self.system, t, q, u).items()
+            for name, value in of_kind
+            if not np.all(np.isfinite(value))
+        ]
+        return tuple(dict.fromkeys(found))
+
+
+def _values_of_parts(system, t, q, u):
+    """Residuals of positions and of accelerations, wrenches, and rates of internal states, by part."""
+    constraints, forces = system.constraints, system.forces
+    position, acceleration, wrenches, rates = _values(system, t, q, u)
+    named = lambda g, values: zip(g.group.names, np.asarray(values), strict=True)
+    each = lambda groups, of_groups: itertools.chain(*map(named, groups, of_groups))
+    return {
+        "residual": (*each(constraints.position, position), *each(constraints.groups, acceleration)),
+        "force": each(forces.groups, wrenches),
+        "rate": [(name, np.asarray(rates)[index]) for name, index in forces.state_names().items()],
+    }
+
+
+@eqx.filter_jit
+def _values(system, t, q, u):
+    now, (constraints, forces) = system.kinematics(t, q, u), (system.constraints, system.forces)
+    return (
+        [g.residual(now.t, now.poses) for g in constraints.position],
+        [g.acceleration(now, jnp.zeros_like(now.velocities)) for g in constraints.groups],
+        [wrenches for wrenches, _ in forces.wrenches(now)],
+        forces.state_rates(now),
+    )

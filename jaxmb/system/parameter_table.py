@@ -1,0 +1,72 @@
+"""The numbers of a system by name: where they stand, their ranges, and which are functions of time."""
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from ..linalg.arrays import is_traced
+from ..parts.series import AbstractSignal
+from .design_variables import variables_in_range
+from .structures import of_structure
+
+# An accessor of an array of the system, and the index of the parameter along axis 0 where parts are stacked.
+ParameterPath = tuple[Callable[[Any], Array], int | None]
+
+
+class ParameterTable(eqx.Module):
+    """The parameters of a system, `parameter_paths`, as numbers in a range and as functions of time."""
+
+    system: Any
+
+    def modules(self) -> dict[str, eqx.Module]:
+        """The modules whose weights are parameters, with shapes in place of the weights."""
+        return {}
+
+    def positive(self) -> frozenset[str]:
+        """Names of the parameters that must stay positive or, if they are matrices, positive definite."""
+        return frozenset()
+
+    def check(self, names: Collection[str]) -> None:
+        """Raise a `ValueError` for values of these parameters that are out of range; traced ones are left to
+        `in_range`.
+        """
+        for name in self.positive() & set(names):
+            value = self._value(name)
+            if not is_traced(value) and not np.all(np.asarray(value) > 0):
+                raise ValueError(f"Parameter {name!r} must be positive, got {np.asarray(value)}.")
+
+    def in_range(self) -> bool | Bool[Array, ""]:
+        """Whether all parameters that are traced are in their ranges; True if none are traced."""
+        values = [self._value(name) for name in sorted(self.positive())]
+        traced = [jnp.all(value > 0) for value in values if is_traced(value)]
+        return (jnp.all(jnp.stack(traced)) if traced else True) & variables_in_range(self.system.design)
+
+    def _value(self, name):
+        where, index = self.system.parameter_paths()[name][0]
+        return where(self.system) if index is None else where(self.system)[index]
+
+    def with_frames_of(self, before: Any) -> Any:
+        """The system with its bodies' frames where they were in the system `before`."""
+        del before
+        return self.system
+
+    @property
+    def signals(self) -> dict[str, tuple[AbstractSignal, bool]]:
+        """The parameters that are functions of time; and whether constraints depend on them."""
+        return {}
+
+    @of_structure
+    def input_names(self) -> dict[str, None]:
+        """The names of these parameters."""
+        return dict.fromkeys(self.signals)
+
+    def with_signals(self, signals: Mapping[str, AbstractSignal]) -> Any:
+        """The system with some parameters as functions of time; shapes have been checked.
+
+        **Raises:** `ValueError` for parameters that must be constant.
+        """
+        raise ValueError(f"{type(self.system).__name__} takes no inputs; got {', '.join(signals)}.")

@@ -1,0 +1,181 @@
+"""A model: an equation of motion whose numbers have names."""
+
+import abc
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._types import Coordinates, Scalar, State, Velocities
+from .catalogue import Catalogue
+from .description import Description, count_independent, count_rows, counted, remarks, shorten
+from .design_variables import DesignVariables, description_rows
+from .equation import AbstractEquation
+from .parameter_table import ParameterPath, ParameterTable
+from .quantities import Quantities, Quantity
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+_NO_MOMENTUM = "Momentum is that of bodies; this system has none. Compute it from the coordinates."
+
+
+class AbstractSystem(AbstractEquation):
+    """A model: an equation of motion whose numbers have names.
+
+    Methods have the values of a model without bodies, whose motion is that of its coordinates: measurable quantities
+    are the coordinates, their rates q̇, and generalized constraint forces, `"theta"`, `"theta_rate"`, `"A.force"`.
+
+    - `guess`: the default guess of `assemble`.
+    - `design`: the design variables, in the order in which they were added; those of later ones may determine earlier
+        ones.
+    - `rows`: for every row of A, the name of its part and its number within the part.
+    - `state_ends`: for each kind of internal state, in the order of z, the index after the last one of this kind.
+    - `body_names`: names of the bodies; `Trajectory[name]` is the motion of a body if there are any, otherwise of a
+        coordinate.
+    """
+
+    guess: AbstractVar[State]
+    design: AbstractVar[tuple[DesignVariables, ...]]
+
+    state_ends: ClassVar[tuple[int, ...]] = ()
+    rows: ClassVar[tuple[tuple[str, int], ...]] = ()
+    body_names: ClassVar[tuple[str, ...]] = ()
+
+    def parameter_paths(self) -> dict[str, list[ParameterPath]]:
+        """Paths to the arrays that hold each parameter, by name."""
+        return {}
+
+    @property
+    def parameter_table(self) -> ParameterTable:
+        """The ranges of the parameters, and the parameters that are functions of time."""
+        return ParameterTable(self)
+
+    @property
+    def catalogue(self) -> Catalogue:
+        """The motions, quantities and forces along a motion."""
+        return Catalogue(self)
+
+    def quantities(self) -> Mapping[str, Quantity]:
+        """The quantities that can be measured of a motion, by name."""
+        return Quantities(self, self.catalogue.measures())
+
+    def prepared(self) -> Self:
+        """The system for the steps of a motion, whose states are close to the constraints, with what depends on its
+        parameters alone computed once; itself where there is no such thing.
+        """
+        return self
+
+    def closing(self) -> Self:
+        """The system whose rows, with `half_turned`, tell whether a state is consistent."""
+        return self.prepared()
+
+    def half_turned(self, q: Coordinates) -> Any:
+        """Which rows of Φ vanish at q because the system is `prepared`, with a joint turned away from where its
+        residual vanishes; False without such rows.
+        """
+        del q
+        return False
+
+    def on_host(self, t: Scalar) -> Any:
+        """The constraints at a time in NumPy, whose numbers are known, so that little or nothing is compiled to satisfy
+        them once; None where there is no such form.
+        """
+        return None
+
+    @property
+    def nz(self) -> int:
+        return self.state_ends[-1] if self.state_ends else 0
+
+    # Coordinates
+
+    @abc.abstractmethod
+    def coordinate_names(self) -> dict[str, list[int]]:
+        """Indices in q by name; one name may denote several coordinates."""
+
+    def rate_names(self) -> dict[str, list[int]]:
+        """Indices in u by name; one name may denote several rates."""
+        return {f"{name}_rate": index for name, index in self.coordinate_names().items()}
+
+    def state_names(self) -> dict[str, list[int]]:
+        """Indices in z by name; one name may denote several internal states."""
+        return {}
+
+    def normalize_fixed(self, q: Coordinates, fixed: Bool[np.ndarray, "nq"]) -> tuple[Float[Array, "nq"], int]:
+        """Coordinates that satisfy the invariants of fixed entries alone, and the number of these invariants.
+
+        Such invariants have no free coordinate that could satisfy them.
+        """
+        del fixed
+        return q, 0
+
+    def joint_coordinates(self) -> Mapping[str, Any]:
+        """The own coordinates of joints, by name; each has a `shape`."""
+        return self.catalogue.joint_coordinates()
+
+    def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar) -> Self:
+        """The same system with coordinates of joints held at values, which change at some rates, from t on."""
+        del values, rates, t
+        return self
+
+    # Functions of time
+
+    @property
+    def of_time(self) -> bool:
+        """Whether parts have functions of time from the user, for `given_in_time`."""
+        return False
+
+    def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "k"]:
+        """What these functions give while nothing moves, such as a prescribed motion or a force; of many parts of one
+        kind a combination. Empty where `of_time` is False.
+        """
+        return jnp.zeros(0, q.dtype)
+
+    # Energy
+
+    @abc.abstractmethod
+    def kinetic_energy(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, ""]:
+        """Kinetic energy [J]."""
+
+    @abc.abstractmethod
+    def potential_energy(self, t: Scalar, q: Coordinates) -> Float[Array, ""]:
+        """Potential energy [J] of gravity and of every conservative force."""
+
+    def linear_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "d"]:
+        """`Σ m v` [kg m/s], world axes."""
+        raise ValueError(_NO_MOMENTUM)
+
+    def angular_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "*d"]:
+        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
+        space.
+        """
+        raise ValueError(_NO_MOMENTUM)
+
+    # Descriptions
+
+    def describe(self) -> Description:
+        """A description of parts, rows, degrees of freedom and redundant rows, as text and as HTML."""
+        coordinates = f"{counted(self.nq, 'coordinate')}: {shorten(self.coordinate_names())}"
+        facts = [
+            ("system", f"{type(self).__name__} of {coordinates}"),
+            ("velocities", str(self.nu)),
+            ("constraint rows", count_rows(self)),
+            ("degrees of freedom", str(self.nu - self.velocity_rank)),
+            ("independent", count_independent(self)),
+        ]
+        tables = {"design variables": tuple(description_rows(self.design))}
+        return Description(tuple(facts), tables, remarks(self))
+
+    def __repr__(self) -> str:
+        (_, kind), *_ = self.describe().facts
+        return f"{type(self).__name__}: {kind}, {counted(self.nu - self.velocity_rank, 'degree')} of freedom"
+
+    def __str__(self) -> str:
+        return str(self.describe())
+
+    def _repr_html_(self) -> str:
+        return self.describe()._repr_html_()
