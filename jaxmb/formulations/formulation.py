@@ -23,7 +23,7 @@ from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..linalg.newton import root
 from ..linalg.sums import unchecked_take
 from ..system import AbstractEquation
-from ..system.residuals import friction_force
+from ..system.instant import Instant
 from .friction import find_multipliers
 
 if TYPE_CHECKING:
@@ -66,9 +66,13 @@ class AbstractFormulation(eqx.Module):
 
 def pivoted_jacobian(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> DenseJacobian:
     """The Jacobian A at a state as one matrix, with its factor after a search for pivots."""
-    jacobian = system.jacobian(t, q, u)
-    pivots = full_pivot(jacobian, scale=system.velocity_scale(), level=row_levels(system))
-    return DenseJacobian(jacobian).eliminated(pivots.order, system.acceleration_rank)
+    return _pivoted(Instant(system, t, q, u))
+
+
+def _pivoted(at):
+    system = at.system
+    pivots = full_pivot(at.jacobian, scale=system.velocity_scale(), level=row_levels(system))
+    return DenseJacobian(at.jacobian).eliminated(pivots.order, system.acceleration_rank)
 
 
 def row_levels(system: AbstractEquation) -> Array:
@@ -104,21 +108,27 @@ def accelerations(
 
     **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
     """
-    check_mass(system, formulation)
-    if system.acceleration_rows == 0:
-        return system.inertia(t, q, u).solve(system.force(t, q, u)), jnp.zeros(0, u.dtype)
-    jacobian = _jacobian(system, formulation, t, q, u)
-    udot, multipliers, failed = solve_constrained(system, formulation, t, q, u, jacobian, gamma_shift)
+    return accelerations_at(Instant(system, t, q, u), formulation, gamma_shift)
+
+
+def accelerations_at(
+    at: Instant, formulation: AbstractFormulation, gamma_shift: Float[Array, "m"] | None = None
+) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
+    """The same at an instant."""
+    check_mass(at.system, formulation)
+    if at.system.acceleration_rows == 0:
+        return at.inertia.solve(at.force), jnp.zeros(0, at.u.dtype)
+    udot, multipliers, failed = solve_constrained(at, formulation, _jacobian(at, formulation), gamma_shift)
     if failed is None:
         return udot, multipliers
     return jnp.where(failed, jnp.nan, udot), jnp.where(failed, jnp.nan, multipliers)
 
 
-def _jacobian(system, formulation, t, q, u):
+def _jacobian(at, formulation):
     if formulation.partitions:
-        return pivoted_jacobian(system, t, q, u)
-    jacobian = system.structured_jacobian(t, q, u)
-    return jacobian.selected(system.acceleration_rank, system.velocity_scale(), row_levels(system))
+        return _pivoted(at)
+    system = at.system
+    return at.structured_jacobian.selected(system.acceleration_rank, system.velocity_scale(), row_levels(system))
 
 
 class Solution(NamedTuple):
@@ -132,11 +142,8 @@ class Solution(NamedTuple):
 
 
 def solve_constrained(
-    system: AbstractEquation,
+    at: Instant,
     formulation: AbstractFormulation,
-    t: Scalar,
-    q: Coordinates,
-    u: Velocities,
     jacobian: AbstractJacobian,
     gamma_shift: Float[Array, "m"] | None = None,
 ) -> Solution:
@@ -146,29 +153,30 @@ def solve_constrained(
     on those of ideal constraints, and is solved for with them. Where it does not determine them, C is that of the
     multipliers of ideal constraints.
     """
-    inertia, force = system.inertia(t, q, u), system.force(t, q, u)
-    gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-    gamma = gamma if gamma_shift is None else gamma - gamma_shift
-    if system.ideal:
-        return Solution(*formulation.solve(inertia, force, jacobian, gamma), None)
-    rows, failed, own = system.friction_rows, None, jnp.zeros(0, u.dtype)
+    gamma = at.gamma if gamma_shift is None else at.gamma - gamma_shift
+    if at.system.ideal:
+        return Solution(*formulation.solve(at.inertia, at.force, jacobian, gamma), None)
+    rows, failed, multipliers = at.system.friction_rows, None, jnp.zeros(0, at.u.dtype)
     if rows.size:
-        formulation = formulation.prepared(inertia, jacobian)
-        known = lax.stop_gradient((system, t, q, u, inertia, force, jacobian, gamma, formulation))
-        found, _, failed = _friction(*known)
+        formulation = formulation.prepared(at.inertia, jacobian)
+        found, _, failed = _friction(at, formulation, jacobian, gamma)
 
-        def residual(own):
-            law = friction_force(system, t, q, u, own)
-            return own - unchecked_take(formulation.solve(inertia, force + law, jacobian, gamma)[1], rows)
+        def residual(multipliers):
+            force = at.force + at.friction_force(multipliers)
+            return multipliers - unchecked_take(formulation.solve(at.inertia, force, jacobian, gamma)[1], rows)
 
-        own = root(residual, found, lambda _, found: found)
-    force = force + friction_force(system, t, q, u, own)
-    return Solution(*formulation.solve(inertia, force, jacobian, gamma), failed)
+        multipliers = root(residual, found, lambda _, found: found)
+    force = at.force + at.friction_force(multipliers)
+    return Solution(*formulation.solve(at.inertia, force, jacobian, gamma), failed)
 
 
-def _friction(system, t, q, u, inertia, force, jacobian, gamma, formulation):
-    """Multipliers of the rows that forces depend on, their coupling, and whether they are not determined."""
-    rows = system.friction_rows
+def _friction(at, formulation, jacobian, gamma):
+    """Multipliers of the rows that forces depend on, their coupling, and whether they are not determined; without
+    derivative.
+    """
+    inertia, force, at = lax.stop_gradient((at.inertia, at.force, at))
+    formulation, jacobian, gamma = lax.stop_gradient((formulation, jacobian, gamma))
+    rows = at.system.friction_rows
     # The equations are symmetric: what a force does to a multiplier, its row does to the accelerations.
     units = jnp.asarray(np.eye(gamma.size)[rows], gamma.dtype)
     forces = jnp.concatenate([force[None], jnp.zeros((rows.size, force.size), force.dtype)])
@@ -176,19 +184,15 @@ def _friction(system, t, q, u, inertia, force, jacobian, gamma, formulation):
     udot, multipliers = solve(forces, jnp.concatenate([gamma[None], units]))
     start, influence = unchecked_take(multipliers[0], rows), -udot[1:]
     # Newton's method evaluates the law again and again, but only for other multipliers.
-    law = with_rest_computed(lambda own: friction_force(system, t, q, u, own), start)
-    contacts = () if system.contacts is None else system.contacts.rows
+    law = with_rest_computed(at.friction_force, start)
+    contacts = () if at.system.contacts is None else at.system.contacts.rows
     return find_multipliers(law, influence, start, np.isin(rows, contacts))
 
 
-def friction_coupling(
-    system: AbstractEquation, formulation: AbstractFormulation, t: Scalar, q: Coordinates, u: Velocities
-) -> Float[Array, "k k"]:
-    """How much the multipliers that friction depends on change with themselves, through its force, at a state; see
-    `friction`. Without derivative.
+def friction_coupling(at: Instant, formulation: AbstractFormulation) -> Float[Array, "k k"]:
+    """How much the multipliers that friction depends on change with themselves, through its force; see `friction`.
+    Without derivative.
     """
-    system, t, q, u = lax.stop_gradient((system, t, q, u))
-    jacobian, inertia = _jacobian(system, formulation, t, q, u), system.inertia(t, q, u)
-    formulation = formulation.prepared(inertia, jacobian)
-    gamma = -system.acceleration_residual(t, q, u, jnp.zeros_like(u))
-    return _friction(system, t, q, u, inertia, system.force(t, q, u), jacobian, gamma, formulation)[1]
+    at = lax.stop_gradient(at)
+    jacobian = _jacobian(at, formulation)
+    return _friction(at, formulation.prepared(at.inertia, jacobian), jacobian, at.gamma)[1]

@@ -47,7 +47,7 @@ from ..system.gaps import (
     mode_places,
     with_modes,
 )
-from ..system.residuals import velocity_rows
+from ..system.instant import Instant
 from .constraints import dense, push
 from .contact_forces import contact_forces, directions, friction_coefficients, largest_force, stick_reserve
 from .impact_event import NEAR, Event, Phase, find_event
@@ -265,7 +265,7 @@ def _equations(of: _Phases, before, dbefore, phase: Phase, normal):
 
     def unmet(system, t, q, first, u):
         """What is left of the rates, and of the balance of momentum."""
-        rates = velocity_rows(system, t, q, phase.u)
+        rates = Instant(system, t, q, phase.u).velocity_rows
         bounce = contacts_of(system).restitution * jnp.maximum(-direction_rates(system, t, q, first)[:n], 0.0)
         bounce = jnp.where(phase.held[:n] & of.rebounds, event.share * bounce, 0.0)
         rates = rates.at[numbers[:n]].add(-bounce)

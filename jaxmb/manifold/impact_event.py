@@ -33,7 +33,7 @@ from ..system.gaps import (
     modes_of,
     with_modes,
 )
-from ..system.residuals import velocity_rows
+from ..system.instant import Instant
 from .contact_forces import directions, free_accelerations, friction_coefficients, slow_slip
 from .contact_laws import REST, Laws, Problem, is_implied
 
@@ -104,7 +104,7 @@ def find_event(system, formulation, touch, t, y) -> Event:
     zero = jnp.zeros(system.acceleration_rows, q.dtype)
     # The changes of velocities by unit impulses, with those that the other constraints answer with; in the last row the
     # change that these constraints ask for themselves.
-    unmet = velocity_rows(system, t, bound(system, q), u)
+    unmet = Instant(system, t, bound(system, q), u).velocity_rows
     forces = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
     asked = jnp.concatenate([jnp.tile(zero, (len(rows), 1)), -unmet[None]])
     moves, answers = jax.vmap(projector.solve)(forces, asked)

@@ -29,7 +29,6 @@ from ..manifold import (
     next_number,
     project,
     state_blocks,
-    with_internal_states,
 )
 from ..manifold.diagnosis import diagnose_friction
 from ..solvers import (
@@ -47,6 +46,7 @@ from ..solvers.gaps import GapSolver
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.inputs import inputs_ended
+from ..system.instant import Instant
 from ..system.parameters import with_parameters
 from ..trajectory import Trajectory
 from .arguments import MOST_ROWS, adapts, default_controller, kept_steps, with_restarts
@@ -138,7 +138,7 @@ class Problem(NamedTuple):
         term, prepared = self.policy.prepare(system.prepared(), self.method, self.solver, self.rtol)
         if self.watches_gaps and not isinstance(prepared, AbstractMultistep):
             prepared = GapSolver(prepared)
-        return with_internal_states(term), prepared
+        return term, prepared
 
     def options(self, start: State) -> dict[str, Any]:
         """Those of `diffrax.diffeqsolve` from a start."""
@@ -347,7 +347,7 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     result = problem.policy.diagnose(system, t, y, evidence, result, stuck)
     if not system.friction_parts:
         return result, None
-    return diagnose_friction(system, problem.method, t, y, result, stuck)
+    return diagnose_friction(Instant.of(system, t, y), problem.method, result, stuck)
 
 
 @eqx.filter_custom_jvp

@@ -4,31 +4,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._types import Coordinates, Scalar, Velocities
 from ..system import AbstractSystem
 from ..system.gaps import are_open, contacts_of, gaps
+from ..system.instant import Instant
 from .closest import tolerance
 
 
 def contacts_against(
-    system: AbstractSystem,
-    t: Scalar,
-    q: Coordinates,
-    u: Velocities,
-    multipliers: Float[Array, "rows"],
-    alone: Bool[Array, "contacts"],
+    at: Instant, multipliers: Float[Array, "rows"], alone: Bool[Array, "contacts"]
 ) -> tuple[Bool[Array, "contacts"], Bool[Array, "contacts"]]:
     """Which open contacts are overlapped, and which closed ones pull; of a system without contacts, none is asked.
 
     **Arguments:** the `multipliers` of all rows; which contacts are `alone`: of those that imply each other only the
     sum of the forces is known.
     """
-    is_open = are_open(system, q)
+    system, is_open = at.system, are_open(at.system, at.q)
     if not is_open.size:
         return is_open, is_open
-    tol = tolerance(q.dtype) ** 0.5
-    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, q, u)))
-    overlaps = is_open & (gaps(system, t, q) < -tol * system.length)
+    tol = tolerance(at.q.dtype) ** 0.5
+    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(at.force))
+    overlaps = is_open & (gaps(system, at.t, at.q) < -tol * system.length)
     pulls = ~is_open & alone & (multipliers[np.array(contacts_of(system).rows, int)] < -tol * largest)
     return overlaps, pulls
 

@@ -26,6 +26,7 @@ from jaxmb.formulations.formulation import solve_constrained
 from jaxmb.linalg.elimination import full_pivot
 from jaxmb.linalg.jacobian import DenseJacobian
 from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
+from jaxmb.system.instant import Instant
 
 WITHOUT_INVERSE_OF_MASS = {name: FORMULATIONS[name] for name in ("partitioned", "null_space", "singular_mass")}
 N, RANK = 7, 4
@@ -229,7 +230,7 @@ def motion_by(system, formulations, q, u):
         jacobian = jax.vmap(lambda q, u: pivoted_jacobian(system, t, q, u))(q, u)
         lane = lambda tree, k: jax.tree.map(lambda x: x[k], tree)
         pairs = [
-            solve_constrained(system, formulation, t, q[k], u[k], lane(jacobian, k))[:2]
+            solve_constrained(Instant(system, t, q[k], u[k]), formulation, lane(jacobian, k))[:2]
             for k, formulation in enumerate(formulations.values())
         ]
         udot, multipliers = (jnp.stack(values) for values in zip(*pairs, strict=True))
