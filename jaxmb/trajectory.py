@@ -20,7 +20,7 @@ from ._results import RESULTS
 from ._types import State
 from .contact_events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation
-from .formulations.formulation import accelerations_at
+from .formulations.laws import accelerations_at
 from .linalg.arrays import ARRAYS, is_traced
 from .linalg.jitted import jitted
 from .linalg.members import vmap_states

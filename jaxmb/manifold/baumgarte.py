@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..formulations import AbstractFormulation
-from ..formulations.formulation import accelerations_at, check_mass
+from ..formulations.formulation import check_mass
+from ..formulations.laws import accelerations_at
 from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractEquation
 from ..system.instant import Instant

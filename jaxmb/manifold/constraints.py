@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
+from ..formulations.laws import laws_of
 from ..system.instant import Instant
 
 
@@ -217,11 +218,10 @@ def _in_time(at: Instant, along: State) -> Instant:
 
 
 def _equations(at, udot, multipliers):
-    """The residuals `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`."""
-    applied = at.force + at.constraint_force(multipliers)
-    if not at.system.ideal:
-        applied = applied + at.nonideal_force(multipliers)
-    return at.acceleration_residual(udot), at.inertia.product(udot) - applied
+    """The residuals `A u̇ − γ` and `M u̇ − F − C(λ) − Aᵀ λ`."""
+    laws = laws_of(at.system)
+    forces = laws.applied(at, laws.remembered(at, multipliers)) + at.constraint_force(multipliers)
+    return at.acceleration_residual(udot), at.inertia.product(udot) - forces
 
 
 def _on_constraints(here, at, along):

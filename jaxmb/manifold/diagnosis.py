@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool, Float
 
 from .._results import RESULTS
 from ..formulations import AbstractFormulation, Multipliers
-from ..formulations.formulation import friction_coupling, row_levels
+from ..formulations.formulation import row_levels
 from ..formulations.friction import contracts
+from ..formulations.laws import friction_coupling
 from ..linalg.elimination import full_pivot
 from ..system.instant import Instant
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace
-from ..formulations.formulation import accelerations_at
+from ..formulations.laws import accelerations_at
 from ..linalg.arrays import as_array, namespace
 from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractEquation

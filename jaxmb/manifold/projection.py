@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 
 from .._compat import WrappedSolver, direction_of, inner_term
 from ..formulations import AbstractFormulation
-from ..formulations.formulation import check_mass, solve_constrained
+from ..formulations.formulation import check_mass
+from ..formulations.laws import laws_of
 from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
@@ -24,7 +25,7 @@ from ..solvers import (
 )
 from ..system import AbstractEquation
 from ..system.instant import Instant, drops_rows
-from .constraints import SolvedState, rates_along, restore, solved
+from .constraints import SolvedState, restore
 from .contact_guards import ContactGuards, contact_guards
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
 from .impulse import after_impulse
@@ -176,65 +177,43 @@ class ProjectionTerm(AbstractConstrainedTerm):
     def evaluate(self, t, y, chart, args):
         at = self.at(t, y).normalized()
         if self.system.velocity_rows == 0:
-            return ManifoldEvaluation(at.state, self.vf(t, at.state, args), chart, jnp.array(False), None)
-        solve = self._ideal if self.system.ideal_on_velocities else self._solved
-        return solve(at, at.binding_velocities.projector(at.inertia), chart)
+            return ManifoldEvaluation(at.state, self.vf(t, at.state, args), chart, jnp.array(False))
+        return self._solved(at, at.binding_velocities.projector(at.inertia), 0, False, chart)
 
     def project_near(self, t, y, linearized_at, args):
         if self.system.velocity_rows == 0:
             return self.evaluate(t, y, linearized_at.chart, args)
         at, near, chart = self.at(t, y), linearized_at.factors, linearized_at.chart
         if not self.system.ideal_on_velocities:
-            at, projector, iterations, failed = project_in_metric(at, _inertia, near, self.newton_tol)
-            out = self._solved(at, projector, chart + iterations)
-            return out._replace(failed=failed | out.failed)
+            found = project_in_metric(at, _inertia, near.constraints.projector, self.newton_tol)
+            return self._solved(*found, chart)
         out: Any = restore(at, near, self.newton_tol)
-        at = at.with_(q=out.q, u=out.u)
-        return ManifoldEvaluation(at.state, at.motion(out.udot), chart + out.iterations, out.failed, None)
-
-    def _solved(self, at, projector: MassProjector, chart):
-        """The evaluation with friction and servos, at a state whose projector on the constraints is known."""
-        jacobian, factor = projector.jacobian, projector.factor
-        if self.system.acceleration_rows > self.system.velocity_rows:
-            jacobian = at.structured_jacobian
-            factor = jacobian.gram(projector.metric).eliminate()
-        solution = solve_constrained(at, FactoredMultipliers(factor), jacobian)
-        failed = jnp.array(False) if solution.failed is None else solution.failed
-        return ManifoldEvaluation(at.state, at.motion(solution.udot), chart, failed, projector)
+        return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart + out.iterations, out.failed)
 
     def project_cold(self, t, y, chart, args):
         if self.system.velocity_rows == 0:
             return self.evaluate(t, y, chart, args)
-        if not self.system.ideal_on_velocities:
-            return super().project_cold(t, y, chart, args)
         # The guess may be far from the constraints: accelerations are found with a factor of the state that is found.
-        at, projector, iterations, failed = project_in_metric(self.at(t, y), _inertia, None, self.newton_tol)
-        return self._ideal(at, projector, chart + iterations)._replace(failed=failed, factors=None)
+        return self._solved(*project_in_metric(self.at(t, y), _inertia, None, self.newton_tol), chart)
 
-    def _ideal(self, at, projector: MassProjector, chart):
-        """The evaluation with ideal constraints that bind velocities, at a state whose projector is known."""
-        udot, multipliers = projector.solve(at.force, at.gamma)
-        near = SolvedState(ProjectorConstraints(at.q, projector), udot, multipliers)
-        return ManifoldEvaluation(at.state, at.motion(udot), chart, jnp.array(False), near)
+    def _solved(self, at, projector: MassProjector, iterations, failed, chart):
+        """The evaluation in a state on the constraints, whose projector is known."""
+        near = ProjectorConstraints(at.q, projector)
+        if self.system.acceleration_rows > self.system.velocity_rows:
+            projector = at.structured_jacobian.projector(projector.metric)
+        laws, method = laws_of(self.system), FactoredMultipliers(projector)
+        udot, multipliers, undetermined = laws.solve(at, method, projector.jacobian, at.gamma)
+        near = SolvedState(near, udot, multipliers)
+        return self.evaluated(at, udot, chart + iterations, failed | undetermined, near)
 
-    def at_solution(self, t, y, f, kept, args):
-        if self.system.velocity_rows == 0 or not self.system.ideal_on_velocities:
-            return super().at_solution(t, y, f, kept, args)
-        at = self.at(t, y)
-        out = solved(projector_constraints, at, f.u)
-        at = at.with_(q=out.q, u=out.u)
-        return at.state, at.motion(out.udot)
-
-    def along_solution(self, t, y, f, along, kept, args):
-        if self.system.velocity_rows == 0 or not self.system.ideal_on_velocities or self.system.nz:
-            return super().along_solution(t, y, f, along, kept, args)
-        return rates_along(projector_constraints, self.at(t, y), f.u, along)
+    def known(self, kept):
+        return (projector_constraints, None) if self.system.velocity_rows and self.system.ideal_on_velocities else None
 
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)
 
     def free(self, chart):
-        return jnp.arange(self.system.nq + self.system.nu + self.system.nz)
+        return None
 
     def update_chart(self, t, y, chart, args):
         return chart

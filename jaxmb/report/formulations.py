@@ -14,7 +14,8 @@ from jax import lax
 from .._printed import Printed
 from .._types import State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from ..formulations.formulation import row_levels, solve_constrained
+from ..formulations.formulation import row_levels
+from ..formulations.laws import laws_of
 from ..linalg.elimination import PivotOrder, full_pivot
 from ..linalg.jacobian import DenseJacobian
 from ..mechanisms import Mechanism
@@ -150,7 +151,7 @@ def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: 
     if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
         matrix = jacobian.dense().matrix
         jacobian = DenseJacobian(matrix).eliminated(order, system.acceleration_rank)
-    return solve_constrained(at, formulation, jacobian)[0]
+    return laws_of(at.system).solve(at, formulation, jacobian, at.gamma)[0]
 
 
 def _evaluated(solve: Callable[[State], Any]):

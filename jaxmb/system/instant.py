@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 
 from .._compat import current_trace
 from .._types import Coordinates, Scalar, State, Velocities
-from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian
 from ..linalg.sums import placed_sums
 from .equation import AbstractEquation
@@ -37,14 +36,35 @@ class kept(Generic[T]):
     def __get__(self, instant, owner=None):
         if instant is None:
             return self
-        values, trace = vars(instant).setdefault("_kept", {}), current_trace()
+        values, trace = getattr(instant, "_kept", None), current_trace()
+        if values is None:
+            values = {}
+            object.__setattr__(instant, "_kept", values)
         found = values.get(self)
         if found is None or found[0] != trace:
             found = values[self] = trace, self._compute(instant)
         return found[1]
 
 
-class Instant(eqx.Module):
+class Keeper:
+    """An object with room for the values of its `kept` properties, which are no part of it as a pytree."""
+
+    __slots__ = ("_kept",)
+
+
+def _of_state(method: Callable[..., T]) -> kept[T]:
+    """The value of a function of (t, q, u) of the equation."""
+    name = method.__name__
+    return kept(lambda at: getattr(at.system, name)(at.t, at.q, at.u))
+
+
+def _of_configuration(method: Callable[..., T]) -> kept[T]:
+    """The value of a function of (t, q)."""
+    name = method.__name__
+    return kept(lambda at: getattr(at.system, name)(at.t, at.q))
+
+
+class Instant(eqx.Module, Keeper):
     """A system at a time, in a state; a pytree. Of a system with internal states its forces have those of the state.
 
     **Fields:** the `system`; `t` [s]; `q`, `u`; `z`: internal states, None without any.
@@ -59,7 +79,7 @@ class Instant(eqx.Module):
     @classmethod
     def of(cls, system: AbstractEquation, t: Scalar, y: State) -> Self:
         """The system in a state, whose internal states it gets."""
-        return cls(system if y.z is None else system.with_states(y.z), t, y.q, y.u, y.z)
+        return cls(system.at(y), t, y.q, y.u, y.z)
 
     @property
     def state(self) -> State:
@@ -86,62 +106,18 @@ class Instant(eqx.Module):
         """The rate of the state with these accelerations."""
         return State(self.rates, udot, None if self.z is None else self.state_rates)
 
-    # What the equation has here, with the same names; see there.
-
-    @kept
-    def rates(self) -> Float[Array, "nq"]:
-        """`K(t, q, u)`."""
-        return self.system.rates(self.t, self.q, self.u)
-
-    @kept
-    def state_rates(self) -> Float[Array, "nz"]:
-        """ż."""
-        return self.system.state_rates(self.t, self.q, self.u)
-
-    @kept
-    def inertia(self) -> AbstractInertia:
-        """M."""
-        return self.system.inertia(self.t, self.q, self.u)
-
-    @kept
-    def force(self) -> Float[Array, "nu"]:
-        """F."""
-        return self.system.force(self.t, self.q, self.u)
-
-    @kept
-    def jacobian(self) -> Float[Array, "m nu"]:
-        """A as one matrix."""
-        return self.system.jacobian(self.t, self.q, self.u)
-
-    @kept
-    def velocity_jacobian(self) -> Float[Array, "mv nu"]:
-        """The rows of A that are those of ψ."""
-        return self.system.velocity_jacobian(self.t, self.q, self.u)
-
-    @kept
-    def structured_jacobian(self) -> AbstractJacobian:
-        """A in blocks, where the system has an order of elimination."""
-        return self.system.structured_jacobian(self.t, self.q, self.u)
-
-    @kept
-    def coordinate_jacobian(self) -> Float[Array, "mq nq"]:
-        """The derivative of Φ, with the coordinates' own invariants."""
-        return self.system.coordinate_jacobian(self.t, self.q)
-
-    @kept
-    def coordinate_residual(self) -> Float[Array, "mq"]:
-        """Φ, with the coordinates' own invariants."""
-        return self.system.coordinate_residual(self.t, self.q)
-
-    @kept
-    def position_residual(self) -> Float[Array, "mp"]:
-        """Φ."""
-        return self.system.position_residual(self.t, self.q)
-
-    @kept
-    def velocity_residual(self) -> Float[Array, "mv"]:
-        """ψ."""
-        return self.system.velocity_residual(self.t, self.q, self.u)
+    # Functions of the equation, see there.
+    rates = _of_state(AbstractEquation.rates)
+    state_rates = _of_state(AbstractEquation.state_rates)
+    inertia = _of_state(AbstractEquation.inertia)
+    force = _of_state(AbstractEquation.force)
+    jacobian = _of_state(AbstractEquation.jacobian)
+    velocity_jacobian = _of_state(AbstractEquation.velocity_jacobian)
+    structured_jacobian = _of_state(AbstractEquation.structured_jacobian)
+    velocity_residual = _of_state(AbstractEquation.velocity_residual)
+    position_residual = _of_configuration(AbstractEquation.position_residual)
+    coordinate_residual = _of_configuration(AbstractEquation.coordinate_residual)
+    coordinate_jacobian = _of_configuration(AbstractEquation.coordinate_jacobian)
 
     @kept
     def gamma(self) -> Float[Array, "m"]:
@@ -156,13 +132,10 @@ class Instant(eqx.Module):
         """`Aᵀ λ`."""
         return self.system.constraint_force(self.t, self.q, self.u, multipliers)
 
-    def nonideal_force(self, multipliers: Float[Array, "m"]) -> Float[Array, "nu"]:
-        """C, from all multipliers."""
-        return self.system.nonideal_force(self.t, self.q, self.u, multipliers)
-
     def friction_force(self, multipliers: Float[Array, "k"]) -> Float[Array, "nu"]:
         """C, from the multipliers of the `friction_rows` that it depends on."""
-        return self.nonideal_force(placed_sums(self.system.friction_rows, self.system.acceleration_rows)(multipliers))
+        of_rows = placed_sums(self.system.friction_rows, self.system.acceleration_rows)
+        return self.system.nonideal_force(self.t, self.q, self.u, of_rows(multipliers))
 
     # Residuals as rows of A, and their sizes.
 

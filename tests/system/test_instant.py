@@ -7,7 +7,7 @@ import numpy as np
 from jax import lax
 
 import jaxmb as mb
-from jaxmb.system.instant import Instant, kept
+from jaxmb.system.instant import Instant, Keeper, kept
 
 
 def four_bar():
@@ -20,7 +20,7 @@ def counted(program, *arguments):
     return str(jax.make_jaxpr(program)(*arguments)).count(" sin ")
 
 
-class Angle(eqx.Module):
+class Angle(eqx.Module, Keeper):
     x: jax.Array
 
     @kept
@@ -52,13 +52,14 @@ def test_a_copy_keeps_nothing():
     force = at.force
     assert at.force is force
     assert jax.tree.map(lambda x: x, at).force is not force
-    assert len(jax.tree.leaves(at)) == len(jax.tree.leaves((at.system, at.t, at.q, at.u)))
+    assert jax.tree.structure(at) == jax.tree.structure(four_bar())
 
 
 def test_what_the_equation_has():
     at = four_bar()
     system, (t, q, u) = at.system, (at.t, at.q, at.u)
-    np.testing.assert_array_equal(at.jacobian @ u - system.acceleration_residual(t, q, u, u), at.gamma)
+    residual = system.acceleration_residual(t, q, u, u)
+    np.testing.assert_allclose(at.jacobian @ u - residual, at.gamma, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(at.rates, system.rates(t, q, u))
     udot = jnp.ones_like(u)
     assert at.motion(udot).u is udot and at.motion(udot).z is None

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._types import Scalar, State
 from ...formulations import Partitioned
-from ...formulations.formulation import accelerations_at
+from ...formulations.laws import accelerations_at
 from ...system import AbstractSystem, Solved, parameters, with_parameters
 from ...system.instant import Instant
 from .comoving import carriers
