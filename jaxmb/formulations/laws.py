@@ -6,7 +6,7 @@ The multipliers that C depends on, those of the `friction_rows`, are the memory 
 """
 
 import abc
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -80,7 +80,7 @@ class ReactiveLaws(AbstractLaws):
     that of the multipliers of ideal constraints.
     """
 
-    def applied(self, at, memory):
+    def applied(self, at, memory: Any):
         return at.force + at.friction_force(memory)
 
     def solve(self, at, formulation, jacobian, gamma):
@@ -96,7 +96,7 @@ class ReactiveLaws(AbstractLaws):
     def remembered(self, at, multipliers):
         return unchecked_take(multipliers, at.system.friction_rows)
 
-    def recalled(self, at, multipliers, memory):
+    def recalled(self, at, multipliers, memory: Any):
         return with_entries(multipliers, at.system.friction_rows, memory)
 
 

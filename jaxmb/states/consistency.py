@@ -93,11 +93,12 @@ def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
 
 @jitted
 def _violated(system, t, y) -> Any:
-    at = Instant.of(system.closing(), t, y).normalized()
+    near = system.closing()
+    at = Instant.of(near, t, y).normalized()
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
     positions, velocities = at.violations(at.row_sizes())
     depths = jnp.zeros(0, y.q.dtype) if system.contacts is None else -gaps(system, t, at.q) / system.length
-    return (positions > tol) | at.system.half_turned(at.q), velocities > tol, depths > tol
+    return (positions > tol) | near.half_turned(at.q), velocities > tol, depths > tol
 
 
 def listed(system: AbstractSystem, violated: Any, residual: Any) -> str:
