@@ -51,6 +51,14 @@ RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
 jaxpr_as_function = core.jaxpr_as_fun
 
 
+def current_trace() -> Any:
+    """The trace that operations go to now, to be compared with another.
+
+    (jax.extend.core.get_opaque_trace_state, 0.9 and 0.10.)
+    """
+    return core.get_opaque_trace_state()
+
+
 def with_rest_computed(function: Callable[[Array], Array], like: Array) -> Callable[[Array], Array]:
     """The same function of an array, in which everything that does not depend on the array is computed now, and not at
     each call: a loop that calls it holds nothing else. `like`: an example of the array.

@@ -19,15 +19,16 @@ from ._compat import changed, steps_of
 from ._results import RESULTS
 from ._types import State
 from .contacts.events import ContactEvents, FoundEvents, contact_events
-from .formulations import AbstractFormulation, accelerations
+from .formulations import AbstractFormulation
+from .formulations.laws import accelerations_at
 from .linalg.arrays import ARRAYS, is_traced
 from .linalg.jitted import jitted
 from .linalg.members import vmap_states
 from .manifold import after_jumps, next_number, project_normalized
 from .parts.names import UnknownNameError, unknown
 from .system import Reaction, Solved
+from .system.instant import Instant
 from .system.quantities import with_shapes
-from .system.residuals import row_sizes
 
 
 class ConstraintViolation(NamedTuple):
@@ -305,7 +306,7 @@ class Trajectory(eqx.Module):
     @property
     @_view
     def _solved(self):
-        single = lambda t, y: accelerations(self.system.at(y), self.formulation, t, y.q, y.u)
+        single = lambda t, y: accelerations_at(Instant.of(self.system, t, y), self.formulation)
         return vmap_states(single, self.system.acceleration_rows * self.system.nu)(self.ts, self.ys)
 
     @property
@@ -348,11 +349,10 @@ class Trajectory(eqx.Module):
         """Largest scaled residuals of position and velocity constraints at every saved time."""
 
         def at(t, y):
-            rows = self.system.position_rows
-            position = jnp.abs(self.system.coordinate_residual(t, y.q))
-            velocity = jnp.abs(self.system.velocity_residual(t, y.q, y.u))
+            rows, at = self.system.position_rows, Instant.of(self.system, t, y)
+            position, velocity = jnp.abs(at.coordinate_residual), jnp.abs(at.velocity_residual)
             if velocity.size:
-                sizes = row_sizes(self.system, t, y)
+                sizes = at.row_sizes()
                 position, velocity = position.at[:rows].divide(sizes[:rows]), velocity / sizes
             return ConstraintViolation(jnp.max(position, initial=0.0), jnp.max(velocity, initial=0.0))
 

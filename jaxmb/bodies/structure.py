@@ -31,7 +31,7 @@ from ..states.redundancy import (
 )
 from ..states.refusals import violated_joints
 from ..system.equation import Ranks
-from ..system.residuals import binding_velocities, displaced, position_rows
+from ..system.instant import Instant
 from .independence import JointBlocks, JointRows
 from .joint_graph import elimination_order, joint_order
 from .rigid_bodies import Implied, RigidBodySystem
@@ -128,8 +128,8 @@ def _numbers(tree):
 @eqx.filter_jit
 def _met(system):
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
-    still = np.zeros(system.nu, bool)
-    q = meet_in_blocks(system, t, q, still) if system.position_rows else system.normalize(q)
+    at, still = _at_rest(system, t, q), np.zeros(system.nu, bool)
+    q = meet_in_blocks(at, still) if system.position_rows else at.normalized().q
     return q, *_evaluated(system, t, q)
 
 
@@ -160,9 +160,13 @@ def _displaced(system, t, q, moved):
     return _of_host(on_host, on_host.displaced(np.asarray(q), on_host.velocity_scale * moved))
 
 
+def _at_rest(system, t, q):
+    return Instant(system, t, q, jnp.zeros(system.nu, q.dtype))
+
+
 @eqx.filter_jit
 def _displaced_by_jax(system, t, q, moved):
-    return _evaluated(system, t, displaced(system, t, q, system.velocity_scale() * moved))
+    return _evaluated(system, t, _at_rest(system, t, q).moved(system.velocity_scale() * moved).q)
 
 
 @eqx.filter_jit
@@ -195,9 +199,8 @@ def _motions_as_one(layout, q):
 def _way_back(system, t, q, moved):
     """The smallest displacement from there to the constraints, in multiples of scales."""
     scale = system.velocity_scale()
-    q = displaced(system, t, q, scale * moved)
-    jacobian = binding_velocities(system, t, q, jnp.zeros_like(scale))
-    return jacobian.projector(DiagonalInertia(1 / scale**2)).cancel(position_rows(system, t, q)) / scale
+    at = _at_rest(system, t, q).moved(scale * moved)
+    return at.binding_velocities.projector(DiagonalInertia(1 / scale**2)).cancel(at.position_rows) / scale
 
 
 def _check_contradictions(system, q, shares):

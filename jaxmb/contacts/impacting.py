@@ -20,7 +20,7 @@ from ..parts.modes import Modes, modes_of_contacts, modes_of_friction
 from ..solvers.events import Bracket, narrowed
 from ..system import AbstractEquation
 from ..system.contact_set import ContactSet
-from ..system.residuals import velocity_rows
+from ..system.instant import Instant
 from .dry_laws import Answers
 from .forces import directions, free_accelerations, friction_coefficients
 from .problem import Laws, Problem, is_implied
@@ -215,7 +215,7 @@ class Impacting:
     def at(cls, system, formulation, tolerance: ContactTolerance, t, y) -> "Impacting":
         contacts, q, u = system.contacts, y.q, y.u
         inertia = system.inertia(t, contacts.with_modes(q, 0.0), u)
-        unmet = velocity_rows(system, t, contacts.bound(q), u)
+        unmet = Instant(system, t, contacts.bound(q), u).velocity_rows
         moves = Moves.at(system, t, q, u, inertia, unmet)
         laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(system, t, q, u))
         gap, rates = contacts.gaps(system, t, q), contacts.at_rows(unmet)

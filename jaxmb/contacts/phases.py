@@ -17,7 +17,7 @@ from ..linalg.pushed import push
 from ..linalg.rotations import norm
 from ..linalg.sums import with_entries
 from ..system.contact_set import ContactSet
-from ..system.residuals import velocity_rows
+from ..system.instant import Instant
 from .forces import directions, friction_coefficients
 from .impacting import Event, Phase
 
@@ -131,7 +131,7 @@ class Phases:
 
         def unmet(system, t, q, first, u):
             """The rates that are left, and the momentum that is not balanced."""
-            rates = velocity_rows(system, t, q, phase.u)
+            rates = Instant(system, t, q, phase.u).velocity_rows
             bounce = _restitution(system) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
             bounce = jnp.where(phase.held[:n] & self.rebound, event.share * bounce, 0.0)
             rates = rates.at[rows[:n]].add(-bounce)

@@ -2,10 +2,10 @@
 
 from .formulation import (
     AbstractFormulation as AbstractFormulation,
-    accelerations as accelerations,
     pivoted_jacobian as pivoted_jacobian,
 )
 from .gauss import gauss_function as gauss_function
+from .laws import accelerations as accelerations
 from .multipliers import Multipliers as Multipliers
 from .null_space import NullSpace as NullSpace
 from .partitioned import Partitioned as Partitioned

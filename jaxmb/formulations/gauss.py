@@ -5,6 +5,7 @@ from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, Velocities
 from ..system import AbstractEquation
+from ..system.instant import Instant
 
 
 def gauss_function(
@@ -20,6 +21,6 @@ def gauss_function(
     Among the accelerations that ideal constraints allow, those with `system.acceleration_residual(t, q, u, u̇) = 0`, the
     true ones have the least; others, farther by δ, have more by `δᵀ M δ`.
     """
-    inertia = system.inertia(t, q, u)
-    deviation = udot - inertia.solve(system.force(t, q, u))
-    return jnp.vdot(deviation, inertia.product(deviation))
+    at = Instant(system, t, q, u)
+    deviation = udot - at.inertia.solve(at.force)
+    return jnp.vdot(deviation, at.inertia.product(deviation))

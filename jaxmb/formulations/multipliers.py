@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from ..linalg.positive_definite import AbstractPositiveFactor
+from ..linalg.jacobian import MassProjector
 from .formulation import AbstractFormulation
 
 
@@ -24,19 +24,20 @@ class Multipliers(AbstractFormulation):
     takes_blocks: ClassVar[bool] = True
 
     def prepared(self, inertia, jacobian):
-        return FactoredMultipliers(jacobian.gram(inertia).eliminate())
+        return FactoredMultipliers(jacobian.projector(inertia))
 
     def solve(self, inertia, force, jacobian, gamma):
         return self.prepared(inertia, jacobian).solve(inertia, force, jacobian, gamma)
 
 
 class FactoredMultipliers(AbstractFormulation):
-    """The same with a `factor` of `A M⁻¹ Aᵀ` that is known already."""
+    """The same with a `projector`, which has a factor of `A M⁻¹ Aᵀ`, that is known already."""
 
-    factor: AbstractPositiveFactor
+    projector: MassProjector
     partitions: ClassVar[bool] = False
     inverts_mass: ClassVar[bool] = True
     takes_blocks: ClassVar[bool] = True
 
     def solve(self, inertia, force, jacobian, gamma):
-        return jacobian.projector(inertia, self.factor).solve(force, gamma)
+        del inertia, jacobian
+        return self.projector.solve(force, gamma)

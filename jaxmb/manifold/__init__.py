@@ -17,7 +17,6 @@ from .internal_states import (
     counted_components as counted_components,
     natural_units as natural_units,
     state_blocks as state_blocks,
-    with_internal_states as with_internal_states,
 )
 from .manifold import AbstractManifold as AbstractManifold
 from .orthogonal_projection import project as project, project_normalized as project_normalized

@@ -11,11 +11,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import State
-from ..formulations import AbstractFormulation, accelerations
+from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
+from ..formulations.laws import accelerations_at
 from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractEquation
+from ..system.instant import Instant
 from .compliant_gaps import compliant_gaps
 from .manifold import AbstractManifold, normalize_state
 
@@ -53,7 +54,7 @@ class Baumgarte(AbstractManifold):
 
 
 class StabilisedField(AbstractVectorField):
-    """`(q, u) ↦ (K(t, q, u), u̇)` with accelerations that stabilise the constraints."""
+    """The rate of a state, with accelerations that stabilise the constraints."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
@@ -65,12 +66,11 @@ class StabilisedField(AbstractVectorField):
 
     def __call__(self, t, y, args):
         del args
-        system, q, u = self.system, self.system.normalize(y.q), y.u
-        position = system.position_residual(t, q)
-        velocity = system.velocity_residual(t, q, u)
+        system, at = self.system, Instant.of(self.system, t, y).normalized()
+        position, velocity = at.position_residual, at.velocity_residual
         holonomic = np.arange(system.velocity_rows) < system.position_rows
         shift = self.rate * jnp.where(holonomic, 2.0, 1.0).astype(velocity.dtype) * velocity
         shift = shift + self.rate**2 * jnp.pad(position, (0, velocity.size - position.size))
         shift = jnp.pad(shift, (0, system.acceleration_rows - shift.size))
-        udot, _ = accelerations(system, self.formulation, t, q, u, shift)
-        return State(system.rates(t, q, u), udot)
+        udot, _ = accelerations_at(at, self.formulation, shift)
+        return at.motion(udot)

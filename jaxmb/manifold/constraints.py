@@ -10,9 +10,8 @@ theorem, not from the algorithm: they are independent of the formulation, and ca
 """
 
 import abc
-import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,35 +19,34 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
+from ..formulations.laws import laws_of
 from ..linalg.pushed import dense, push
-from ..system import AbstractEquation
+from ..system.instant import Instant
 
 
 class AbstractConstraints(eqx.Module):
-    """The constraints that are active, linearised at a state.
+    """The constraints that are active, linearised at an instant.
 
     A chart solves for the dependent coordinates and velocities and keeps the independent ones; a projector makes the
     smallest changes in a metric. What they do to residuals is linear, so JAX transposes it.
     """
 
     @abc.abstractmethod
-    def restore(
-        self, system: AbstractEquation, t: Scalar, y: State, near: "SolvedState", tol: Scalar
-    ) -> "RestoredState":
+    def restore(self, at: Instant, near: "SolvedState", tol: Scalar) -> "RestoredState":
         """`restore`, without derivative."""
 
     @abc.abstractmethod
-    def at(self, system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> "AbstractConstraints":
-        """The same rows in the same split or metric, linearised at another state."""
+    def at(self, instant: Instant) -> "AbstractConstraints":
+        """The same rows in the same split or metric, linearised at another instant."""
 
     @abc.abstractmethod
-    def multipliers(self, system: AbstractEquation, t: Scalar, restored: "RestoredState") -> Float[Array, "m"]:
-        """The multipliers of a state with its accelerations, at the state of this linearisation."""
+    def multipliers(self, at: Instant, restored: "RestoredState") -> Float[Array, "m"]:
+        """The multipliers of a state with its accelerations, at the instant of this linearisation."""
 
     @abc.abstractmethod
-    def push_positions(self, at: tuple[Any, ...], along: tuple[Any, ...]) -> Float[Array, "nq"]:
-        """The tangent of restored coordinates, from (system, t, q) at the state of this linearisation and its tangent
-        before they are restored.
+    def push_positions(self, at: Instant, along: Instant) -> Float[Array, "nq"]:
+        """The tangent of restored coordinates, from the instant of this linearisation and its tangent before they are
+        restored.
         """
 
     @abc.abstractmethod
@@ -57,29 +55,23 @@ class AbstractConstraints(eqx.Module):
 
     @abc.abstractmethod
     def balance(
-        self,
-        system: AbstractEquation,
-        at: tuple[Scalar, Coordinates, Velocities],
-        rows: Float[Array, "m"],
-        forces: Float[Array, "nu"],
+        self, at: Instant, rows: Float[Array, "m"], forces: Float[Array, "nu"]
     ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
         """The changes of accelerations and of multipliers that change `A u̇ − γ` by `−rows` and `M u̇ − F − Aᵀ λ` by
-        `−forces`, at (t, q, u).
+        `−forces`.
         """
 
     @abc.abstractmethod
     def cancel_residuals(
-        self,
-        system: AbstractEquation,
-        at: tuple[Scalar, Coordinates, Velocities],
-        multipliers: Float[Array, "m"],
-        forces: Float[Array, "nu"],
-        rows: Float[Array, "m"],
+        self, at: Instant, multipliers: Float[Array, "m"], rows: Float[Array, "m"], forces: Float[Array, "nu"]
     ) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
-        """The change of accelerations, together with one of the multipliers λ, that changes `M u̇ − F − Aᵀ λ − C(λ)` by
-        `−forces` and `A u̇ − γ` by `−rows`, at (t, q, u); and the change of the multipliers that C depends on, None
-        without any.
+        """The change of accelerations, together with one of the multipliers λ, that changes `A u̇ − γ` by `−rows` and
+        `M u̇ − F − Aᵀ λ − C(λ)` by `−forces`; and the change of the multipliers that C depends on, None without any.
         """
+
+
+# The constraints linearised at an instant, a pytree.
+Linearise: TypeAlias = Callable[[Instant], AbstractConstraints]
 
 
 class SolvedState(eqx.Module):
@@ -112,146 +104,147 @@ class RestoredState(eqx.Module):
 
 # Wrapped in a compiled function, so that it is traced once for all its places.
 @eqx.filter_jit
-def restore(system: AbstractEquation, t: Scalar, y: State, near: SolvedState, tol: Scalar) -> RestoredState:
+def restore(at: Instant, near: SolvedState, tol: Scalar) -> RestoredState:
     """Restore a state to the constraints and find the accelerations there.
 
     Derivatives are exact in a chart; those of a projector for a state on the constraints, and off them wrong by the
     size of the displacement.
 
-    **Arguments:** `y`: a state near the constraints, whose independent entries a chart keeps; `near`: a state close by
-    at the same time; `tol`: size of the corrections that are left out, relative to the system's size, its speed and its
-    accelerations.
+    **Arguments:** `at`: near the constraints, where a chart keeps the independent entries of the state; `near`: a state
+    close by at the same time; `tol`: size of the corrections that are left out, relative to the system's size, its
+    speed and its accelerations.
     """
-    return _restore(system, t, y, near, tol)
+    return _restore(at, near, tol)
 
 
 @eqx.filter_custom_jvp
-def _restore(system, t, y, near, tol):
-    return near.constraints.restore(system, t, y, near, tol)
+def _restore(at, near, tol):
+    return near.constraints.restore(at, near, tol)
 
 
 @_restore.def_jvp
 def _restore_jvp(primals, tangents):
-    system, t, y, near, tol = primals
-    dsystem, dt, dy, _, _ = tangents
-    out = restore(system, t, y, near, tol)
+    at, near, tol = primals
+    out = restore(at, near, tol)
     # The factor of the other state solves the equations, but only that of this state differentiates them.
-    here = near.constraints.at(system, t, out.q, out.u)
-    return out, _push_solution(here, system, t, out, (dsystem, dt, dense(dy.q, y.q), dense(dy.u, y.u)))
+    return out, _push_solution(near.constraints.at, at, tangents[0], out)
 
 
-def _push_solution(here, system, t, out, along):
-    """The tangent of a restored state, from one of (system, t, q, u) before it was restored."""
-    along = _on_constraints(here, (system, t, out.q, out.u), along)
-    dudot, dmultipliers = push_accelerations(here, (system, t, out.q, out.u), along, out)
-    return RestoredState(along[2], along[3], dudot, dmultipliers)
+def _push_solution(linearise: Linearise, at: Instant, along: Instant, out: RestoredState):
+    """The tangent of a restored state, from that of the instant before it was restored."""
+    along, at = dense_along(along, at), at.with_(q=out.q, u=out.u)
+    here = linearise(at)
+    along = _on_constraints(here, at, along)
+    return RestoredState(along.q, along.u, *push_accelerations(here, at, along, out))
 
 
 @eqx.filter_custom_jvp
 def solved(
-    at: Callable[..., AbstractConstraints], system: AbstractEquation, t: Scalar, solution: RestoredState
+    linearise: Linearise,
+    at: Instant,
+    udot: Float[Array, "nu"],
+    multipliers: Float[Array, "m"] | Float[Array, "k"] | None = None,
 ) -> RestoredState:
-    """A state on the constraints with its accelerations, as they are, with the derivatives that `restore` gives them.
+    """A state on the constraints with its accelerations, all known, with the derivatives that `restore` gives them.
 
-    **Arguments:** `at(system, t, q, u)`: the constraints at a state, a pytree; `solution`: known.
+    **Arguments:** `multipliers`: as in `RestoredState`.
     """
-    return solution
+    del linearise
+    return RestoredState(at.q, at.u, udot, multipliers)
 
 
 @solved.def_jvp
 def _solved_jvp(primals, tangents):
-    at, system, t, solution = primals
-    _, dsystem, dt, dsolution = tangents
+    linearise, at, *_ = primals
     out = solved(*primals)
-    along = dsystem, dt, dense(dsolution.q, solution.q), dense(dsolution.u, solution.u)
-    return out, _push_solution(at(system, t, out.q, out.u), system, t, out, along)
+    return out, _push_solution(linearise, at, tangents[1], out)
 
 
 def rates_along(
-    at: Callable[..., AbstractConstraints], system: AbstractEquation, t: Scalar, y: State, f: State, along: State | None
+    linearise: Linearise, at: Instant, udot: Float[Array, "nu"], along: State | None
 ) -> tuple[State, State, State]:
-    """A state with its rate, both known, and the rate of that, as `AbstractManifoldTerm.along_solution` has them.
-
-    **Arguments:** `at(system, t, q, u)`: the constraints at a state, a pytree.
-    """
-    out = RestoredState(y.q, y.u, f.u)
+    """A state with its rate, both known, and the rate of that, as `AbstractManifoldTerm.along_solution` has them."""
     if along is None:
-        out = solved(at, system, t, out)
-        along = State(system.rates(t, out.q, out.u), out.udot)
-    out, jerk = _accelerated(at, system, t, out, along)
-    rates = lambda t, q, u: system.rates(t, q, u)
-    qdot, qddot = jax.jvp(rates, (t, out.q, out.u), (jnp.ones_like(t), along.q, along.u))
-    return State(out.q, out.u), State(qdot, out.udot), State(qddot, jerk)
+        out = solved(linearise, at, udot)
+        at, udot = at.with_(q=out.q, u=out.u), out.udot
+        along = at.motion(udot)
+    out, jerk = _accelerated(linearise, at, udot, along)
+    at = at.with_(q=out.q, u=out.u)
+    rates = lambda t, q, u: at.system.rates(t, q, u)
+    qdot, qddot = jax.jvp(rates, (at.t, at.q, at.u), (jnp.ones_like(at.t), along.q, along.u))
+    return at.state, State(qdot, out.udot), State(qddot, jerk)
 
 
 @eqx.filter_custom_jvp
-def _accelerated(at, system, t, solution, along):
+def _accelerated(linearise, at, udot, along):
     """A known state as `solved` has it, and the rate of its accelerations along a rate of the state.
 
     Derivatives are those of the equations of motion, and of these differentiated in time, so that no factor is
     differentiated. Friction must not depend on multipliers.
     """
-    return solution, _rates(at(system, t, solution.q, solution.u), system, t, solution, along)[1]
+    return RestoredState(at.q, at.u, udot), _rates(linearise(at), at, udot, along)[1]
 
 
 @_accelerated.def_jvp
 def _accelerated_jvp(primals, tangents):
-    at, system, t, solution, along = primals
-    _, dsystem, dt, dsolution, dalong = tangents
-    out, here = solved(at, system, t, solution), at(system, t, solution.q, solution.u)
-    state = t, out.q, out.u
-    multipliers, jerk, change = _rates(here, system, t, out, along)
+    linearise, at, udot, along = primals
+    _, dat, _, dalong = tangents
+    out = solved(linearise, at, udot)
+    moved, at, udot = dense_along(dat, at), at.with_(q=out.q, u=out.u), out.udot
+    here = linearise(at)
+    multipliers, jerk, change = _rates(here, at, udot, along)
 
-    moved = dsystem, dt, dense(dsolution.q, out.q), dense(dsolution.u, out.u)
-    moved = _on_constraints(here, (system, *state), moved)
-    x = system, *state, out.udot, multipliers
-    dudot, dmultipliers = here.balance(system, state, *push(_equations, x, (*moved, None, None)))
+    moved = _on_constraints(here, at, moved)
+    dudot, dmultipliers = here.balance(at, *push(_equations, (at, udot, multipliers), (moved, None, None)))
 
-    def rate(x, along):
-        equations = functools.partial(_equations, x[0])
-        return push(equations, x[1:], (jnp.ones_like(t), along.q, along.u, jerk, change))
+    def rate(at, udot, multipliers, along):
+        return push(_equations, (at, udot, multipliers), (_in_time(at, along), jerk, change))
 
-    residuals = push(rate, (x, along), ((*moved, dudot, dmultipliers), dalong))
-    djerk, _ = here.balance(system, state, *residuals)
-    return (out, jerk), (RestoredState(moved[2], moved[3], dudot), djerk)
+    residuals = push(rate, (at, udot, multipliers, along), (moved, dudot, dmultipliers, dalong))
+    djerk, _ = here.balance(at, *residuals)
+    return (out, jerk), (RestoredState(moved.q, moved.u, dudot), djerk)
 
 
-def _rates(here, system, t, solution, along):
+def _rates(here, at, udot, along):
     """The multipliers, and the rates of accelerations and multipliers along a rate of the state."""
-    q, u, udot = solution.q, solution.u, solution.udot
-    multipliers = here.multipliers(system, t, solution)
-    equations = lambda t, q, u: _equations(system, t, q, u, udot, multipliers)
-    residuals = push(equations, (t, q, u), (jnp.ones_like(t), along.q, along.u))
-    return multipliers, *here.balance(system, (t, q, u), *residuals)
+    multipliers = here.multipliers(at, RestoredState(at.q, at.u, udot))
+    residuals = push(lambda at: _equations(at, udot, multipliers), (at,), (_in_time(at, along),))
+    return multipliers, *here.balance(at, *residuals)
 
 
-def _equations(system, t, q, u, udot, multipliers):
-    """The residuals `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`."""
-    applied = system.force(t, q, u) + system.constraint_force(t, q, u, multipliers)
-    if not system.ideal:
-        applied = applied + system.nonideal_force(t, q, u, multipliers)
-    return system.acceleration_residual(t, q, u, udot), system.inertia(t, q, u).product(udot) - applied
+def _in_time(at: Instant, along: State) -> Instant:
+    """The tangent of an instant in time, along a rate of the state."""
+    none: Any = jax.tree.map(lambda _: None, at.system)
+    return Instant(none, jnp.ones_like(at.t), along.q, along.u)
+
+
+def _equations(at, udot, multipliers):
+    """The residuals `A u̇ − γ` and `M u̇ − F − C(λ) − Aᵀ λ`."""
+    laws = laws_of(at.system)
+    forces = laws.applied(at, laws.remembered(at, multipliers)) + at.constraint_force(multipliers)
+    return at.acceleration_residual(udot), at.inertia.product(udot) - forces
 
 
 def _on_constraints(here, at, along):
-    """The tangent of (system, t, q, u) with coordinates and velocities on the constraints."""
-    dsystem, dt, _, du = along
-    return push_velocities(here, at, (dsystem, dt, here.push_positions(at[:3], along[:3]), du))
+    """The tangent of an instant with coordinates and velocities on the constraints."""
+    return push_velocities(here, at, along.with_(q=here.push_positions(at, along)))
 
 
-def push_velocities(here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The tangent of (system, t, q, u) with that of velocities on the constraints."""
-    dsystem, dt, dq, du = along
-    rows = push(lambda s, t, q, u: s.velocity_residual(t, q, u), at, along)
-    return dsystem, dt, dq, du + here.cancel_velocities(rows)
+def push_velocities(here: AbstractConstraints, at: Instant, along: Instant) -> Instant:
+    """The tangent of an instant with that of velocities on the constraints."""
+    rows = push(lambda at: at.velocity_residual, (at,), (along,))
+    return along.with_(u=along.u + here.cancel_velocities(rows))
 
 
 def push_accelerations(
-    here: AbstractConstraints, at: tuple[Any, ...], along: tuple[Any, ...], out: RestoredState
+    here: AbstractConstraints, at: Instant, along: Instant, out: RestoredState
 ) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
-    """The tangents of the accelerations at (system, t, q, u), and of the multipliers that friction depends on."""
-    system, t, q, u = at
-    multipliers = here.multipliers(system, t, out)
-    equations = lambda system, t, q, u: _equations(system, t, q, u, out.udot, multipliers)
-    rows, forces = push(equations, at, along)
-    return here.cancel_residuals(system, (t, q, u), multipliers, forces, rows)
+    """The tangents of the accelerations, and of the multipliers that friction depends on."""
+    multipliers = here.multipliers(at, out)
+    residuals = push(lambda at: _equations(at, out.udot, multipliers), (at,), (along,))
+    return here.cancel_residuals(at, multipliers, *residuals)
+
+
+def dense_along(along: Instant, at: Instant) -> Instant:
+    """The tangent of an instant, zeros for None in coordinates and velocities."""
+    return along.with_(q=dense(along.q, at.q), u=dense(along.u, at.u))

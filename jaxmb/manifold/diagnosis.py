@@ -8,12 +8,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._results import RESULTS
-from .._types import Scalar, State
 from ..formulations import AbstractFormulation, Multipliers
-from ..formulations.formulation import friction_coupling, row_levels
+from ..formulations.formulation import row_levels
 from ..formulations.friction import contracts
+from ..formulations.laws import friction_coupling
 from ..linalg.elimination import full_pivot
-from ..system import AbstractEquation
+from ..system.instant import Instant
 
 # Result of a step whose end could not be returned to the constraints, until the simulation is diagnosed. It ends a run
 # only where no error estimate shortens the step.
@@ -26,25 +26,24 @@ _SINGULAR_PIVOT = 1e-3
 _SINGULAR_COUPLING = 1e-3
 
 
-def diagnose(
-    system: AbstractEquation, t: Scalar, y: State, singular: Bool[Array, ""], result: Any, failed: Bool[Array, ""]
-) -> Any:
+def diagnose(at: Instant, singular: Bool[Array, ""], result: Any, failed: Bool[Array, ""]) -> Any:
     """Tell singular configurations, and failures of Newton's method, from other failures of a simulation whose steps
     end on the constraints.
 
-    **Arguments:** `t`, `y`: the last state; `singular`: whether the chart there has lost rank already; `result`: a
+    **Arguments:** `at` the last state; `singular`: whether the chart there has lost rank already; `result`: a
     `RESULTS`; `failed`: whether it is a failure.
     """
+    at = lax.stop_gradient(at)
+    system = at.system
     if system.velocity_rows == 0:
         return result
-    system, t, y = lax.stop_gradient((system, t, y))
 
     def smallest_pivot():
-        pivots = full_pivot(system.jacobian(t, y.q, y.u), scale=system.velocity_scale(), level=row_levels(system))
+        pivots = full_pivot(at.jacobian, scale=system.velocity_scale(), level=row_levels(system))
         return jnp.where(pivots.rank < system.acceleration_rank, 0.0, pivots.smallest)
 
-    known = failed & jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.u))
-    pivot = lax.cond(known, smallest_pivot, lambda: jnp.ones((), y.q.dtype))
+    known = failed & jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.u))
+    pivot = lax.cond(known, smallest_pivot, lambda: jnp.ones((), at.q.dtype))
     singular = failed & ((pivot < _SINGULAR_PIVOT) | singular)
     result = RESULTS.where(singular, RESULTS.singular_configuration, result)
     return diagnose_newton(result, failed & ~singular)
@@ -57,12 +56,7 @@ def diagnose_newton(result: Any, failed: Bool[Array, ""]) -> Any:
 
 
 def diagnose_friction(
-    system: AbstractEquation,
-    formulation: AbstractFormulation,
-    t: Scalar,
-    y: State,
-    result: Any,
-    failed: Bool[Array, ""],
+    at: Instant, formulation: AbstractFormulation, result: Any, failed: Bool[Array, ""]
 ) -> tuple[Any, Float[Array, "k k"]]:
     """Tell failures where friction has no solution, or more than one.
 
@@ -70,9 +64,9 @@ def diagnose_friction(
 
     **Returns:** the result, and the coupling of friction with its own reactions; zero where it is not the reason.
     """
-    none = jnp.zeros((system.friction_rows.size,) * 2, y.q.dtype)
+    none = jnp.zeros((at.system.friction_rows.size,) * 2, at.q.dtype)
     # Without a search for pivots.
-    formulation = Multipliers() if system.positive_definite_mass else formulation
-    coupling = lax.cond(failed, lambda: friction_coupling(system.at(y), formulation, t, y.q, y.u), lambda: none)
+    formulation = Multipliers() if at.system.positive_definite_mass else formulation
+    coupling = lax.cond(failed, lambda: friction_coupling(at, formulation), lambda: none)
     singular = failed & jnp.all(jnp.isfinite(coupling)) & ~contracts((1 + _SINGULAR_COUPLING) * coupling)
     return RESULTS.where(singular, RESULTS.friction_undetermined, result), jnp.where(singular, coupling, none)

@@ -14,6 +14,7 @@ from .._types import Coordinates, Scalar, State
 from ..contacts.guards import ContactGuards
 from ..contacts.impacting import Event
 from ..system import AbstractEquation
+from ..system.instant import Instant
 from .orthogonal_projection import project_velocities
 
 # Jumps are looked for in this number of intervals in all, and in no fewer between two restarts.
@@ -65,7 +66,8 @@ def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
 
     Source: L. A. Pars, "A Treatise on Analytical Dynamics", Heinemann, 1965 (impulsive motion).
     """
-    u, failed = project_velocities(system, t, y.q, y.u, system.inertia(t, y.q, y.u))
+    at = Instant.of(system, t, y)
+    u, failed = project_velocities(at, at.inertia)
     return dataclasses.replace(y, u=jnp.where(failed, jnp.nan, u))
 
 
@@ -137,8 +139,9 @@ def find_jumps(
 
 def _prescribed(system, q, shift, t):
     """What ψ and A have where nothing moves, with coordinates that are shifted."""
-    q, rest = system.normalize(q + system.coordinate_scale() * shift), jnp.zeros(system.nu, q.dtype)
-    return jnp.concatenate([system.velocity_residual(t, q, rest), system.acceleration_residual(t, q, rest, rest)])
+    rest = jnp.zeros(system.nu, q.dtype)
+    at = Instant(system, t, system.normalize(q + system.coordinate_scale() * shift), rest)
+    return jnp.concatenate([at.velocity_residual, at.acceleration_residual(rest)])
 
 
 @eqx.filter_jit

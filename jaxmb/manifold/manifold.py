@@ -12,10 +12,12 @@ from jaxtyping import Array, PyTree
 
 from .._types import Scalar, State
 from ..contacts.tolerance import ContactTolerance
-from ..formulations import AbstractFormulation, Multipliers, NullSpace, accelerations
+from ..formulations import AbstractFormulation, Multipliers, NullSpace
+from ..formulations.laws import accelerations_at
 from ..linalg.arrays import as_array, namespace
 from ..solvers.manifold_term import AbstractVectorField
 from ..system import AbstractEquation
+from ..system.instant import Instant
 from .compliant_gaps import compliant_gaps
 
 if TYPE_CHECKING:
@@ -104,7 +106,7 @@ class AbstractManifold(eqx.Module):
 
 
 class VectorField(AbstractVectorField):
-    """`(q, u) ↦ (K(t, q, u), u̇)` with the accelerations of a formulation."""
+    """The rate of a state, with the accelerations of a formulation."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
@@ -115,9 +117,9 @@ class VectorField(AbstractVectorField):
 
     def __call__(self, t, y, args):
         del args
-        q = self.system.normalize(y.q)
-        udot, _ = accelerations(self.system, self.formulation, t, q, y.u)
-        return State(self.system.rates(t, q, y.u), udot)
+        at = Instant.of(self.system, t, y).normalized()
+        udot, _ = accelerations_at(at, self.formulation)
+        return at.motion(udot)
 
 
 def normalize_state(system: AbstractEquation, t: Scalar, y: State) -> State:

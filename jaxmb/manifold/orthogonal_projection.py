@@ -7,7 +7,6 @@ projector of the Jacobian's structure.
 Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", §IV.4 (standard projection method).
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -16,14 +15,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._types import Coordinates, Scalar, State, Velocities
+from .._types import Coordinates, Scalar, State
 from ..linalg.elimination import full_pivot, solve_positive
 from ..linalg.inertia import AbstractInertia, DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, solve_linear
 from ..linalg.pushed import push
 from ..system import AbstractEquation
-from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
+from ..system.instant import Instant
 from .constraints import AbstractConstraints, RestoredState
 from .manifold import normalize_state
 
@@ -42,9 +41,9 @@ _MEASURED_SPEED = 0.4
 _FEW, _MORE = 3, 5
 
 
-def projector_constraints(system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> "ProjectorConstraints":
-    """The constraints by their projector at a state."""
-    return ProjectorConstraints(q, system.structured_jacobian(t, q, u).projector(system.inertia(t, q, u)))
+def projector_constraints(at: Instant) -> "ProjectorConstraints":
+    """The constraints by their projector at an instant."""
+    return ProjectorConstraints(at.q, at.structured_jacobian.projector(at.inertia))
 
 
 class ProjectorConstraints(AbstractConstraints):
@@ -55,38 +54,39 @@ class ProjectorConstraints(AbstractConstraints):
     q: Coordinates
     projector: MassProjector
 
-    def restore(self, system, t, y, near, tol):
-        fixed, scale = self.projector, system.velocity_scale()
-        start = system.normalize(y.q)
-        distance = jnp.max(jnp.abs(start - self.q) / system.coordinate_scale())
+    def restore(self, at, near, tol):
+        fixed, scale, at = self.projector, at.system.velocity_scale(), at.normalized()
+        start = at.q
+        distance = jnp.max(jnp.abs(start - self.q) / at.system.coordinate_scale())
         rate = jnp.minimum(_RATE * distance, 0.5)
         one = jnp.ones((), start.dtype)
 
         def move(q):
-            step = fixed.cancel(position_rows(system, t, q))
-            return displaced(system, t, q, step), _largest(step, scale)
+            here = at.with_(q=q)
+            step = fixed.cancel(here.position_rows)
+            return here.moved(step).q, _largest(step, scale)
 
         q, iterations, failed = chord(move, start, first=one, tol=tol, most=_ITERATIONS, rate=rate)
-        speed = _nonzero(_largest(y.u, scale))
+        at, speed = at.with_(q=q), _nonzero(_largest(at.u, scale))
 
         def turn(u):
-            step = fixed.cancel(system.velocity_residual(t, q, u))
+            step = fixed.cancel(at.with_(u=u).velocity_residual)
             return u + step, _largest(step, scale) / speed
 
         # Velocities and accelerations are known to rounding errors of all that adds up to them. Both equations are
         # linear, so that corrections may be large: those of a body at rest are all that there is.
         rounding, any_size = jnp.finfo(start.dtype).eps ** 0.5, jnp.inf
         u, _, failed_u = chord(
-            turn, y.u, first=one, tol=tol, most=_ITERATIONS, rate=rate, rounding=rounding, largest=any_size
+            turn, at.u, first=one, tol=tol, most=_ITERATIONS, rate=rate, rounding=rounding, largest=any_size
         )
-        inertia, force = system.inertia(t, q, u), system.force(t, q, u)
-        given = inertia.solve(force)
+        here = at.with_(u=u)
+        given, inertia = here.inertia.solve(here.force), here.inertia
         strength = _nonzero(_largest(given, scale) + _largest(near.udot, scale))
 
         def accelerate(x):
             _, multipliers = x
-            free = given + inertia.solve(system.constraint_force(t, q, u, multipliers))
-            change = -fixed.multipliers(system.acceleration_residual(t, q, u, free))
+            free = given + inertia.solve(here.constraint_force(multipliers))
+            change = -fixed.multipliers(here.acceleration_residual(free))
             # What the constraints add to free accelerations is the size that shrinks with the distance. Those of a
             # light body between heavy ones are off by much more than its acceleration changes.
             step = fixed.direction(change)
@@ -104,32 +104,29 @@ class ProjectorConstraints(AbstractConstraints):
         )
         return RestoredState(q, u, udot, multipliers, iterations, failed | failed_u | failed_udot)
 
-    def at(self, system, t, q, u):
-        return projector_constraints(system, t, q, u)
+    def at(self, instant):
+        return projector_constraints(instant)
 
-    def multipliers(self, system, t, restored):
+    def multipliers(self, at, restored):
         if restored.multipliers is not None:
             return restored.multipliers
-        q, u = restored.q, restored.u
-        free = system.inertia(t, q, u).solve(system.force(t, q, u))
-        return -self.projector.multipliers(system.acceleration_residual(t, q, u, free))
+        return -self.projector.multipliers(at.acceleration_residual(at.inertia.solve(at.force)))
 
     def push_positions(self, at, along):
-        system, t, q = at
-        still = jnp.zeros(system.nu, q.dtype)
+        still = jnp.zeros(at.system.nu, at.q.dtype)
         # Constraints hold for normalised coordinates.
-        dq = push(lambda system, q: system.normalize(q), (system, q), (along[0], along[2]))
-        step = self.cancel_velocities(push(position_rows, at, (*along[:2], dq)))
-        return push(lambda q, step: displaced(system, t, q, step), (q, still), (dq, step))
+        along = along.with_(q=push(lambda at: at.normalized().q, (at,), (along,)))
+        step = self.cancel_velocities(push(lambda at: at.position_rows, (at,), (along,)))
+        return push(lambda q, step: at.with_(q=q).moved(step).q, (at.q, still), (along.q, step))
 
     def cancel_velocities(self, residual):
         return self.projector.displacement(-residual)
 
-    def balance(self, system, at, rows, forces):
+    def balance(self, at, rows, forces):
         return self.projector.solve(-forces, -rows)
 
-    def cancel_residuals(self, system, at, multipliers, forces, rows):
-        return self.balance(system, at, rows, forces)[0], None
+    def cancel_residuals(self, at, multipliers, rows, forces):
+        return self.balance(at, rows, forces)[0], None
 
 
 def _largest(values, scale):
@@ -158,46 +155,43 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
     """The state that `project` reaches, and whether Newton's method failed; a state that was not found has no meaning,
     and finite derivatives.
     """
-    eps = jnp.finfo(y.q.dtype).eps
+    eps, at = jnp.finfo(y.q.dtype).eps, Instant.of(system, jnp.asarray(t, y.q.dtype), y)
+    failed = jnp.array(False)
     if system.elimination is not None:
-        t, tol = jnp.asarray(t, y.q.dtype), eps**_MEASURED
-        metric_of = lambda system, t, y: DiagonalInertia(1 / system.velocity_scale() ** 2)
-        found, _, _, failed = project_in_metric(system, t, y, metric_of, None, tol)
-        return found, failed | ~_is_finite(found)
-    q, failed = y.q, jnp.array(False)
+        metric_of = lambda at: DiagonalInertia(1 / at.system.velocity_scale() ** 2)
+        at, _, _, failed = project_in_metric(at, metric_of, None, eps**_MEASURED)
+        return at.state, failed | ~_is_finite(at)
     if system.coordinate_rank > 0:
-        t = jnp.asarray(t, q.dtype)
         scale = system.coordinate_scale()
-        jacobian = system.coordinate_jacobian(t, q)
+        jacobian = at.coordinate_jacobian
         rows = independent_rows(jacobian, scale, system.coordinate_rank)
         ahead = jacobian[rows] * (scale**2)[None, :]
         gram = ahead @ jacobian[rows].T
-        moved = lambda multipliers: q - ahead.T @ multipliers
-        residual = lambda multipliers: system.coordinate_residual(t, moved(multipliers))[rows]
+        start = at
+        moved = lambda multipliers: start.with_(q=start.q - ahead.T @ multipliers)
+        residual = lambda multipliers: moved(multipliers).coordinate_residual[rows]
         multipliers, failed = _multipliers(residual, gram, ahead / scale[None, :])
-        q = moved(multipliers)
-    u = y.u
+        at = moved(multipliers)
     if system.velocity_rank > 0:
         scale = system.velocity_scale()
-        u, failed_u = project_velocities(system, t, q, u, DiagonalInertia(1 / scale**2))
-        failed = failed | failed_u
-    found = dataclasses.replace(y, q=q, u=u)
-    return found, failed | ~_is_finite(found)
+        u, failed_u = project_velocities(at, DiagonalInertia(1 / scale**2))
+        at, failed = at.with_(u=u), failed | failed_u
+    return at.state, failed | ~_is_finite(at)
 
 
-def project_velocities(
-    system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities, metric: AbstractInertia
-) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
+def project_velocities(at: Instant, metric: AbstractInertia) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
     """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed, as it
     can where ψ is not linear in them.
     """
+    system = at.system
 
     def corrected(u, _=None):
-        jacobian = binding_velocities(system, t, q, u).selected(system.velocity_rank, system.velocity_scale())
-        change = jacobian.projector(metric).displacement(-velocity_rows(system, t, q, u))
+        here = at.with_(u=u)
+        jacobian = here.binding_velocities.selected(system.velocity_rank, system.velocity_scale())
+        change = jacobian.projector(metric).displacement(-here.velocity_rows)
         return u + change, change
 
-    u, change = corrected(u)
+    u, change = corrected(at.u)
     if system.linear:
         return u, jnp.array(False)
     scale, small = system.velocity_scale(), jnp.finfo(u.dtype).eps ** _MEASURED_SPEED
@@ -216,7 +210,7 @@ def project_velocities(
     return lax.cond(far, go_on, lambda u: (u, far), u)
 
 
-def _is_finite(y: State) -> Bool[Array, ""]:
+def _is_finite(y: Instant) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(y.q)) & jnp.all(jnp.isfinite(y.u))
 
 
@@ -251,35 +245,30 @@ def _multipliers(residual, gram: Array, unscaled: Array) -> tuple[Array, Bool[Ar
 
 
 def project_in_metric(
-    system: AbstractEquation,
-    t: Scalar,
-    y: State,
-    metric_of: Callable[[AbstractEquation, Scalar, State], AbstractInertia],
-    linearized_at: MassProjector | None,
-    tol: Scalar,
-) -> tuple[State, MassProjector, Int[Array, ""], Bool[Array, ""]]:
+    at: Instant, metric_of: Callable[[Instant], AbstractInertia], linearized_at: MassProjector | None, tol: Scalar
+) -> tuple[Instant, MassProjector, Int[Array, ""], Bool[Array, ""]]:
     """Project a state on constraints that are linear in velocities, by the smallest displacement in a metric.
 
     Derivatives are exact for a state on the constraints, and off them wrong by the size of the displacement.
 
-    **Arguments:** `metric_of(system, t, y)`: the metric at a state; `linearized_at`: the projector at a state close by,
-    whose derivatives do not count, for a chord method; None for Newton's method; `tol`: size of the last correction,
-    relative to the system's size.
+    **Arguments:** `metric_of(at)`: the metric at an instant; `linearized_at`: the projector at a state close by, whose
+    derivatives do not count, for a chord method; None for Newton's method; `tol`: size of the last correction, relative
+    to the system's size.
 
-    **Returns:** the state, the projector there, the number of iterations, and whether they failed.
+    **Returns:** the instant, the projector there, the number of iterations, and whether they failed.
     """
-    fixed_system, fixed_t, before, fixed, tol = lax.stop_gradient((system, t, y, linearized_at, tol))
-    scale = fixed_system.velocity_scale()
+    before, fixed, tol = lax.stop_gradient((at, linearized_at, tol))
+    scale = before.system.velocity_scale()
 
     def projector_at(q):
-        metric = metric_of(fixed_system, fixed_t, State(q, before.u))
-        return binding_velocities(fixed_system, fixed_t, q, before.u).projector(metric)
+        here = before.with_(q=q)
+        return here.binding_velocities.projector(metric_of(here))
 
     def correction(projector, q):
-        step = projector.cancel(position_rows(fixed_system, fixed_t, q))
+        step = projector.cancel(before.with_(q=q).position_rows)
         return step, jnp.max(jnp.abs(step) / scale)
 
-    moved = lambda q, step: displaced(fixed_system, fixed_t, q, step)
+    moved = lambda q, step: before.with_(q=q).moved(step).q
     if fixed is None:
         found, own, iterations, failed = _by_newton(projector_at, correction, moved, before, tol)
     else:
@@ -288,17 +277,16 @@ def project_in_metric(
             step, size = correction(fixed, q)
             return moved(q, step), size
 
-        first = jnp.ones((), y.q.dtype)
+        first = jnp.ones((), at.q.dtype)
         found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
         own = projector_at(found)
     # The solution depends on the state that it was found from as one Newton correction at it does, with constant
     # matrices. What coordinates are normalised by has no part in it: constraints hold for normalised ones.
-    start = system.normalize(y.q)
-    q = found + (start - lax.stop_gradient(start))
-    q = displaced(system, t, q, own.displacement(-position_rows(system, t, q)))
-    here = binding_velocities(system, t, q, y.u).projector(metric_of(system, t, State(q, y.u)), own.factor)
-    u = y.u + here.displacement(-velocity_rows(system, t, q, y.u))
-    return dataclasses.replace(y, q=q, u=u), here, iterations, failed
+    start = at.system.normalize(at.q)
+    at = at.with_(q=found + (start - lax.stop_gradient(start)))
+    at = at.moved(own.displacement(-at.position_rows))
+    here = at.binding_velocities.projector(metric_of(at), own.factor)
+    return at.with_(u=at.u + here.displacement(-at.velocity_rows)), here, iterations, failed
 
 
 def _by_newton(projector_at, correction, moved, start, tol):

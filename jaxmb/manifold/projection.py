@@ -10,16 +10,15 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._compat import WrappedSolver, direction_of, inner_term
-from .._types import State
 from ..contacts.guards import ContactGuards, contact_guards
 from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation
-from ..formulations.formulation import check_mass, solve_constrained
+from ..formulations.formulation import check_mass
+from ..formulations.laws import laws_of
 from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
 from ..solvers import (
-    AbstractManifoldTerm,
     AbstractMultistep,
     AbstractMultistepState,
     ManifoldEvaluation,
@@ -27,11 +26,10 @@ from ..solvers import (
     crossing,
 )
 from ..system import AbstractEquation
-from ..system.residuals import binding_velocities, drops_rows, row_sizes, violation_of_dropped_rows
-from .compliant_gaps import compliant_gaps
-from .constraints import RestoredState, SolvedState, rates_along, restore, solved
+from ..system.instant import Instant, drops_rows
+from .constraints import SolvedState, restore
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
-from .impulse import after_jump, found_at_jump
+from .impulse import after_jump
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (
     ProjectorConstraints,
@@ -40,6 +38,7 @@ from .orthogonal_projection import (
     projected,
     projector_constraints,
 )
+from .term import AbstractConstrainedTerm
 
 # Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
@@ -115,17 +114,17 @@ class Projection(AbstractManifold):
         return {} if chart is None else {"newton_iterations": chart}
 
     def violated(self, system, t, y):
-        return _violated(*lax.stop_gradient((system, t, y))) if drops_rows(system) else False
+        return _violated(lax.stop_gradient(Instant.of(system, t, y))) if drops_rows(system) else False
 
     def diagnose(self, system, t, y, evidence, result, failed):
         if system.elimination is None:
-            return diagnose(system, t, y, jnp.array(False), result, failed)
+            return diagnose(Instant.of(system, t, y), jnp.array(False), result, failed)
         # The rank of constraints that are eliminated along the graph of joints is not looked at.
         return diagnose_newton(result, failed) if system.velocity_rows else result
 
 
-def _inertia(system, t, y):
-    return system.inertia(t, y.q, y.u)
+def _inertia(at):
+    return at.inertia
 
 
 def _returned(system, t, y):
@@ -134,9 +133,9 @@ def _returned(system, t, y):
 
 
 @eqx.filter_jit
-def _violated(system, t, y):
+def _violated(at):
     """Whether redundant rows are violated at a state on the others."""
-    return violation_of_dropped_rows(system, t, y, row_sizes(system, t, y)) > _ALLOWED * jnp.finfo(y.q.dtype).eps ** 0.5
+    return at.violation_of_dropped_rows(at.row_sizes()) > _ALLOWED * jnp.finfo(at.q.dtype).eps ** 0.5
 
 
 def _check_multistep(system, formulation, solver):
@@ -160,7 +159,7 @@ def _check_multistep(system, formulation, solver):
         raise ValueError(f"Projection with {solver} takes constraints that are linear in velocities; use Partition().")
 
 
-class ProjectionTerm(AbstractManifoldTerm):
+class ProjectionTerm(AbstractConstrainedTerm):
     """A constrained system whose states are projected in the metric of the mass matrix. Its chart is the number of
     Newton iterations so far. `at_contact`: what counts as zero there, None without contacts.
     """
@@ -170,100 +169,49 @@ class ProjectionTerm(AbstractManifoldTerm):
     newton_tol: Float[Array, ""]
     at_contact: ContactTolerance | None = None
 
-    def vf(self, t, y, args):
-        return VectorField(self.system, self.formulation)(t, y, args)
-
     def init_chart(self, t, y, args):
         return jnp.array(0)
 
     def evaluate(self, t, y, chart, args):
-        system, y = self.system, State(self.system.normalize(y.q), y.u)
-        if system.velocity_rows == 0:
-            return ManifoldEvaluation(y, self.vf(t, y, args), chart, jnp.array(False), None)
-        if not system.ideal_on_velocities:
-            jacobian, inertia = binding_velocities(system, t, y.q, y.u), system.inertia(t, y.q, y.u)
-            return self._solved(t, y, jacobian.projector(inertia), chart)
-        projector = system.structured_jacobian(t, y.q, y.u).projector(system.inertia(t, y.q, y.u))
-        return self._ideal(t, y, projector, chart)
+        at = self.at(t, y).normalized()
+        if self.system.velocity_rows == 0:
+            return ManifoldEvaluation(at.state, self.vf(t, at.state, args), chart, jnp.array(False))
+        return self._solved(at, at.binding_velocities.projector(at.inertia), 0, False, chart)
 
     def project_near(self, t, y, linearized_at, args):
         if self.system.velocity_rows == 0:
             return self.evaluate(t, y, linearized_at.chart, args)
+        at, near, chart = self.at(t, y), linearized_at.factors, linearized_at.chart
         if not self.system.ideal_on_velocities:
-            y, projector, iterations, failed = project_in_metric(
-                self.system, t, y, _inertia, linearized_at.factors, self.newton_tol
-            )
-            out = self._solved(t, y, projector, linearized_at.chart + iterations)
-            return out._replace(failed=failed | out.failed)
-        out: Any = restore(self.system, t, y, linearized_at.factors, self.newton_tol)
-        f = State(self.system.rates(t, out.q, out.u), out.udot)
-        return ManifoldEvaluation(State(out.q, out.u), f, linearized_at.chart + out.iterations, out.failed, None)
-
-    def _solved(self, t, y, projector: MassProjector, chart):
-        """The evaluation with friction and servos, at a state whose projector on the constraints is known."""
-        system, jacobian, factor = self.system, projector.jacobian, projector.factor
-        if system.acceleration_rows > system.velocity_rows:
-            jacobian = system.structured_jacobian(t, y.q, y.u)
-            factor = jacobian.gram(projector.metric).eliminate()
-        solution = solve_constrained(system, FactoredMultipliers(factor), t, y.q, y.u, jacobian)
-        failed = jnp.array(False) if solution.failed is None else solution.failed
-        return ManifoldEvaluation(y, State(system.rates(t, y.q, y.u), solution.udot), chart, failed, projector)
+            found = project_in_metric(at, _inertia, near.constraints.projector, self.newton_tol)
+            return self._solved(*found, chart)
+        out: Any = restore(at, near, self.newton_tol)
+        return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart + out.iterations, out.failed)
 
     def project_cold(self, t, y, chart, args):
-        system = self.system
-        if system.velocity_rows == 0:
+        if self.system.velocity_rows == 0:
             return self.evaluate(t, y, chart, args)
-        if not system.ideal_on_velocities:
-            return super().project_cold(t, y, chart, args)
         # The guess may be far from the constraints: accelerations are found with a factor of the state that is found.
-        y, projector, iterations, failed = project_in_metric(system, t, y, _inertia, None, self.newton_tol)
-        out = self._ideal(t, y, projector, chart + iterations)
-        return out._replace(failed=failed, factors=None)
+        return self._solved(*project_in_metric(self.at(t, y), _inertia, None, self.newton_tol), chart)
 
-    def _ideal(self, t, y, projector: MassProjector, chart):
-        """The evaluation with ideal constraints that bind velocities, at a state whose projector is known."""
-        system = self.system
-        gamma = -system.acceleration_residual(t, y.q, y.u, jnp.zeros_like(y.u))
-        udot, multipliers = projector.solve(system.force(t, y.q, y.u), gamma)
-        f = State(system.rates(t, y.q, y.u), udot)
-        near = SolvedState(ProjectorConstraints(y.q, projector), udot, multipliers)
-        return ManifoldEvaluation(y, f, chart, jnp.array(False), near)
+    def _solved(self, at, projector: MassProjector, iterations, failed, chart):
+        """The evaluation in a state on the constraints, whose projector is known."""
+        near = ProjectorConstraints(at.q, projector)
+        if self.system.acceleration_rows > self.system.velocity_rows:
+            projector = at.structured_jacobian.projector(projector.metric)
+        laws, method = laws_of(self.system), FactoredMultipliers(projector)
+        udot, multipliers, undetermined = laws.solve(at, method, projector.jacobian, at.gamma)
+        near = SolvedState(near, udot, multipliers)
+        return self.evaluated(at, udot, chart + iterations, failed | undetermined, near)
 
-    def at_solution(self, t, y, f, kept, args):
-        system = self.system
-        if system.velocity_rows == 0 or not system.ideal_on_velocities:
-            return super().at_solution(t, y, f, kept, args)
-        out = solved(projector_constraints, system, t, RestoredState(y.q, y.u, f.u))
-        return State(out.q, out.u), State(system.rates(t, out.q, out.u), out.udot)
-
-    def along_solution(self, t, y, f, along, kept, args):
-        system = self.system
-        if system.velocity_rows == 0 or not system.ideal_on_velocities:
-            return super().along_solution(t, y, f, along, kept, args)
-        return rates_along(projector_constraints, system, t, y, f, along)
+    def known(self, kept):
+        return (projector_constraints, None) if self.system.velocity_rows and self.system.ideal_on_velocities else None
 
     def jacobian(self, t, y, args):
         return self.system.field_jacobian(t, y)
 
-    @property
-    def guards(self):
-        return contact_guards(self.system, self.formulation, self.at_contact)
-
-    @property
-    def gaps(self):
-        return compliant_gaps(self.system)
-
-    def found_at_jump(self, t, y, args):
-        return found_at_jump(self.guards, t, y)
-
-    def after_jump(self, t, y, found, args):
-        return after_jump(self.system, self.guards, t, y, found)
-
-    def controlled(self, chart):
-        return State(jnp.ones(self.system.nq, bool), jnp.ones(self.system.nu, bool))
-
     def free(self, chart):
-        return jnp.arange(self.system.nq + self.system.nu)
+        return None
 
     def update_chart(self, t, y, chart, args):
         return chart
@@ -301,7 +249,7 @@ class ProjectedSolver(WrappedSolver):
         result = diffrax.RESULTS.where(failed, NOT_PROJECTED, result)
         if drops_rows(system):
             # diffrax forgets the result of a step that is rejected.
-            violated = _violated(*lax.stop_gradient((system, t1, y1)))
+            violated = _violated(lax.stop_gradient(Instant.of(system, t1, y1)))
             result = diffrax.RESULTS.where(violated, _FAILED, result)
         if self.guards is not None:
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate

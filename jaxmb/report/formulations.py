@@ -14,11 +14,13 @@ from jax import lax
 from .._printed import Printed
 from .._types import State
 from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from ..formulations.formulation import row_levels, solve_constrained
+from ..formulations.formulation import row_levels
+from ..formulations.laws import laws_of
 from ..linalg.elimination import PivotOrder, full_pivot
-from ..linalg.jacobian import AbstractJacobian, DenseJacobian
+from ..linalg.jacobian import DenseJacobian
 from ..mechanisms import Mechanism
 from ..system import AbstractSystem
+from ..system.instant import Instant
 from .table import aligned
 from .timing import interleaved
 
@@ -144,12 +146,12 @@ def formulation_costs(
 
 
 def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: State, order: PivotOrder):
-    t, system = jnp.zeros((), y.q.dtype), system.at(y)
-    jacobian: AbstractJacobian = system.structured_jacobian(t, y.q, y.u)
+    at = Instant.of(system, jnp.zeros((), y.q.dtype), y)
+    jacobian = at.structured_jacobian
     if formulation.partitions or system.acceleration_rank < system.acceleration_rows:
         matrix = jacobian.dense().matrix
         jacobian = DenseJacobian(matrix).eliminated(order, system.acceleration_rank)
-    return solve_constrained(system, formulation, t, y.q, y.u, jacobian)[0]
+    return laws_of(at.system).solve(at, formulation, jacobian, at.gamma)[0]
 
 
 def _evaluated(solve: Callable[[State], Any]):

@@ -14,7 +14,6 @@ from ..manifold import (
     default_manifold,
     natural_units,
     state_blocks,
-    with_internal_states,
 )
 from ..solvers import AbstractMultistep, MultistepController, RunningScales, with_counted
 from ..solvers.gaps import GapSolver
@@ -79,7 +78,7 @@ class Method(NamedTuple):
         term, solver = self.policy.prepare(system.prepared(), self.formulation, self.solver, self.rtol)
         if self.watches_gaps(system) and not isinstance(solver, AbstractMultistep):
             solver = GapSolver(solver)
-        return with_internal_states(term), solver
+        return term, solver
 
     def controls(self, system: AbstractSystem, state: State, duration: Any) -> Any:
         """The controller of the steps of a motion from a state."""

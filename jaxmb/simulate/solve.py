@@ -20,6 +20,7 @@ from ..solvers import NO_STATE, AbstractMultistep, events_found, intended_step
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.inputs import inputs_ended
+from ..system.instant import Instant
 from ..trajectory import Trajectory
 from .compiling import tracing_begins
 from .integrate import integrated
@@ -253,4 +254,4 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck)
     if not system.friction_rows.size:
         return result, None
-    return diagnose_friction(system, problem.method.formulation, t, y, result, stuck)
+    return diagnose_friction(Instant.of(system, t, y), problem.method.formulation, result, stuck)

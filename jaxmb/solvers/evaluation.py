@@ -1,4 +1,4 @@
-"""Evaluations of a term, for a vector field and for one on a manifold.
+"""Evaluations of a term; a plain vector field is one on a manifold without constraints.
 
 diffrax wraps the terms of a solver so that time always increases; derivatives here are with respect to that time.
 States are raveled: one vector of all components.
@@ -19,10 +19,10 @@ from .manifold_term import (
     AbstractGaps,
     AbstractGuards,
     AbstractManifoldTerm,
-    AbstractVectorField,
     Args,
     Chart,
     ManifoldEvaluation,
+    PlainTerm,
     stop,
 )
 from .packing import Layout
@@ -35,7 +35,7 @@ class Evaluation(NamedTuple):
     f: Array
     chart: Chart | None
     failed: Any
-    of_manifold: ManifoldEvaluation | None
+    of_manifold: ManifoldEvaluation
 
 
 def check_term(term: Any) -> None:
@@ -76,84 +76,67 @@ def derivative(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]
 
 
 def first_chart(term: Any, t: Any, y: PyTree[Array], args: Args) -> Chart | None:
-    """A chart that `next_chart` makes one at `y`; `None` for a plain vector field."""
-    manifold = _manifold(term)
-    return None if manifold is None else freeze(manifold.init_chart(t * direction_of(term), y, args))
+    """A chart that `next_chart` makes one at `y`; None for a plain vector field."""
+    return freeze(_manifold(term).init_chart(t * direction_of(term), y, args))
 
 
 def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: Args) -> Chart | None:
-    """The same chart, or a better one at `y`; `None` for a plain vector field."""
-    manifold = _manifold(term)
-    return None if manifold is None else freeze(manifold.update_chart(t * direction_of(term), y, chart, args))
+    """The same chart, or a better one at `y`."""
+    return freeze(_manifold(term).update_chart(t * direction_of(term), y, chart, args))
 
 
 def chart_after_step(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: Args) -> Chart | None:
-    """The chart at the end of a step to `y`, from which `refused` tells; `None` for a plain vector field."""
-    manifold = _manifold(term)
-    return None if manifold is None else freeze(manifold.after_step(t * direction_of(term), y, chart, args))
+    """The chart at the end of a step to `y`, from which `refused` tells."""
+    return freeze(_manifold(term).after_step(t * direction_of(term), y, chart, args))
 
 
 def refused(term: Any, chart: Chart | None, before: Chart | None) -> Any:
     """Whether the step from a chart `before` to this one must be retried with a smaller one."""
-    manifold = _manifold(term)
-    return False if manifold is None else manifold.refuses(chart, before)
+    return _manifold(term).refuses(chart, before)
 
 
 def found_at_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
     """The numbers of a jump by which `after_jump` knows the state after it, as few vectors; None without any."""
-    manifold = _manifold(term)
-    found = None if manifold is None else manifold.found_at_jump(t * direction_of(term), y, args)
+    found = _manifold(term).found_at_jump(t * direction_of(term), y, args)
     return None if found is None else Layout(found).packed(found)
 
 
 def after_jump(term: Any, t: Any, y: PyTree[Array], found: PyTree[Array], args: Args) -> PyTree[Array]:
-    """The state just after a jump; `y` for a plain vector field."""
+    """The state just after a jump."""
     manifold, t = _manifold(term), t * direction_of(term)
-    if manifold is None:
-        return y
     if found is not None:
         found = Layout(eqx.filter_eval_shape(manifold.found_at_jump, t, y, args)).unpacked(found)
     return manifold.after_jump(t, y, found, args)
 
 
 def chart_after_jump(term: Any, chart: Chart | None) -> Chart | None:
-    """The chart just after a jump, which `next_chart` makes one; `None` for a plain vector field."""
-    manifold = _manifold(term)
-    return None if manifold is None else manifold.chart_after_jump(chart)
+    """The chart just after a jump, which `next_chart` makes one."""
+    return _manifold(term).chart_after_jump(chart)
 
 
 def guards_of(term: Any) -> AbstractGuards | None:
-    """The guards of a term; None for a plain vector field."""
-    manifold = _manifold(term)
-    return None if manifold is None else manifold.guards
+    """The guards of a term; None without any."""
+    return _manifold(term).guards
 
 
 def gaps_of(term: Any) -> AbstractGaps | None:
     """The gaps of the forces of a term; None of a term that knows none."""
-    inner = inner_term(term)
-    known = inner.vector_field if isinstance(inner, diffrax.ODETerm) else inner
-    return known.gaps if isinstance(known, AbstractVectorField | AbstractManifoldTerm) else None
+    return _manifold(term).gaps
 
 
 def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart | None, args: Args) -> Evaluation:
     """Evaluate the vector field; `like` has the structure of the state before raveling."""
-    manifold = _manifold(term)
-    if manifold is None:
-        return _evaluate_plain(term, t, flat, like, args)
-    out = manifold.evaluate(t * direction_of(term), unravel_like(like, flat), chart, args)
+    out = _manifold(term).evaluate(t * direction_of(term), unravel_like(like, flat), chart, args)
     return _raveled(term, out, flat.dtype)
 
 
 def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluation, args: Args) -> Evaluation:
-    """Project a corrected state on the manifold, if there is one, and evaluate the vector field there.
+    """Project a corrected state on the manifold, and evaluate the vector field there.
 
     `before` is the evaluation of the prediction, at the same time.
     """
-    manifold = _manifold(term)
-    if manifold is None or before.of_manifold is None:
-        return _evaluate_plain(term, t, flat, like, args)
-    out = manifold.project_near(t * direction_of(term), unravel_like(like, flat), before.of_manifold, args)
-    return _raveled(term, out, flat.dtype)
+    y = unravel_like(like, flat)
+    return _raveled(term, _manifold(term).project_near(t * direction_of(term), y, before.of_manifold, args), flat.dtype)
 
 
 def jacobian_of(term: Any, t: Any, like: PyTree[Array], args: Args) -> Callable[[Array], Any]:
@@ -164,34 +147,26 @@ def jacobian_of(term: Any, t: Any, like: PyTree[Array], args: Args) -> Callable[
 
 
 def _jacobian(term, t, like, args, flat):
-    manifold, direction = _manifold(term), direction_of(term)
-    own = None if manifold is None else manifold.jacobian(t * direction, unravel_like(like, flat), args)
-    return None if own is None else (own, jnp.asarray(direction))
+    direction = direction_of(term)
+    jacobian = _manifold(term).jacobian(t * direction, unravel_like(like, flat), args)
+    return None if jacobian is None else (jacobian, jnp.asarray(direction))
 
 
 def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: Args) -> Any:
     """`(t, y) -> ((y on the manifold, f), (chart, failed))` for raveled states, a pytree."""
-    manifold = _manifold(term)
-    flat = ravel(like)
+    manifold, flat = _manifold(term), ravel(like)
 
-    def plain(t, flat):
-        f = derivative(term, t, unravel_like(like, flat), args)
-        return (flat, ravel(f, flat.dtype)), (None, jnp.array(False))
-
-    def constrained(t, flat):
-        assert manifold is not None
+    def field(t, flat):
         out = manifold.project_cold(t * direction_of(term), unravel_like(like, flat), chart, args)
         out = _raveled(term, out, flat.dtype)
-        return (out.y, out.f), (out.chart, out.failed)
+        return (out.y, out.f), (out.chart, jnp.asarray(out.failed))
 
-    return eqx.filter_closure_convert(plain if manifold is None else constrained, t, flat)
+    return eqx.filter_closure_convert(field, t, flat)
 
 
 def kept_of_chart(term: Any, chart: Chart | None, at_start: bool = False) -> PyTree[Array]:
     """What `at_solution` needs of the chart at the end of a step; `at_start`: of a first step, for its start."""
     manifold = _manifold(term)
-    if manifold is None:
-        return None
     return manifold.kept_at_start(chart) if at_start else manifold.kept(chart)
 
 
@@ -200,8 +175,6 @@ def at_solution(
 ) -> tuple[Array, Array]:
     """The state and the vector field at the end of a step, which are known, with their derivatives."""
     manifold, direction = _manifold(term), direction_of(term)
-    if manifold is None:
-        return flat, ravel(derivative(term, t, unravel_like(like, flat), args), flat.dtype)
     sign = jnp.asarray(direction).astype(flat.dtype)
     y, f = manifold.at_solution(t * direction, unravel_like(like, flat), unravel_like(like, f * sign), kept, args)
     return ravel(y, flat.dtype), ravel(f, flat.dtype) * sign
@@ -211,19 +184,9 @@ def solution_of(term: Any, t: Any, like: PyTree[Array], kept: PyTree[Array], arg
     """`(t, y, f, along) -> (y, f, g)` for raveled states, a pytree: a known state, its vector field, and the rate of
     that along a rate of the state, by default the field, with the derivatives that the equations give them.
     """
-    manifold = _manifold(term)
-    if manifold is not None:
-        return eqx.Partial(_along_solution, manifold, jnp.asarray(direction_of(term)), like, kept, args)
-    flat = ravel(like)
-    field = lambda t, flat: ravel(derivative(term, t, unravel_like(like, flat), args), flat.dtype)
-    # What a vector field closes over has derivatives as well.
-    return eqx.Partial(_along_field, eqx.filter_closure_convert(field, t, flat))
-
-
-def _along_field(field, t, flat, f, along):
-    del f
-    along = field(t, flat) if along is None else along
-    return flat, *jax.jvp(field, (t, flat), (jnp.ones_like(t), along))
+    direction = direction_of(term)
+    manifold = _manifold(term).closed(t * direction, like, args)
+    return eqx.Partial(_along_solution, manifold, jnp.asarray(direction), like, kept, args)
 
 
 def _along_solution(manifold, direction, like, kept, args, t, flat, f, along):
@@ -236,13 +199,14 @@ def _along_solution(manifold, direction, like, kept, args, t, flat, f, along):
 
 def free_components(term: Any, flat: Array, chart: Chart | None) -> Array:
     """Indices of the components that are integrated."""
-    manifold = _manifold(term)
-    return jnp.arange(flat.size) if manifold is None else manifold.free(chart)
+    free = _manifold(term).free(chart)
+    return jnp.arange(flat.size) if free is None else free
 
 
-def _evaluate_plain(term, t, flat, like, args):
-    f = derivative(term, t, unravel_like(like, flat), args)
-    return Evaluation(flat, ravel(f, flat.dtype), None, False, None)
+def controlled_components(term: Any, chart: Chart | None) -> Array | None:
+    """A mask of the components that are integrated, or `None` if all of them are."""
+    controlled = _manifold(term).controlled(chart)
+    return None if controlled is None else ravel(controlled, bool)
 
 
 def _raveled(term, out: ManifoldEvaluation, dtype):
@@ -251,15 +215,9 @@ def _raveled(term, out: ManifoldEvaluation, dtype):
     return Evaluation(ravel(out.y, dtype), f, chart, out.failed, out._replace(chart=chart, factors=factors))
 
 
-def controlled_components(term: Any, chart: Chart | None) -> Array | None:
-    """A mask of the components that are integrated, or `None` if all of them are."""
-    manifold = _manifold(term)
-    return None if manifold is None else ravel(manifold.controlled(chart), bool)
-
-
-def _manifold(term: Any) -> AbstractManifoldTerm | None:
+def _manifold(term: Any) -> AbstractManifoldTerm:
     inner = inner_term(term)
-    return inner if isinstance(inner, AbstractManifoldTerm) else None
+    return inner if isinstance(inner, AbstractManifoldTerm) else PlainTerm(inner)
 
 
 def freeze(tree: Any) -> Any:

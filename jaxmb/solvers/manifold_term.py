@@ -42,7 +42,7 @@ class ManifoldEvaluation(NamedTuple):
     y: Y
     f: Y
     chart: Chart
-    failed: Bool[Array, ""]
+    failed: Bool[Array, ""] | bool
     factors: PyTree = None
 
 
@@ -257,13 +257,16 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         """The gaps in which forces act, which no step may pass over; by default None."""
         return None
 
-    @abc.abstractmethod
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:
-        """A mask with the structure of `y`: true for the components that the local error is measured on."""
+        """A mask with the structure of `y`: true for the components that the local error is measured on; by default
+        None, all.
+        """
+        del chart
+        return None
 
     @abc.abstractmethod
-    def free(self, chart: Chart) -> Int[Array, " free"]:
-        """Indices of the independent components in the raveled state; their number never changes."""
+    def free(self, chart: Chart) -> Int[Array, " free"] | None:
+        """Indices of the independent components in the raveled state; their number never changes. None for all."""
 
     @abc.abstractmethod
     def update_chart(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
@@ -278,6 +281,14 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         del t, y, args
         return None
 
+    def closed(self, t: Any, y: Y, args: Args) -> "AbstractManifoldTerm":
+        """The same term as a pytree of all numbers that it depends on; by default it is one.
+
+        **Arguments:** as those of `vf`, an example.
+        """
+        del t, y, args
+        return self
+
     def after_step(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
         """The chart at the end of a step, with what `refuses` needs to know of the state there; by default the same."""
         del t, y, args
@@ -287,6 +298,48 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         """Whether a step that began with the chart `before` must not end with this one; it is then retried, shorter."""
         del chart, before
         return False
+
+
+class PlainTerm(AbstractManifoldTerm):
+    """Another term of an ordinary differential equation, as a manifold without constraints and charts."""
+
+    term: diffrax.AbstractTerm
+
+    def vf(self, t, y, args):
+        zero = jnp.zeros_like(t)
+        return self.term.vf_prod(t, y, args, self.term.contr(zero, zero + 1))
+
+    def init_chart(self, t, y, args):
+        return None
+
+    def evaluate(self, t, y, chart, args):
+        return ManifoldEvaluation(y, self.vf(t, y, args), None, False)
+
+    def project_near(self, t, y, linearized_at, args):
+        return self.evaluate(t, y, None, args)
+
+    def project_cold(self, t, y, chart, args):
+        return self.evaluate(t, y, None, args)
+
+    def along_solution(self, t, y, f, along, kept, args):
+        field = lambda t, y: self.vf(t, y, args)
+        along = field(t, y) if along is None else along
+        return y, *jax.jvp(field, (t, y), (jnp.ones_like(t), along))
+
+    @property
+    def gaps(self):
+        field = self.term.vector_field if isinstance(self.term, diffrax.ODETerm) else None
+        return field.gaps if isinstance(field, AbstractVectorField) else None
+
+    def free(self, chart):
+        return None
+
+    def update_chart(self, t, y, chart, args):
+        return None
+
+    def closed(self, t, y, args):
+        # Functions may close over numbers that have derivatives.
+        return PlainTerm(diffrax.ODETerm(eqx.filter_closure_convert(self.vf, t, y, args)))
 
 
 def stop(x: Any) -> Any:

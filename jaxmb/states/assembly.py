@@ -21,6 +21,7 @@ from ..linalg.jitted import jitted
 from ..parts.modes import CLOSED, OPEN
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
+from ..system.instant import Instant
 from ..system.quantities import rates_of
 from .arguments import (
     check_system,
@@ -104,13 +105,14 @@ def assemble(
     # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled.
     known = not is_traced((system, guess, fix, u, t))
     at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
-    u, ok_rates = (u, True) if at_rest else _velocities(system, t, q, u, fixed_rates)
+    at = Instant(system, t, q, u)
+    u, ok_rates = (u, True) if at_rest else _velocities(at, fixed_rates)
     # Under a derivative it is known whether a state was found, but its numbers are traced.
     traced = is_traced((system, q, u, t))
     # Under a trace, results of concrete numbers are traced as well.
     if raises and not is_traced((ok, ok_rates)):
         if not ok_rates and not traced:
-            raise ValueError(cannot_move(system, t, q, u, fixed_rates))
+            raise ValueError(cannot_move(at.with_(u=u), fixed_rates))
         if ok and ok_rates:
             if of_bodies and not is_traced((system, u)):
                 _warn_of_changed_velocities(system, guess.u, u)
@@ -180,16 +182,17 @@ def configuration(
     return q, fixed, ok
 
 
-def _velocities(system, t, q, u, fixed):
+def _velocities(guess, fixed):
     """The second half of `assemble`: the velocities, and whether they satisfy the constraints."""
+    system = guess.system
     if not system.velocity_rows:
-        return u, jnp.array(True)
-    on_host = None if is_traced((system, t, q, u)) else system.on_host(t)
+        return guess.u, jnp.array(True)
+    on_host = None if is_traced(guess) else system.on_host(guess.t)
     if on_host is not None:
-        found = on_host.closest_velocities(np.asarray(q), np.asarray(u), fixed, system.velocity_rank)
+        found = on_host.closest_velocities(np.asarray(guess.q), np.asarray(guess.u), fixed, system.velocity_rank)
         if found is not None:
             return jax.device_put(found), jnp.array(True)
-    return closest_velocities(system, t, q, u, tuple(fixed.tolist()))
+    return closest_velocities(guess, tuple(fixed.tolist()))
 
 
 def _check_modes(system, q, fixed):

@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Coordinates, Scalar, Velocities
+from .._types import Coordinates, Scalar
 from ..linalg.arrays import namespace
 from ..linalg.elimination import full_pivot, solve
 from ..linalg.inertia import DiagonalInertia
@@ -32,7 +32,7 @@ from ..linalg.jacobian import MassProjector
 from ..linalg.jitted import jitted
 from ..linalg.newton import newton, root, solve_linear
 from ..system import AbstractEquation
-from ..system.residuals import binding_velocities, displaced, position_rows, velocity_rows
+from ..system.instant import Instant
 
 # From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
 _MANY_ROWS = 300
@@ -120,30 +120,32 @@ def meet_constraints(
     return newton(correct, far, (start, none), most=_ITERATIONS, dtype=start.dtype)[0]
 
 
-def meet_in_blocks(
-    system: AbstractEquation, t: Scalar, start: Coordinates, fixed: Bool[np.ndarray, "nu"]
-) -> Float[Array, "nq"]:
+def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array, "nq"]:
     """The same along the velocities, without motion along fixed ones, and without a dense matrix where the system has
     an order of elimination. The normal equations are regularised in the measure of the residuals.
+
+    **Arguments:** `start`: a guess at rest.
     """
+    system, dtype = start.system, start.q.dtype
     scale = system.velocity_scale()
-    least = float(jnp.finfo(start.dtype).eps) ** _LEAST
-    metric, at_rest = DiagonalInertia(jnp.where(fixed, jnp.inf, 1 / scale**2)), jnp.zeros_like(scale)
-    residual = lambda q: system.position_residual(t, q)
+    least = float(jnp.finfo(dtype).eps) ** _LEAST
+    metric = DiagonalInertia(jnp.where(fixed, jnp.inf, 1 / scale**2))
+    residual = lambda q: start.with_(q=q).position_residual
 
     def correct(q):
-        before, jacobian = residual(q), binding_velocities(system, t, q, at_rest)
+        at = start.with_(q=q)
+        before, jacobian = at.position_residual, at.binding_velocities
         largest = largest_residual(before, jacobian.row_norms(scale)[: system.position_rows])
         factor = jacobian.gram(metric).eliminate(jnp.clip(_OF_RESIDUAL * largest, least, _OF_RESIDUAL))
-        multipliers = factor.refined(jacobian.gather_rows(position_rows(system, t, q)))
+        multipliers = factor.refined(jacobian.gather_rows(at.position_rows))
         step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
         longest = jnp.max(jnp.abs(step) / scale)
-        best, size, better = _shortened(residual, lambda step: displaced(system, t, q, step), q, step, longest)
+        best, size, better = _shortened(residual, lambda step: at.moved(step).q, q, step, longest)
         return jnp.where(better, best, q), size
 
-    small = float(jnp.finfo(start.dtype).eps) ** 0.75
+    small = float(jnp.finfo(dtype).eps) ** 0.75
     far = lambda q, size: (size > small * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
-    return newton(correct, far, system.normalize(start), most=_ITERATIONS, dtype=start.dtype)[0]
+    return newton(correct, far, start.normalized().q, most=_ITERATIONS, dtype=dtype)[0]
 
 
 def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Array], q, step, longest):
@@ -235,27 +237,23 @@ def _refine(residual, x):
 
 @jitted
 def closest_velocities(
-    system: AbstractEquation,
-    t: Scalar,
-    q: Coordinates,
-    guess: Velocities,
-    held: tuple[bool, ...],
-    in_blocks: bool | None = None,
+    guess: Instant, held: tuple[bool, ...], in_blocks: bool | None = None
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
     """The velocities closest to the guess with some rates held; and whether every residual is at rounding level.
 
     More rates may be held than there are degrees of freedom, as long as they agree with each other.
     """
+    system, u = guess.system, guess.u
     if system.velocity_rows == 0:
-        return guess, jnp.array(True)
+        return u, jnp.array(True)
     fixed = np.array(held)
     if _in_blocks(system, in_blocks):
-        return _velocities_in_blocks(system, t, q, guess, fixed)
+        return _velocities_in_blocks(guess, fixed)
     scale = jnp.where(fixed, 0.0, system.velocity_scale())
-    u, rank, ok = guess, system.velocity_rank, jnp.array(True)
-    jacobian = system.velocity_jacobian(t, q, u)
-    for step in range(1 if system.linear else 8):
-        jacobian = jacobian if step == 0 else system.velocity_jacobian(t, q, u)
+    at, rank, ok = guess, system.velocity_rank, jnp.array(True)
+    jacobian = at.velocity_jacobian
+    for _ in range(1 if system.linear else 8):
+        jacobian = at.velocity_jacobian
         pivots = full_pivot(jacobian, scale=scale)
         if not fixed.any():
             ok = ok & (pivots.rank == rank)
@@ -264,10 +262,9 @@ def closest_velocities(
         bound = jnp.arange(rank) >= pivots.rank
         selected = jnp.where(bound[:, None], 0.0, jacobian[rows] * scale[None, :])
         gram = selected @ selected.T + jnp.diag(bound.astype(u.dtype))
-        u = u - scale * (selected.T @ solve(gram, system.velocity_residual(t, q, u)[rows]))
-    residual = system.velocity_residual(t, q, u)
-    size = 1.0 + jnp.max(jnp.abs(jacobian) @ jnp.abs(u))
-    return u, ok & (jnp.max(jnp.abs(residual)) <= 1e2 * tolerance(u.dtype) * size)
+        at = at.with_(u=at.u - scale * (selected.T @ solve(gram, at.velocity_residual[rows])))
+    size = 1.0 + jnp.max(jnp.abs(jacobian) @ jnp.abs(at.u))
+    return at.u, ok & (jnp.max(jnp.abs(at.velocity_residual)) <= 1e2 * tolerance(u.dtype) * size)
 
 
 # Without dense matrices
@@ -276,15 +273,16 @@ def closest_velocities(
 def _configuration_in_blocks(system, t, guess, held, fixed):
     """`closest_configuration` with some coordinates held, and so some velocities fixed."""
     where = _Held(tuple(held.tolist()), tuple(fixed.tolist()))
-    return _closest(system, jnp.asarray(t, guess.dtype), guess, where, tolerance(guess.dtype))
+    at_rest = Instant(system, jnp.asarray(t, guess.dtype), guess, jnp.zeros(system.nu, guess.dtype))
+    return _closest(at_rest, where, tolerance(guess.dtype))
 
 
-def _velocities_in_blocks(system, t, q, guess, held):
+def _velocities_in_blocks(guess, held):
     """`closest_velocities` with some rates held."""
     # Rates that are held have an infinite mass.
-    metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / system.velocity_scale() ** 2))
-    here = binding_velocities(system, t, q, jnp.zeros_like(guess)).projector(metric)
-    u = guess + here.cancel(velocity_rows(system, t, q, guess))
+    metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / guess.system.velocity_scale() ** 2))
+    here = guess.with_(u=jnp.zeros_like(guess.u)).binding_velocities.projector(metric)
+    u = guess.u + here.cancel(guess.velocity_rows)
     return u, jnp.all(jnp.isfinite(u)) & (here.factor.smallest_pivot() > _INDEPENDENT)
 
 
@@ -294,7 +292,7 @@ class _Held(eqx.Module):
 
 
 class _Optimality(NamedTuple):
-    """The equations of the closest configuration at one; `projector` in their metric."""
+    """The equations of the closest configuration; `projector` in their metric."""
 
     projector: MassProjector
     multipliers: Float[Array, "m"]
@@ -302,98 +300,97 @@ class _Optimality(NamedTuple):
 
 
 @eqx.filter_custom_jvp
-def _closest(system, t, guess, held, tol):
-    fixed = np.array(held.velocities)
+def _closest(guess, held, tol):
+    system, dtype, fixed = guess.system, guess.q.dtype, np.array(held.velocities)
     square = 1 / system.coordinate_scale() ** 2
-    distance = lambda q: jnp.sum(square * (q - guess) ** 2)
+    distance = lambda q: jnp.sum(square * (q - guess.q) ** 2)
 
     def correct(carry):
         q, step, length, _ = carry
-        new = meet_in_blocks(system, t, displaced(system, t, q, length * step), fixed)
-        norms = binding_velocities(system, t, new, jnp.zeros_like(step)).row_norms(system.velocity_scale())
-        residual = largest_residual(system.position_residual(t, new), norms[: system.position_rows])
+        at = guess.with_(q=meet_in_blocks(guess.with_(q=q).moved(length * step), fixed))
+        new, norms = at.q, at.binding_velocities.row_norms(system.velocity_scale())
+        residual = largest_residual(at.position_residual, norms[: system.position_rows])
         before, after = distance(q), distance(new)
         size = length * jnp.max(jnp.abs(step) / system.velocity_scale())
         # The first step leads to the constraints, and the last ones change the distance by rounding errors only.
         better = (length == 0.0) | (after < before) | (size <= _LAST)
-        go_on = lambda: (new, _newton_step(system, t, new, guess, fixed), jnp.ones_like(length), residual)
+        go_on = lambda: (new, _newton_step(at, guess.q, fixed), jnp.ones_like(length), residual)
         halve = lambda: (q, step, 0.5 * length, residual)
         out = lax.cond(better, go_on, halve)
         ahead = jnp.max(jnp.abs(out[1]) / system.velocity_scale()) * out[2]
         return out, jnp.where(residual <= tol, ahead, jnp.inf)
 
-    none = jnp.zeros(())
+    none = jnp.zeros((), dtype)
     far = lambda carry, ahead: (ahead > 1e-3 * tol) & jnp.all(jnp.isfinite(carry[0])) & ~(carry[3] > tol)
-    start = guess, jnp.zeros(system.nu, guess.dtype), none.astype(guess.dtype), none.astype(guess.dtype)
-    (q, _, length, residual), ahead = newton(correct, far, start, most=_STEPS, dtype=guess.dtype)
-    at = _optimality(system, t, q, guess, fixed)
+    start = guess.q, jnp.zeros(system.nu, dtype), none, none
+    (q, _, length, residual), ahead = newton(correct, far, start, most=_STEPS, dtype=dtype)
+    projector = _optimality(guess.with_(q=q), guess.q, fixed).projector
     found = jnp.all(jnp.isfinite(q)) & (residual <= tol) & (ahead <= tol) & (length > 0)
-    return q, found & (at.projector.factor.smallest_pivot() > _INDEPENDENT)
+    return q, found & (projector.factor.smallest_pivot() > _INDEPENDENT)
 
 
 @_closest.def_jvp
 def _closest_jvp(primals, tangents):
-    system, t, guess, held, tol = primals
-    dsystem, dt, dguess, _, _ = tangents
-    q, found = _closest(system, t, guess, held, tol)
-    fixed = np.array(held.velocities)
-    at = _optimality(system, t, q, guess, fixed)
-    dguess = jnp.zeros_like(guess) if dguess is None else dguess
+    guess, held, tol = primals
+    q, found = _closest(guess, held, tol)
+    at, fixed = guess.with_(q=q), np.array(held.velocities)
+    optimum = _optimality(at, guess.q, fixed)
+    dguess = jnp.zeros_like(guess.q) if tangents[0].q is None else tangents[0].q
     moved = jnp.where(np.array(held.coordinates), dguess, 0.0)
 
-    def equations(system, t, guess, q):
-        return _gradient(system, t, q, guess, at.multipliers), position_rows(system, t, q)
+    def equations(at, guess):
+        return _gradient(at, guess, optimum.multipliers), at.position_rows
 
-    _, (gradient, unmet) = eqx.filter_jvp(equations, (system, t, guess, q), (dsystem, dt, dguess, moved))
-    step = _solve(system, t, q, guess, fixed, at, -gradient, -unmet)
-    along = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(step),), (step,))[1]
+    _, (gradient, unmet) = eqx.filter_jvp(equations, (at, guess.q), (tangents[0].with_(q=moved), dguess))
+    step = _solve(at, guess.q, fixed, optimum, -gradient, -unmet)
+    along = jax.jvp(lambda u: at.with_(u=u).rates, (jnp.zeros_like(step),), (step,))[1]
     return (q, found), (moved + along, None)
 
 
-def _optimality(system, t, q, guess, fixed):
-    metric = DiagonalInertia(jnp.where(fixed, jnp.inf, _weights(system, t, q)))
-    projector = binding_velocities(system, t, q, jnp.zeros(system.nu, q.dtype)).projector(metric)
-    gradient = _gradient(system, t, q, guess, jnp.zeros(system.acceleration_rows, q.dtype))
+def _optimality(at, guess, fixed):
+    metric = DiagonalInertia(jnp.where(fixed, jnp.inf, _weights(at)))
+    projector = at.binding_velocities.projector(metric)
+    gradient = _gradient(at, guess, jnp.zeros(at.system.acceleration_rows, guess.dtype))
     multipliers = -projector.balancing(gradient)
     return _Optimality(projector, multipliers, gradient + projector.jacobian.transpose_product(multipliers))
 
 
-def _gradient(system, t, q, guess, multipliers):
+def _gradient(at, guess, multipliers):
     """`g`, of a configuration that the multipliers do not depend on."""
-    rates = lambda u: system.rates(t, q, u)
-    (pulled,) = jax.linear_transpose(rates, jnp.zeros(system.nu, q.dtype))((q - guess) / system.coordinate_scale() ** 2)
-    return pulled + system.constraint_force(t, q, jnp.zeros(system.nu, q.dtype), multipliers)
+    rates, scale = lambda u: at.with_(u=u).rates, at.system.coordinate_scale()
+    (pulled,) = jax.linear_transpose(rates, jnp.zeros(at.system.nu, guess.dtype))((at.q - guess) / scale**2)
+    return pulled + at.constraint_force(multipliers)
 
 
-def _weights(system, t, q):
+def _weights(at):
     """The diagonal of `Kᵀ S⁻² K`."""
-    rates = lambda u: system.rates(t, q, u)
-    ones = jnp.ones(system.nu, q.dtype)
-    return jax.linear_transpose(rates, ones)(rates(ones) / system.coordinate_scale() ** 2)[0]
+    rates = lambda u: at.with_(u=u).rates
+    ones = jnp.ones(at.system.nu, at.q.dtype)
+    return jax.linear_transpose(rates, ones)(rates(ones) / at.system.coordinate_scale() ** 2)[0]
 
 
-def _newton_step(system, t, q, guess, fixed):
-    at = _optimality(system, t, q, guess, fixed)
-    curved = _curvature(system, t, q, guess, fixed, at.multipliers)
-    return at.projector.null_space_solution(curved, -at.gradient)
+def _newton_step(at, guess, fixed):
+    optimum = _optimality(at, guess, fixed)
+    curved = _curvature(at, guess, fixed, optimum.multipliers)
+    return optimum.projector.null_space_solution(curved, -optimum.gradient)
 
 
-def _curvature(system, t, q, guess, fixed, multipliers):
+def _curvature(at, guess, fixed, multipliers):
     """How g changes with a displacement along velocities that are not fixed."""
 
     def along(v):
         v = jnp.where(fixed, 0.0, v)
-        dq = jax.jvp(lambda u: system.rates(t, q, u), (jnp.zeros_like(v),), (v,))[1]
-        change = jax.jvp(lambda q: _gradient(system, t, q, guess, multipliers), (q,), (dq,))[1]
+        dq = jax.jvp(lambda u: at.with_(u=u).rates, (jnp.zeros_like(v),), (v,))[1]
+        change = jax.jvp(lambda q: _gradient(at.with_(q=q), guess, multipliers), (at.q,), (dq,))[1]
         return jnp.where(fixed, 0.0, change)
 
     return along
 
 
-def _solve(system, t, q, guess, fixed, at, gradient, unmet):
+def _solve(at, guess, fixed, optimum, gradient, unmet):
     """The displacement that changes g and Φ by this much: `H v + Aᵀ δμ`, `A v`."""
-    projector, order = at.projector, at.projector.jacobian
-    curved = _curvature(system, t, q, guess, fixed, at.multipliers)
+    projector, order, nu = optimum.projector, optimum.projector.jacobian, at.system.nu
+    curved = _curvature(at, guess, fixed, optimum.multipliers)
     free = ~fixed
     independent = order.active
 
@@ -401,7 +398,7 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
     join = lambda v, multipliers: jnp.concatenate([v, multipliers])
 
     def matrix(x):
-        v, multipliers = x[: system.nu], x[system.nu :]
+        v, multipliers = x[:nu], x[nu:]
         forces = jnp.where(free, order.transpose_product(independent * multipliers), v)
         rows = independent * order.product(jnp.where(free, v, 0.0))
         return join(curved(v) + forces, rows + (1 - independent) * multipliers)
@@ -410,7 +407,7 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         return projector.direction(projector.multipliers(rows))
 
     def solve(_, b):
-        forces, rows = b[: system.nu], b[system.nu :]
+        forces, rows = b[:nu], b[nu:]
         particular = displacement(rows)
         v = particular + projector.null_space_solution(curved, forces - curved(particular))
         # Both are refined once: the last pivots of long loops are small.
@@ -421,4 +418,4 @@ def _solve(system, t, q, guess, fixed, at, gradient, unmet):
         return join(jnp.where(free, v, forces), multipliers + (1 - independent) * rows)
 
     right = join(jnp.where(free, gradient, 0.0), independent * unmet)
-    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[: system.nu]
+    return lax.custom_linear_solve(matrix, right, solve, symmetric=True)[:nu]

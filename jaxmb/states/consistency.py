@@ -1,6 +1,5 @@
 """Consistency of a state with the constraints of its system, before a motion starts from it."""
 
-import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
@@ -14,7 +13,7 @@ from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..system import AbstractSystem, parameters, with_parameters
-from ..system.residuals import row_sizes, violations
+from ..system.instant import Instant
 
 # The largest violation of states that count as consistent, relative to the system's size and to the largest velocity;
 # at least this power of eps, 3e-4 in single precision.
@@ -65,16 +64,17 @@ def constraints_depend_on(system: AbstractSystem, t: Any, state: State, names: I
     start = parameters(system)
 
     def rows(values):
-        changed = with_parameters(system, values)
-        return changed.position_residual(t, state.q), changed.velocity_residual(t, state.q, state.u)
+        at = Instant.of(with_parameters(system, values), t, state)
+        return at.position_residual, at.velocity_residual
 
     return any(used_inputs(rows, {name: start[name] for name in names}).values())
 
 
 def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
     """A message about implied rows that are violated at the end of a motion."""
-    residual = np.abs(np.asarray(system.velocity_residual(t, state.q, state.u)))
-    residual[: system.position_rows] = np.abs(np.asarray(system.position_residual(t, state.q)))
+    at = Instant.of(system, t, state)
+    residual = np.abs(np.asarray(at.velocity_residual))
+    residual[: system.position_rows] = np.abs(np.asarray(at.position_residual))
     names = listed(system, residual > 1e-3 * np.max(residual), residual)
     return (
         f"At t = {float(t):g} the constraints {names} contradict the others: rows of them, which others implied when "
@@ -92,12 +92,12 @@ def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
 
 @jitted
 def _violated(system, t, y) -> Any:
-    y = dataclasses.replace(y, q=system.normalize(y.q))
-    tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
     near = system.closing()
-    positions, velocities = violations(near, t, y, row_sizes(near, t, y))
-    depths = -system.contacts.gaps(system, t, y.q) / system.length
-    return (positions > tol) | near.half_turned(y.q), velocities > tol, depths > tol
+    at = Instant.of(near, t, y).normalized()
+    tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
+    positions, velocities = at.violations(at.row_sizes())
+    depths = -system.contacts.gaps(system, t, at.q) / system.length
+    return (positions > tol) | near.half_turned(at.q), velocities > tol, depths > tol
 
 
 def listed(system: AbstractSystem, violated: Any, residual: Any) -> str:

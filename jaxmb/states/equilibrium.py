@@ -26,6 +26,7 @@ from ..linalg.newton import root
 from ..linalg.rotations import norm
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
+from ..system.instant import Instant
 from ..system.quantities import directions
 from .arguments import check_system, checked_guess, checked_time, holding, split_coordinates, split_internal_states
 from .assembly import configuration
@@ -114,7 +115,7 @@ def equilibrium(
     start, fixed, assembled = configuration(system, guess.q, fix, time, raises)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
-    still = jnp.array(True) if system.drift_free else _still(system, time, start, u)
+    still = jnp.array(True) if system.drift_free else _still(Instant(system, time, start, u))
     # Under a derivative the outcome is known, but the numbers that a message needs are traced.
     errors = raises and not is_traced((system, time, start, z, still))
     if errors and not bool(still):
@@ -130,9 +131,10 @@ def equilibrium(
     if errors and np.any(overlaps | pulls):
         against, change = about_contacts("The forces balance", system, overlaps, pulls)
         raise ValueError(f"{against}For example jaxmb.equilibrium(system, {change}).")
-    steady = True if z is None else _steady(system, time, q, u)
+    at = Instant(system, time, q, u, z)
+    steady = True if z is None else _steady(at)
     if errors and not np.all(steady):
-        raise ValueError(_changing(system, time, q, u, np.asarray(steady)))
+        raise ValueError(_changing(at, np.asarray(steady)))
     if errors:
         return State(q, u, z)
     ok = ok & still & assembled & jnp.all(jnp.asarray(steady)) & ~jnp.any(overlaps | pulls)
@@ -149,21 +151,21 @@ def equilibrium(
 
 
 @eqx.filter_jit
-def _still(system, t, q, u):
+def _still(at):
     """Whether all prescribed motions are at rest."""
-    speeds = jnp.concatenate([system.velocity_residual(t, q, u), system.rates(t, q, u)])
-    return jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(q.dtype)
+    speeds = jnp.concatenate([at.velocity_residual, at.rates])
+    return jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(at.q.dtype)
 
 
 @eqx.filter_jit
-def _steady(system, t, q, u):
+def _steady(at):
     """Which internal states do not change."""
-    return jnp.abs(system.state_rates(t, q, u)) <= tolerance(q.dtype) ** 0.5 * system.state_scale()
+    return jnp.abs(at.state_rates) <= tolerance(at.q.dtype) ** 0.5 * at.system.state_scale()
 
 
-def _changing(system, t, q, u, steady):
-    rates = np.asarray(system.state_rates(t, q, u))
-    names = {name: rates[index] for name, index in system.state_names().items() if not np.all(steady[index])}
+def _changing(at, steady):
+    rates = np.asarray(at.state_rates)
+    names = {name: rates[index] for name, index in at.system.state_names().items() if not np.all(steady[index])}
     listed = ", ".join(f"{name} ({np.max(np.abs(rate)):.3g} per second)" for name, rate in names.items())
     return (
         f"In the equilibrium internal states change: {listed}. They are those of the guess; give values at which they "
@@ -301,7 +303,7 @@ def _against(system, t, q, multipliers, implied):
     if not contacts:
         return (jnp.zeros(0, bool),) * 2
     alone = contacts.at_rows(jnp.diag(implied))[: contacts.n] <= tolerance(q.dtype) ** 0.5
-    return contacts_against(system, t, q, jnp.zeros(system.nu, q.dtype), multipliers, alone)
+    return contacts_against(Instant(system, t, q, jnp.zeros(system.nu, q.dtype)), multipliers, alone)
 
 
 _linearised_alone, _against_alone = on_host(_linearised), on_host(_against)

@@ -4,30 +4,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._types import Coordinates, Scalar, Velocities
 from ..system import AbstractSystem
+from ..system.instant import Instant
 from .closest import tolerance
 
 
 def contacts_against(
-    system: AbstractSystem,
-    t: Scalar,
-    q: Coordinates,
-    u: Velocities,
-    multipliers: Float[Array, "rows"],
-    alone: Bool[Array, "contacts"],
+    at: Instant, multipliers: Float[Array, "rows"], alone: Bool[Array, "contacts"]
 ) -> tuple[Bool[Array, "contacts"], Bool[Array, "contacts"]]:
     """Which open contacts are overlapped, and which closed ones pull; of a system without contacts, none is asked.
 
     **Arguments:** the `multipliers` of all rows; which contacts are `alone`: of those that imply each other only the
     sum of the forces is known.
     """
-    contacts, is_open = system.contacts, system.contacts.modes(q).open
+    contacts, is_open = at.system.contacts, at.system.contacts.modes(at.q).open
     if not is_open.size:
         return is_open, is_open
-    tol = tolerance(q.dtype) ** 0.5
-    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, q, u)))
-    overlaps = is_open & (contacts.gaps(system, t, q) < -tol * system.length)
+    tol = tolerance(at.q.dtype) ** 0.5
+    largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(at.force))
+    overlaps = is_open & (contacts.gaps(at.system, at.t, at.q) < -tol * at.system.length)
     pulls = ~is_open & alone & (contacts.at_rows(multipliers)[: contacts.n] < -tol * largest)
     return overlaps, pulls
 

@@ -1,14 +1,15 @@
 """Why a mechanism cannot be assembled or moved as it was asked for, and where its constraints lose rank."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._types import Coordinates, Scalar, State, Velocities
+from .._types import Coordinates, Scalar, State
 from ..system import AbstractSystem
+from ..system.instant import Instant
 from ..system.quantities import directions
 from .consistency import listed
 
@@ -150,16 +151,17 @@ def _dependence(together, free):
     return f"{', '.join(together[:-1])} and {together[-1]} depend on each other: {chosen}"
 
 
-def cannot_move(system: AbstractSystem, t: Scalar, q: Coordinates, u: Velocities, fixed: Int[np.ndarray, "nu"]) -> str:
+def cannot_move(at: Instant, fixed: Int[np.ndarray, "nu"]) -> str:
     """Why no velocities have the prescribed rates, from the closest ones that were found; arguments as in
     `cannot_assemble`.
     """
+    system: Any = at.system
     of_system = directions(system.rate_names())
     places = [k for k in of_system if fixed[k]]
     coordinates = system.joint_coordinates()
     rows = [k for k, (name, _) in enumerate(system.rows[: system.velocity_rows]) if name in coordinates]
     held = _Held([*(of_system[k] for k in places), *(system.rows[k][0] for k in rows)], places, rows)
-    residual = np.nan_to_num(np.abs(np.asarray(system.velocity_residual(t, q, u))), nan=np.inf)
+    residual = np.nan_to_num(np.abs(np.asarray(at.velocity_residual)), nan=np.inf)
     least = 1e-6 * np.max(residual)
     unmet = {name for (name, _), r in zip(system.rows, residual, strict=False) if r >= least} - set(held.names)
     unmet = ", ".join(sorted(unmet))
@@ -171,12 +173,12 @@ def cannot_move(system: AbstractSystem, t: Scalar, q: Coordinates, u: Velocities
         )
     text += f" with the rates {', '.join(dict.fromkeys(held.names))} fixed"
     scale = np.asarray(system.velocity_scale())
-    jacobian, own = np.asarray(system.jacobian(t, q, u)) * scale, np.asarray(system.velocity_residual(t, q, u))
+    jacobian, rates = np.asarray(at.jacobian) * scale, np.asarray(at.velocity_residual)
     still = np.linalg.norm(held.directions(_unit_rows(jacobian), _DEPENDENT), axis=1) < _ZERO
     # How the rates that are held change on the way to velocities that satisfy the constraints alone.
-    others = np.setdiff1d(np.arange(own.size), rows)
-    change = np.linalg.lstsq(jacobian[others], -own[others], rcond=_DEPENDENT)[0]
-    changes = np.abs(np.append((scale * change)[places], jacobian[rows] @ change + own[rows]))
+    others = np.setdiff1d(np.arange(rates.size), rows)
+    change = np.linalg.lstsq(jacobian[others], -rates[others], rcond=_DEPENDENT)[0]
+    changes = np.abs(np.append((scale * change)[places], jacobian[rows] @ change + rates[rows]))
     wrong = still & (changes > _ZERO * np.max(changes, initial=0.0))
     if np.any(wrong):
         names = dict.fromkeys(name for name, is_wrong in zip(held.names, wrong, strict=True) if is_wrong)

@@ -12,7 +12,6 @@ from oracles import driven
 
 import jaxmb as mb
 from jaxmb import contact, formulations, manifold, mechanisms, planar, solvers, spatial, terrain
-from jaxmb.manifold import with_internal_states
 from jaxmb.manifold.impulse import after_impulse
 from jaxmb.parts import (
     AbstractDynamicForce,
@@ -472,9 +471,6 @@ def test_nothing_is_traced_without_internal_states():
     mechanism = mechanisms.four_bar()
     system, state = mechanism.system, mechanism.state
     assert state.z is None and system.nz == 0 and system.at(state) is system
-    policy = manifold.Partition()
-    term, _ = policy.prepare(system, policy.default_formulation(system), solvers.Adams(), 1e-8)
-    assert with_internal_states(term) is term
     assert len(jax.tree.leaves(mb.simulate(system, state, t1=0.01).ys)) == 2
 
 

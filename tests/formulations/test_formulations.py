@@ -22,10 +22,11 @@ from jaxmb.formulations import (
     gauss_function,
     pivoted_jacobian,
 )
-from jaxmb.formulations.formulation import solve_constrained
+from jaxmb.formulations.laws import laws_of
 from jaxmb.linalg.elimination import full_pivot
 from jaxmb.linalg.jacobian import DenseJacobian
 from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
+from jaxmb.system.instant import Instant
 
 WITHOUT_INVERSE_OF_MASS = {name: FORMULATIONS[name] for name in ("partitioned", "null_space", "singular_mass")}
 N, RANK = 7, 4
@@ -228,8 +229,9 @@ def motion_by(system, formulations, q, u):
     def evaluate(t, q, u):
         jacobian = jax.vmap(lambda q, u: pivoted_jacobian(system, t, q, u))(q, u)
         lane = lambda tree, k: jax.tree.map(lambda x: x[k], tree)
+        solved = lambda at, formulation, jacobian: laws_of(system).solve(at, formulation, jacobian, at.gamma)
         pairs = [
-            solve_constrained(system, formulation, t, q[k], u[k], lane(jacobian, k))[:2]
+            solved(Instant(system, t, q[k], u[k]), formulation, lane(jacobian, k))[:2]
             for k, formulation in enumerate(formulations.values())
         ]
         udot, multipliers = (jnp.stack(values) for values in zip(*pairs, strict=True))

@@ -9,8 +9,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import manifold, planar, spatial
-from jaxmb.formulations import Multipliers
-from jaxmb.formulations.formulation import accelerations
+from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.report import stress_test
 
 

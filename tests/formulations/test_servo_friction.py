@@ -11,10 +11,11 @@ from rough_machines import GRAVITY, SCENES, manipulator, pendulum, sledge
 
 import jaxmb as mb
 from jaxmb import formulations, planar, solvers
-from jaxmb.formulations.formulation import accelerations
+from jaxmb.formulations import accelerations
 from jaxmb.linalg.rotations import rotate, rotate_2d
 from jaxmb.manifold import Partition
-from jaxmb.manifold.partition import general_acceleration
+from jaxmb.manifold.partition import acceleration
+from jaxmb.system.instant import Instant
 
 
 def random_state(system, seed):
@@ -292,7 +293,7 @@ def test_second_derivatives_of_accelerations():
 
     def by_rule(x):
         own = mb.with_parameters(system, dict(zip(names, x, strict=True)))
-        found = general_acceleration(own, formulations.Partitioned(), jnp.zeros(()), q, u, chart.split)
+        found = acceleration(Instant(own, jnp.zeros(()), q, u), formulations.Partitioned(), chart.split)
         return weights @ found.udot
 
     def by_method(x):

@@ -483,6 +483,23 @@ def test_steps_of_dense_solutions(compat):
     np.testing.assert_allclose(starts[1:11], -solution.ts[:10], err_msg=about)
 
 
+def test_traces_are_told_apart(compat):
+    outside = compat.current_trace()
+    inside = []
+
+    def loop(x):
+        own = compat.current_trace()
+        lax.fori_loop(0, 2, lambda _, x: inside.append(compat.current_trace()) or x, x)
+        inside.extend([own, compat.current_trace()])
+        return x
+
+    jax.jit(loop)(1.0)
+    of_loop, *of_program = inside
+    about = "the trace that operations go to can no longer be told from others"
+    assert compat.current_trace() == outside, about
+    assert of_program[0] == of_program[1] and outside not in inside and of_loop not in of_program, about
+
+
 def test_functions_with_their_rest_computed(compat):
     def slow(angle, x):
         return jax.jit(lambda angle, x: jnp.sin(angle) * x**2 + jnp.cos(angle))(angle, x)

@@ -9,7 +9,7 @@ from every_contact import CONTACTS, system_of
 import jaxmb as mb
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts.modes import CLOSED, OPEN
-from jaxmb.system.residuals import displaced
+from jaxmb.system.instant import Instant
 
 
 @pytest.mark.parametrize("name", CONTACTS)
@@ -24,7 +24,7 @@ def test_gap_and_its_derivatives(name):
 
     @jax.jit
     def ahead(s):
-        q_s = displaced(system, t, q, s * u)
+        q_s = Instant(system, t, q, u).moved(s * u).q
         return of.gaps(system, t, q_s)[0], of.rates(system, t, q_s, u)[0]
 
     h = 1e-5

@@ -12,6 +12,7 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.states import closest
+from jaxmb.system.instant import Instant
 
 
 def planar_tree(n=15, **options):
@@ -71,7 +72,7 @@ def test_the_closest_state_and_its_derivatives(build, names):
 
     def found(system, guess, in_blocks):
         q, ok = closest.closest_configuration(system, 0.0, guess.q, tuple(held.tolist()), rank, in_blocks)
-        u, also = closest.closest_velocities(system, 0.0, q, guess.u, tuple(fixed.tolist()), in_blocks)
+        u, also = closest.closest_velocities(Instant(system, 0.0, q, guess.u), tuple(fixed.tolist()), in_blocks)
         return jnp.concatenate([q, u]), ok & also
 
     sparse, dense = functools.partial(found, in_blocks=True), functools.partial(found, in_blocks=False)

@@ -8,6 +8,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.states.closest import closest_configuration, closest_velocities
+from jaxmb.system.instant import Instant
 
 # With coordinates that may be held.
 MACHINES = {
@@ -46,7 +47,7 @@ def test_closest_states_are_those_of_programs(name, holds):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
         u = np.array(jax.random.normal(key, (system.nu,)))
         none = np.zeros(system.nu, bool)
-        expected, ok = closest_velocities(system, jnp.zeros(()), found, u, tuple(none.tolist()))
+        expected, ok = closest_velocities(Instant(system, jnp.zeros(()), found, u), tuple(none.tolist()))
         rates = on_host.closest_velocities(found, u, none, system.velocity_rank)
         assert ok and rates is not None
         np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-11)
@@ -107,7 +108,7 @@ def test_states_of_any_constraints_are_those_of_programs(make):
     found = on_host.closest_configuration(guess, none, system.coordinate_rank)
     assert ok and found is not None
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-    expected, ok = closest_velocities(system, t, found, u, tuple(still.tolist()))
+    expected, ok = closest_velocities(Instant(system, t, found, u), tuple(still.tolist()))
     rates = on_host.closest_velocities(found, u, still, system.velocity_rank)
     assert ok and rates is not None
     np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-11)

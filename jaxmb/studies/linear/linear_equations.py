@@ -19,8 +19,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..._types import Scalar, State
-from ...formulations import Partitioned, accelerations
+from ...formulations import Partitioned
+from ...formulations.laws import accelerations_at
 from ...system import AbstractSystem, Solved, parameters, with_parameters
+from ...system.instant import Instant
 from .comoving import carriers
 from .perturbations import Perturbations, StateNames, joined, parted, perturbations
 from .quantities import measured
@@ -38,10 +40,9 @@ def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State
     In independent accelerations: with multipliers, derivatives along the motion of light and heavy bodies together lose
     as many digits as their masses differ by.
     """
-    system = system.at(state)
-    udot, multipliers = accelerations(system, Partitioned(), t, state.q, state.u)
-    zdot = system.state_rates(t, state.q, state.u) if system.nz else None
-    return State(system.rates(t, state.q, state.u), udot, zdot), multipliers
+    at = Instant.of(system, t, state)
+    udot, multipliers = accelerations_at(at, Partitioned())
+    return at.motion(udot), multipliers
 
 
 class LinearEquations(NamedTuple):
@@ -194,5 +195,6 @@ def _applied(system, t, state):
     """The largest acceleration that applied forces would cause without constraints, in the same units."""
     if not system.positive_definite_mass:
         return jnp.zeros((), state.q.dtype)
-    free = system.inertia(t, state.q, state.u).solve(system.at(state).force(t, state.q, state.u))
+    at = Instant.of(system, t, state)
+    free = at.inertia.solve(at.force)
     return jnp.max(jnp.abs(free) / system.velocity_scale())

@@ -21,6 +21,7 @@ from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...states.held import about_contacts, contacts_against
 from ...system import AbstractSystem
+from ...system.instant import Instant
 from .comoving import AbstractCarrier, Advance, Bodies, body_index, carriers
 from .linear_equations import fastest, vector_field
 from .linearise import remaining
@@ -198,8 +199,8 @@ def _search(
     (field, multipliers), carried = vector_field(system, t, state), carrier.field(state)
     against = None
     if system.contacts:
-        own = lax.stop_gradient((system, t, state.q, state.u, multipliers))
-        against = contacts_against(*own, alone=jnp.ones(system.contacts.n, bool))
+        at, forces = lax.stop_gradient((Instant.of(system, t, state), multipliers))
+        against = contacts_against(at, forces, alone=jnp.ones(system.contacts.n, bool))
     remaining = jnp.concatenate([field.q - carried.q, field.u - carried.u])
     # An array without entries that a program returns makes XLA lose the types of its LAPACK calls (jaxlib 0.10.2).
     return _Found(state, remaining, left, solved, solved & same, against)

@@ -1,0 +1,172 @@
+"""The laws of constraint forces: ideal ones, and forces C besides that may depend on the multipliers.
+
+    M u̇ = F + C(λ) + Aᵀ λ,    A u̇ = γ
+
+The multipliers that C depends on, those of the `friction_rows`, are the memory of a law; None where it depends on none.
+"""
+
+import abc
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .._compat import with_rest_computed
+from .._types import Coordinates, Scalar, Velocities
+from ..linalg.jacobian import AbstractJacobian
+from ..linalg.newton import root
+from ..linalg.sums import unchecked_take, with_entries
+from ..system import AbstractEquation
+from ..system.instant import Instant
+from .formulation import AbstractFormulation, check_mass, suitable_jacobian
+from .friction import find_multipliers
+
+Memory: TypeAlias = Float[Array, "k"] | None
+
+
+class Solution(NamedTuple):
+    """Accelerations u̇ and multipliers λ, and whether they `failed` to be determined."""
+
+    udot: Float[Array, "nu"]
+    multipliers: Float[Array, "m"]
+    failed: Bool[Array, ""]
+
+
+class AbstractLaws(eqx.Module):
+    """The laws of a system's constraint forces; see `laws_of`."""
+
+    @abc.abstractmethod
+    def applied(self, at: Instant, memory: Memory) -> Float[Array, "nu"]:
+        """`F + C`."""
+
+    def solve(
+        self, at: Instant, formulation: AbstractFormulation, jacobian: AbstractJacobian, gamma: Float[Array, "m"]
+    ) -> Solution:
+        """Accelerations and multipliers, from the Jacobian A and γ."""
+        solved = formulation.solve(at.inertia, self.applied(at, None), jacobian, gamma)
+        return Solution(*solved, jnp.array(False))
+
+    def remembered(self, at: Instant, multipliers: Float[Array, "m"]) -> Memory:
+        """The memory of all multipliers."""
+        del at, multipliers
+        return None
+
+    def recalled(self, at: Instant, multipliers: Float[Array, "m"], memory: Memory) -> Float[Array, "m"]:
+        """All multipliers, with those of the memory."""
+        del at, memory
+        return multipliers
+
+
+class IdealLaws(AbstractLaws):
+    """C is zero."""
+
+    def applied(self, at, memory):
+        return at.force
+
+
+class GivenLaws(AbstractLaws):
+    """C depends on no multiplier, such as viscous friction."""
+
+    def applied(self, at, memory):
+        return at.force + at.friction_force(at.u[:0])
+
+
+class ReactiveLaws(AbstractLaws):
+    """C depends on multipliers, which it changes: they are solved for together. Where C does not determine them, it is
+    that of the multipliers of ideal constraints.
+    """
+
+    def applied(self, at, memory: Any):
+        return at.force + at.friction_force(memory)
+
+    def solve(self, at, formulation, jacobian, gamma):
+        formulation = formulation.prepared(at.inertia, jacobian)
+        found, _, failed = _friction(at, formulation, jacobian, gamma)
+
+        def solved(memory):
+            return formulation.solve(at.inertia, self.applied(at, memory), jacobian, gamma)
+
+        memory = root(lambda memory: memory - self.remembered(at, solved(memory)[1]), found, lambda _, found: found)
+        return Solution(*solved(memory), failed)
+
+    def remembered(self, at, multipliers):
+        return unchecked_take(multipliers, at.system.friction_rows)
+
+    def recalled(self, at, multipliers, memory: Any):
+        return with_entries(multipliers, at.system.friction_rows, memory)
+
+
+# Made once.
+_IDEAL, _GIVEN, _REACTIVE = IdealLaws(), GivenLaws(), ReactiveLaws()
+
+
+def laws_of(system: AbstractEquation) -> AbstractLaws:
+    """The laws of a system's constraint forces."""
+    if system.ideal:
+        return _IDEAL
+    return _REACTIVE if system.friction_rows.size else _GIVEN
+
+
+def accelerations(
+    system: AbstractEquation,
+    formulation: AbstractFormulation,
+    t: Scalar,
+    q: Coordinates,
+    u: Velocities,
+    gamma_shift: Float[Array, "m"] | None = None,
+) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
+    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, those of
+    `A u̇ = γ − gamma_shift`. NaN where friction does not determine them.
+
+    ```python
+    method = jaxmb.formulations.Multipliers()
+    udot, multipliers = jaxmb.formulations.accelerations(system, method, 0.0, state.q, state.u)
+    ```
+
+    **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
+    """
+    return accelerations_at(Instant(system, t, q, u), formulation, 0.0 if gamma_shift is None else gamma_shift)
+
+
+def accelerations_at(
+    at: Instant, formulation: AbstractFormulation, gamma_shift: Float[Array, "m"] | float = 0.0
+) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
+    """The same at an instant."""
+    check_mass(at.system, formulation)
+    if at.system.acceleration_rows == 0:
+        return at.inertia.solve(at.force), jnp.zeros(0, at.u.dtype)
+    jacobian = suitable_jacobian(at, formulation)
+    udot, multipliers, failed = laws_of(at.system).solve(at, formulation, jacobian, at.gamma - gamma_shift)
+    return jnp.where(failed, jnp.nan, udot), jnp.where(failed, jnp.nan, multipliers)
+
+
+def _friction(at, formulation, jacobian, gamma):
+    """Multipliers of the rows that forces depend on, their coupling, and whether they are not determined; without
+    derivative.
+    """
+    inertia, force, at = lax.stop_gradient((at.inertia, at.force, at))
+    formulation, jacobian, gamma = lax.stop_gradient((formulation, jacobian, gamma))
+    rows = at.system.friction_rows
+    # The equations are symmetric: what a force does to a multiplier, its row does to the accelerations.
+    units = jnp.asarray(np.eye(gamma.size)[rows], gamma.dtype)
+    forces = jnp.concatenate([force[None], jnp.zeros((rows.size, force.size), force.dtype)])
+    solve = jax.vmap(lambda force, gamma: formulation.solve(inertia, force, jacobian, gamma))
+    udot, multipliers = solve(forces, jnp.concatenate([gamma[None], units]))
+    start, influence = unchecked_take(multipliers[0], rows), -udot[1:]
+    # Newton's method evaluates the law again and again, but only for other multipliers.
+    law = with_rest_computed(at.friction_force, start)
+    contacts = at.system.contacts
+    return find_multipliers(law, influence, start, np.isin(rows, contacts.rows[: contacts.n]))
+
+
+def friction_coupling(at: Instant, formulation: AbstractFormulation) -> Float[Array, "k k"]:
+    """How much the multipliers that friction depends on change with themselves, through its force; see `friction`.
+    Without derivative.
+    """
+    at = lax.stop_gradient(at)
+    jacobian = suitable_jacobian(at, formulation)
+    return _friction(at, formulation.prepared(at.inertia, jacobian), jacobian, at.gamma)[1]

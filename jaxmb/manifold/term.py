@@ -1,0 +1,88 @@
+"""A constrained system as a term: the part that does not depend on how its states return to the constraints."""
+
+import abc
+from typing import TYPE_CHECKING, Any
+
+from jaxtyping import Array, Float
+
+from .._types import State
+from ..contacts.guards import contact_guards
+from ..contacts.tolerance import ContactTolerance
+from ..formulations import AbstractFormulation
+from ..formulations.laws import Memory
+from ..solvers import AbstractManifoldTerm, ManifoldEvaluation
+from ..system import AbstractEquation
+from ..system.instant import Instant
+from .compliant_gaps import compliant_gaps
+from .constraints import Linearise, SolvedState, rates_along, solved
+from .impulse import after_jump, found_at_jump
+from .manifold import VectorField
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+
+class AbstractConstrainedTerm(AbstractManifoldTerm):
+    """A constrained system, with its internal states if it has any.
+
+    **Fields:** `at_contact`: what counts as zero there, None without contacts; `newton_tol`: size of the corrections
+    that are left out.
+    """
+
+    system: AbstractVar[AbstractEquation]
+    formulation: AbstractVar[AbstractFormulation]
+    newton_tol: AbstractVar[Float[Array, ""]]
+    at_contact: AbstractVar[ContactTolerance | None]
+
+    def at(self, t: Any, y: State) -> Instant:
+        """The system in a state."""
+        return Instant.of(self.system, t, y)
+
+    def evaluated(
+        self, at: Instant, udot: Float[Array, "nu"], chart: Any, failed: Any, near: SolvedState | None = None
+    ) -> ManifoldEvaluation:
+        """The evaluation in a state whose accelerations are known.
+
+        **Arguments:** `near`: the state as one that others are restored from, None where no other will be.
+        """
+        return ManifoldEvaluation(at.state, at.motion(udot), chart, failed, near)
+
+    @abc.abstractmethod
+    def known(self, kept: Any) -> tuple[Linearise, Memory] | None:
+        """The constraints at a solution, as functions of an instant, and the memory of the laws there; None where the
+        equations are solved again.
+        """
+
+    def at_solution(self, t, y, f, kept, args):
+        known = self.known(kept)
+        if known is None:
+            return super().at_solution(t, y, f, kept, args)
+        at, (linearise, memory) = self.at(t, y), known
+        out = solved(linearise, at, f.u, memory)
+        at = at.with_(q=out.q, u=out.u)
+        return at.state, at.motion(out.udot)
+
+    def along_solution(self, t, y, f, along, kept, args):
+        known = self.known(kept)
+        if known is None or known[1] is not None or y.z is not None:
+            return super().along_solution(t, y, f, along, kept, args)
+        return rates_along(known[0], self.at(t, y), f.u, along)
+
+    def vf(self, t, y, args):
+        return VectorField(self.system, self.formulation)(t, y, args)
+
+    @property
+    def guards(self):
+        return contact_guards(self.system, self.formulation, self.at_contact)
+
+    @property
+    def gaps(self):
+        return compliant_gaps(self.system)
+
+    def found_at_jump(self, t, y, args):
+        return found_at_jump(self.guards, t, y)
+
+    def after_jump(self, t, y, found, args):
+        return after_jump(self.system, self.guards, t, y, found)

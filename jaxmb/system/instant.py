@@ -1,0 +1,191 @@
+"""The system at an instant: time, coordinates, velocities and internal states, and everything that follows from them.
+
+Each quantity is computed when it is first asked for, and kept on the instant for the rest of the trace that asked. A
+copy by flattening, as transformations of JAX make, keeps nothing.
+"""
+
+from collections.abc import Callable
+from typing import Any, Generic, Self, TypeVar, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._compat import current_trace
+from .._types import Coordinates, Scalar, State, Velocities
+from ..linalg.jacobian import AbstractJacobian
+from ..linalg.sums import placed_sums
+from .equation import AbstractEquation
+
+T = TypeVar("T")
+
+
+class kept(Generic[T]):
+    """A property that is computed once in each trace. A value of another trace is never used: it may be a tracer of a
+    branch or a loop that has ended.
+    """
+
+    def __init__(self, compute: Callable[[Any], T]):
+        self._compute, self.__doc__ = compute, compute.__doc__
+
+    @overload
+    def __get__(self, instant: None, owner: Any = None) -> Self: ...
+    @overload
+    def __get__(self, instant: object, owner: Any = None) -> T: ...
+    def __get__(self, instant, owner=None):
+        if instant is None:
+            return self
+        values, trace = getattr(instant, "_kept", None), current_trace()
+        if values is None:
+            values = {}
+            object.__setattr__(instant, "_kept", values)
+        found = values.get(self)
+        if found is None or found[0] != trace:
+            found = values[self] = trace, self._compute(instant)
+        return found[1]
+
+
+class Keeper:
+    """An object with room for the values of its `kept` properties, which are no part of it as a pytree."""
+
+    __slots__ = ("_kept",)
+
+
+def _of_state(method: Callable[..., T]) -> kept[T]:
+    """The value of a function of (t, q, u) of the equation."""
+    name = method.__name__
+    return kept(lambda at: getattr(at.system, name)(at.t, at.q, at.u))
+
+
+def _of_configuration(method: Callable[..., T]) -> kept[T]:
+    """The value of a function of (t, q)."""
+    name = method.__name__
+    return kept(lambda at: getattr(at.system, name)(at.t, at.q))
+
+
+class Instant(eqx.Module, Keeper):
+    """A system at a time, in a state; a pytree. Of a system with internal states its forces have those of the state.
+
+    **Fields:** the `system`; `t` [s]; `q`, `u`; `z`: internal states, None without any.
+    """
+
+    system: AbstractEquation
+    t: Scalar
+    q: Coordinates
+    u: Velocities
+    z: Float[Array, "nz"] | None = None
+
+    @classmethod
+    def of(cls, system: AbstractEquation, t: Scalar, y: State) -> Self:
+        """The system in a state, whose internal states it gets."""
+        return cls(system.at(y), t, y.q, y.u, y.z)
+
+    @property
+    def state(self) -> State:
+        """The state."""
+        return State(self.q, self.u, self.z)
+
+    def with_(self, *, q: Coordinates | None = None, u: Velocities | None = None) -> Self:
+        """The same instant with other coordinates or velocities."""
+        return type(self)(self.system, self.t, self.q if q is None else q, self.u if u is None else u, self.z)
+
+    def normalized(self) -> Self:
+        """The same instant with the coordinates' own invariants satisfied."""
+        return self.with_(q=self.system.normalize(self.q))
+
+    def moved(self, step: Float[Array, "nu"]) -> Self:
+        """The instant with its coordinates after a small displacement along the velocities."""
+        if self.system.rates_are_velocities:
+            return self.with_(q=self.q + step)
+        rates = lambda u: self.system.rates(self.t, self.q, u)
+        _, change = jax.jvp(rates, (jnp.zeros_like(step),), (step,))
+        return self.with_(q=self.system.normalize(self.q + change))
+
+    def motion(self, udot: Float[Array, "nu"]) -> State:
+        """The rate of the state with these accelerations."""
+        return State(self.rates, udot, None if self.z is None else self.state_rates)
+
+    # Functions of the equation, see there.
+    rates = _of_state(AbstractEquation.rates)
+    state_rates = _of_state(AbstractEquation.state_rates)
+    inertia = _of_state(AbstractEquation.inertia)
+    force = _of_state(AbstractEquation.force)
+    jacobian = _of_state(AbstractEquation.jacobian)
+    velocity_jacobian = _of_state(AbstractEquation.velocity_jacobian)
+    structured_jacobian = _of_state(AbstractEquation.structured_jacobian)
+    velocity_residual = _of_state(AbstractEquation.velocity_residual)
+    position_residual = _of_configuration(AbstractEquation.position_residual)
+    coordinate_residual = _of_configuration(AbstractEquation.coordinate_residual)
+    coordinate_jacobian = _of_configuration(AbstractEquation.coordinate_jacobian)
+
+    @kept
+    def gamma(self) -> Float[Array, "m"]:
+        """γ of `A u̇ = γ`."""
+        return -self.acceleration_residual(jnp.zeros_like(self.u))
+
+    def acceleration_residual(self, udot: Float[Array, "nu"]) -> Float[Array, "m"]:
+        """`A u̇ − γ`."""
+        return self.system.acceleration_residual(self.t, self.q, self.u, udot)
+
+    def constraint_force(self, multipliers: Float[Array, "m"]) -> Float[Array, "nu"]:
+        """`Aᵀ λ`."""
+        return self.system.constraint_force(self.t, self.q, self.u, multipliers)
+
+    def friction_force(self, multipliers: Float[Array, "k"]) -> Float[Array, "nu"]:
+        """C, from the multipliers of the `friction_rows` that it depends on."""
+        of_rows = placed_sums(self.system.friction_rows, self.system.acceleration_rows)
+        return self.system.nonideal_force(self.t, self.q, self.u, of_rows(multipliers))
+
+    # Residuals as rows of A, and their sizes.
+
+    @property
+    def position_rows(self) -> Float[Array, "m"]:
+        """Φ, and zeros for the rows that bind velocities or accelerations only."""
+        return self._as_rows(self.position_residual)
+
+    @property
+    def velocity_rows(self) -> Float[Array, "m"]:
+        """ψ, and zeros for the rows that bind accelerations only."""
+        return self._as_rows(self.velocity_residual)
+
+    def _as_rows(self, residual):
+        return jnp.pad(residual, (0, self.system.acceleration_rows - residual.size))
+
+    @property
+    def binding_velocities(self) -> AbstractJacobian:
+        """A whose independent rows are those that bind positions or velocities."""
+        system = self.system
+        if system.acceleration_rows == system.velocity_rows:
+            return self.structured_jacobian
+        return self.structured_jacobian.of_rows(tuple(range(system.velocity_rows)))
+
+    def row_sizes(self) -> Float[Array, "mv"]:
+        """The norm of the gradient of each row of ψ, in the scales of the velocities."""
+        sizes = self.structured_jacobian.row_norms(self.system.velocity_scale())[: self.system.velocity_rows]
+        return jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps ** 0.75 * jnp.max(sizes) + jnp.finfo(sizes.dtype).tiny)
+
+    def violations(self, sizes: Float[Array, "mv"]) -> tuple[Float[Array, "mp"], Float[Array, "mv"]]:
+        """For each row of Φ the change of the coordinates, in their scales, that restores it; for each row of ψ the
+        change of the velocities that does, relative to the largest velocity.
+
+        **Arguments:** `sizes`: those of the rows, at this instant or another.
+        """
+        speed = jnp.max(jnp.abs(self.u) / self.system.velocity_scale())
+        rate = jnp.abs(self.velocity_residual) / sizes
+        positions = jnp.abs(self.position_residual) / sizes[: self.system.position_rows]
+        # At rest there are only rounding errors to compare.
+        return positions, jnp.where(rate > jnp.finfo(rate.dtype).eps ** 0.75, rate / speed, 0.0)
+
+    def violation_of_dropped_rows(self, sizes: Float[Array, "mv"]) -> Float[Array, ""]:
+        """The largest violation of a state that satisfies the independent rows: that of rows that are left out."""
+        (positions, velocities), system = self.violations(sizes), self.system
+        # Where all rows left out are of positions, their velocities follow.
+        follow = system.velocity_rank - system.position_rank == system.velocity_rows - system.position_rows
+        largest = jnp.max(positions, initial=0.0)
+        return largest if follow else jnp.maximum(largest, jnp.max(velocities))
+
+
+def drops_rows(system: AbstractEquation) -> bool:
+    """Whether rows of ψ are left out because others imply them."""
+    return system.velocity_rank < system.velocity_rows

@@ -1,0 +1,66 @@
+"""The system at an instant: quantities are computed once in each trace, and never taken from one that has ended."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+import jaxmb as mb
+from jaxmb.system.instant import Instant, Keeper, kept
+
+
+def four_bar():
+    mechanism = mb.mechanisms.four_bar()
+    return Instant.of(mechanism.system, 0.0, mechanism.state)
+
+
+def counted(program, *arguments):
+    """How often a program evaluates its sine."""
+    return str(jax.make_jaxpr(program)(*arguments)).count(" sin ")
+
+
+class Angle(eqx.Module, Keeper):
+    x: jax.Array
+
+    @kept
+    def sine(self):
+        return jnp.sin(self.x)
+
+
+def test_a_quantity_is_computed_once_in_a_trace():
+    assert counted(lambda x: (lambda angle: angle.sine + angle.sine)(Angle(x)), 0.3) == 1
+    assert counted(lambda x: Angle(x).sine + Angle(x).sine, 0.3) == 2
+
+
+def test_quantities_of_branches_loops_and_derivatives_stay_there():
+    def program(x):
+        angle = Angle(x)
+        branch = lax.cond(x > 0, lambda: angle.sine, lambda: 2 * angle.sine)
+        loop = lax.fori_loop(0, 2, lambda _, y: y + angle.sine, 0.0)
+        slope = jax.grad(lambda y: y * angle.sine)(x)
+        lanes = jax.vmap(lambda y: y * angle.sine)(jnp.ones(2))
+        return branch + loop + slope + jnp.sum(lanes) + angle.sine
+
+    for of in (program, jax.jit(program), lambda x: jax.vmap(program)(x[None])[0]):
+        np.testing.assert_allclose(of(jnp.array(0.3)), 7 * np.sin(0.3), rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(program)(0.3), 7 * np.cos(0.3), rtol=1e-6)
+
+
+def test_a_copy_keeps_nothing():
+    at = four_bar()
+    force = at.force
+    assert at.force is force
+    assert jax.tree.map(lambda x: x, at).force is not force
+    assert jax.tree.structure(at) == jax.tree.structure(four_bar())
+
+
+def test_what_the_equation_has():
+    at = four_bar()
+    system, (t, q, u) = at.system, (at.t, at.q, at.u)
+    residual = system.acceleration_residual(t, q, u, u)
+    np.testing.assert_allclose(at.jacobian @ u - residual, at.gamma, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(at.rates, system.rates(t, q, u))
+    udot = jnp.ones_like(u)
+    assert at.motion(udot).u is udot and at.motion(udot).z is None
+    assert at.position_rows.size == at.velocity_rows.size == system.acceleration_rows
