@@ -11,7 +11,7 @@ from ..system.structures import of_structure
 from .joint_coordinates import joint_coordinates, joint_measures
 from .motion import body_measures, body_motion, frame_measures, scalar_measures
 from .picture import picture
-from .reactions import JointPlaces, applied_wrenches, places, reaction_measures, reactions
+from .reactions import applied_wrenches, joint_places, places, reaction_measures, reactions
 
 
 class SceneCatalogue(Catalogue):
@@ -45,7 +45,7 @@ class SceneCatalogue(Catalogue):
         return self.constraint_names()
 
     def reaction(self, name, ts, ys, multipliers):
-        return reactions(self.system, JointPlaces.of(self.system.constraints, name), ts, ys, multipliers)
+        return reactions(self.system, joint_places(self.system.constraints, name), ts, ys, multipliers)
 
     def force_names(self):
         groups = (*self.system.forces.groups, *self.system.constraints.nonideal)

@@ -75,21 +75,6 @@ class ConstraintSet(eqx.Module):
         ]
         return [*((g.group.body_index[:, -1], g.group.part.inertia) for g in self.inertial), *modes]
 
-    @property
-    def rows(self) -> tuple[tuple[str, int], ...]:
-        """Name and number within its part of every row of A."""
-        return tuple((name, k) for g in self.groups for name in g.group.names for k in range(g.rows))
-
-    @property
-    def linear(self) -> bool:
-        """Whether the rows are linear in velocities up to a constant term."""
-        return all(g.group.part.linear for g in self.velocity)
-
-    @property
-    def drift_free(self) -> bool:
-        """Whether that term is zero."""
-        return not any(g.rheonomic for g in self.position) and all(g.homogeneous for g in self.velocity)
-
     def prepared(self) -> "ConstraintSet":
         """The same, with the rows of elementary joints together."""
         elements = elementary_rows(self.position, self.layout.ground)
@@ -127,21 +112,13 @@ class ConstraintSet(eqx.Module):
 
     # Jacobians
 
-    def blocks(
-        self, now: Kinematics, groups: Sequence[AbstractConstraintGroup] | None = None
-    ) -> Float[Array, "entries"]:
-        """Derivatives with respect to the velocities of the bodies of each row, group by group, followed by a zero; by
-        default of all groups.
-        """
-        groups = self.groups if groups is None else groups
+    def blocks(self, now: Kinematics, groups: Sequence[AbstractConstraintGroup]) -> Float[Array, "entries"]:
+        """Derivatives with respect to the velocities of the bodies of each row, group by group, followed by a zero."""
         pieces = self._pieces(groups, lambda elements: elements.jacobian(now.poses), lambda g: g.jacobian(now))
         return joined([*pieces, jnp.zeros(1, now.poses.dtype)], now.poses.dtype)
 
-    def jacobian(
-        self, now: Kinematics, groups: Sequence[AbstractConstraintGroup] | None = None
-    ) -> Float[Array, "rows nu"]:
-        """The rows of A of some groups, by default of all."""
-        groups = self.groups if groups is None else groups
+    def jacobian(self, now: Kinematics, groups: Sequence[AbstractConstraintGroup]) -> Float[Array, "rows nu"]:
+        """The rows of A of some groups."""
         return self._assembled(self.blocks(now, groups), groups, of_poses=False)
 
     def jacobian_of_poses(

@@ -40,22 +40,16 @@ def _place(number: int, member: int, group: Group) -> Place:
     return Place(number, np.array(member), last, tuple(layout.is_place(bodies).tolist()))
 
 
-class JointPlaces(NamedTuple):
+def joint_places(constraints: ConstraintSet, name: str) -> tuple[tuple[Place, ...], tuple[Place, ...]]:
     """Where the constraints of a joint stand among all constraints, and its dry friction among all dry friction."""
-
-    constraints: tuple[Place, ...]
-    frictions: tuple[Place, ...]
-
-    @classmethod
-    def of(cls, constraints: ConstraintSet, name: str) -> "JointPlaces":
-        return cls(places(constraints.groups, name), places(constraints.frictions, name))
+    return places(constraints.groups, name), places(constraints.frictions, name)
 
 
 def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
     """The forces and moments of joints."""
     d = system.layout.space.dimension
     fields = {"force": (d,), "moment": () if d == 2 else (3,)}
-    found = {name: JointPlaces.of(system.constraints, name) for name in names}
+    found = {name: joint_places(system.constraints, name) for name in names}
     return {
         f"{name}.{field}": Measure(shape, _field_of_reaction, (field, joint), of_forces=True)
         for name, joint in found.items()
@@ -70,17 +64,18 @@ def _field_of_reaction(system, place, ts, ys, solved):
 
 
 @view_of_motion
-def reactions(system: Any, place: JointPlaces, ts: Any, ys: State, multipliers: Any) -> Reaction:
-    """Reactions of a joint along a motion, from the multipliers of the rows of all joints."""
+def reactions(system: Any, place: Any, ts: Any, ys: State, multipliers: Any) -> Reaction:
+    """Reactions of a joint along a motion, from the multipliers of the rows of all joints; `place`: `joint_places`."""
+    of_constraints, of_frictions = place
 
     def single(t, y, multipliers):
         now = system.kinematics(t, y.q, y.u)
-        out = _reaction(system.constraints, place.constraints, now, multipliers)
-        slips = [system.constraints.frictions[at.group].law for at in place.frictions]
+        out = _reaction(system.constraints, of_constraints, now, multipliers)
+        slips = [system.constraints.frictions[at.group].law for at in of_frictions]
         if not slips:
             return out
         wrenches = system.constraints.nonideal_wrenches(slips, now, multipliers)
-        return _with_slip(out, slips, place.frictions, now, wrenches)
+        return _with_slip(out, slips, of_frictions, now, wrenches)
 
     return jax.vmap(single)(ts, ys, multipliers)
 

@@ -125,7 +125,7 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def rows(self):
-        return self.constraints.rows
+        return tuple((name, k) for g in self.constraints.groups for name in g.group.names for k in range(g.rows))
 
     # Bodies
 
@@ -251,7 +251,7 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def jacobian(self, t, q, u):
-        return self.constraints.jacobian(self.kinematics(t, q, u))
+        return self.constraints.jacobian(self.kinematics(t, q, u), self.constraints.groups)
 
     def structured_jacobian(self, t, q, u):
         if self.elimination is None:
@@ -260,7 +260,7 @@ class RigidBodySystem(AbstractSystem):
 
     def block_jacobian(self, t: Scalar, q: Coordinates, u: Velocities, order: JointOrder) -> BlockJacobian:
         """`A` in blocks of joints on bodies."""
-        return block_jacobian(self.constraints.blocks(self.kinematics(t, q, u)), order)
+        return block_jacobian(self.constraints.blocks(self.kinematics(t, q, u), self.constraints.groups), order)
 
     @eqx.filter_jit
     def constraint_force(self, t, q, u, multipliers):
@@ -269,11 +269,12 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def linear(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.constraints.linear
+        return all(g.group.part.linear for g in self.constraints.velocity)
 
     @property
     def drift_free(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.constraints.drift_free
+        groups = self.constraints
+        return not any(g.rheonomic for g in groups.position) and all(g.homogeneous for g in groups.velocity)
 
     @property
     def ideal(self) -> bool:

@@ -1,8 +1,8 @@
 """The motions, quantities and forces of a system by name."""
 
+import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,9 @@ from .quantities import Measure, Reaction, entries_along, view_of_motion
 from .structures import of_structure
 
 
-class Catalogue(eqx.Module):
+# No module, whose methods take many times as long to be called.
+@dataclasses.dataclass(frozen=True)
+class Catalogue:
     """Motions, quantities and forces by name, along a motion with time as axis 0: `ts` of shape (times,), `ys` a
     `State`, `multipliers` of shape (times, rows).
 

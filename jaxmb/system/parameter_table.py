@@ -1,5 +1,6 @@
 """The numbers of a system by name: where they stand, their ranges, and which are functions of time."""
 
+import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
@@ -17,7 +18,9 @@ from .structures import of_structure
 ParameterPath = tuple[Callable[[Any], Array], int | None]
 
 
-class ParameterTable(eqx.Module):
+# No module, whose methods take many times as long to be called.
+@dataclasses.dataclass(frozen=True)
+class ParameterTable:
     """The parameters of a system, `parameter_paths`, as numbers in a range and as functions of time."""
 
     system: Any

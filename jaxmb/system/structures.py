@@ -22,14 +22,14 @@ def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], d
     """
 
     @functools.lru_cache(_MOST)
-    def found(structure, leaves):
+    def found(kind, structure, leaves):
         zeros = lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape) if isinstance(x, jax.ShapeDtypeStruct) else x
-        return function(jax.tree.unflatten(structure, map(zeros, leaves)))
+        return function(kind(jax.tree.unflatten(structure, map(zeros, leaves))))
 
     @functools.wraps(function)
     def called(of: Any) -> dict[str, Any]:
-        (leaves, structure), batch = jax.tree.flatten(of), of.system.length.ndim
+        (leaves, structure), batch = jax.tree.flatten(of.system), of.system.length.ndim
         shapes = (jax.ShapeDtypeStruct(x.shape[batch:], x.dtype) if isinstance(x, ARRAYS) else x for x in leaves)
-        return dict(found(structure, tuple(shapes)))
+        return dict(found(type(of), structure, tuple(shapes)))
 
     return called
