@@ -135,7 +135,7 @@ def correct_positions(at: Instant, split: ChartIndices) -> Instant:
 def acceleration(at: Instant, formulation: AbstractFormulation, split: ChartIndices) -> ConstrainedAcceleration:
     """Accelerations at coordinates on the manifold or near it.
 
-    **Arguments:** `at`: independent velocities exact, dependent ones a guess; `split`: without its matrix.
+    **Arguments:** `at`: independent velocities exact, dependent ones a guess.
     """
     return _acceleration(at, formulation, split)
 
