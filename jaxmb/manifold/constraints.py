@@ -16,10 +16,11 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
-from ..formulations.laws import laws_of
+from ..formulations.laws import Memory, laws_of
 from ..linalg.pushed import dense, push
 from ..system.instant import Instant
 
@@ -114,50 +115,33 @@ def restore(at: Instant, near: SolvedState, tol: Scalar) -> RestoredState:
     close by at the same time; `tol`: size of the corrections that are left out, relative to the system's size, its
     speed and its accelerations.
     """
-    return _restore(at, near, tol)
+    # The factor of the other state solves the equations, but only that of this state differentiates them.
+    return implicitly(near.constraints.at, at, near.constraints.restore(*lax.stop_gradient((at, near, tol))))
+
+
+def solved(linearise: Linearise, at: Instant, udot: Float[Array, "nu"], memory: Memory = None) -> RestoredState:
+    """A state on the constraints with its accelerations, all known, with the derivatives that `restore` gives them."""
+    return implicitly(linearise, at, RestoredState(at.q, at.u, udot, memory))
 
 
 @eqx.filter_custom_jvp
-def _restore(at, near, tol):
-    return near.constraints.restore(at, near, tol)
+def implicitly(linearise: Linearise, at: Instant, found: RestoredState) -> RestoredState:
+    """A state that satisfies the constraints and the equations of motion, with the derivatives that these give it.
+
+    **Arguments:** `at`: the instant that it was restored from; `found`: the state, whose derivatives do not count.
+    """
+    del linearise, at
+    return found
 
 
-@_restore.def_jvp
-def _restore_jvp(primals, tangents):
-    at, near, tol = primals
-    out = restore(at, near, tol)
-    # The factor of the other state solves the equations, but only that of this state differentiates them.
-    return out, _push_solution(near.constraints.at, at, tangents[0], out)
-
-
-def _push_solution(linearise: Linearise, at: Instant, along: Instant, out: RestoredState):
-    """The tangent of a restored state, from that of the instant before it was restored."""
-    along, at = dense_along(along, at), at.with_(q=out.q, u=out.u)
+@implicitly.def_jvp
+def _implicitly_jvp(primals, tangents):
+    linearise, at, _ = primals
+    out = implicitly(*primals)
+    along, at = dense_along(tangents[1], at), at.with_(q=out.q, u=out.u)
     here = linearise(at)
     along = _on_constraints(here, at, along)
-    return RestoredState(along.q, along.u, *push_accelerations(here, at, along, out))
-
-
-@eqx.filter_custom_jvp
-def solved(
-    linearise: Linearise,
-    at: Instant,
-    udot: Float[Array, "nu"],
-    multipliers: Float[Array, "m"] | Float[Array, "k"] | None = None,
-) -> RestoredState:
-    """A state on the constraints with its accelerations, all known, with the derivatives that `restore` gives them.
-
-    **Arguments:** `multipliers`: as in `RestoredState`.
-    """
-    del linearise
-    return RestoredState(at.q, at.u, udot, multipliers)
-
-
-@solved.def_jvp
-def _solved_jvp(primals, tangents):
-    linearise, at, *_ = primals
-    out = solved(*primals)
-    return out, _push_solution(linearise, at, tangents[1], out)
+    return out, RestoredState(along.q, along.u, *push_accelerations(here, at, along, out))
 
 
 def rates_along(

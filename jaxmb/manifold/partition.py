@@ -136,7 +136,7 @@ def correct_positions(at: Instant, split: ChartIndices) -> Instant:
 def acceleration(at: Instant, formulation: AbstractFormulation, split: ChartIndices) -> ConstrainedAcceleration:
     """Accelerations at coordinates on the manifold or near it.
 
-    **Arguments:** `at`: independent velocities exact, dependent ones a guess; `split`: without its matrix.
+    **Arguments:** `at`: independent velocities exact, dependent ones a guess.
     """
     return _acceleration(at, formulation, split)
 
@@ -473,9 +473,9 @@ class PartitionTerm(AbstractConstrainedTerm):
         choose = lambda at: _choose(at, _of_coordinates(at))
         split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, at))
         redundant = RedundantRows(at.row_sizes(), jnp.zeros((), y.q.dtype)) if drops_rows(self.system) else None
-        frictions = self.system.friction_rows.size
-        multipliers = jnp.zeros((2, frictions), y.q.dtype) if frictions else None
-        return Chart(split, jnp.full_like(quality, jnp.inf), quality, jnp.zeros(5, int), redundant, multipliers)
+        memory = laws_of(self.system).remembered(at, jnp.zeros(self.system.acceleration_rows, y.q.dtype))
+        unknown, none = jnp.full_like(quality, jnp.inf), jnp.zeros(5, int)
+        return Chart(split, unknown, quality, none, redundant, _both(memory, memory))
 
     def evaluate(self, t, y, chart, args):
         return self._evaluate(correct_positions(self.at(t, y), lax.stop_gradient(chart.split)), chart)

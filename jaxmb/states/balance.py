@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.jitted import on_host
 from ..system import AbstractSystem
+from ..system.instant import Instant
 
 # The change of a coordinate, imaginary, by which derivatives are found.
 _IMAGINARY = 1e-30
@@ -39,18 +40,22 @@ class Balance(eqx.Module):
     def rest(self) -> Float[Array, "nu"]:
         return jnp.zeros(self.system.nu, self.system.guess.q.dtype)
 
+    def at(self, q: Array) -> Instant:
+        """The system at rest."""
+        return Instant(self.system, self.t, q, self.rest)
+
     def moved(self, q, z):
         """The configuration after a small displacement."""
-        return self.system.normalize(q + self.system.rates(self.t, q, self.system.velocity_scale() * z))
+        return self.system.normalize(q + self.at(q).with_(u=self.system.velocity_scale() * z).rates)
 
     def applied(self, q):
         """The applied forces."""
-        return self.system.velocity_scale() * self.system.force(self.t, q, self.rest)
+        return self.system.velocity_scale() * self.at(q).force
 
     def of_rows(self, q, multipliers):
         """The forces of the rows."""
         rows = self.system.velocity_rows
-        force = self.system.constraint_force(self.t, q, self.rest, multipliers[:rows])
+        force = self.at(q).constraint_force(multipliers[:rows])
         if self.held:
             force += jax.vjp(lambda u: self._held_rates(q, u), self.rest)[1](multipliers[rows:])[0]
         return self.system.velocity_scale() * force
@@ -73,19 +78,18 @@ class Balance(eqx.Module):
     def jacobian(self, q):
         """Derivatives of the rows with respect to displacements."""
         held = jax.jacfwd(lambda u: self._held_rates(q, u))(self.rest)
-        rows = jnp.concatenate([self.system.velocity_jacobian(self.t, q, self.rest), held])
+        rows = jnp.concatenate([self.at(q).velocity_jacobian, held])
         return rows * self.system.velocity_scale()[None, :]
 
     def residual(self, q, jacobian, z):
         """Residuals of the rows; those of velocity constraints depend on the displacement alone."""
         constraints = slice(self.system.position_rows, self.system.velocity_rows)
         rolled = jacobian[constraints] @ z
-        return jnp.concatenate(
-            [self.system.position_residual(self.t, q), rolled, q[np.array(self.held, int)] - self.values]
-        )
+        held = q[np.array(self.held, int)] - self.values
+        return jnp.concatenate([self.at(q).position_residual, rolled, held])
 
     def _held_rates(self, q, u):
-        return self.system.rates(self.t, q, u)[np.array(self.held, int)]
+        return self.at(q).with_(u=u).rates[np.array(self.held, int)]
 
 
 @on_host
