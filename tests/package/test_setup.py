@@ -1,4 +1,4 @@
-"""The settings of JAX, how programs are compiled, and kept on disk, in processes of their own: JAX has one a process."""
+"""The settings of JAX, how programs are compiled, and kept on disk, in processes of their own."""
 
 import ast
 import os
