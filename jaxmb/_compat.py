@@ -103,8 +103,9 @@ def computes_on_processors() -> bool:
 
     (jax.config.jax_platforms; the module jax_plugins and the entry points of that name, and libtpu, 0.9 to 0.12.)
     """
-    if jax.config.jax_platforms:
-        return jax.config.jax_platforms.split(",")[0] == "cpu"
+    platforms = getattr(jax.config, "jax_platforms", None)
+    if platforms:
+        return platforms.split(",")[0] == "cpu"
     if importlib.util.find_spec("libtpu") or metadata.entry_points(group="jax_plugins"):
         return False
     plugins = importlib.util.find_spec("jax_plugins")
