@@ -11,12 +11,8 @@ from . import (
     trajectory as trajectory,
 )
 from ._faulty_versions import warn_of_jaxlib as _warn_of_jaxlib
-from ._programs import (
-    compile_quickly as compile_quickly,
-    keep_compiled as keep_compiled,
-    run_quickly as run_quickly,
-)
 from ._results import RESULTS as RESULTS
+from ._setup import setup as setup
 from ._types import State as State
 from ._version import __version__ as __version__
 from .bodies import RigidBodySystem as RigidBodySystem
@@ -117,6 +113,12 @@ else:
         "studies.optimise": "Optimum optimise optimize robust",
         "studies.sweep": "cases load_sweep sweep",
     }
+    # Names of the last release.
+    _RENAMED = {
+        "compile_quickly": "jaxmb.setup()",
+        "run_quickly": 'jaxmb.setup(compile="for speed")',
+        "keep_compiled": "jaxmb.setup(keep=folder)",
+    }
     _SOURCES = {name: source for source, names in _NAMES.items() for name in names.split()}
     # Modules that Python puts here when it imports them, and which are no part of the interface.
     _INNER = {"TYPE_CHECKING", "bodies", "contacts", "linalg", "states"}
@@ -131,6 +133,8 @@ else:
             return importlib.import_module(f".{name}", __name__)
         if name in _SOURCES:
             return globals().setdefault(name, getattr(importlib.import_module(f".{_SOURCES[name]}", __name__), name))
+        if name in _RENAMED:
+            raise AttributeError(f"jaxmb.{name} is {_RENAMED[name]} now.", name=name, obj=sys.modules[__name__])
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
     def __dir__() -> list[str]:

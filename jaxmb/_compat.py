@@ -5,8 +5,13 @@ test of each, which says what is missing when an update takes it away.
 """
 
 import functools
+import importlib.util
+import mmap
+import pkgutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from importlib import metadata
+from pathlib import Path
 from typing import Any, TypeVar
 
 import diffrax
@@ -14,6 +19,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 from diffrax._integrate import SaveState
 from diffrax._term import AdjointTerm, WrapTerm
@@ -99,6 +105,36 @@ def has_started() -> bool:
     return xla_bridge.backends_are_initialized()
 
 
+def computes_on_processors() -> bool:
+    """Whether JAX computes on processors by default, as far as this is known before it starts: a platform is named, or
+    nothing for an accelerator is installed.
+
+    (jax.config.jax_platforms; the module jax_plugins and the entry points of that name, and libtpu, 0.9 to 0.12.)
+    """
+    platforms = getattr(jax.config, "jax_platforms", None)
+    if platforms:
+        return platforms.split(",")[0] == "cpu"
+    if importlib.util.find_spec("libtpu") or metadata.entry_points(group="jax_plugins"):
+        return False
+    plugins = importlib.util.find_spec("jax_plugins")
+    return plugins is None or not list(pkgutil.iter_modules(plugins.submodule_search_locations))
+
+
+@functools.cache
+def takes_option(name: str) -> bool:
+    """Whether this XLA takes an option in `XLA_FLAGS`; an option that it does not know ends the process.
+
+    (Names of options are strings in the libraries of jaxlib, which end with a zero; jaxlib 0.9 to 0.12.)
+    """
+    libraries = Path(jaxlib.__file__).parent.glob("*jax_common*")
+    return any(_holds(path, b"\0" + name.encode() + b"\0") for path in libraries)
+
+
+def _holds(path: Path, text: bytes) -> bool:
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as library:
+        return library.find(text) >= 0
+
+
 def keep_programs_as(store: type[CacheInterface]) -> None:
     """Let JAX make such a store of the folder that it keeps compiled programs in, as `store(path, max_size=bytes)`.
 
@@ -170,6 +206,16 @@ def define_linear(
     ad.deflinear2(own, lambda c, a, **static: [transpose(c, a.aval.shape, **static)])
     batching.primitive_batchers[own] = batched
     return functools.partial(own.bind, lead=0)
+
+
+def let_go(primitive: Primitive, rule: Callable[[list[bool], Any], tuple[list[bool], Any]]) -> None:
+    """Let JAX leave out the results of an operation that nothing uses, by `rule(used results, equation)`, which returns
+    the operands that are used and the new equation.
+
+    (jax.interpreters.partial_eval.dce_rules, 0.7 to 0.12; from 0.12 on a rule takes the operands that are used
+    elsewhere before the equation.)
+    """
+    partial_eval.dce_rules[primitive] = lambda used, *more: rule(used, more[-1])
 
 
 def used_inputs(function: Callable[[Any], Any], x: Any) -> Any:

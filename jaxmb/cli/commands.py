@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import jax
 
 from .. import mechanisms
-from .._programs import VARIABLE, compile_quickly, keep_compiled
+from .._setup import VARIABLE, setup
 from .._traced_functions import is_of_user
 from . import doctor, help, report, run, sweep
 
@@ -67,8 +67,7 @@ def _prepare() -> None:
     """Compile quickly, and keep what is compiled."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        compile_quickly()
-        keep_compiled()
+        setup()
     for warning in caught:
         print(f"jaxmb: {warning.message}", file=sys.stderr)
 

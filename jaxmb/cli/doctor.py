@@ -21,8 +21,8 @@ import jax
 from .. import mechanisms
 from .._faulty_versions import fault_of
 from .._machine import cores, limit_of_threads
-from .._programs import VARIABLE, kept_in
 from .._results import RESULTS
+from .._setup import VARIABLE, kept_in
 from .._version import __version__
 from ..report.table import aligned
 from ..report.timing import interleaved
@@ -49,9 +49,7 @@ import diffrax, jax
 done()
 import jaxmb as mb
 done()
-jax.config.update("jax_enable_x64", True)
-mb.compile_quickly()
-mb.keep_compiled()
+mb.setup()
 stop = mb.Stop("stop", "slide.displacement", lower=0.3, restitution=0.5)
 machines = [
     ("four_bar", "coupler", [], None),
@@ -128,7 +126,7 @@ def _facts() -> Iterable[tuple[str, str]]:
         yield "wrong numbers", "; ".join(faults)
     devices = Counter((device.platform, device.device_kind) for device in jax.devices())
     yield "devices", ", ".join(f"{count} {name} ({kind})" for (name, kind), count in devices.items())
-    yield "double precision", "on in commands; in Python by jax.config.update('jax_enable_x64', True)"
+    yield "double precision", "on in commands; in Python by jaxmb.setup()"
     yield "kept programs", _kept()
 
 

@@ -25,7 +25,7 @@ _OF_PACKAGE = {
     "Scenes and their numbers": "Scene RigidBodySystem State parameters with_parameters modules with_inputs "
     "design Variable",
     "States and motions": "assemble assembly_gap equilibrium simulate batch Trajectory ContactEvents Event load "
-    "RESULTS compile_quickly run_quickly keep_compiled UnknownNameError",
+    "RESULTS setup UnknownNameError",
     "Forces and drives of both spaces": "Gravity Motor Actuator Controller Servo Series Tendon FixedTendon "
     "JointSpring JointForce JointStop JointFriction DryFriction JointDriver JointInertia JointCoupling",
     "Unilateral constraints": "Stop RigidContact RigidBallContact RigidPlaneContact RigidBoxContact Slack",

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._compat import Primitive, ShapedArray, Zero, ad, batching, mlir, partial_eval
+from .._compat import Primitive, ShapedArray, Zero, ad, batching, let_go, mlir
 
 _SECOND_REVERSE = (
     "A derivative of a motion is differentiated in forward mode only: take jax.hessian, or jax.jacfwd of jax.grad, "
@@ -204,4 +204,4 @@ mlir.register_lowering(_linear_map, mlir.lower_fun(_evaluate, multiple_results=T
 ad.primitive_jvps[_linear_map] = _push
 ad.primitive_transposes[_linear_map] = _transpose
 batching.primitive_batchers[_linear_map] = _batch
-partial_eval.dce_rules[_linear_map] = _without_unused
+let_go(_linear_map, _without_unused)

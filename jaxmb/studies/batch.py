@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from .._arguments import whole_number
 from .._compat import ClosedJaxpr, Jaxpr
-from .._programs import bytes_of_kernel_loops
+from .._setup import bytes_of_kernel_loops
 from .._traced_functions import NEED_NUMBERS
 from ..linalg.arrays import ARRAYS
 from ..linalg.members import in_blocks
@@ -47,8 +47,8 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     - `function`: of any arguments by position, pytrees of arrays, to a pytree of arrays; it is traced by JAX.
     - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
         which the numbers that the largest loop of the function carries from step to step stay in the cache of a core;
-        1 where that loop becomes one kernel, by `run_quickly`, which is as fast and waits for no other member; all
-        members, where it has no loop, and on other devices than a CPU.
+        1 where that loop becomes one kernel, by `setup(compile="for speed")`, which is as fast and waits for no other
+        member; all members, where it has no loop, and on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array, compiled at its first call,
     whose results have them there as well. Values that are no arrays, such as names, are the same for all members, and

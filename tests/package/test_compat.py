@@ -126,6 +126,21 @@ def test_whether_jax_has_started(compat):
     assert compat.has_started() is True, "jax._src.xla_bridge no longer tells whether there are backends"
 
 
+def test_options_that_xla_takes(compat):
+    assert compat.takes_option("xla_disable_hlo_passes"), "names of options no longer stand in the library of jaxlib"
+    assert not compat.takes_option("xla_no_option_of_this_name")
+
+
+def test_results_that_nothing_uses_are_let_go(compat):
+    twice, seen = compat.Primitive("twice"), []
+    twice.multiple_results = True
+    twice.def_abstract_eval(lambda x: [x, x])
+    compat.let_go(twice, lambda used, equation: (seen.append(list(used)), ([True], equation))[1])
+    traced = jax.make_jaxpr(lambda x: twice.bind(x)[0])(1.0).jaxpr
+    compat.partial_eval.dce_jaxpr(traced, [True])
+    assert seen == [[True, False]], "jax.interpreters.partial_eval.dce_rules changed their arguments"
+
+
 def test_jax_makes_the_store_of_programs_that_it_is_told(compat, monkeypatch, tmp_path):
     of_jax = importlib.import_module("jax._src.compilation_cache")
     monkeypatch.setattr(of_jax, "LRUCache", of_jax.LRUCache)

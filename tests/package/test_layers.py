@@ -17,7 +17,7 @@ LAYERS = [
         "_kept_programs",
         "_machine",
         "_printed",
-        "_programs",
+        "_setup",
         "_types",
         "_results",
         "_version",

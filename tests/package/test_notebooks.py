@@ -34,8 +34,7 @@ def test_lint(path):
     notebook = nbformat.read(path, as_version=4)
     assert notebook.cells[0].cell_type == "markdown" and notebook.cells[0].source.startswith("# ")
     first = next(cell.source for cell in notebook.cells if cell.cell_type == "code").splitlines()
-    prepared = ["mb.compile_quickly()", "mb.keep_compiled()", 'jax.config.update("jax_enable_x64", True)']
-    assert first[-3:] == prepared
+    assert first[-1] == "mb.setup()"
     assert notebook.metadata.kernelspec.name == "python3"
     for cell in notebook.cells:
         texts = [cell.source]

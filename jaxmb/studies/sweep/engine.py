@@ -15,7 +15,7 @@ import numpy as np
 
 from ..._compat import processes_of
 from ..._machine import cores, limit_of_threads
-from ..._programs import SETTINGS
+from ..._setup import SETTINGS
 from .batch import Batch
 from .dataset import packages
 from .outputs import statuses

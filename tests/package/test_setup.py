@@ -1,4 +1,4 @@
-"""How programs are compiled, and kept on disk, in processes of their own, since JAX has one folder a process."""
+"""The settings of JAX, how programs are compiled, and kept on disk, in processes of their own."""
 
 import ast
 import os
@@ -12,7 +12,8 @@ import pytest
 from compiling import QUICKLY
 
 import jaxmb as mb
-from jaxmb import _programs
+from jaxmb import _setup
+from jaxmb._compat import computes_on_processors, takes_option
 
 # Counts of the programs that JAX asked for, and of those that it found.
 COUNTING = """
@@ -21,6 +22,7 @@ counts = collections.Counter()
 jax.monitoring.register_event_listener(lambda event, **_: counts.update([event.rsplit("/", 1)[-1]]))
 import jax.numpy as jnp, jaxmb as mb
 jax.config.update("jax_enable_x64", True)
+KEEP = dict(compile=None)
 """
 REPORT = """
 print(dict(asked=counts["compile_requests_use_cache"], found=counts["cache_hits"], kept=counts["cache_misses"]))
@@ -39,10 +41,10 @@ def process(code, **environment):
 @pytest.fixture
 def new_user(monkeypatch, tmp_path):
     """The home of somebody who has told JAX nothing; nothing is compiled meanwhile."""
-    names = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", *_programs.SETTINGS)
+    names = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", *_setup.SETTINGS)
     before = {name: getattr(jax.config, name) for name in names}
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    for name in (_programs.VARIABLE, "XDG_CACHE_HOME"):
+    for name in (_setup.VARIABLE, "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     jax.config.update("jax_compilation_cache_dir", None)
     yield tmp_path / "home"
@@ -50,13 +52,12 @@ def new_user(monkeypatch, tmp_path):
         jax.config.update(name, value)
 
 
-def kept(*arguments, **options):
-    """Where programs are kept after a call, as JAX was told; and JAX forgets it."""
-    folder = mb.keep_compiled(*arguments, **options)
-    told = jax.config.jax_compilation_cache_dir
-    assert str(folder) == str(told)
+def kept(folder=True, **options):
+    """Where programs are kept after a call; and JAX forgets it."""
+    mb.setup(compile=None, keep=folder, **options)
+    found = _setup.kept_in()
     jax.config.update("jax_compilation_cache_dir", None)
-    return folder
+    return found
 
 
 def options_of(code, flags=""):
@@ -64,10 +65,11 @@ def options_of(code, flags=""):
     return process(f'import os\n{code}\nprint(repr(os.environ["XLA_FLAGS"]))', XLA_FLAGS=flags)
 
 
-@pytest.mark.parametrize("name", ["compile_quickly", "run_quickly"])
-def test_options_of_the_compiler_are_set_before_jax_starts(name):
-    flags = getattr(_programs, f"_{name.upper()}")
-    code = f"mb.{name}()\nmb.{name}()\njnp.ones(3)\nmb.{name}()"
+@pytest.mark.parametrize("way", ["quickly", "for speed"])
+def test_options_of_the_compiler_are_set_before_jax_starts(way):
+    flags = {option: value for option, value in _setup._OPTIONS[way].items() if takes_option(option)}
+    call = f"mb.setup(compile={way!r}, keep=False)"
+    code = f"{call}\n{call}\njnp.ones(3)\n{call}"
     own, said = options_of(code)
     assert said == "" and set(own.split()) == {f"--{option}={value}" for option, value in flags.items()}
     # Those of the user stay.
@@ -80,14 +82,54 @@ def test_options_of_the_compiler_are_set_before_jax_starts(name):
 
 
 def test_the_last_way_to_compile_counts():
+    quickly, fast = "mb.setup(keep=False)", "mb.setup(compile='for speed', keep=False)"
     for code, last in (
-        ("mb.compile_quickly()\nmb.run_quickly()", "_RUN_QUICKLY"),
-        ("mb.run_quickly()\nmb.compile_quickly()", "_COMPILE_QUICKLY"),
+        (f"{quickly}\n{fast}", "for speed"),
+        (f"{fast}\n{quickly}", "quickly"),
+        (f"{fast}\nmb.setup(compile=None, keep=False)", None),
     ):
         own, said = options_of(code)
-        assert said == "" and own.split() == [f"--{name}={value}" for name, value in getattr(_programs, last).items()]
-    _, said = options_of("mb.compile_quickly()\njnp.ones(3)\nmb.run_quickly()")
+        flags = [f"--{name}={value}" for name, value in _setup._OPTIONS[last].items() if takes_option(name)]
+        assert said == "" and own.split() == flags
+    _, said = options_of(f"{quickly}\njnp.ones(3)\n{fast}")
     assert "JAX has computed something already" in said
+
+
+def test_options_that_xla_does_not_know_are_left_out():
+    code = """
+from jaxmb import _setup
+_setup._QUICKLY["xla_cpu_no_option_of_this_name"] = "true"
+mb.setup(keep=False)
+jnp.ones(3)
+"""
+    flags, said = options_of(code)
+    assert said == "" and "xla_disable_hlo_passes" in flags and "xla_cpu_no_option_of_this_name" not in flags
+
+
+@pytest.mark.parametrize("platforms, on_processors", [("cpu", True), ("cuda,cpu", False), (None, True)])
+def test_options_are_those_of_processors(platforms, on_processors, monkeypatch):
+    before = jax.config.jax_platforms
+    jax.config.update("jax_platforms", platforms)
+    try:
+        assert computes_on_processors() == on_processors
+    finally:
+        jax.config.update("jax_platforms", before)
+
+
+def test_what_is_asked_for_alone_is_set():
+    code = "mb.setup(x64=False, compile=None, keep=False)\nprint([float(jnp.pi), os.environ.get('XLA_FLAGS', '')])"
+    (pi, flags), said = process("import os\njax.config.update('jax_enable_x64', False)\n" + code, XLA_FLAGS="")
+    assert (pi, flags, said) == (np.pi, "", "")
+    code = "jax.config.update('jax_enable_x64', False)\nmb.setup(compile=None)\nprint(repr(str(jnp.ones(1).dtype)))"
+    assert process(code, JAXMB_CACHE="off") == ("float64", "")
+    with pytest.raises(ValueError, match='compile must be "quickly", "for speed" or None, got \'fast\''):
+        mb.setup(compile="fast")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("name", ["compile_quickly", "run_quickly", "keep_compiled"])
+def test_names_of_the_last_release_tell_the_new_one(name):
+    with pytest.raises(AttributeError, match=rf"jaxmb\.{name} is jaxmb\.setup\(.* now"):
+        getattr(mb, name)
 
 
 @pytest.mark.always
@@ -107,14 +149,16 @@ for function in (angle, jax.grad(angle)):
     found.append([rest.count(" while("), start.count(" while("), program(machine.state.u).tolist()])
 print(found)
 """
-    plain, quick = (process(call + code, XLA_FLAGS="")[0] for call in ("", "mb.run_quickly()\n"))
+    plain, quick = (
+        process(call + code, XLA_FLAGS="")[0] for call in ("", "mb.setup(compile='for speed', keep=False)\n")
+    )
     for one, other in zip(plain, quick, strict=True):
         assert one[1] > 0 == other[1] and other[0] > 0
         np.testing.assert_allclose(other[2], one[2], rtol=1e-8, atol=1e-8)
 
 
 def test_python_looks_for_garbage_less_often():
-    code = "import gc\nbefore = gc.get_threshold()\nmb.compile_quickly()\nprint([before, gc.get_threshold()])"
+    code = "import gc\nbefore = gc.get_threshold()\nmb.setup(keep=False)\nprint([before, gc.get_threshold()])"
     before, after = process(code)[0]
     assert after[0] > before[0] and after[1:] == before[1:]
     for first in (0, 10**6):
@@ -122,13 +166,13 @@ def test_python_looks_for_garbage_less_often():
 
 
 def test_what_is_compiled_quickly_is_kept(tmp_path):
-    code = "mb.compile_quickly()\nmb.keep_compiled()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
+    code = "mb.setup()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
     first, second = (process(code, JAXMB_CACHE=str(tmp_path), XLA_FLAGS="")[0] for _ in range(2))
     assert second == {"asked": first["asked"], "found": first["kept"], "kept": 0}
 
 
 def test_the_second_process_finds_what_the_first_compiled(tmp_path):
-    code = "mb.keep_compiled()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
+    code = "mb.setup(**KEEP)\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
     first, second = (process(code, JAXMB_CACHE=str(tmp_path))[0] for _ in range(2))
     assert first["kept"] == first["asked"] > 0 == first["found"]
     assert second == {"asked": first["asked"], "found": first["asked"], "kept": 0}
@@ -136,7 +180,7 @@ def test_the_second_process_finds_what_the_first_compiled(tmp_path):
 
 def test_a_motion_and_its_gradient_are_compiled_once(tmp_path):
     code = """
-mb.keep_compiled()
+mb.setup(**KEEP)
 machine = mb.mechanisms.get("pendulum")
 
 def height(mass):
@@ -155,7 +199,7 @@ print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts[
 @pytest.mark.long
 def test_programs_of_stiff_motions_are_found(tmp_path):
     code = """
-mb.keep_compiled()
+mb.setup(**KEEP)
 from jaxmb import planar
 body = planar.Body("bob", mass=1.0, inertia=1.0, position=(1.0, 0.0), angle=0.0)
 law = lambda poses, velocities, t, p: -p["stiffness"] * poses
@@ -175,7 +219,7 @@ print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts[
 
 
 def test_a_program_that_was_compiled_before_is_not_kept(tmp_path):
-    code = "f = jax.jit(lambda x: jnp.sin(x) + x)\nf(1.0)\nmb.keep_compiled()\nf(1.0)\nf(jnp.ones(3))" + REPORT
+    code = "f = jax.jit(lambda x: jnp.sin(x) + x)\nf(1.0)\nmb.setup(**KEEP)\nf(1.0)\nf(jnp.ones(3))" + REPORT
     found, _ = process(code, JAXMB_CACHE=str(tmp_path))
     assert 0 < found["kept"] < found["asked"]
 
@@ -217,21 +261,23 @@ def test_settings_of_jax_stay(new_user, tmp_path, monkeypatch):
     assert kept() is None and not (tmp_path / "not").exists()
     # From the environment, which JAX reads when it is imported.
     own = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "of_jax"), "JAXMB_CACHE": str(tmp_path / "not")}
-    assert process("print(repr(str(mb.keep_compiled())))", **own)[0] == str(tmp_path / "of_jax")
+    assert process("mb.setup(**KEEP)\nprint(repr(jax.config.jax_compilation_cache_dir))", **own)[0] == str(
+        tmp_path / "of_jax"
+    )
 
 
 def test_the_size_is_bounded(tmp_path):
-    code = "mb.keep_compiled(max_bytes=20_000)\nfor n in range(2, 20): jnp.cumsum(jnp.ones(n)).block_until_ready()"
+    code = "mb.setup(**KEEP, max_bytes=20_000)\nfor n in range(2, 20): jnp.cumsum(jnp.ones(n)).block_until_ready()"
     counts, _ = process(code + REPORT, JAXMB_CACHE=str(tmp_path))
     sizes = [path.stat().st_size for path in tmp_path.glob("*-cache")]
     assert sum(sizes) <= 20_000 and 0 < len(sizes) < counts["kept"]
     with pytest.raises(ValueError, match="max_bytes must be positive, got 0"):
-        mb.keep_compiled(max_bytes=0)
+        mb.setup(max_bytes=0)
 
 
 def test_no_process_waits_for_another_one(tmp_path):
     """While another process of JAX holds its lock of the folder: nothing is said, and all is kept."""
-    code = "mb.keep_compiled()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
+    code = "mb.setup(**KEEP)\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
     with filelock.FileLock(tmp_path / ".lockfile"):
         first, second = (process(code, JAXMB_CACHE=str(tmp_path)) for _ in range(2))
     assert not any("compilation cache" in said for _, said in (first, second))

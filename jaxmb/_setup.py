@@ -1,0 +1,178 @@
+"""JAX at the head of a script: its precision, how programs are compiled, and that they are kept on disk."""
+
+import gc
+import os
+import re
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+
+from ._compat import computes_on_processors, has_started, keep_programs_as, takes_option
+from ._kept_programs import KeptPrograms
+
+# What XLA is told to compile quickly: one kernel of a simulation is a few numbers, for which its older way to emit
+# loops gives code that is as fast and compiles in half the time; the passes pay for themselves in large arrays only. A
+# loop that reads and writes less than 64 KiB in a turn, such as an elimination, becomes one kernel; it is long for
+# LLVM, which at its highest level unrolls it, for nothing.
+_PASSES = (
+    "while-loop-invariant-code-motion",
+    "while-loop-constant-sinking",
+    "reshape-mover",
+    "tree_reduction_rewriter",
+    "simplify-sorts",
+    "simplify-conditional",
+)
+_KERNEL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
+_QUICKLY = {
+    "xla_cpu_use_fusion_emitters": "false",
+    "xla_backend_optimization_level": "2",
+    "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**16}",
+    "xla_disable_hlo_passes": ",".join(_PASSES),
+}
+# For speed the loop over steps becomes one kernel too, unless it contains what XLA leaves to a library, as it
+# does products of matrices by one of these passes. Calling a hundred kernels takes most of the time of a step. In large
+# arrays it takes none of it, and what is too long takes LLVM minutes: no loops of more than 1 MiB.
+_FOR_SPEED = _QUICKLY | {
+    "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**20}",
+    "xla_disable_hlo_passes": ",".join((*_PASSES, "dot-library-rewriter")),
+}
+_OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, None: {}}
+# Python looks for garbage after so many more new objects than have gone. A program is traced into a million of them,
+# among which there is little, and the search takes a sixth of that time when it comes after 700, as by default.
+_NEW_OBJECTS = 50_000
+# The folder in place of that which a program names, or `off`.
+VARIABLE = "JAXMB_CACHE"
+MAX_BYTES = 2**27
+# What JAX is told besides the folder: to keep every program, as hundreds of small ones take seconds together too.
+SETTINGS = {
+    "jax_compilation_cache_max_size": MAX_BYTES,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+
+
+def setup(
+    *,
+    x64: bool = True,
+    compile: Literal["quickly", "for speed"] | None = "quickly",
+    keep: bool | str | os.PathLike[str] = True,
+    max_bytes: int = MAX_BYTES,
+) -> None:
+    """Prepare JAX: double precision, short waits for programs, and programs that later processes find.
+
+    ```python
+    import jaxmb
+
+    jaxmb.setup()  # At the head of a script or notebook, before anything is computed.
+    ```
+
+    It changes settings of JAX for the whole process. Importing jaxmb changes none; the command line calls this, but for
+    reports. `jaxmb help setup` has more.
+
+    **Arguments:**
+
+    - `x64`: whether JAX computes in double precision; False leaves its precision as it is.
+    - `compile`: `"quickly"` lets programs compile in about six tenths of the time, `"for speed"` lets those of small
+        machines run in a third to three quarters of it. Results differ in rounding. Both are options of XLA for
+        processors, in the environment variable `XLA_FLAGS`; those that are set there already stay. None sets none,
+        and where JAX has an accelerator none are set.
+    - `keep`: whether compiled programs are kept on disk, for this and later processes; or the folder to keep them in,
+        by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME`, in `~/.cache`, on macOS
+        `~/Library/Caches`, on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes its place:
+        another folder, or `off`. Where JAX has a folder already, that stays, with its settings.
+    - `max_bytes`: size of the folder beyond which programs that have not been used for longest are dropped [bytes].
+
+    **Raises:** a `ValueError` for other values. `UserWarning`s tell of a folder that cannot be written to, and of JAX
+    that has computed something already, after which options of XLA have no effect.
+    """
+    if compile not in _OPTIONS:
+        raise ValueError(f'compile must be "quickly", "for speed" or None, got {compile!r}.')
+    if not max_bytes > 0:
+        raise ValueError(f"max_bytes must be positive, got {max_bytes}.")
+    if x64:
+        jax.config.update("jax_enable_x64", True)
+    _tell(_OPTIONS[compile] if computes_on_processors() else {})
+    if keep is not False:
+        _keep_programs(None if keep is True else keep, max_bytes)
+
+
+# What this module has set in XLA_FLAGS.
+_told: dict[str, str] = {}
+
+
+def _tell(flags: dict[str, str]) -> None:
+    first, *others = gc.get_threshold()
+    # Zero switches the search off.
+    if flags and 0 < first < _NEW_OBJECTS:
+        gc.set_threshold(_NEW_OBJECTS, *others)
+    given = os.environ.get("XLA_FLAGS", "").split()
+    kept = [flag for flag in given if flag not in {f"--{name}={value}" for name, value in _told.items()}]
+    names = [name for name in flags if takes_option(name) and not any(flag.startswith(f"--{name}") for flag in kept)]
+    told = [f"--{name}={flags[name]}" for name in names]
+    if set(given) == {*kept, *told}:
+        return
+    if has_started():
+        warnings.warn(
+            "JAX has computed something already, so this makes no difference to how programs compile: call "
+            "jaxmb.setup() at the head of the script or notebook.",
+            stacklevel=3,
+        )
+        return
+    _told.clear()
+    _told.update({name: flags[name] for name in names})
+    os.environ["XLA_FLAGS"] = " ".join([*kept, *told])
+
+
+def bytes_of_kernel_loops() -> int:
+    """The bytes in a turn below which XLA was told to make a loop one kernel; zero where it was not told."""
+    found = re.search(rf"{_KERNEL_LOOPS}=(\d+)", os.environ.get("XLA_FLAGS", ""))
+    return int(found[1]) if found else 0
+
+
+def _keep_programs(folder: str | os.PathLike[str] | None, max_bytes: int) -> None:
+    """Keep compiled programs on disk, by JAX's persistent compilation cache; any number of processes share the folder,
+    and none waits for another one.
+    """
+    told = os.environ.get(VARIABLE)
+    if kept_in() is not None or not _setting("jax_enable_compilation_cache") or told == "off":
+        return
+    chosen = told or folder
+    try:
+        path = _default_folder() if chosen is None else Path(chosen).expanduser().absolute()
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except (OSError, RuntimeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        warnings.warn(
+            f"compiled programs are not kept: {chosen or 'the cache folder'} cannot be written to ({reason}); "
+            f"{VARIABLE} names another folder, or is off.",
+            stacklevel=3,
+        )
+        return
+    for name, value in (SETTINGS | {"jax_compilation_cache_max_size": max_bytes}).items():
+        jax.config.update(name, value)
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    keep_programs_as(KeptPrograms)
+
+
+def kept_in() -> Path | None:
+    """The folder that compiled programs are kept in; None if they are not."""
+    folder = _setting("jax_compilation_cache_dir")
+    return Path(folder) if folder and _setting("jax_enable_compilation_cache") else None
+
+
+def _setting(name: str) -> Any:
+    return getattr(jax.config, name)
+
+
+def _default_folder() -> Path:
+    """That of this package among the user's caches."""
+    above = os.environ.get("XDG_CACHE_HOME") or (sys.platform == "win32" and os.environ.get("LOCALAPPDATA"))
+    if above:
+        return Path(above) / "jaxmb"
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "jaxmb"
