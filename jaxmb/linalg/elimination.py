@@ -80,6 +80,24 @@ class Factor(eqx.Module):
     null_space: Float[Array, "n f"]
     rows: Int[Array, "r"] | None
 
+    def for_matrix(self, matrix: Float[Array, "m n"]) -> "Factor":
+        """The same numbers with the derivatives of the factor of a matrix, of the same value in the same split."""
+        return _for_matrix(self, matrix)
+
+
+@eqx.filter_custom_jvp
+def _for_matrix(factor, matrix):
+    del matrix
+    return factor
+
+
+@_for_matrix.def_jvp
+def _for_matrix_jvp(primals, tangents):
+    factor, change = _for_matrix(*primals), tangents[1]
+    change = jnp.zeros_like(primals[1]) if change is None else change
+    pushed = factor.right_inverse @ change
+    return factor, Factor(-(pushed @ factor.right_inverse), -(pushed @ factor.null_space), None)
+
 
 def full_pivot(
     A: Float[Array, "m n"],

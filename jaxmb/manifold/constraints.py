@@ -140,8 +140,9 @@ def _implicitly_jvp(primals, tangents):
     out = implicitly(*primals)
     along, at = dense_along(tangents[1], at), at.with_(q=out.q, u=out.u)
     here = linearise(at)
-    along = _on_constraints(here, at, along)
-    return out, RestoredState(along.q, along.u, *push_accelerations(here, at, along, out))
+    along, multipliers = _on_constraints(here, at, along), here.multipliers(at, out)
+    residuals = push(lambda at: _equations(at, out.udot, multipliers), (at,), (along,))
+    return out, RestoredState(along.q, along.u, *here.cancel_residuals(at, multipliers, *residuals))
 
 
 def rates_along(
@@ -211,22 +212,9 @@ def _equations(at, udot, multipliers):
 
 def _on_constraints(here, at, along):
     """The tangent of an instant with coordinates and velocities on the constraints."""
-    return push_velocities(here, at, along.with_(q=here.push_positions(at, along)))
-
-
-def push_velocities(here: AbstractConstraints, at: Instant, along: Instant) -> Instant:
-    """The tangent of an instant with that of velocities on the constraints."""
+    along = along.with_(q=here.push_positions(at, along))
     rows = push(lambda at: at.velocity_residual, (at,), (along,))
     return along.with_(u=along.u + here.cancel_velocities(rows))
-
-
-def push_accelerations(
-    here: AbstractConstraints, at: Instant, along: Instant, out: RestoredState
-) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
-    """The tangents of the accelerations, and of the multipliers that friction depends on."""
-    multipliers = here.multipliers(at, out)
-    residuals = push(lambda at: _equations(at, out.udot, multipliers), (at,), (along,))
-    return here.cancel_residuals(at, multipliers, *residuals)
 
 
 def dense_along(along: Instant, at: Instant) -> Instant:

@@ -5,7 +5,7 @@ the one elimination of the step. `ChartConstraints` take the corrected state, ke
 velocities, solve `Φ = 0` and `ψ = 0` for the dependent ones, and find the accelerations there by one Newton correction
 of those of the prediction: it needs no Jacobian and no elimination, and costs a fifth. Where no state nearby has been
 evaluated, `restore_positions` is followed by `acceleration`. Its derivatives are those of the equations at their
-solution; the factors that these need are differentiated with them, so higher derivatives are right.
+solution, and the factors that these need have the derivatives of their matrices, so higher derivatives are right.
 
 Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikravesh and I. S. Chung, J. Mech. Design
 104(4), 1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
@@ -42,9 +42,8 @@ from .constraints import (
     RestoredState,
     SolvedState,
     dense_along,
+    implicitly,
     push,
-    push_accelerations,
-    push_velocities,
     restore,
 )
 from .diagnosis import diagnose
@@ -102,8 +101,8 @@ class ConstrainedAcceleration(eqx.Module):
     """Velocities on the manifold of their coordinates, and accelerations.
 
     **Fields:** `u`, `udot`; the `factor` of the velocities' Jacobian; that of `every` row of A, None where none binds
-    accelerations only; the `memory` of the system's laws; whether these `failed` to determine the accelerations, None
-    in tangents.
+    accelerations only; the `memory` of the system's laws; whether these `failed` to determine the accelerations. The
+    factors are without derivatives.
     """
 
     u: Velocities
@@ -111,7 +110,7 @@ class ConstrainedAcceleration(eqx.Module):
     factor: Factor
     every: Factor | None
     memory: Memory
-    failed: Bool[Array, ""] | None = None
+    failed: Bool[Array, ""]
 
 
 def shares_split(system: AbstractEquation) -> bool:
@@ -131,17 +130,19 @@ def correct_positions(at: Instant, split: ChartIndices) -> Instant:
     return at.with_(q=at.q - split.right_inverse @ at.coordinate_residual)
 
 
-# A function with a derivative rule is wrapped in a compiled one, so that it is traced once for all its places.
+# Wrapped in a compiled function, so that it is traced once for all its places.
 @eqx.filter_jit
 def acceleration(at: Instant, formulation: AbstractFormulation, split: ChartIndices) -> ConstrainedAcceleration:
     """Accelerations at coordinates on the manifold or near it.
 
     **Arguments:** `at`: independent velocities exact, dependent ones a guess.
     """
-    return _acceleration(at, formulation, split)
+    out = _acceleration(*lax.stop_gradient((at, formulation, split)))
+    linearise = eqx.Partial(_at_coordinates, split, out.factor, out.every)
+    found = implicitly(linearise, at, RestoredState(at.q, out.u, out.udot, out.memory))
+    return ConstrainedAcceleration(found.u, found.udot, out.factor, out.every, found.multipliers, out.failed)
 
 
-@eqx.filter_custom_jvp
 def _acceleration(at, formulation, split):
     system, before = at.system, at
     factor = eliminate(at.jacobian[: system.velocity_rows], split.velocity, system.velocity_rank)
@@ -158,25 +159,14 @@ def _acceleration(at, formulation, split):
     return ConstrainedAcceleration(at.u, udot, factor, every, laws.remembered(at, multipliers), failed)
 
 
-@_acceleration.def_jvp
-def _acceleration_jvp(primals, tangents):
-    at, formulation, split = primals
-    out = acceleration(at, formulation, split)
-    along, at = dense_along(tangents[0], at), at.with_(u=out.u)
-    # The factors are those of these velocities where the Jacobian does not depend on them.
-    here = ChartConstraints(out.factor, split, out.every) if at.system.linear else _chart_constraints(split, at)
-    along = push_velocities(here, at, along)
-    dudot, dmemory = push_accelerations(here, at, along, RestoredState(at.q, out.u, out.udot, out.memory))
-    change = push(lambda at: at.jacobian, (at,), (along,))
-    dfactor = _pushed(here.factor, change[: at.system.velocity_rows])
-    devery = None if here.every is None else _pushed(here.every, change)
-    return out, ConstrainedAcceleration(along.u, dudot, dfactor, devery, dmemory)
-
-
-def _pushed(factor: Factor, change: Float[Array, "m n"]) -> Factor:
-    """The tangent of the factor of a matrix."""
-    pushed = factor.right_inverse @ change
-    return Factor(-(pushed @ factor.right_inverse), -(pushed @ factor.null_space), None)
+def _at_coordinates(split, factor, every, at):
+    """The constraints of velocities and accelerations at coordinates as they are, by the factors of `acceleration`."""
+    if not at.system.linear:
+        # Those are of other velocities, on which the Jacobian depends.
+        here = _chart_constraints(split, at)
+        factor, every = here.factor, here.every
+    factor = factor.for_matrix(at.jacobian[: at.system.velocity_rows])
+    return ChartConstraints(factor, None, None if every is None else every.for_matrix(at.jacobian))
 
 
 @eqx.filter_custom_jvp
@@ -239,12 +229,13 @@ def _chart_constraints(split, at):
 class ChartConstraints(AbstractConstraints):
     """The constraints in a chart: independent coordinates and velocities keep their values.
 
-    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`; the factor of `every` row of A, None
-    where none binds accelerations only; whether the split's matrix is known to be `outdated`.
+    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`, None where coordinates stay as they
+    are; the factor of `every` row of A, None where none binds accelerations only; whether the split's matrix is known
+    to be `outdated`.
     """
 
     factor: Factor
-    split: ChartIndices
+    split: ChartIndices | None
     every: Factor | None = None
     outdated: Bool[Array, ""] | bool = False
 
@@ -280,7 +271,7 @@ class ChartConstraints(AbstractConstraints):
         return at.inertia.product(solution.udot) - laws_of(at.system).applied(at, solution.multipliers)
 
     def push_positions(self, at, along):
-        if at.system.coordinate_rank == 0:
+        if self.split is None or at.system.coordinate_rank == 0:
             return along.q
         factor = self.factor if self.split.coordinate is None else coordinate_factor(at, self.split)
         return _push_positions(factor, at, along)
