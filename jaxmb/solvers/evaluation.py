@@ -211,8 +211,9 @@ def controlled_components(term: Any, chart: Chart | None) -> Array | None:
 
 def _raveled(term, out: ManifoldEvaluation, dtype):
     chart, factors = freeze((out.chart, out.factors))
-    f = ravel(out.f, dtype) * jnp.asarray(direction_of(term)).astype(dtype)
-    return Evaluation(ravel(out.y, dtype), f, chart, out.failed, out._replace(chart=chart, factors=factors))
+    out, sign = out._replace(chart=chart, factors=factors), jnp.asarray(direction_of(term))
+    f = jax.tree.map(lambda x: x * sign.astype(jnp.result_type(x)), out.f)
+    return Evaluation(ravel(out.y, dtype), ravel(f, dtype), chart, out.failed, out)
 
 
 def _manifold(term: Any) -> AbstractManifoldTerm:

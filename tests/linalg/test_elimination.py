@@ -183,3 +183,22 @@ def test_solve_has_derivatives_of_every_order():
 
 def test_solve_with_a_singular_matrix_is_not_finite():
     assert not np.any(np.isfinite(solve(np.array([[1.0, 2.0], [2.0, 4.0]]), np.ones(2))))
+
+
+def test_a_factor_has_the_derivatives_of_a_matrix():
+    """Also the second ones, although its numbers have none."""
+    rng = np.random.default_rng(3)
+    A, along = (jnp.asarray(rng.normal(size=(3, 5))) for _ in range(2))
+    order = full_pivot(A).order
+    known = eliminate(A, order, 3)
+
+    def derivatives(of):
+        matrices = lambda s: jax.tree.leaves((of(A + s * along).right_inverse, of(A + s * along).null_space))
+        return matrices(0.0), jax.jacfwd(matrices)(0.0), jax.jacfwd(jax.jacfwd(matrices))(0.0)
+
+    found, expected = jax.jit(lambda: (derivatives(known.for_matrix), derivatives(lambda A: eliminate(A, order, 3))))()
+    # The numbers stay those of the matrix at which they were found.
+    for one, other in zip(jax.tree.leaves(found[1]), jax.tree.leaves(expected[1]), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
+    for one, other in zip(jax.tree.leaves(found[2]), jax.tree.leaves(expected[2]), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-11)
