@@ -71,7 +71,7 @@ def setup(
     ```
 
     It changes settings of JAX for the whole process. Importing jaxmb changes none; the command line calls this, but for
-    reports. `jaxmb help setup` has more.
+    reports. `jaxmb help compiling` has more.
 
     **Arguments:**
 
