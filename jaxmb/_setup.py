@@ -33,8 +33,8 @@ _QUICKLY = {
     "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**16}",
     "xla_disable_hlo_passes": ",".join(_PASSES),
 }
-# For speed the loop over steps becomes one kernel too, unless it contains what XLA leaves to a library, as it
-# does products of matrices by one of these passes. Calling a hundred kernels takes most of the time of a step. In large
+# For speed the loop over steps becomes one kernel too, unless it contains what XLA leaves to a library, as it does
+# products of matrices by one of these passes. Calling a hundred kernels takes most of the time of a step. In large
 # arrays it takes none of it, and what is too long takes LLVM minutes: no loops of more than 1 MiB.
 _FOR_SPEED = _QUICKLY | {
     "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**20}",
@@ -91,10 +91,14 @@ def setup(
     """
     if compile not in _OPTIONS:
         raise ValueError(f'compile must be "quickly", "for speed" or None, got {compile!r}.')
+    if not isinstance(keep, bool | str | os.PathLike):
+        raise ValueError(f"keep must be True, False or the folder to keep compiled programs in, got {keep!r}.")
     if not max_bytes > 0:
         raise ValueError(f"max_bytes must be positive, got {max_bytes}.")
     if x64:
         jax.config.update("jax_enable_x64", True)
+    if compile is not None:
+        _look_for_garbage_less_often()
     _tell(_OPTIONS[compile] if computes_on_processors() else {})
     if keep is not False:
         _keep_programs(None if keep is True else keep, max_bytes)
@@ -104,11 +108,15 @@ def setup(
 _told: dict[str, str] = {}
 
 
-def _tell(flags: dict[str, str]) -> None:
+def _look_for_garbage_less_often() -> None:
     first, *others = gc.get_threshold()
     # Zero switches the search off.
-    if flags and 0 < first < _NEW_OBJECTS:
+    if 0 < first < _NEW_OBJECTS:
         gc.set_threshold(_NEW_OBJECTS, *others)
+
+
+def _tell(flags: dict[str, str]) -> None:
+    """Set options of XLA, in place of those that this module has set before."""
     given = os.environ.get("XLA_FLAGS", "").split()
     kept = [flag for flag in given if flag not in {f"--{name}={value}" for name, value in _told.items()}]
     names = [name for name in flags if takes_option(name) and not any(flag.startswith(f"--{name}") for flag in kept)]

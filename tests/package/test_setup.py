@@ -124,6 +124,9 @@ def test_what_is_asked_for_alone_is_set():
     assert process(code, JAXMB_CACHE="off") == ("float64", "")
     with pytest.raises(ValueError, match='compile must be "quickly", "for speed" or None, got \'fast\''):
         mb.setup(compile="fast")  # pyright: ignore[reportArgumentType]
+    for keep in (None, 3):
+        with pytest.raises(ValueError, match=f"keep must be True, False or the folder .* got {keep}"):
+            mb.setup(keep=keep)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("name", ["compile_quickly", "run_quickly", "keep_compiled"])
