@@ -11,8 +11,9 @@ Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikrav
 104(4), 1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
 """
 
+import abc
 import dataclasses
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -30,29 +31,30 @@ from ..formulations.formulation import check_mass, row_levels
 from ..formulations.friction import solve_coupled
 from ..formulations.laws import Memory, laws_of
 from ..formulations.partitioned import reduced_accelerations
-from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot, positive_solver
+from ..linalg.elimination import Factor, eliminate, full_pivot, positive_solver
 from ..linalg.jacobian import DenseJacobian
-from ..linalg.newton import chord
 from ..linalg.sums import unchecked_take
-from ..solvers import AbstractMultistep
+from ..solvers import AbstractMultistep, ManifoldEvaluation
 from ..system import AbstractEquation
 from ..system.instant import Instant, drops_rows
 from .constraints import (
     AbstractConstraints,
     RestoredState,
     SolvedState,
-    dense_along,
     implicitly,
-    push,
     restore,
 )
 from .diagnosis import diagnose
 from .manifold import AbstractManifold, newton_tolerance
 from .orthogonal_projection import project_normalized
+from .split import AbstractSplit, Independent, kind_of_split, quality_of, restore_positions
 from .term import AbstractConstrainedTerm
 
-# Largest number of Newton iterations for positions.
-_MAX_ITERATIONS = 12
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
 # A stored position factor is refreshed after this many steps, or when Newton's method takes this many iterations.
 _AGE = 4
 _SLOW = 3
@@ -77,26 +79,6 @@ _NEARER = 8.0
 _ALLOWED = 8.0
 
 
-class ChartIndices(eqx.Module):
-    """A chart's index sets, and the matrix that restores positions.
-
-    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `acceleration`: that of all rows of A,
-    None where no row binds accelerations only; `coordinate`: that of the coordinates' Jacobian, None where one order
-    serves both; `right_inverse` (nq × coordinate rows): that of the coordinates' Jacobian, from a state of this step or
-    of an earlier one.
-    """
-
-    velocity: PivotOrder
-    acceleration: PivotOrder | None
-    coordinate: PivotOrder | None
-    right_inverse: Float[Array, "nq mq"]
-
-    @property
-    def of_coordinates(self) -> PivotOrder:
-        """The order of elimination of the coordinates' Jacobian."""
-        return self.velocity if self.coordinate is None else self.coordinate
-
-
 class ConstrainedAcceleration(eqx.Module):
     """Velocities on the manifold of their coordinates, and accelerations.
 
@@ -113,26 +95,9 @@ class ConstrainedAcceleration(eqx.Module):
     failed: Bool[Array, ""]
 
 
-def shares_split(system: AbstractEquation) -> bool:
-    """Whether one split serves coordinates and velocities: q̇ = u, and no nonholonomic rows."""
-    return system.rates_are_velocities and system.velocity_rows == system.position_rows
-
-
-def coordinate_factor(at: Instant, split: ChartIndices) -> Factor:
-    """Factor of the coordinates' Jacobian in a chart."""
-    return eliminate(at.coordinate_jacobian, split.of_coordinates, at.system.coordinate_rank)
-
-
-def correct_positions(at: Instant, split: ChartIndices) -> Instant:
-    """Coordinates nearer to the manifold, by one modified-Newton correction with the stored matrix."""
-    if at.system.coordinate_rank == 0:
-        return at
-    return at.with_(q=at.q - split.right_inverse @ at.coordinate_residual)
-
-
 # Wrapped in a compiled function, so that it is traced once for all its places.
 @eqx.filter_jit
-def acceleration(at: Instant, formulation: AbstractFormulation, split: ChartIndices) -> ConstrainedAcceleration:
+def acceleration(at: Instant, formulation: AbstractFormulation, split: AbstractSplit) -> ConstrainedAcceleration:
     """Accelerations at coordinates on the manifold or near it.
 
     **Arguments:** `at`: independent velocities exact, dependent ones a guess.
@@ -166,56 +131,8 @@ def _at_coordinates(split, factor, every, at):
         here = _chart_constraints(split, at)
         factor, every = here.factor, here.every
     factor = factor.for_matrix(at.jacobian[: at.system.velocity_rows])
-    return ChartConstraints(factor, None, None if every is None else every.for_matrix(at.jacobian))
-
-
-@eqx.filter_custom_jvp
-def restore_positions(
-    at: Instant, split: ChartIndices, outdated: Bool[Array, ""], tol: float
-) -> tuple[Float[Array, "nq"], Int[Array, ""] | None, Bool[Array, ""] | None]:
-    """Solve `Φ = 0` for the dependent coordinates by Newton with a fixed matrix: `(q, iterations, failed)`.
-
-    **Arguments:** `outdated`: whether the stored matrix is known to be of no use here.
-    """
-    if at.system.coordinate_rank == 0:
-        return at.q, jnp.array(0), jnp.array(False)
-    if split.coordinate is None:
-        # Velocities and coordinates share their factor: it is of this time, and wrong by the first correction only.
-        return _newton(at, split.right_inverse, 1.0, tol)
-    # Of an older one nothing is known.
-    found = _newton(at, split.right_inverse, 0.0, tol)
-
-    def with_own_factor(found):
-        corrected, iterations, failed = _newton(at, coordinate_factor(at, split).right_inverse, 1.0, tol)
-        return corrected, found[1] + iterations, failed
-
-    return cond_of_lanes(found[2] | outdated, with_own_factor, lambda found: found, found)
-
-
-def _newton(at, right_inverse, first, tol):
-    scale = at.system.coordinate_scale()
-
-    def correct(q):
-        step = right_inverse @ at.with_(q=q).coordinate_residual
-        return q - step, jnp.max(jnp.abs(step) / scale)
-
-    return chord(correct, at.q, first=jnp.full((), first, at.q.dtype), tol=tol, most=_MAX_ITERATIONS, peel=True)
-
-
-@restore_positions.def_jvp
-def _restore_positions_jvp(primals, tangents):
-    at, split, outdated, tol = primals
-    out = restore_positions(at, split, outdated, tol)
-    along, at = dense_along(tangents[0], at), at.with_(q=out[0])
-    dq = along.q
-    if at.system.coordinate_rank > 0:
-        dq = _push_positions(coordinate_factor(at, split), at, along)
-    return out, (dq, None, None)
-
-
-def _push_positions(factor, at, along):
-    """Tangent of the coordinates on the manifold, from their factor there."""
-    return along.q - factor.right_inverse @ push(lambda at: at.coordinate_residual, (at,), (along,))
+    coordinates = Independent(split.velocity, split.acceleration)
+    return ChartConstraints(factor, coordinates, None if every is None else every.for_matrix(at.jacobian))
 
 
 def _chart_constraints(split, at):
@@ -229,13 +146,13 @@ def _chart_constraints(split, at):
 class ChartConstraints(AbstractConstraints):
     """The constraints in a chart: independent coordinates and velocities keep their values.
 
-    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`, None where coordinates stay as they
-    are; the factor of `every` row of A, None where none binds accelerations only; whether the split's matrix is known
-    to be `outdated`.
+    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`, `Independent` where coordinates stay
+    as they are; the factor of `every` row of A, None where none binds accelerations only; whether the split's matrix is
+    known to be `outdated`.
     """
 
     factor: Factor
-    split: ChartIndices | None
+    split: AbstractSplit
     every: Factor | None = None
     outdated: Bool[Array, ""] | bool = False
 
@@ -271,10 +188,7 @@ class ChartConstraints(AbstractConstraints):
         return at.inertia.product(solution.udot) - laws_of(at.system).applied(at, solution.multipliers)
 
     def push_positions(self, at, along):
-        if self.split is None or at.system.coordinate_rank == 0:
-            return along.q
-        factor = self.factor if self.split.coordinate is None else coordinate_factor(at, self.split)
-        return _push_positions(factor, at, along)
+        return self.split.push(at, along, self.factor)
 
     def cancel_velocities(self, residual):
         return -(self.factor.right_inverse @ residual)
@@ -358,7 +272,8 @@ class Partition(AbstractManifold):
             )
         check_mass(system, formulation)
         tolerances = newton_tolerance(self.newton_tol, rtol), self.contact_tolerance(system, rtol)
-        return PartitionTerm(system, formulation, self.max_influence, *tolerances), solver
+        term = PartitionTerm if system.acceleration_rows else FreeTerm
+        return term(system, formulation, self.max_influence, *tolerances), solver
 
     def default_formulation(self, system):
         return _PARTITIONED
@@ -401,7 +316,7 @@ class Chart(eqx.Module):
     any.
     """
 
-    split: ChartIndices
+    split: AbstractSplit
     quality: Float[Array, "k"]
     fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
@@ -445,23 +360,19 @@ class Chart(eqx.Module):
         return self.counters[4] > 0
 
 
-class PartitionTerm(AbstractConstrainedTerm):
-    """A constrained system as a term with charts; `at_contact`: what counts as zero there, None without contacts."""
+class AbstractChartTerm(AbstractConstrainedTerm):
+    """A system as a term with charts."""
 
     # The error is measured on all components: where dependent ones change fast, that of the independent ones alone
     # shows it too late. (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a
     # spatial slider-crank 3107 against 3867.)
 
-    system: AbstractEquation
-    formulation: AbstractFormulation
-    max_influence: float = eqx.field(static=True)
-    newton_tol: Float[Array, ""]
-    at_contact: ContactTolerance | None = None
+    max_influence: AbstractVar[float]
 
     def init_chart(self, t, y, args):
         # A chart of no use, so that charts are chosen in one place.
         at = lax.stop_gradient(self.at(t, y))
-        choose = lambda at: _choose(at, _of_coordinates(at))
+        choose = lambda at: _choose(at, at.coordinate_jacobian)
         split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, at))
         redundant = RedundantRows(at.row_sizes(), jnp.zeros((), y.q.dtype)) if drops_rows(self.system) else None
         memory = laws_of(self.system).remembered(at, jnp.zeros(self.system.acceleration_rows, y.q.dtype))
@@ -469,38 +380,13 @@ class PartitionTerm(AbstractConstrainedTerm):
         return Chart(split, unknown, quality, none, redundant, _both(memory, memory))
 
     def evaluate(self, t, y, chart, args):
-        return self._evaluate(correct_positions(self.at(t, y), lax.stop_gradient(chart.split)), chart)
-
-    def _evaluate(self, at, chart):
-        if self.system.acceleration_rows == 0:
-            return self.evaluated(at, at.inertia.solve(at.force), chart, chart.singular)
-        split = chart.split
-        out = acceleration(at, self.formulation, split)
-        quality = _velocity_quality(self.system, out.factor, split.velocity)
-        if split.coordinate is None:
-            split = ChartIndices(split.velocity, split.acceleration, None, out.factor.right_inverse)
-        chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=_both(out.memory, out.memory))
-        near = SolvedState(ChartConstraints(out.factor, split, out.every, chart.outdated), out.udot, out.memory)
-        return self.evaluated(at.with_(u=out.u), out.udot, chart, chart.singular | out.failed, near)
-
-    def project_near(self, t, y, linearized_at, args):
-        at, chart, near = self.at(t, y), linearized_at.chart, linearized_at.factors
-        if self.system.acceleration_rows == 0:
-            return self._project(at, chart, chart.split)
-        out: Any = restore(at, near, self.newton_tol)
-        memory = _both(near.multipliers, out.multipliers)
-        chart = dataclasses.replace(_counted(chart, out.iterations), multipliers=memory)
-        return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart, out.failed | chart.singular)
+        return self._evaluate(lax.stop_gradient(chart.split).correct(self.at(t, y)), chart)
 
     def project_cold(self, t, y, chart, args):
         if not (self.system.ideal_on_velocities and self.system.linear):
             return super().project_cold(t, y, chart, args)
-        at, split = self.at(t, y), chart.split
-        if split.coordinate is None:
-            # The chart's matrix is that of the state before the step.
-            right_inverse = coordinate_factor(lax.stop_gradient(at), split).right_inverse
-            split = eqx.tree_at(lambda s: s.right_inverse, split, right_inverse)
-        return self._project(at, chart, split)
+        at = self.at(t, y)
+        return self._project(at, chart, chart.split.at_guess(lax.stop_gradient(at)))
 
     def _project(self, at, chart, split):
         """Restore positions with the matrix of a split, then evaluate there."""
@@ -508,23 +394,19 @@ class PartitionTerm(AbstractConstrainedTerm):
         out = self._evaluate(at.with_(q=q), _counted(chart, iterations))
         return out._replace(failed=failed | out.failed)
 
+    @abc.abstractmethod
+    def _evaluate(self, at: Instant, chart: Chart) -> ManifoldEvaluation:
+        """The evaluation at coordinates near the constraints or on them."""
+
+    @abc.abstractmethod
+    def _kept(self, chart: Chart, k: int) -> Any:
+        """See `kept`, from the memory of the laws at the prediction of a step, 0, or at its end, 1."""
+
     def kept(self, chart):
         return self._kept(chart, 1)
 
     def kept_at_start(self, chart):
         return self._kept(chart, 0)
-
-    def _kept(self, chart, k):
-        if self.system.acceleration_rows == 0:
-            return chart
-        split = eqx.tree_at(lambda split: split.right_inverse, chart.split, None)
-        return split, jax.tree.map(lambda memories: memories[k], chart.multipliers)
-
-    def known(self, kept):
-        if self.system.acceleration_rows == 0:
-            return None
-        split, memory = kept
-        return eqx.Partial(_chart_constraints, split), memory
 
     def chart_after_jump(self, chart):
         if not self.system.contacts:
@@ -534,7 +416,7 @@ class PartitionTerm(AbstractConstrainedTerm):
 
     def free(self, chart):
         system, velocity = self.system, chart.split.velocity
-        coordinates = chart.split.of_coordinates.columns[system.coordinate_rank :]
+        coordinates = chart.split.independent(system)
         velocities = system.nq + velocity.columns[system.velocity_rank :]
         # Internal states are independent in every chart.
         states = system.nq + system.nu + jnp.arange(system.nz, dtype=velocities.dtype)
@@ -552,6 +434,61 @@ class PartitionTerm(AbstractConstrainedTerm):
     def refuses(self, chart, before):
         nearer = (chart.nearness > _NEARER * before.nearness) & (chart.charts == before.charts)
         return nearer if chart.redundant is None else nearer | (chart.redundant.violation > 1)
+
+
+class PartitionTerm(AbstractChartTerm):
+    """A constrained system; `at_contact`: what counts as zero there, None without contacts."""
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+    max_influence: float = eqx.field(static=True)
+    newton_tol: Float[Array, ""]
+    at_contact: ContactTolerance | None = None
+
+    def _evaluate(self, at, chart):
+        out = acceleration(at, self.formulation, chart.split)
+        split = chart.split.at_evaluation(out.factor)
+        quality = _velocity_quality(self.system, out.factor, split.velocity)
+        chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=_both(out.memory, out.memory))
+        near = SolvedState(ChartConstraints(out.factor, split, out.every, chart.outdated), out.udot, out.memory)
+        return self.evaluated(at.with_(u=out.u), out.udot, chart, chart.singular | out.failed, near)
+
+    def project_near(self, t, y, linearized_at, args):
+        at, chart, near = self.at(t, y), linearized_at.chart, linearized_at.factors
+        out: Any = restore(at, near, self.newton_tol)
+        memory = _both(near.multipliers, out.multipliers)
+        chart = dataclasses.replace(_counted(chart, out.iterations), multipliers=memory)
+        return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart, out.failed | chart.singular)
+
+    def _kept(self, chart, k):
+        return chart.split.orders(), jax.tree.map(lambda memories: memories[k], chart.multipliers)
+
+    def known(self, kept):
+        split, memory = kept
+        return eqx.Partial(_chart_constraints, split), memory
+
+
+class FreeTerm(AbstractChartTerm):
+    """A system without constraints, whose coordinates have invariants at most."""
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+    max_influence: float = eqx.field(static=True)
+    newton_tol: Float[Array, ""]
+    at_contact: ContactTolerance | None = None
+
+    def _evaluate(self, at, chart):
+        return self.evaluated(at, at.inertia.solve(at.force), chart, chart.singular)
+
+    def project_near(self, t, y, linearized_at, args):
+        chart = linearized_at.chart
+        return self._project(self.at(t, y), chart, chart.split)
+
+    def _kept(self, chart, k):
+        return chart
+
+    def known(self, kept):
+        return None
 
 
 def _both(first, second):
@@ -581,13 +518,13 @@ def _updated(at, chart, max_influence):
 
         return cond_of_lanes(worse(chart), renew, lambda chart: chart, chart)
 
-    if chart.split.coordinate is None or at.system.coordinate_rank == 0:
-        return renewed(chart, _of_coordinates(at))
+    if not chart.split.ages:
+        return renewed(chart, None)
     stale = worse(chart) | (chart.age >= _AGE) | (chart.iterations >= _SLOW) | chart.outdated
 
     def refresh(chart):
-        jacobian = _of_coordinates(at)
-        split, of_coordinates = _refreshed(at.system, jacobian, chart.split)
+        jacobian = at.coordinate_jacobian
+        split, of_coordinates = chart.split.refreshed(at.system, jacobian)
         quality = chart.quality.at[:-1].max(of_coordinates)
         # Only a chart that has been refreshed can be worse.
         fresh, counters = chart.fresh.at[-1].set(chart.nearness), chart.counters.at[0].set(0)
@@ -607,11 +544,6 @@ def _violation(at, sizes, newton_tol):
     return at.violation_of_dropped_rows(sizes) / allowed
 
 
-def _of_coordinates(at):
-    """The coordinates' Jacobian, where that of the velocities does not serve both."""
-    return None if shares_split(at.system) else at.coordinate_jacobian
-
-
 def _choose(at, of_coordinates):
     """A chart by full pivoting, its quality, and whether the rank is less than it was when the scene was compiled.
 
@@ -627,19 +559,9 @@ def _choose(at, of_coordinates):
     if system.acceleration_rows > rows:
         every = full_pivot(jacobian, scale=scale, level=levels)
         acceleration, singular = every.order, singular | (every.rank < system.acceleration_rank)
-    if shares_split(system):
-        return ChartIndices(velocity.order, acceleration, None, solved.right_inverse), quality, singular
-    pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
-    split = ChartIndices(velocity.order, acceleration, pivots.order, jnp.zeros(()))
-    split, own = _refreshed(system, of_coordinates, split)
-    return split, quality.at[:-1].max(own), singular | (pivots.rank < system.coordinate_rank)
-
-
-def _refreshed(system, jacobian, split):
-    """The split with the position factor of this state, from its Jacobian, and the coordinates' quality."""
-    solved = eliminate(jacobian, split.coordinate, system.coordinate_rank)
-    own = _quality(system, solved, system.coordinate_scale(), split.coordinate, system.coordinate_rank)
-    return ChartIndices(split.velocity, split.acceleration, split.coordinate, solved.right_inverse), own
+    orders = velocity.order, acceleration
+    split, quality, lost = kind_of_split(system).chosen(at, of_coordinates, orders, solved, quality)
+    return split, quality, singular | lost
 
 
 def _velocity_quality(system, solved, order):
@@ -647,13 +569,4 @@ def _velocity_quality(system, solved, order):
     solved, rank = lax.stop_gradient(solved), system.velocity_rank
     diagonal = solved.right_inverse.at[order.columns[:rank], order.rows[:rank]]
     nearness = jnp.max(jnp.abs(diagonal.get(mode="promise_in_bounds", wrap_negative_indices=False)), initial=0.0)
-    return jnp.append(_quality(system, solved, system.velocity_scale(), order, rank), nearness)
-
-
-def _quality(system, solved, scale, order, rank):
-    """That of the coordinates or velocities that it makes depend on others, in units of their scales."""
-    influence = jnp.abs(solved.null_space) * scale[order.columns[rank:]][None, :] / scale[:, None]
-    largest = [jnp.max(influence, initial=1.0)]
-    if system.velocity_rank < system.velocity_rows:
-        largest.append(jnp.max(jnp.abs(solved.right_inverse) / scale[:, None], initial=0.0))
-    return jnp.stack(largest)
+    return jnp.append(quality_of(system, solved, system.velocity_scale(), order, rank), nearness)

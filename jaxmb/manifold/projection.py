@@ -103,7 +103,8 @@ class Projection(AbstractManifold):
         tol = newton_tolerance(self.newton_tol, rtol)
         if self.newton_tol is None:
             tol = namespace(tol).minimum(tol, float(jnp.finfo(jnp.result_type(float)).eps) ** _LEFT_OUT)
-        return ProjectionTerm(system, formulation, tol, self.contact_tolerance(system, rtol)), solver
+        term = ProjectionTerm if system.velocity_rows else NormalisedTerm
+        return term(system, formulation, tol, self.contact_tolerance(system, rtol)), solver
 
     def correction(self, interpolated):
         return _returned if interpolated else None
@@ -159,9 +160,25 @@ def _check_multistep(system, formulation, solver):
         raise ValueError(f"Projection with {solver} takes constraints that are linear in velocities; use Partition().")
 
 
-class ProjectionTerm(AbstractConstrainedTerm):
-    """A constrained system whose states are projected in the metric of the mass matrix. Its chart is the number of
-    Newton iterations so far. `at_contact`: what counts as zero there, None without contacts.
+class AbstractProjectionTerm(AbstractConstrainedTerm):
+    """A system whose states are projected. Its chart is the number of Newton iterations so far."""
+
+    def init_chart(self, t, y, args):
+        return jnp.array(0)
+
+    def jacobian(self, t, y, args):
+        return self.system.field_jacobian(t, y)
+
+    def free(self, chart):
+        return None
+
+    def update_chart(self, t, y, chart, args):
+        return chart
+
+
+class ProjectionTerm(AbstractProjectionTerm):
+    """A constrained system, projected in the metric of the mass matrix; `at_contact`: what counts as zero there, None
+    without contacts.
     """
 
     system: AbstractEquation
@@ -169,18 +186,11 @@ class ProjectionTerm(AbstractConstrainedTerm):
     newton_tol: Float[Array, ""]
     at_contact: ContactTolerance | None = None
 
-    def init_chart(self, t, y, args):
-        return jnp.array(0)
-
     def evaluate(self, t, y, chart, args):
         at = self.at(t, y).normalized()
-        if self.system.velocity_rows == 0:
-            return ManifoldEvaluation(at.state, self.vf(t, at.state, args), chart, jnp.array(False))
         return self._solved(at, at.binding_velocities.projector(at.inertia), 0, False, chart)
 
     def project_near(self, t, y, linearized_at, args):
-        if self.system.velocity_rows == 0:
-            return self.evaluate(t, y, linearized_at.chart, args)
         at, near, chart = self.at(t, y), linearized_at.factors, linearized_at.chart
         if not self.system.ideal_on_velocities:
             found = project_in_metric(at, _inertia, near.constraints.projector, self.newton_tol)
@@ -189,8 +199,6 @@ class ProjectionTerm(AbstractConstrainedTerm):
         return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart + out.iterations, out.failed)
 
     def project_cold(self, t, y, chart, args):
-        if self.system.velocity_rows == 0:
-            return self.evaluate(t, y, chart, args)
         # The guess may be far from the constraints: accelerations are found with a factor of the state that is found.
         return self._solved(*project_in_metric(self.at(t, y), _inertia, None, self.newton_tol), chart)
 
@@ -205,16 +213,29 @@ class ProjectionTerm(AbstractConstrainedTerm):
         return self.evaluated(at, udot, chart + iterations, failed | undetermined, near)
 
     def known(self, kept):
-        return (projector_constraints, None) if self.system.velocity_rows and self.system.ideal_on_velocities else None
+        return (projector_constraints, None) if self.system.ideal_on_velocities else None
 
-    def jacobian(self, t, y, args):
-        return self.system.field_jacobian(t, y)
 
-    def free(self, chart):
+class NormalisedTerm(AbstractProjectionTerm):
+    """A system whose rows, if there are any, bind accelerations only: its coordinates are normalised."""
+
+    system: AbstractEquation
+    formulation: AbstractFormulation
+    newton_tol: Float[Array, ""]
+    at_contact: ContactTolerance | None = None
+
+    def evaluate(self, t, y, chart, args):
+        at = self.at(t, y).normalized()
+        return ManifoldEvaluation(at.state, self.vf(t, at.state, args), chart, jnp.array(False))
+
+    def project_near(self, t, y, linearized_at, args):
+        return self.evaluate(t, y, linearized_at.chart, args)
+
+    def project_cold(self, t, y, chart, args):
+        return self.evaluate(t, y, chart, args)
+
+    def known(self, kept):
         return None
-
-    def update_chart(self, t, y, chart, args):
-        return chart
 
 
 class ProjectedSolver(WrappedSolver):

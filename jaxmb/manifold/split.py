@@ -1,0 +1,265 @@
+"""How coordinates return to the position constraints in a chart, where some of them depend on the others.
+
+There are three kinds of splits: coordinates that share the split of the velocities, coordinates with another split, and
+coordinates that are all independent, without position constraints.
+"""
+
+import abc
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._compat import cond_of_lanes
+from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot
+from ..linalg.newton import chord
+from ..system import AbstractEquation
+from ..system.instant import Instant
+from .constraints import dense_along, push
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+# Largest number of Newton iterations for positions.
+_MAX_ITERATIONS = 12
+
+# Coordinates on the constraints, the number of Newton's iterations, and whether they failed.
+Restored = tuple[Float[Array, "nq"], Int[Array, ""] | None, Bool[Array, ""] | None]
+
+
+class AbstractSplit(eqx.Module):
+    """The index sets of a chart.
+
+    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `acceleration`: that of all rows of A,
+    None where no row binds accelerations only; `ages`: whether a stored matrix is that of an earlier state.
+    """
+
+    velocity: AbstractVar[PivotOrder]
+    acceleration: AbstractVar[PivotOrder | None]
+    ages: ClassVar[bool] = False
+
+    @classmethod
+    @abc.abstractmethod
+    def chosen(
+        cls,
+        at: Instant,
+        of_coordinates: Float[Array, "mq nq"] | None,
+        orders: tuple[PivotOrder, PivotOrder | None],
+        solved: Factor,
+        quality: Float[Array, "k"],
+    ) -> tuple[Self, Float[Array, "k"], Any]:
+        """The split with these orders of velocities and accelerations; the quality with that of the coordinates;
+        whether these have lost rank.
+
+        **Arguments:** the coordinates' Jacobian, None where no split ages; the factor of the velocities' Jacobian, and
+        its quality.
+        """
+
+    @abc.abstractmethod
+    def independent(self, system: AbstractEquation) -> Int[Array, "free"]:
+        """The independent coordinates."""
+
+    @abc.abstractmethod
+    def correct(self, at: Instant) -> Instant:
+        """Coordinates nearer to the constraints, by one correction with the stored matrix."""
+
+    @abc.abstractmethod
+    def restore(self, at: Instant, outdated: Any, tol: Any) -> Restored:
+        """See `restore_positions`."""
+
+    @abc.abstractmethod
+    def push(self, at: Instant, along: Instant, factor: Factor | None) -> Float[Array, "nq"]:
+        """The tangent of coordinates on the constraints, from that of coordinates that were restored there.
+
+        **Arguments:** the `factor` of the velocities' Jacobian, if it is known.
+        """
+
+    def at_evaluation(self, factor: Factor) -> Self:
+        """The split at a state, from the factor of the velocities' Jacobian there."""
+        del factor
+        return self
+
+    def at_guess(self, at: Instant) -> Self:
+        """The split at a state where nothing has been evaluated."""
+        del at
+        return self
+
+    def orders(self) -> Self:
+        """The orders of elimination alone."""
+        return self
+
+
+class Independent(AbstractSplit):
+    """The split of a system without position constraints and invariants."""
+
+    velocity: PivotOrder
+    acceleration: PivotOrder | None
+
+    @classmethod
+    def chosen(cls, at, of_coordinates, orders, solved, quality):
+        return cls(*orders), quality, False
+
+    def independent(self, system):
+        return jnp.arange(system.nq, dtype=self.velocity.packed.dtype)
+
+    def correct(self, at):
+        return at
+
+    def restore(self, at, outdated, tol):
+        return at.q, jnp.array(0), jnp.array(False)
+
+    def push(self, at, along, factor):
+        return along.q
+
+
+class Shared(AbstractSplit):
+    """The split of velocities, which is that of coordinates: q̇ = u, and no row binds velocities only.
+
+    **Fields:** `right_inverse`, that of the velocities' Jacobian at the last evaluation.
+    """
+
+    velocity: PivotOrder
+    acceleration: PivotOrder | None
+    right_inverse: Float[Array, "nq mq"]
+
+    @classmethod
+    def chosen(cls, at, of_coordinates, orders, solved, quality):
+        return cls(*orders, solved.right_inverse), quality, False
+
+    def independent(self, system):
+        return self.velocity.columns[system.coordinate_rank :]
+
+    def correct(self, at):
+        return at.with_(q=at.q - self.right_inverse @ at.coordinate_residual)
+
+    def restore(self, at, outdated, tol):
+        # The factor is of this time, and wrong by the first correction only.
+        return _newton(at, self.right_inverse, 1.0, tol)
+
+    def push(self, at, along, factor):
+        return _pushed(self._factor(at) if factor is None else factor, at, along)
+
+    def _factor(self, at):
+        return eliminate(at.coordinate_jacobian, self.velocity, at.system.coordinate_rank)
+
+    def at_evaluation(self, factor):
+        return Shared(self.velocity, self.acceleration, factor.right_inverse)
+
+    def at_guess(self, at):
+        # The stored matrix is that of the state before the step.
+        return self.at_evaluation(self._factor(at))
+
+    def orders(self):
+        return eqx.tree_at(lambda split: split.right_inverse, self, None)
+
+
+class Separate(AbstractSplit):
+    """The split of velocities, and beside it that of coordinates.
+
+    **Fields:** `coordinate`: order of elimination of the coordinates' Jacobian; `right_inverse` of that, at a state of
+    this step or of an earlier one.
+    """
+
+    velocity: PivotOrder
+    acceleration: PivotOrder | None
+    coordinate: PivotOrder
+    right_inverse: Float[Array, "nq mq"]
+    ages: ClassVar[bool] = True
+
+    @classmethod
+    def chosen(cls, at, of_coordinates, orders, solved, quality):
+        system = at.system
+        pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
+        split, own = cls(*orders, pivots.order, jnp.zeros(())).refreshed(system, of_coordinates)
+        return split, quality.at[:-1].max(own), pivots.rank < system.coordinate_rank
+
+    def independent(self, system):
+        return self.coordinate.columns[system.coordinate_rank :]
+
+    def correct(self, at):
+        return at.with_(q=at.q - self.right_inverse @ at.coordinate_residual)
+
+    def restore(self, at, outdated, tol):
+        # Of an older matrix nothing is known.
+        found = _newton(at, self.right_inverse, 0.0, tol)
+
+        def with_factor_of_this_state(found):
+            corrected, iterations, failed = _newton(at, self._factor(at).right_inverse, 1.0, tol)
+            return corrected, found[1] + iterations, failed
+
+        return cond_of_lanes(found[2] | outdated, with_factor_of_this_state, lambda found: found, found)
+
+    def push(self, at, along, factor):
+        del factor
+        return _pushed(self._factor(at), at, along)
+
+    def _factor(self, at):
+        return eliminate(at.coordinate_jacobian, self.coordinate, at.system.coordinate_rank)
+
+    def refreshed(
+        self, system: AbstractEquation, jacobian: Float[Array, "mq nq"]
+    ) -> tuple["Separate", Float[Array, "k"]]:
+        """The split with the matrix of a state, from the coordinates' Jacobian there, and the quality of that."""
+        solved = eliminate(jacobian, self.coordinate, system.coordinate_rank)
+        quality = quality_of(system, solved, system.coordinate_scale(), self.coordinate, system.coordinate_rank)
+        return dataclasses.replace(self, right_inverse=solved.right_inverse), quality
+
+    def orders(self):
+        return eqx.tree_at(lambda split: split.right_inverse, self, None)
+
+
+def kind_of_split(system: AbstractEquation) -> type[AbstractSplit]:
+    """The class of the splits of a system."""
+    if system.coordinate_rank == 0:
+        return Independent
+    shared = system.rates_are_velocities and system.velocity_rows == system.position_rows
+    return Shared if shared else Separate
+
+
+@eqx.filter_custom_jvp
+def restore_positions(at: Instant, split: AbstractSplit, outdated: Bool[Array, ""], tol: float) -> Restored:
+    """Solve `Φ = 0` for the dependent coordinates by Newton with a fixed matrix: `(q, iterations, failed)`.
+
+    **Arguments:** `outdated`: whether the stored matrix is known to be of no use here.
+    """
+    return split.restore(at, outdated, tol)
+
+
+@restore_positions.def_jvp
+def _restore_positions_jvp(primals, tangents):
+    at, split, *_ = primals
+    out = restore_positions(*primals)
+    along, at = dense_along(tangents[0], at), at.with_(q=out[0])
+    return out, (split.push(at, along, None), None, None)
+
+
+def _newton(at, right_inverse, first, tol):
+    scale = at.system.coordinate_scale()
+
+    def correct(q):
+        step = right_inverse @ at.with_(q=q).coordinate_residual
+        return q - step, jnp.max(jnp.abs(step) / scale)
+
+    return chord(correct, at.q, first=jnp.full((), first, at.q.dtype), tol=tol, most=_MAX_ITERATIONS, peel=True)
+
+
+def _pushed(factor, at, along):
+    """The tangent of coordinates on the constraints, from their factor there."""
+    return along.q - factor.right_inverse @ push(lambda at: at.coordinate_residual, (at,), (along,))
+
+
+def quality_of(
+    system: AbstractEquation, solved: Factor, scale: Float[Array, "n"], order: PivotOrder, rank: int
+) -> Float[Array, "k"]:
+    """The quality of a factor: its largest |H| in units of the `scale`; where rows are redundant, the largest entry of
+    the solution of the others as well.
+    """
+    influence = jnp.abs(solved.null_space) * scale[order.columns[rank:]][None, :] / scale[:, None]
+    largest = [jnp.max(influence, initial=1.0)]
+    if system.velocity_rank < system.velocity_rows:
+        largest.append(jnp.max(jnp.abs(solved.right_inverse) / scale[:, None], initial=0.0))
+    return jnp.stack(largest)
