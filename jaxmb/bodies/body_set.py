@@ -192,9 +192,9 @@ class BodySet(eqx.Module):
         """
         if not self.layout.scalars:
             return self.mass
-        still = [k for k, scalar in enumerate(self.layout.scalars, self.layout.bodies) if not scalar.moves]
-        order = np.argsort(np.concatenate([*(numbers for numbers, _ in of_scalars), still]).astype(int))
-        ones = jnp.ones(len(still), self.mass.dtype)
+        fixed = [k for k, scalar in enumerate(self.layout.scalars, self.layout.bodies) if not scalar.moves]
+        order = np.argsort(np.concatenate([*(numbers for numbers, _ in of_scalars), fixed]).astype(int))
+        ones = jnp.ones(len(fixed), self.mass.dtype)
         inertias = unchecked_take(jnp.concatenate([*(inertia for _, inertia in of_scalars), ones]), order)
         return jnp.concatenate([self.mass, inertias])
 

@@ -52,21 +52,21 @@ class SceneCatalogue(Catalogue):
         return tuple(dict.fromkeys(name for g in groups for name in g.group.names))
 
     def applied_wrenches(self, name, ts, ys, multipliers):
-        found = places(self.system.forces.groups, name), places(self.system.constraints.nonideal, name)
-        return applied_wrenches(self.system, found, ts, ys, multipliers)
+        place = places(self.system.forces.groups, name), places(self.system.constraints.nonideal, name)
+        return applied_wrenches(self.system, place, ts, ys, multipliers)
 
     def picture(self, ts, ys):
         acting = (*self.system.constraints.groups, *self.system.forces.groups)
         return picture(self.system, [g.group for g in acting], ts, ys)
 
     def not_finite(self, t, q, u):
-        found = [
+        names = [
             f"the {kind} of {name!r}"
             for kind, of_kind in _values_of_parts(self.system, t, q, u).items()
             for name, value in of_kind
             if not np.all(np.isfinite(value))
         ]
-        return tuple(dict.fromkeys(found))
+        return tuple(dict.fromkeys(names))
 
 
 def _values_of_parts(system, t, q, u):
@@ -74,10 +74,10 @@ def _values_of_parts(system, t, q, u):
     constraints, forces = system.constraints, system.forces
     position, acceleration, wrenches, rates = _values(system, t, q, u)
     named = lambda g, values: zip(g.group.names, np.asarray(values), strict=True)
-    each = lambda groups, of_groups: itertools.chain(*map(named, groups, of_groups))
+    by_part = lambda groups, of_groups: itertools.chain(*map(named, groups, of_groups))
     return {
-        "residual": (*each(constraints.position, position), *each(constraints.groups, acceleration)),
-        "force": each(forces.groups, wrenches),
+        "residual": (*by_part(constraints.position, position), *by_part(constraints.groups, acceleration)),
+        "force": by_part(forces.groups, wrenches),
         "rate": [(name, np.asarray(rates)[index]) for name, index in forces.state_names().items()],
     }
 

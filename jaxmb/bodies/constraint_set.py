@@ -103,8 +103,8 @@ class ConstraintSet(eqx.Module):
 
     def half_turned(self, poses: BodyPoses) -> Bool[Array, "position_rows"]:
         """Which rows of elementary joints vanish at these poses with the joint turned away from where it closes."""
-        known, found = self._is_elementary(self.position), half_turned(self.position, poses)
-        return found if known.all() else jnp.zeros(known.size, bool).at[np.flatnonzero(known)].set(found)
+        mask, turned = self._is_elementary(self.position), half_turned(self.position, poses)
+        return turned if mask.all() else jnp.zeros(mask.size, bool).at[np.flatnonzero(mask)].set(turned)
 
     def _is_elementary(self, groups):
         """Which rows of some groups are rows of elementary joints."""
@@ -148,24 +148,24 @@ class ConstraintSet(eqx.Module):
         """Wrenches of all rows, `Aᵀ λ`."""
         out: list[Acting] = []
         if self.elements is not None:
-            known = self._is_elementary(self.groups)
-            of_elements = multipliers if known.all() else unchecked_take(multipliers, np.flatnonzero(known))
+            elementary = self._is_elementary(self.groups)
+            of_elements = multipliers if elementary.all() else unchecked_take(multipliers, np.flatnonzero(elementary))
             wrenches = self.elements.wrenches(now.poses, of_elements)
             out.append((wrenches[:, None], np.arange(self.elements.places.ground)[:, None]))
-        others = [pair for pair in self.of_groups(multipliers) if self.elements is None or not is_elementary(pair[0])]
-        return [*out, *((g.wrenches(now, of_group), g.group.body_index) for g, of_group in others)]
+        rest = [pair for pair in self.of_groups(multipliers) if self.elements is None or not is_elementary(pair[0])]
+        return [*out, *((g.wrenches(now, of_group), g.group.body_index) for g, of_group in rest)]
 
     def reactions(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
     ) -> list[Float[Array, "parts k v"]]:
         """The wrenches of the joints of non-ideal laws on the bodies of these, law group by law group."""
         named, wrenches, bodies = {name for g in laws for name in g.joints}, [], []
-        known = None if self.elements is None else self.elements.jacobian(now.poses)
+        jacobian = None if self.elements is None else self.elements.jacobian(now.poses)
         first = 0
         for g, of_group in self.of_groups(multipliers):
             # From the matrix A, which the equation needs as well.
-            if known is not None and is_elementary(g):
-                blocks = lambda known=known, at=first, n=of_group.size: known[at : at + n]
+            if jacobian is not None and is_elementary(g):
+                blocks = lambda jacobian=jacobian, at=first, n=of_group.size: jacobian[at : at + n]
                 first += of_group.size
             else:
                 blocks = lambda g=g: g.jacobian(now)
@@ -179,8 +179,8 @@ class ConstraintSet(eqx.Module):
         take = lambda g: unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints))
         of_joints = [jnp.sum(take(g), axis=1) for g in laws]
         # Scalar coordinates that a law has beyond those of its joint take no reaction.
-        more = [len(g.group.bodies[0]) - reaction.shape[1] for g, reaction in zip(laws, of_joints, strict=True)]
-        return [jnp.pad(reaction, ((0, 0), (0, k), (0, 0))) for reaction, k in zip(of_joints, more, strict=True)]
+        missing = [len(g.group.bodies[0]) - reaction.shape[1] for g, reaction in zip(laws, of_joints, strict=True)]
+        return [jnp.pad(reaction, ((0, 0), (0, k), (0, 0))) for reaction, k in zip(of_joints, missing, strict=True)]
 
     def nonideal_wrenches(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
@@ -204,12 +204,12 @@ class ConstraintSet(eqx.Module):
         """Values of rows, in pieces that follow each other."""
         if self.elements is None:
             return [of_group(g) for g in groups]
-        known, out, first = of_elements(self.elements), [], 0
+        of_rows, out, first = of_elements(self.elements), [], 0
         if all(map(is_elementary, groups)):
-            return [known]
+            return [of_rows]
         for g in groups:
             if is_elementary(g):
-                out.append(known[first : first + g.row_count])
+                out.append(of_rows[first : first + g.row_count])
                 first += g.row_count
             else:
                 out.append(of_group(g))

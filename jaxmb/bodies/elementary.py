@@ -207,8 +207,8 @@ class _Rows:
         forces = jnp.stack([-force, force])
         moments = turning.moment(jnp.stack([now.of_a, now.of_b]), forces)
         along, turn = self._of_products(now)
-        own = of_products[None, :, None]
-        wrenches = [jnp.concatenate(x, axis=-1) for x in ((forces, moments), (own * along, own * turn))]
+        factors = of_products[None, :, None]
+        wrenches = [jnp.concatenate(x, axis=-1) for x in ((forces, moments), (factors * along, factors * turn))]
         entries = jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in wrenches])
         bodies = np.concatenate([places.pairs[:s].T.ravel(), places.pairs[s:].T.ravel()])
         force, moment = _cut(placed_sums(bodies, places.ground)(entries), [d])
@@ -219,21 +219,21 @@ class _Rows:
         """The world vectors at poses, and their first and second rates where velocities and accelerations are given."""
         places, v, bodies = self.places, self.vectors, self.places.of_vectors
         rate, d = self._turning.rate, self._turning.dimension
-        columns, spins = [v], [unchecked_take(_cut(own, [d])[1], bodies) for own in rates]
+        columns, spins = [v], [unchecked_take(_cut(rate_values, [d])[1], bodies) for rate_values in rates]
         if spins:
             columns.append(rate(spins[0], v))
         if len(spins) == 2:
             columns.append(rate(spins[0], columns[1]) + rate(spins[1], v))
         matrices = unchecked_take(self._turning.matrices(poses), bodies)
         of_world = matrix_products(matrices, namespace(poses).stack(columns, axis=-1))
-        origins = [_cut(own, [d])[0] for own in (poses, *rates)]
-        found = []
-        for own, moved in zip(_cut(of_world, list(range(1, len(columns)))), origins, strict=True):
-            of_b, of_a, x, y_b, y_a = _cut(own[..., 0], places.ends, axis=0)
-            apart = unchecked_take(moved, places.between[:, 1]) - unchecked_take(moved, places.between[:, 0])
+        origins = [_cut(values, [d])[0] for values in (poses, *rates)]
+        motions = []
+        for vectors, origin in zip(_cut(of_world, list(range(1, len(columns)))), origins, strict=True):
+            of_b, of_a, x, y_b, y_a = _cut(vectors[..., 0], places.ends, axis=0)
+            apart = unchecked_take(origin, places.between[:, 1]) - unchecked_take(origin, places.between[:, 0])
             of_points, of_products = _cut(apart, [places.points], axis=0)
-            found.append(_Motion(of_b, of_a, x, y_b, y_a, of_points + of_b - of_a, of_products + y_b - y_a))
-        return found
+            motions.append(_Motion(of_b, of_a, x, y_b, y_a, of_points + of_b - of_a, of_products + y_b - y_a))
+        return motions
 
     def _x(self, now: _Motion):
         """X, also of products that have a length in place of it."""
@@ -260,8 +260,8 @@ class _Rows:
         of_points = xp.concatenate([unit, xp.stack([-of_a, of_b], axis=2)], axis=-1)
         along, turn = self._of_products(now)
         of_bodies = unchecked_take(matrices, places.pairs[s:].T.ravel())
-        own = self._turning.in_bodies(of_bodies, turn.reshape(-1, turn.shape[-1])).reshape(turn.shape)
-        of_products = xp.concatenate([along, own], axis=-1).swapaxes(0, 1)
+        moments = self._turning.in_bodies(of_bodies, turn.reshape(-1, turn.shape[-1])).reshape(turn.shape)
+        of_products = xp.concatenate([along, moments], axis=-1).swapaxes(0, 1)
         return xp.concatenate([of_points.reshape(-1, *of_products.shape[1:]), of_products])
 
     def _ordered(self, of_points, of_products):
@@ -324,13 +324,13 @@ def _listed(groups: Sequence[AbstractConstraintGroup]) -> list[Listed]:
     """The elements of those groups that are elementary; their rows are numbered through."""
     listed, first = [], 0
     for g in filter(is_elementary, groups):
-        own = g.group
-        of_part = lambda part, own=own: on_bodies(part, own.layout.space, own.kernel("elements")(part))
-        places = first + g.rows * np.arange(len(own.names))
-        for element in jax.vmap(of_part)(own.part):
-            listed.append(Listed(element, own.body_index, places))
-            places = places + element.rows(own.layout.space.dimension)
-        first += g.rows * len(own.names)
+        group = g.group
+        of_part = lambda part, group=group: on_bodies(part, group.layout.space, group.kernel("elements")(part))
+        places = first + g.rows * np.arange(len(group.names))
+        for element in jax.vmap(of_part)(group.part):
+            listed.append(Listed(element, group.body_index, places))
+            places = places + element.rows(group.layout.space.dimension)
+        first += g.rows * len(group.names)
     return listed
 
 
@@ -339,57 +339,57 @@ def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> 
     half a turn away, or a third of one about a diagonal.
     """
     space, listed = groups[0].group.layout.space, _listed(groups)
-    rows = sum(own.element.rows(space.dimension) * len(own.rows) for own in listed)
-    told = [own for own in listed if getattr(own.element, "along_a", None) is not None]
-    if not told:
+    rows = sum(item.element.rows(space.dimension) * len(item.rows) for item in listed)
+    pairs = [item for item in listed if getattr(item.element, "along_a", None) is not None]
+    if not pairs:
         return jnp.zeros(rows, bool)
     turned = jax.vmap(space.direction)
-    bodies = np.concatenate([own.bodies for own in told])
-    of_a, of_b = (jnp.concatenate([getattr(own.element, name) for own in told]) for name in ("along_a", "along_b"))
+    bodies = np.concatenate([item.bodies for item in pairs])
+    of_a, of_b = (jnp.concatenate([getattr(item.element, name) for item in pairs]) for name in ("along_a", "along_b"))
     a, b = turned(unchecked_take(poses, bodies[:, 0]), of_a), turned(unchecked_take(poses, bodies[:, 1]), of_b)
     sizes = rot.norm(of_a) * rot.norm(of_b)
     # They are parallel where the joint closes.
     opposite = _DOT[space.dimension](a, b)[:, 0] < 0.5 * sizes
-    return jnp.zeros(rows, bool).at[np.concatenate([own.rows for own in told])].set(opposite)
+    return jnp.zeros(rows, bool).at[np.concatenate([item.rows for item in pairs])].set(opposite)
 
 
 def stacked(listed: Sequence[Listed], ground: int, d: int) -> ElementaryRows:
     """The rows of elements in the plane or in space, of d dimensions."""
-    points = [own for own in listed if own.element.coincide]
-    products = [own for own in listed if not own.element.coincide]
-    xp = namespace(*jax.tree.leaves([own.element for own in listed]))
-    dtype = xp.result_type(*jax.tree.leaves([own.element for own in listed]))
+    points = [item for item in listed if item.element.coincide]
+    products = [item for item in listed if not item.element.coincide]
+    xp = namespace(*jax.tree.leaves([item.element for item in listed]))
+    dtype = xp.result_type(*jax.tree.leaves([item.element for item in listed]))
 
     def numbers(of_element: Callable[[Any], Any], among: Sequence[Listed], shape: tuple[int, ...] = (d,)):
         """The vectors of elements, zero where they have none."""
-        found = [(of_element(own.element), (len(own.bodies), *shape)) for own in among]
+        entries = [(of_element(item.element), (len(item.bodies), *shape)) for item in among]
         return xp.concatenate(
-            [xp.zeros((0, *shape), dtype), *(np.zeros(size) if x is None else x.reshape(size) for x, size in found)],
+            [xp.zeros((0, *shape), dtype), *(np.zeros(size) if x is None else x.reshape(size) for x, size in entries)],
             dtype=dtype,
         )
 
     def of_joints(of_element: Callable[[Any], Any], among: Sequence[Listed]):
         """What is known of elements, once for each joint."""
-        found = [np.full(len(own.bodies), of_element(own.element)) for own in among]
-        return np.concatenate([np.zeros(0, bool), *found])
+        values = [np.full(len(item.bodies), of_element(item.element)) for item in among]
+        return np.concatenate([np.zeros(0, bool), *values])
 
-    bodies = lambda among: np.concatenate([np.zeros((0, 2), int), *(own.bodies for own in among)])
-    s = sum(len(own.bodies) for own in points)
+    bodies = lambda among: np.concatenate([np.zeros((0, 2), int), *(item.bodies for item in among)])
+    s = sum(len(item.bodies) for item in points)
     of_points = [numbers(lambda x: x.point_b, points), numbers(lambda x: x.point_a, points)]
     of_products = [numbers(lambda x: x.x_a, products), numbers(lambda x: x.y_b, products)]
     vectors = xp.concatenate([*of_points, *of_products, numbers(lambda x: x.y_a, products)])
     unit = np.eye(3, dtype=dtype) if d == 3 else np.ones((1, 1), dtype)
-    spins: Any = [xp.broadcast_to(own, (2 * s, *own.shape)) for own in unit]
+    spins: Any = [xp.broadcast_to(axis, (2 * s, *axis.shape)) for axis in unit]
     turns = xp.stack([_TURNING[d].rate(spin, vectors[: 2 * s]) for spin in spins], axis=-1)
     lengths = inverses = None
-    if any(own.element.length is not None for own in products):  # pyright: ignore[reportAttributeAccessIssue]
+    if any(item.element.length is not None for item in products):  # pyright: ignore[reportAttributeAccessIssue]
         lengths = numbers(lambda x: x.length, products, (1,))
         inverses = numbers(lambda x: None if x.length is None else 1 / x.length, products, (1,))
     with_x = of_joints(lambda x: x.x_a is not None, products)
     with_points = of_joints(lambda x: x.y_a is not None, products)
     (a, b), (a2, b2) = bodies(points).T, bodies(products).T
     between = np.where(with_points[:, None], bodies(products), ground)
-    rows = [np.add.outer(own.rows, np.arange(d)).ravel() for own in points] + [own.rows for own in products]
+    rows = [np.add.outer(item.rows, np.arange(d)).ravel() for item in points] + [item.rows for item in products]
     places = Places(
         key=None,
         of_vectors=np.concatenate([b, a, np.where(with_x, a2, ground), b2, np.where(with_points, a2, ground)]),
@@ -415,9 +415,9 @@ def check_elements(system: Any, state: State, t: float = 0.0) -> None:
 
     **Arguments:** `system`: a compiled scene; a consistent `state`; the time `t` [s].
     """
-    for what, (own, exact) in _compared(system, jnp.asarray(t, state.q.dtype), state).items():
-        own, exact = (np.asarray(x).reshape(x.shape[0], -1)[: system.position_rows] for x in (own, exact))
-        off = np.max(np.abs(own - exact), axis=1, initial=0.0)
+    for what, (elementary, exact) in _compared(system, jnp.asarray(t, state.q.dtype), state).items():
+        elementary, exact = (np.asarray(x).reshape(x.shape[0], -1)[: system.position_rows] for x in (elementary, exact))
+        off = np.max(np.abs(elementary - exact), axis=1, initial=0.0)
         row = int(np.argmax([*off, 0.0]))
         if row < off.size and not off[row] <= _AGREE * (1 + np.max(np.abs(exact))):
             name, number = system.rows[row]
@@ -434,10 +434,10 @@ def _compared(system, t, state):
     other = jnp.linspace(-1.0, 1.0, u.size, dtype=u.dtype)
     both = lambda rows_of: (rows_of(near), rows_of(system))
     return {
-        "values": both(lambda own: own.position_residual(t, q)),
-        "rates": both(lambda own: own.velocity_residual(t, q, other)),
-        "Jacobians": both(lambda own: own.jacobian(t, q, u)),
-        "second rates": both(lambda own: own.acceleration_residual(t, q, u, other)),
+        "values": both(lambda model: model.position_residual(t, q)),
+        "rates": both(lambda model: model.velocity_residual(t, q, other)),
+        "Jacobians": both(lambda model: model.jacobian(t, q, u)),
+        "second rates": both(lambda model: model.acceleration_residual(t, q, u, other)),
     }
 
 

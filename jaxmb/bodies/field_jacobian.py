@@ -45,7 +45,7 @@ def contributions(
     gyroscopic = system.bodies.gyroscopic_damping(now)
     stiffness.append(jnp.zeros_like(gyroscopic))
     damping.append(gyroscopic)
-    join = lambda blocks: jnp.concatenate([own.reshape(-1, size, size) for own in blocks])
+    join = lambda blocks: jnp.concatenate([block.reshape(-1, size, size) for block in blocks])
     return join(stiffness), join(damping)
 
 
@@ -84,7 +84,7 @@ class MotionJacobian(AbstractFieldJacobian):
         residual = residual.at[0].set(jnp.where(binds_positions, residual[0], 0.0))
         # A loop, so that it is compiled once for both.
         both = both + lax.map(self.projector.cancel, residual)
-        move, velocity = (unchecked_take(jnp.append(own, 0.0), index) for own in both)
+        move, velocity = (unchecked_take(jnp.append(values, 0.0), index) for values in both)
         return self.raveled(move, velocity)
 
     def of_bodies(self, x: Array) -> tuple[Array, Array]:
@@ -116,8 +116,8 @@ class MotionJacobian(AbstractFieldJacobian):
         # The identity for what a body without rotation lacks.
         missing = np.ones((bodies, widest))
         missing[:, :size] = self.layout.velocity_index[:-1] == self.layout.nu
-        own = _padded(self.mass, widest) + missing[:, :, None] * np.eye(widest)
-        blocks = [own.astype(dtype) - pairs[:bodies], -pairs[bodies:]]
+        diagonal = _padded(self.mass, widest) + missing[:, :, None] * np.eye(widest)
+        blocks = [diagonal.astype(dtype) - pairs[:bodies], -pairs[bodies:]]
         if self.rows is not None:
             kept = self.rows.order.kept
             of_joints = jnp.where(kept[:, None, :, None], self.rows.blocks, 0.0).astype(dtype)
@@ -154,20 +154,20 @@ class MotionResolvent(AbstractResolvent):
     factor: BlockFactor
 
     def solve(self, x):
-        own = self.jacobian
-        move, velocity = own.of_bodies(x)
-        load = vector_products(own.mass.astype(x.dtype), velocity) + self.r * self._stiff(move)
+        jacobian = self.jacobian
+        move, velocity = jacobian.of_bodies(x)
+        load = vector_products(jacobian.mass.astype(x.dtype), velocity) + self.r * self._stiff(move)
         solved = self._substitute(self.factor, load)
-        return own.raveled(move + self.r * solved, solved)
+        return jacobian.raveled(move + self.r * solved, solved)
 
     def transpose_solve(self, x):
-        own = self.jacobian
+        jacobian = self.jacobian
         # The transposes of the maps between a state and its bodies.
-        pull = jax.linear_transpose(lambda both: own.raveled(*both), own.of_bodies(x))
-        push = jax.linear_transpose(own.of_bodies, x)
+        pull = jax.linear_transpose(lambda both: jacobian.raveled(*both), jacobian.of_bodies(x))
+        push = jax.linear_transpose(jacobian.of_bodies, x)
         move, velocity = pull(x)[0]
         solved = self._substitute(self.factor.transpose(), velocity + self.r * move)
-        load = vector_products(own.mass.astype(x.dtype), solved)
+        load = vector_products(jacobian.mass.astype(x.dtype), solved)
         return push((move + self.r * self._stiff(solved, transpose=True), load))[0]
 
     def _substitute(self, factor, load):
@@ -183,12 +183,12 @@ class MotionResolvent(AbstractResolvent):
         return order.by_row(vector_products(K, unchecked_take(move, order.column)))
 
     def weights(self):
-        own, layout = self.jacobian, self.jacobian.layout
-        root = jnp.sqrt(jnp.diagonal(own.mass, axis1=1, axis2=2))
+        jacobian, layout = self.jacobian, self.jacobian.layout
+        root = jnp.sqrt(jnp.diagonal(jacobian.mass, axis1=1, axis2=2))
         # Positions count as velocities at the frequency 1 / |r|.
-        scaled = root / (jnp.sqrt(jnp.sum(own.moves**2, axis=2)) * jnp.abs(self.r))
-        d, more = layout.space.dimension, layout.space.pose_size - layout.space.dimension
-        turns = jnp.repeat(jnp.max(scaled[:, d:], axis=1, keepdims=True), more, axis=1)
+        scaled = root / (jnp.sqrt(jnp.sum(jacobian.moves**2, axis=2)) * jnp.abs(self.r))
+        d, attitude_size = layout.space.dimension, layout.space.pose_size - layout.space.dimension
+        turns = jnp.repeat(jnp.max(scaled[:, d:], axis=1, keepdims=True), attitude_size, axis=1)
         poses = jnp.concatenate([scaled[:, :d], turns], axis=1).ravel()
         places = layout.coordinate_place, layout.velocity_place
         return jnp.concatenate(

@@ -61,14 +61,14 @@ class Input(eqx.Module):
     def alone(self) -> "list[Input]":
         """The same of each part."""
         signals = of_each(self.signal, len(self.names))
-        each = zip(signals, self.names, self.members, strict=True)
-        return [Input(signal, (name,), self.keys, (member,), self.moves) for signal, name, member in each]
+        entries = zip(signals, self.names, self.members, strict=True)
+        return [Input(signal, (name,), self.keys, (member,), self.moves) for signal, name, member in entries]
 
     def value(self, member: Any, t: Scalar) -> Array:
         """The number of a part that is among these; of one kind all are computed, once for all parts."""
         if len(self.members) == 1:
             return self.signal(t)
-        values = jax.vmap(lambda own: own(t))(self.signal)
+        values = jax.vmap(lambda signal: signal(t))(self.signal)
         place = self._entry(np.arange(len(self.members)), 0, member)
         return values.at[place].get(mode="clip", wrap_negative_indices=False)
 
@@ -86,12 +86,12 @@ class Input(eqx.Module):
 def together(inputs: Sequence[Input]) -> tuple[Input, ...]:
     """Inputs of single parts with those of one kind together."""
     kinds: dict[Any, list[Input]] = {}
-    for own in inputs:
-        kinds.setdefault((own.keys, own.moves), []).append(own)
+    for single in inputs:
+        kinds.setdefault((single.keys, single.moves), []).append(single)
     out = []
-    for (keys, moves), same in kinds.items():
-        for numbers, signal in of_one_kind([own.signal for own in same]):
-            names, members = ([getattr(same[k], field)[0] for k in numbers] for field in ("names", "members"))
+    for (keys, moves), alike in kinds.items():
+        for numbers, signal in of_one_kind([single.signal for single in alike]):
+            names, members = ([getattr(alike[k], field)[0] for k in numbers] for field in ("names", "members"))
             out.append(Input(signal, tuple(names), keys, tuple(members), moves))
     return tuple(out)
 
@@ -120,15 +120,15 @@ class Group(eqx.Module):
     def map(self, kernel: Callable[..., Any], *per_part: Array) -> Any:
         """`kernel(at, …)` of every part with its rows of some arrays, where `at(t)` is the part at a time."""
         if not self.inputs:
-            return jax.vmap(lambda part, *own: kernel(lambda t: part, *own))(self.part, *per_part)
-        single = lambda member, part, *own: kernel(lambda t: self._at(member, part, t), *own)
+            return jax.vmap(lambda part, *rows: kernel(lambda t: part, *rows))(self.part, *per_part)
+        single = lambda member, part, *rows: kernel(lambda t: self._at(member, part, t), *rows)
         members = jnp.arange(len(self.names)) if self.chosen is None else self.chosen
         return jax.vmap(single)(members, self.part, *per_part)
 
     def kernel(self, name: str) -> Callable[..., Any]:
         """A kernel as a function of one part and of what it takes after `space`; without that it is a property."""
         space = self.layout.space
-        plain = lambda part, *own: getattr(part, name)(space, *own) if own else getattr(part, name)
+        plain = lambda part, *arguments: getattr(part, name)(space, *arguments) if arguments else getattr(part, name)
         return dict(self.kernels).get(name, plain)
 
     def coordinates(self, part: Any, poses: Float[Array, "k p"]) -> dict[str, Array]:
@@ -142,18 +142,18 @@ class Group(eqx.Module):
     def _at(self, member, part, t):
         """One part with its inputs at a time, and their rates."""
         drift = jax.tree.map(lambda _: None, part)
-        for own in self.inputs:
-            where = lambda part, keys=own.keys: entry(part, keys)
+        for driven in self.inputs:
+            where = lambda part, keys=driven.keys: entry(part, keys)
             given = where(part)
-            signal = lambda t, own=own, like=given: jnp.asarray(own.value(member, t), like.dtype)
-            if own.moves and part.takes_drift:
+            signal = lambda t, driven=driven, like=given: jnp.asarray(driven.value(member, t), like.dtype)
+            if driven.moves and part.takes_drift:
                 time = jnp.asarray(t, jnp.result_type(float))
                 value, rate = jax.jvp(signal, (time,), (jnp.ones_like(time),))
-                rate = jnp.where(own.drives(member), rate, jnp.zeros_like(rate))
+                rate = jnp.where(driven.drives(member), rate, jnp.zeros_like(rate))
                 drift = eqx.tree_at(where, drift, rate, is_leaf=lambda x: x is None)
             else:
                 value = signal(t)
-            part = eqx.tree_at(where, part, jnp.where(own.drives(member), value, given))
+            part = eqx.tree_at(where, part, jnp.where(driven.drives(member), value, given))
         return part.with_fields(drift=drift) if jax.tree.leaves(drift) else part
 
     @property
@@ -182,7 +182,7 @@ def stack(
     group, whose functions are those of all others.
     """
     groups: dict[Any, list] = {}
-    known: dict[Any, tuple[Any, Any]] = {}
+    structures: dict[Any, tuple[Any, Any]] = {}
     for part, bodies in parts:
         leaves, structure = jtu.tree_flatten(anonymous(part))
         if not all(eqx.is_array_like(leaf) for leaf in leaves):
@@ -192,7 +192,7 @@ def stack(
             if check is not None:
                 check(part, layout.space, len(bodies))
             part_now, kernels = captured(anonymous(part), layout.space, len(bodies))
-            known[key] = jtu.tree_structure(part_now), tuple(kernels.items())
+            structures[key] = jtu.tree_structure(part_now), tuple(kernels.items())
         groups.setdefault(key, []).append((leaves, part.name, bodies, list(inner_parts(part))))
     out = []
     for key, members in groups.items():
@@ -201,15 +201,15 @@ def stack(
         leaves = [jax.device_put(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
         inner = tuple((keys, tuple(m[3][k][1].name for m in members)) for k, (keys, _) in enumerate(members[0][3]))
-        structure, kernels = known[key]
+        structure, kernels = structures[key]
         out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout, inner=inner, kernels=kernels))
     return tuple(out)
 
 
 def _not_numbers(part: AbstractPart) -> str:
     """What is wrong with a part that holds other things than numbers in fields that are not static."""
-    found = [(path, leaf) for path, leaf in jtu.tree_flatten_with_path(part)[0] if not eqx.is_array_like(leaf)]
-    path, leaf = found[0]
+    wrong = [(path, leaf) for path, leaf in jtu.tree_flatten_with_path(part)[0] if not eqx.is_array_like(leaf)]
+    path, leaf = wrong[0]
     field = jtu.keystr(path).removeprefix(".")
     return (
         f"{part.label}: {field} is {leaf!r}, which is not a number. Declare a function with fields.function(), and "
@@ -233,8 +233,8 @@ class AbstractGroup(eqx.Module):
 
     def only(self, member: Any) -> Self:
         """The group of one of its parts, whose number may be traced."""
-        others = jax.tree.map(lambda leaf: leaf[member][None], dataclasses.replace(self, group=None))
-        return dataclasses.replace(others, group=self.group.only(member))
+        rest = jax.tree.map(lambda leaf: leaf[member][None], dataclasses.replace(self, group=None))
+        return dataclasses.replace(rest, group=self.group.only(member))
 
     def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
         """The parts' own coordinates, by name within the part."""
@@ -255,9 +255,9 @@ class AbstractGroup(eqx.Module):
     def _space(self):
         return self.group.layout.space
 
-    def _map(self, kernel, *of_bodies, more=()):
+    def _map(self, kernel, *of_bodies, per_part=()):
         """`kernel(at, …)` of every part, with the rows of its bodies, and with `more` per part."""
-        return self.group.map(kernel, *map(self.group.gather, of_bodies), *more)
+        return self.group.map(kernel, *map(self.group.gather, of_bodies), *per_part)
 
     def _of_motion(self, name, now):
         """A kernel of every part, as a function of its pose and velocity and of time."""
@@ -383,7 +383,7 @@ class ConstraintGroup(AbstractConstraintGroup):
         def single(at, x, moves):
             def along_one(body):
                 # The residuals themselves are the same for every body, and computed once.
-                residual = lambda own: self._residual(at, t, jnp.stack([*x[:body], own, *x[body + 1 :]]))
+                residual = lambda pose: self._residual(at, t, jnp.stack([*x[:body], pose, *x[body + 1 :]]))
                 push = lambda dx: jax.jvp(residual, (x[body],), (dx,))[1]
                 return jax.vmap(push, out_axes=-1)(moves[body])
 
@@ -400,15 +400,15 @@ class ConstraintGroup(AbstractConstraintGroup):
         return self._map(lambda at, x, xdot: self._rate(at, now.t, x, xdot), now.poses, rates)
 
     def wrenches(self, now, multipliers):
-        return self._map(functools.partial(self._wrench, now.t), now.poses, more=(multipliers,))
+        return self._map(functools.partial(self._wrench, now.t), now.poses, per_part=(multipliers,))
 
     def _wrench(self, t, at, x, multipliers):
         _, pull = jax.vjp(lambda x: self._residual(at, t, x), x)
         return jax.vmap(self._space.pull_back)(x, *pull(multipliers))
 
     def wrench_derivatives(self, now, multipliers):
-        single = lambda at, x, own: along_moves(self._space, lambda x: self._wrench(now.t, at, x, own), x)
-        return self._map(single, now.poses, more=(multipliers,))
+        single = lambda at, x, lam: along_moves(self._space, lambda x: self._wrench(now.t, at, x, lam), x)
+        return self._map(single, now.poses, per_part=(multipliers,))
 
     def acceleration(self, now, accelerations):
         t, poses, velocities = now
@@ -465,14 +465,14 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
         return self._map(single, now.poses, now.velocities)
 
     def wrenches(self, now, multipliers):
-        return self._map(functools.partial(self._wrench, now.t), now.poses, now.velocities, more=(multipliers,))
+        return self._map(functools.partial(self._wrench, now.t), now.poses, now.velocities, per_part=(multipliers,))
 
     def _wrench(self, t, at, x, v, multipliers):
         return jax.vjp(lambda w: self._residual(at, t, x, w), v)[1](multipliers)[0]
 
     def wrench_derivatives(self, now, multipliers):
-        single = lambda at, x, v, own: along_moves(self._space, lambda x: self._wrench(now.t, at, x, v, own), x)
-        return self._map(single, now.poses, now.velocities, more=(multipliers,))
+        single = lambda at, x, v, lam: along_moves(self._space, lambda x: self._wrench(now.t, at, x, v, lam), x)
+        return self._map(single, now.poses, now.velocities, per_part=(multipliers,))
 
     def acceleration(self, now, accelerations):
         t, poses, velocities = now
@@ -488,8 +488,8 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
 def servo_group(group: Group) -> ConstraintGroup:
     """The programs of stacked servos with their gains."""
     part = group.part
-    own = dataclasses.replace(group, part=part.program.with_fields(body_frames=part.body_frames))
-    return ConstraintGroup(own, part.damping, part.stiffness)
+    program = dataclasses.replace(group, part=part.program.with_fields(body_frames=part.body_frames))
+    return ConstraintGroup(program, part.damping, part.stiffness)
 
 
 class ForceGroup(AbstractGroup):
@@ -555,12 +555,12 @@ class NonIdealGroup(AbstractGroup):
         """Wrenches of the laws on the bodies of their joints; `reactions`: those of the joints."""
         space, kernel = self._space, self.group.kernel("wrenches")
 
-        def single(at, x, v, own):
+        def single(at, x, v, reaction):
             part = at(now.t)
-            seen = *part.seen(space, x, v), part.seen_wrenches(space, x, own)
+            seen = *part.seen(space, x, v), part.seen_wrenches(space, x, reaction)
             return part.wrenches_on_bodies(space, x, kernel(part, *seen, now.t))
 
-        return self._map(single, now.poses, now.velocities, more=(reactions,))
+        return self._map(single, now.poses, now.velocities, per_part=(reactions,))
 
 
 def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:

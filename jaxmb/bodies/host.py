@@ -47,18 +47,18 @@ class HostScene(AbstractHost):
     """The constraints of a system of rigid bodies; made by `host_scene`."""
 
     def __init__(self, system: Any, t: Any):
-        self._layout, self._groups, self._given = system.layout, system.constraints.groups, np.asarray(system.guess.u)
+        self._layout, self._groups, self._u = system.layout, system.constraints.groups, np.asarray(system.guess.u)
         self._t, self._positions = np.asarray(t, system.guess.q.dtype), len(system.constraints.position)
-        self._elements, self._along = _elements(system)
-        self._known = [_is_known(g) for g in self._groups]
-        self._others = tuple(g for g, known in zip(self._groups, self._known, strict=True) if not known)
+        self._elements, self._directions = _elements(system)
+        self._listed = [_in_numpy(g) for g in self._groups]
+        self._compiled = tuple(g for g, listed in zip(self._groups, self._listed, strict=True) if not listed)
         self._last = None
         places = [(g.group.body_index, g.rows) for g in self._groups]
         self._of_poses = self._layout.jacobian_source(places[: self._positions], of_poses=True)
         self._of_velocities = self._layout.jacobian_source(places, of_poses=False)
-        self.analytic = not self._others
+        self.analytic = not self._compiled
         self.linear, self.velocity_rows = system.linear, system.velocity_rows
-        self.coordinate_scale, self.velocity_scale = system.known_scales()
+        self.coordinate_scale, self.velocity_scale = system.concrete_scales()
 
     def _poses(self, q) -> Any:
         """Poses of the bodies, of scalar coordinates and the ground."""
@@ -93,24 +93,24 @@ class HostScene(AbstractHost):
         turned: Any = zip(poses[:, 3:], of_bodies[:, 3:], strict=True)
         return np.concatenate([of_bodies[:, :3], [rot.rates(p, w) for p, w in turned]], axis=1)
 
-    def _of_others(self, q, u=None) -> list[_Rows]:
+    def _evaluated(self, q, u=None) -> list[_Rows]:
         """Rows of constraints that are not known as elements, by default at the given velocities."""
-        if not self._others:
+        if not self._compiled:
             return []
-        u = self._given if u is None else u
+        u = self._u if u is None else u
         key = q.tobytes(), u.tobytes()
         if self._last is None or self._last[0] != key:
             of_bodies: Any = np.append(u, 0.0)[self._layout.velocity_index]
             now = Kinematics(self._t, self._prepared(q), of_bodies)
-            self._last = key, _rows(self._others, now, self._moves(q))
+            self._last = key, _rows(self._compiled, now, self._moves(q))
         return self._last[1]
 
-    def _joined(self, groups, of_elements: Any, of_others: Iterable[Any]) -> list[Any]:
+    def _joined(self, groups, of_elements: Any, of_compiled: Iterable[Any]) -> list[Any]:
         """What is known of elements and of other constraints, group by group."""
-        others, out, first = iter(of_others), [], 0
-        for g, known in zip(groups, self._known, strict=False):
-            if not known:
-                out.append(next(others))
+        compiled, out, first = iter(of_compiled), [], 0
+        for g, listed in zip(groups, self._listed, strict=False):
+            if not listed:
+                out.append(next(compiled))
                 continue
             out.append(of_elements[first : first + g.row_count])
             first += g.row_count
@@ -118,8 +118,8 @@ class HostScene(AbstractHost):
 
     def residual(self, q):
         """Φ."""
-        known = None if self._elements is None else self._elements.residual(self._prepared(q))
-        return _flat(self._joined(self._groups[: self._positions], known, (x.values for x in self._of_others(q))))
+        listed = None if self._elements is None else self._elements.residual(self._prepared(q))
+        return _flat(self._joined(self._groups[: self._positions], listed, (x.values for x in self._evaluated(q))))
 
     def coordinate_residual(self, q):
         p = self._euler(q)
@@ -127,10 +127,10 @@ class HostScene(AbstractHost):
 
     def blocks(self, q, u=None) -> list[Float[np.ndarray, "parts rows k v"]]:
         """A, group by group, for the bodies of each part; by default at the given velocities."""
-        known = None if self._elements is None else self._elements.jacobian(self._prepared(q))
-        others = zip(self._others, self._of_others(q, u), strict=True)
-        found = self._joined(self._groups, known, (self._along_velocities(q, g, x.blocks) for g, x in others))
-        pairs = zip(self._groups, found, strict=True)
+        listed = None if self._elements is None else self._elements.jacobian(self._prepared(q))
+        compiled = zip(self._compiled, self._evaluated(q, u), strict=True)
+        joined = self._joined(self._groups, listed, (self._along_velocities(q, g, x.blocks) for g, x in compiled))
+        pairs = zip(self._groups, joined, strict=True)
         return [x.reshape(len(g.group.names), g.rows, *x.shape[-2:]) for g, x in pairs]
 
     def jacobian(self, q):
@@ -147,12 +147,12 @@ class HostScene(AbstractHost):
         return np.einsum("prkn,pknv->prkv", blocks, turned)
 
     def coordinate_jacobian(self, q):
-        known = None
+        listed = None
         if self._elements is not None:
             derivative = self._elements.jacobian_of_poses if self._layout.spatial else self._elements.jacobian
-            known = derivative(self._prepared(q))
-        own = self._joined(self._groups[: self._positions], known, (x.blocks for x in self._of_others(q)))
-        rows = np.append(_flat(own), 0.0)[self._of_poses]
+            listed = derivative(self._prepared(q))
+        blocks = self._joined(self._groups[: self._positions], listed, (x.blocks for x in self._evaluated(q)))
+        rows = np.append(_flat(blocks), 0.0)[self._of_poses]
         of_lengths = np.zeros((len(self._layout.turning), q.size))
         places = self._layout.pose_index[self._layout.turning, 3:]
         of_lengths[np.arange(len(self._layout.turning))[:, None], places] = q[places]
@@ -160,14 +160,14 @@ class HostScene(AbstractHost):
 
     def velocity_rows_at(self, q, u):
         blocks, of_bodies = self.blocks(q, u), np.append(u, 0.0)[self._layout.velocity_index]
-        others, unmet = dict(zip(map(id, self._others), self._of_others(q, u), strict=True)), []
-        for g, own in zip(self._groups, blocks, strict=True):
-            more = others.get(id(g))
-            if more is not None and not g.of_poses:
-                unmet.append(more.values)
+        compiled, unmet = dict(zip(map(id, self._compiled), self._evaluated(q, u), strict=True)), []
+        for g, group_blocks in zip(self._groups, blocks, strict=True):
+            rows = compiled.get(id(g))
+            if rows is not None and not g.of_poses:
+                unmet.append(rows.values)
                 continue
-            rates = np.einsum("prkv,pkv->pr", own, of_bodies[g.group.body_index])
-            unmet.append(rates if more is None or not more.drift.size else rates + more.drift)
+            rates = np.einsum("prkv,pkv->pr", group_blocks, of_bodies[g.group.body_index])
+            unmet.append(rates if rows is None or not rows.drift.size else rates + rows.drift)
         jacobian = np.append(_flat(blocks), 0.0)[self._of_velocities]
         return _flat(unmet)[: self.velocity_rows], jacobian[: self.velocity_rows]
 
@@ -198,7 +198,7 @@ class HostScene(AbstractHost):
         poses, turned = self._prepared(q), self._layout.space.direction
         return all(
             turned(poses[a], u) @ turned(poses[b], v) > 0
-            for bodies, of_a, of_b in self._along
+            for bodies, of_a, of_b in self._directions
             for (a, b), u, v in zip(bodies, of_a, of_b, strict=True)
         )
 
@@ -213,7 +213,7 @@ def host_scene(system: Any, t: Any) -> HostScene | None:
     return HostScene(system, t) if small and not system.bodies.turn_counts else None
 
 
-def _is_known(group):
+def _in_numpy(group):
     return is_elementary(group) and not group.group.kernels
 
 
@@ -222,18 +222,18 @@ def _elements(system) -> tuple[HostRows | None, list[tuple[np.ndarray, Any, Any]
     of joints and the directions.
     """
     space, listed, along, first = system.layout.space, [], [], 0
-    for g in filter(_is_known, system.constraints.position):
-        own = g.group
-        numbers, structure = jax.tree.flatten(own.part)
+    for g in filter(_in_numpy, system.constraints.position):
+        group = g.group
+        numbers, structure = jax.tree.flatten(group.part)
         numbers = [np.asarray(x) for x in numbers]
-        parts = [jax.tree.unflatten(structure, [x[k] for x in numbers]) for k in range(len(own.names))]
+        parts = [jax.tree.unflatten(structure, [x[k] for x in numbers]) for k in range(len(group.names))]
         elements = [on_bodies(part, space, part.elements) for part in parts]
-        places = first + g.rows * np.arange(len(own.names))
-        for same in zip(*elements, strict=True):
-            element = jax.tree.map(lambda *x: np.stack(x), *same)
-            listed.append(Listed(element, own.body_index, places))
+        places = first + g.rows * np.arange(len(group.names))
+        for alike in zip(*elements, strict=True):
+            element = jax.tree.map(lambda *x: np.stack(x), *alike)
+            listed.append(Listed(element, group.body_index, places))
             if getattr(element, "along_a", None) is not None:
-                along.append((own.body_index, element.along_a, element.along_b))
+                along.append((group.body_index, element.along_a, element.along_b))
             places = places + element.rows(space.dimension)
-        first += g.rows * len(own.names)
+        first += g.rows * len(group.names)
     return HostRows.of(stacked(listed, system.layout.ground, space.dimension)) if listed else None, along

@@ -73,16 +73,16 @@ class JointBlocks(NamedTuple):
     layout: Layout
     scale: Float[np.ndarray, "nu"]
 
-    def dense(self, own: Sequence[int], columns: Int[np.ndarray, "n"]) -> Float[np.ndarray, "m n"]:
+    def dense(self, numbers: Sequence[int], columns: Int[np.ndarray, "n"]) -> Float[np.ndarray, "m n"]:
         """Rows of some parts in some columns."""
-        out = np.zeros((sum(self.parts[p].rows for p in own), columns.size), self.scale.dtype)
+        out = np.zeros((sum(self.parts[p].rows for p in numbers), columns.size), self.scale.dtype)
         row = 0
-        for p in own:
+        for p in numbers:
             for k, body in enumerate(self.parts[p].bodies):
                 index = self.layout.velocity_index[body]
                 place = np.minimum(np.searchsorted(columns, index), columns.size - 1) if columns.size else index
-                here = (columns[place] == index) if columns.size else np.zeros(index.size, bool)
-                out[row : row + self.parts[p].rows, place[here]] += self.blocks[p][:, k, here]
+                present = (columns[place] == index) if columns.size else np.zeros(index.size, bool)
+                out[row : row + self.parts[p].rows, place[present]] += self.blocks[p][:, k, present]
             row += self.parts[p].rows
         return out
 
@@ -94,43 +94,43 @@ class JointBlocks(NamedTuple):
         """
         ground = self.layout.ground
         vertices = [{*part.bodies, *([ground] if p in absolute else ())} for p, part in enumerate(self.parts)]
-        found = components(vertices, ground)
-        alone = {own.joints[0]: own.top for own in found if len(own.joints) == 1}
+        biconnected = components(vertices, ground)
+        alone = {component.joints[0]: component.top for component in biconnected if len(component.joints) == 1}
         regular = self._regular_parts(alone)
         out = []
-        for component in found:
+        for component in biconnected:
             bodies = sorted({body for p in component.joints for body in vertices[p]} - {component.top, ground})
             columns = self.layout.velocity_index[bodies].ravel() if bodies else np.zeros(0, int)
             columns = np.sort(columns[columns < self.layout.nu])
             rows = np.concatenate([self.parts[p].numbers for p in component.joints])
-            own, shares, is_sparse = component.joints, (), rows.size > dense
-            if len(own) == 1 and own[0] in regular:
+            numbers, shares, is_sparse = component.joints, (), rows.size > dense
+            if len(numbers) == 1 and numbers[0] in regular:
                 order, rank = np.argsort(level[rows], kind="stable"), rows.size
             elif is_sparse:
-                pivots, sizes = self.eliminate(own, columns, level[rows], _ZERO)
+                pivots, sizes = self.eliminate(numbers, columns, level[rows], _ZERO)
                 order, rank = pivots.order, pivots.rank
                 shares = tuple(_sparse_share(pivots, sizes, rows, r) for r in order[rank:].tolist())
             else:
-                whole = self.dense(own, columns)
+                whole = self.dense(numbers, columns)
                 order, rank = dense_pivots(whole * self.scale[columns], level[rows], _ZERO)
                 shares = _dense_shares(whole, rows, order[:rank], order[rank:]) if rank < rows.size else ()
-            out.append(Subset(own, rows, columns, rows[order[:rank]], rows[order[rank:]], is_sparse, shares))
+            out.append(Subset(numbers, rows, columns, rows[order[:rank]], rows[order[rank:]], is_sparse, shares))
         return out
 
     def eliminate(
-        self, own: Sequence[int], columns: Int[np.ndarray, "n"], level: Int[np.ndarray, "m"], zero: float
+        self, numbers: Sequence[int], columns: Int[np.ndarray, "n"], level: Int[np.ndarray, "m"], zero: float
     ) -> tuple[SparsePivots, Float[np.ndarray, "m"]]:
         """Independent rows of some parts in some columns without a dense matrix, and the norms of the rows. Pivots
         follow from sparsity; those below this power `zero` of eps are none.
         """
         rows: list[dict[int, float]] = []
-        known, scales = set(columns.tolist()), self.scale.tolist()
-        for p in own:
+        wanted, scales = set(columns.tolist()), self.scale.tolist()
+        for p in numbers:
             index = self.layout.velocity_index[list(self.parts[p].bodies)].ravel().tolist()
             for row in self.blocks[p].reshape(self.parts[p].rows, -1).tolist():
                 entries: dict[int, float] = {}
                 for c, value in zip(index, row, strict=True):
-                    if value and c in known:
+                    if value and c in wanted:
                         entries[c] = entries.get(c, 0.0) + value * scales[c]
                 rows.append(entries)
         eps = float(np.finfo(self.scale.dtype).eps)
@@ -148,9 +148,9 @@ class JointBlocks(NamedTuple):
         """
         ground = motions.shape[1] - 1
         out = set()
-        for numbers, bodies, own in self._alike(range(len(self.parts))):
-            change = np.einsum("prkv,dpkv->prd", own, motions[:, bodies])
-            size = np.einsum("prkv,dpkv->prd", np.abs(own), np.abs(motions[:, bodies]))
+        for numbers, bodies, blocks in self._alike(range(len(self.parts))):
+            change = np.einsum("prkv,dpkv->prd", blocks, motions[:, bodies])
+            size = np.einsum("prkv,dpkv->prd", np.abs(blocks), np.abs(motions[:, bodies]))
             moved = np.abs(change) > np.finfo(change.dtype).eps ** 0.75 * (size + 1e-300)
             bound = np.any(moved, axis=(1, 2)) | (bodies.shape[1] == 1)
             out.update(numbers[bound & ~np.any(bodies == ground, axis=1)].tolist())
@@ -161,8 +161,12 @@ class JointBlocks(NamedTuple):
         groups: dict[tuple[int, ...], list[int]] = {}
         for p in numbers:
             groups.setdefault(self.blocks[p].shape, []).append(p)
-        for own in groups.values():
-            yield np.array(own), np.array([self.parts[p].bodies for p in own]), np.stack([self.blocks[p] for p in own])
+        for members in groups.values():
+            yield (
+                np.array(members),
+                np.array([self.parts[p].bodies for p in members]),
+                np.stack([self.blocks[p] for p in members]),
+            )
 
     def _regular_parts(self, held):
         """Those of some parts whose rows are all independent, each with one of its bodies held: `dense_pivots` of many
@@ -171,10 +175,10 @@ class JointBlocks(NamedTuple):
         out = set()
         of_bodies = np.append(self.scale, 0.0)[np.minimum(self.layout.velocity_index, self.layout.nu)]
         of_bodies[self.layout.ground] = 0.0
-        for numbers, bodies, own in self._alike(held):
+        for numbers, bodies, blocks in self._alike(held):
             top = np.array([held[p] for p in numbers])
             free = np.where((bodies == top[:, None])[:, :, None], 0.0, of_bodies[bodies])
-            work = (own * free[:, None]).reshape(*own.shape[:2], -1)
+            work = (blocks * free[:, None]).reshape(*blocks.shape[:2], -1)
             size = np.linalg.norm(work, axis=2)
             work = work / np.maximum(size, least_size(size))[:, :, None]
             number, rows = np.arange(len(work)), work.shape[1]
@@ -192,16 +196,18 @@ class JointBlocks(NamedTuple):
 
 
 def _dense_shares(whole, rows, kept, dropped):
-    sizes, own_sizes = (np.linalg.norm(whole[own], axis=1) for own in (kept, dropped))
-    unit = np.linalg.lstsq((whole[kept] / sizes[:, None]).T, (whole[dropped] / own_sizes[:, None]).T, rcond=None)[0].T
-    found = [np.flatnonzero(np.abs(own) > _NEGLIGIBLE) for own in unit]
+    kept_sizes, dropped_sizes = (np.linalg.norm(whole[numbers], axis=1) for numbers in (kept, dropped))
+    unit = np.linalg.lstsq(
+        (whole[kept] / kept_sizes[:, None]).T, (whole[dropped] / dropped_sizes[:, None]).T, rcond=None
+    )[0].T
+    implying = [np.flatnonzero(np.abs(share) > _NEGLIGIBLE) for share in unit]
     return tuple(
-        Share(int(rows[r]), rows[kept[by]], own[by] * size / sizes[by])
-        for r, by, own, size in zip(dropped, found, unit, own_sizes, strict=True)
+        Share(int(rows[r]), rows[kept[by]], share[by] * size / kept_sizes[by])
+        for r, by, share, size in zip(dropped, implying, unit, dropped_sizes, strict=True)
     )
 
 
 def _sparse_share(pivots, sizes, rows, r):
-    own = {k: x for k, x in pivots.shares(r).items() if abs(x) > _NEGLIGIBLE}
-    by = np.array(list(own), int)
-    return Share(int(rows[r]), rows[by], np.array(list(own.values())) * sizes[r] / sizes[by])
+    shares = {k: x for k, x in pivots.shares(r).items() if abs(x) > _NEGLIGIBLE}
+    by = np.array(list(shares), int)
+    return Share(int(rows[r]), rows[by], np.array(list(shares.values())) * sizes[r] / sizes[by])

@@ -43,26 +43,26 @@ def joint_coordinates(
     # Shapes only: nothing is computed.
     poses = jax.eval_shape(lambda ground: jnp.tile(space.prepare(ground), (layout.ground + 1, 1)), ground)
     time = jax.ShapeDtypeStruct((), dtype)
-    for g, own in enumerate(groups):
-        found = jax.eval_shape(lambda own, t, poses: own.coordinates(t, poses), own, time, poses)
-        for field, values in found.items():
-            for k, name in enumerate(own.group.names):
-                coordinate = JointCoordinate(g, k, field, values.shape[1:], field in own.group.part.periodic)
+    for g, group in enumerate(groups):
+        coordinates = jax.eval_shape(lambda group, t, poses: group.coordinates(t, poses), group, time, poses)
+        for field, values in coordinates.items():
+            for k, name in enumerate(group.group.names):
+                coordinate = JointCoordinate(g, k, field, values.shape[1:], field in group.group.part.periodic)
                 out[f"{name}.{field}"] = coordinate
     return out
 
 
-def joint_measures(known: Mapping[str, JointCoordinate]) -> dict[str, Measure]:
+def joint_measures(coordinates: Mapping[str, JointCoordinate]) -> dict[str, Measure]:
     """Coordinates of joints, their rates and accelerations, as quantities of a motion.
 
     Angles known up to full turns are continued from time to time: a change in one interval is taken to be that by which
     the angle and the trapezoidal rule of its rate differ least.
     """
     out = {}
-    for name, own in known.items():
-        coordinate = own._replace(member=np.array(own.member))
+    for name, coordinate in coordinates.items():
+        place = coordinate._replace(member=np.array(coordinate.member))
         for order, end in enumerate(ORDERS):
-            out[f"{name}{end}"] = Measure(own.shape, _of_joint, (coordinate, order), of_forces=order == 2)
+            out[f"{name}{end}"] = Measure(coordinate.shape, _of_joint, (place, order), of_forces=order == 2)
     return out
 
 
@@ -99,7 +99,7 @@ def _continued(ts, angles, rates):
 
 def held_groups(
     groups: Sequence[ConstraintGroup | CoordinateGroup],
-    known: Mapping[str, JointCoordinate],
+    coordinates: Mapping[str, JointCoordinate],
     values: Mapping[str, Array],
     rates: Mapping[str, Array],
     t: Scalar,
@@ -107,21 +107,21 @@ def held_groups(
     """Constraints that hold coordinates of joints at values, which change at some rates, from a time on."""
     out = []
     for name, value in values.items():
-        own = known[name]
-        group = groups[own.group].group
+        coordinate = coordinates[name]
+        group = groups[coordinate.group].group
         driver = JointDriver(name, name, value=value - rates[name] * jnp.asarray(t, value.dtype), rate=rates[name])
         part = driver.with_fields(
-            joints={"0": jax.tree.map(lambda leaf, k=own.member: leaf[k], group.part)},
-            places=(tuple(range(len(group.bodies[own.member]))),),
-            within=own.field,
-            rows=math.prod(own.shape),
+            joints={"0": jax.tree.map(lambda leaf, k=coordinate.member: leaf[k], group.part)},
+            places=(tuple(range(len(group.bodies[coordinate.member]))),),
+            within=coordinate.field,
+            rows=math.prod(coordinate.shape),
         )
         stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)
         inputs = tuple(
             dataclasses.replace(alone, keys=("joints", "0", *alone.keys), members=(0,))
             for signal in group.inputs
             for alone in signal.alone()
-            if alone.members == (own.member,)
+            if alone.members == (coordinate.member,)
         )
-        out.append(ConstraintGroup(Group(stacked, (name,), (group.bodies[own.member],), group.layout, inputs)))
+        out.append(ConstraintGroup(Group(stacked, (name,), (group.bodies[coordinate.member],), group.layout, inputs)))
     return tuple(out)

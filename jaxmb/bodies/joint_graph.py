@@ -57,12 +57,12 @@ def joint_order(system: Any, left_out: tuple[int, ...] = (), absolute: frozenset
     return _joint_order(system.layout, parts, left_out, absolute)
 
 
-def joint_order_with_more(system: Any, before: Any, order: JointOrder) -> JointOrder:
+def extended_joint_order(system: Any, before: Any, order: JointOrder) -> JointOrder:
     """The order of elimination of a scene that has more position constraints, after those of one with a known order."""
-    parts = lambda own: sum(len(g.group.names) for g in own.constraints.position)
-    more, rows = parts(system) - parts(before), system.position_rows - before.position_rows
-    left_out = tuple(row if row < before.position_rows else row + rows for row in order.left_out)
-    absolute = frozenset(part if part < parts(before) else part + more for part in order.absolute)
+    count = lambda scene: sum(len(g.group.names) for g in scene.constraints.position)
+    new_parts, new_rows = count(system) - count(before), system.position_rows - before.position_rows
+    left_out = tuple(row if row < before.position_rows else row + new_rows for row in order.left_out)
+    absolute = frozenset(part if part < count(before) else part + new_parts for part in order.absolute)
     return joint_order(system, left_out, absolute)
 
 
@@ -71,7 +71,7 @@ def _joint_order(
     layout: Layout, groups: tuple[Any, ...], left_out: tuple[int, ...], absolute: frozenset[int]
 ) -> JointOrder:
     ground, size = layout.ground, layout.space.velocity_size
-    parts = [(own, rows) for bodies, rows in groups for own in bodies]
+    parts = [(part_bodies, rows) for bodies, rows in groups for part_bodies in bodies]
     joints = _merged(parts, ground)
     rows, bodies_of, blocks = _indices(parts, joints, ground, size)
     total = sum(rows for _, rows in parts)
@@ -115,16 +115,16 @@ def _joint_order(
 def _indices(parts, joints, ground, size):
     """Rows, bodies and entries of the blocks of each joint, padded to the largest."""
     first_row = [0, *itertools.accumulate(rows for _, rows in parts)]
-    first_entry = [0, *itertools.accumulate(rows * len(own) * size for own, rows in parts)]
-    widest = max(sum(parts[p][1] for p in own) for _, own in joints)
+    first_entry = [0, *itertools.accumulate(rows * len(bodies) * size for bodies, rows in parts)]
+    widest = max(sum(parts[p][1] for p in numbers) for _, numbers in joints)
     most = max(len(bodies) for bodies, _ in joints)
     rows = np.full((len(joints), widest), first_row[-1], np.int32)
     bodies_of = np.full((len(joints), most), ground, np.int32)
     blocks = np.full((len(joints), most, widest, size), first_entry[-1], np.int32)
-    for joint, (bodies, own) in enumerate(joints):
+    for joint, (bodies, numbers) in enumerate(joints):
         bodies_of[joint, : len(bodies)] = bodies
         start = 0
-        for p in own:
+        for p in numbers:
             part_bodies, n = parts[p]
             rows[joint, start : start + n] = np.arange(first_row[p], first_row[p + 1])
             entries = np.arange(first_entry[p], first_entry[p + 1]).reshape(n, len(part_bodies), size)
@@ -138,16 +138,16 @@ def _indices(parts, joints, ground, size):
 def _nodes(joints, of_body, hubs, below, size):
     """The order of elimination of joints and hubs."""
     neighbours: list[set[int]] = [set() for _ in range(len(joints) + len(hubs))]
-    for body, own in of_body.items():
+    for body, incident in of_body.items():
         if body in hubs:
-            neighbours[hubs[body]].update(own)
-            for joint in own:
+            neighbours[hubs[body]].update(incident)
+            for joint in incident:
                 neighbours[joint].add(hubs[body])
         else:
-            for joint in own:
-                neighbours[joint].update(other for other in own if other != joint)
-    above = lambda joint, own: [hubs[body] for body in own if body in hubs and joint not in below[body]]
-    after = [above(joint, own) for joint, (own, _) in enumerate(joints)]
+            for joint in incident:
+                neighbours[joint].update(other for other in incident if other != joint)
+    above = lambda joint, bodies: [hubs[body] for body in bodies if body in hubs and joint not in below[body]]
+    after = [above(joint, bodies) for joint, (bodies, _) in enumerate(joints)]
     return order_nodes(neighbours, size, after=[*after, *(below[hub] for hub in hubs)])
 
 
@@ -158,14 +158,14 @@ def _gram(joints, of_body, hubs, nodes, most):
     stored = {pair: k for k, pair in enumerate(zip(nodes.row.tolist(), nodes.column.tolist(), strict=True))}
     block = lambda joint, body: joint * most + joints[joint][0].index(body)
     first, second, products, on_hubs, hub_places = [], [], [], [], []
-    for body, own in of_body.items():
+    for body, incident in of_body.items():
         if body in hubs:
             hub = hubs[body]
-            on_hubs += [block(joint, body) for joint in own]
-            hub_places += [stored[hub, j] if (hub, j) in stored else stored[j, hub] for j in own]
+            on_hubs += [block(joint, body) for joint in incident]
+            hub_places += [stored[hub, j] if (hub, j) in stored else stored[j, hub] for j in incident]
             continue
-        for i, a in enumerate(own):
-            for b in own[: i + 1]:
+        for i, a in enumerate(incident):
+            for b in incident[: i + 1]:
                 # The later of the two nodes is the row.
                 row, column = (a, b) if (a, b) in stored else (b, a)
                 first.append(block(row, body))
@@ -196,13 +196,13 @@ def _merged(parts, ground):
 
 def _hubs(joints, parts, absolute, ground):
     """Bodies that are nodes of the elimination, each with the joints that are eliminated before it."""
-    if max(np.bincount([body for own, _ in joints for body in own], minlength=1)) < _HUB:
+    if max(np.bincount([body for bodies, _ in joints for body in bodies], minlength=1)) < _HUB:
         return {}
     # The ground counts as well.
     bound = lambda p: {*parts[p][0], *([ground] if p in absolute else ())}
-    vertices = [set().union(*map(bound, own)) for _, own in joints]
+    vertices = [set().union(*map(bound, numbers)) for _, numbers in joints]
     below: dict[int, set[int]] = {}
     for component in components(vertices, ground):
-        own = {joint for joint in component.joints if component.top in vertices[joint]}
-        below.setdefault(component.top, set()).update(own)
-    return {body: own for body, own in below.items() if body != ground and len(own) >= _HUB}
+        hanging = {joint for joint in component.joints if component.top in vertices[joint]}
+        below.setdefault(component.top, set()).update(hanging)
+    return {body: hanging for body, hanging in below.items() if body != ground and len(hanging) >= _HUB}

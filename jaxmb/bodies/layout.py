@@ -107,7 +107,7 @@ class Layout:
     @property
     def _velocity_sizes(self) -> list[int]:
         size, d = self.space.velocity_size, self.space.dimension
-        return [*(size if rotates else d for rotates in self.rotates), *(int(own.moves) for own in self.scalars)]
+        return [*(size if rotates else d for rotates in self.rotates), *(int(scalar.moves) for scalar in self.scalars)]
 
     def jacobian_source(self, groups: list[tuple[np.ndarray, int]], *, of_poses: bool) -> np.ndarray:
         """Source of each entry of an assembled Jacobian.
@@ -142,21 +142,21 @@ class Layout:
         k, velocity size), raveled one after the other and followed by a zero.
         """
         size, start = self.space.velocity_size, 0
-        found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        sources: dict[str, list[np.ndarray]] = {name: [] for name in names}
         for parts, bodies in joints:
-            for name, own in zip(parts, bodies, strict=True):
-                if name in found:
-                    found[name].append(start + np.arange(len(own) * size).reshape(len(own), size))
-                start += len(own) * size
-        width = max(map(len, found.values()))
+            for name, part_bodies in zip(parts, bodies, strict=True):
+                if name in sources:
+                    sources[name].append(start + np.arange(len(part_bodies) * size).reshape(len(part_bodies), size))
+                start += len(part_bodies) * size
+        width = max(map(len, sources.values()))
         fill = lambda blocks: [*blocks, *[np.full_like(blocks[0], start)] * (width - len(blocks))]
-        return np.array([fill(found[name]) for name in names])
+        return np.array([fill(sources[name]) for name in names])
 
 
 def _index(sizes: list[int], constant: list[int]) -> np.ndarray:
     """The entries of bodies of these sizes, one after the other, and constants for what they lack and the ground."""
     index, start = [], 0
-    for own in sizes:
-        index.append([*range(start, start + own), *constant[own:]])
-        start += own
+    for size in sizes:
+        index.append([*range(start, start + size), *constant[size:]])
+        start += size
     return np.array([*index, constant], np.int32)

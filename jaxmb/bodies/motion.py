@@ -43,14 +43,14 @@ def _names(layout, bodies, index, fields, groups, of_scalars=""):
     names = {}
     rows = index[:-1].tolist()
     for body, row, rotates in zip(bodies, rows[: layout.bodies], layout.rotates, strict=True):
-        own = len(fields) if rotates else layout.space.dimension
-        for k in range(own):
+        count = len(fields) if rotates else layout.space.dimension
+        for k in range(count):
             names[f"{body}.{fields[k]}"] = [row[k]]
         for group, where in groups.items():
-            if where.stop <= own:
+            if where.stop <= count:
                 names[f"{body}.{group}"] = row[where]
     scalars = zip(layout.scalars, rows[layout.bodies :], strict=True)
-    return names | {f"{own.name}{of_scalars}": [row[0]] for own, row in scalars if own.moves}
+    return names | {f"{scalar.name}{of_scalars}": [row[0]] for scalar, row in scalars if scalar.moves}
 
 
 def body_motion(layout: Layout, body: int, ys: State) -> BodyMotion:
@@ -89,11 +89,11 @@ def body_measures(layout: Layout, names: Sequence[str]) -> dict[str, Measure]:
     out = {}
     for body, name in enumerate(names):
         rotates, starts = layout.rotates[body], _starts(layout, body)
-        own = translation | rotation if rotates else translation
-        for field, shape in own.items():
+        fields = translation | rotation if rotates else translation
+        for field, shape in fields.items():
             out[f"{name}.{field}"] = Measure(shape, _of_body, (field, rotates, False, starts))
         for rate, (field, shape) in rates.items():
-            if field in own:
+            if field in fields:
                 place = field, rotates, True, starts
                 out[f"{name}.{rate}"] = Measure(shape, _of_body, place, of_forces=True)
     return out
@@ -111,12 +111,12 @@ def _of_body(system, place, ts, ys, solved):
 def scalar_measures(layout: Layout) -> dict[str, Measure]:
     """Scalar coordinates that move, their rates and accelerations, `"rotor.angle"`, `"rotor.angle_rate"`."""
     out = {}
-    for k, own in enumerate(layout.scalars, layout.bodies):
-        if own.moves:
+    for k, scalar in enumerate(layout.scalars, layout.bodies):
+        if scalar.moves:
             i, j = _starts(layout, k)
-            out[own.name] = Measure((), entries_along, ("q", i, ()))
-            out[f"{own.name}_rate"] = Measure((), entries_along, ("u", j, ()))
-            out[f"{own.name}_acceleration"] = Measure((), entries_along, ("accelerations", j, ()), of_forces=True)
+            out[scalar.name] = Measure((), entries_along, ("q", i, ()))
+            out[f"{scalar.name}_rate"] = Measure((), entries_along, ("u", j, ()))
+            out[f"{scalar.name}_acceleration"] = Measure((), entries_along, ("accelerations", j, ()), of_forces=True)
     return out
 
 
@@ -128,8 +128,8 @@ def frame_measures(groups: Sequence[FrameGroup], layout: Layout) -> dict[str, Me
     at_velocities |= {"angle": ()} if d == 2 else {"orientation": (4,)}
     at_accelerations = {"acceleration": (d,), "angular_acceleration": turning, "specific_force": (d,)}
     out = {}
-    for g, own in enumerate(groups):
-        for k, name in enumerate(own.group.names):
+    for g, group in enumerate(groups):
+        for k, name in enumerate(group.group.names):
             for field, shape in (at_velocities | at_accelerations).items():
                 of_forces = field in at_accelerations
                 out[f"{name}.{field}"] = Measure(shape, _of_frame, (g, field, of_forces, np.array(k)), of_forces)

@@ -74,8 +74,8 @@ def _motion_order(
 ) -> MotionOrder:
     ground, size = layout.ground, layout.space.velocity_size
     # Every pair of bodies of a part, row by row, as `contributions` of `jaxmb.bodies.field_jacobian` lists them.
-    rows = [own[i] for group in acting for own in group for i in range(len(own)) for _ in own]
-    columns = [own[j] for group in acting for own in group for _ in own for j in range(len(own))]
+    rows = [bodies[i] for group in acting for bodies in group for i in range(len(bodies)) for _ in bodies]
+    columns = [bodies[j] for group in acting for bodies in group for _ in bodies for j in range(len(bodies))]
     rows, columns = [*rows, *range(ground)], [*columns, *range(ground)]
     places: dict[tuple[int, int], int] = {(body, body): body for body in range(ground)}
     outside = -1
@@ -88,15 +88,15 @@ def _motion_order(
     )
     row, column = np.array(list(places), np.int32).reshape(-1, 2).T
 
-    of_joints = [] if joints is None else [tuple(int(b) for b in own if b != ground) for own in joints.bodies]
+    of_joints = [] if joints is None else [tuple(int(b) for b in bodies if b != ground) for bodies in joints.bodies]
     neighbours: list[set[int]] = [set() for _ in range(ground + len(of_joints))]
     for a, b in places:
         if a != b:
             neighbours[a].add(b)
             neighbours[b].add(a)
-    for joint, own in enumerate(of_joints, ground):
-        neighbours[joint].update(own)
-        for body in own:
+    for joint, bodies in enumerate(of_joints, ground):
+        neighbours[joint].update(bodies)
+        for body in bodies:
             neighbours[body].add(joint)
     widest = size if joints is None else max(size, joints.rows.shape[1])
     after = [*([()] * ground), *vertices_before(of_joints, ground)]
@@ -106,10 +106,10 @@ def _motion_order(
     pairs, most = len(places), 0 if joints is None else joints.bodies.shape[1]
     across = len(of_joints) * most
     block = {
-        (b, a): pairs + across + k * most + own.index(b)
-        for k, own in enumerate(of_joints)
+        (b, a): pairs + across + k * most + bodies.index(b)
+        for k, bodies in enumerate(of_joints)
         for a in [ground + k]
-        for b in own
+        for b in bodies
     }
     source = dict(places)
     for (body, joint), place in block.items():

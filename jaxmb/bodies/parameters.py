@@ -136,7 +136,7 @@ class SceneParameters(ParameterTable):
         # The rates of inputs count in constraints, or in velocities that forces depend on.
         out: dict[str, tuple[AbstractSignal, bool]] = {}
         for path, groups in self._groups.items():
-            for single in (single for g in groups for each in g.group.inputs for single in each.alone()):
+            for single in (single for g in groups for driven in g.group.inputs for single in driven.alone()):
                 (name,) = single.names
                 _, counts = out.get(name, (single.signal, False))
                 out[name] = single.signal, counts or path in _BIND or single.moves
@@ -202,5 +202,5 @@ def _inputs(
 
 def _with_inputs(group, inputs):
     names = {single.names for single in inputs}
-    kept = (single for each in group.group.inputs for single in each.alone() if single.names not in names)
+    kept = (single for driven in group.group.inputs for single in driven.alone() if single.names not in names)
     return dataclasses.replace(group, group=dataclasses.replace(group.group, inputs=together([*kept, *inputs])))

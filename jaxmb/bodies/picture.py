@@ -20,22 +20,24 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
     layout, names = system.layout, (*system.body_names, GROUND)
     space, groups = layout.space, [_pictured(group) for group in groups]
     # Scalar coordinates are at no place.
-    known = dict(zip((*range(layout.bodies), layout.ground), names, strict=True))
-    position, orientation = (np.asarray(own)[list(known)] for own in _placements(system, ys))
+    body_names = dict(zip((*range(layout.bodies), layout.ground), names, strict=True))
+    position, orientation = (np.asarray(values)[list(body_names)] for values in _placements(system, ys))
     single = [
-        (name, tuple(known[body] for body in bodies if body in known), part)
+        (name, tuple(body_names[body] for body in bodies if body in body_names), part)
         for group in groups
         for name, bodies, part in zip(group.names, group.bodies, _unstacked(group), strict=True)
     ]
     parts: dict[str, Anchors] = {}
-    for name, own, part in single:
-        points = [part.anchor(k) for k in range(len(own))]
+    for name, bodies, part in single:
+        points = [part.anchor(k) for k in range(len(bodies))]
         parts.setdefault(
-            name, Anchors(own, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
+            name, Anchors(bodies, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
         )
     width = _width(float(system.length), parts)
     shapes = [
-        (GROUND if k is None else own[k], shape) for _, own, part in single for k, shape in _shapes(part, space, width)
+        (GROUND if k is None else bodies[k], shape)
+        for _, bodies, part in single
+        for k, shape in _shapes(part, space, width)
     ]
     # The friction of a joint acts where the joint does.
     of_laws = {law: joint for g in system.constraints.laws for law, joint in zip(g.group.names, g.joints, strict=True)}
@@ -52,7 +54,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         shapes=shapes,
         paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()},
         centres={
-            name: np.asarray(space.in_space(own)) for g in system.bodies.groups for name, own in _centres(g.group)
+            name: np.asarray(space.in_space(centre)) for g in system.bodies.groups for name, centre in _centres(g.group)
         },
         inertias={name: (float(m), J) for name, m, J in zip(names, mass, moments, strict=False)},
     )
@@ -63,7 +65,7 @@ def _pictured(group):
     moved = jax.vmap(lambda part: part.pictured(group.layout.space))(group.part)
     on_ground = group.body_index[:, -1] == group.layout.ground
     kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)
-    return eqx.tree_at(lambda own: own.part, group, jax.tree.map(kept, group.part, moved))
+    return eqx.tree_at(lambda stacked: stacked.part, group, jax.tree.map(kept, group.part, moved))
 
 
 def _shapes(part, space, width):
@@ -93,7 +95,7 @@ def _width(length, parts):
         for body, point in zip(part.bodies, part.points, strict=True):
             if point is not None and body != GROUND:
                 reach[body] = max(reach.get(body, 0.0), float(np.linalg.norm(point)))
-    typical = float(np.median([own for own in reach.values() if own > 0] or [length]))
+    typical = float(np.median([distance for distance in reach.values() if distance > 0] or [length]))
     return min(0.024 * length, 0.08 * typical)
 
 

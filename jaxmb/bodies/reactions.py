@@ -29,8 +29,8 @@ class Place(NamedTuple):
 
 def places(groups: Sequence[AbstractGroup], name: str) -> tuple[Place, ...]:
     """Where the parts of a name stand: the components of a part in several groups or more than once in one."""
-    found = ((g, k) for g, group in enumerate(groups) for k, other in enumerate(group.group.names) if other == name)
-    return tuple(_place(g, k, groups[g].group) for g, k in found)
+    numbers = ((g, k) for g, group in enumerate(groups) for k, other in enumerate(group.group.names) if other == name)
+    return tuple(_place(g, k, groups[g].group) for g, k in numbers)
 
 
 def _place(number: int, member: int, group: Group) -> Place:
@@ -49,10 +49,10 @@ def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
     """The forces and moments of joints."""
     d = system.layout.space.dimension
     fields = {"force": (d,), "moment": () if d == 2 else (3,)}
-    found = {name: joint_places(system.constraints, name) for name in names}
+    joints = {name: joint_places(system.constraints, name) for name in names}
     return {
         f"{name}.{field}": Measure(shape, _field_of_reaction, (field, joint), of_forces=True)
-        for name, joint in found.items()
+        for name, joint in joints.items()
         for field, shape in fields.items()
     }
 
@@ -92,12 +92,12 @@ def applied_wrenches(system: Any, place: Any, ts: Any, ys: State, multipliers: A
         if of_laws:
             laws = [system.constraints.nonideal[at.group] for at in of_laws]
             wrenches = system.constraints.nonideal_wrenches(laws, now, multipliers)
-            found = [values[at.member] for (values, _), at in zip(wrenches, of_laws, strict=True)]
+            of_parts = [values[at.member] for (values, _), at in zip(wrenches, of_laws, strict=True)]
         else:
             alone = [system.at(y).forces.groups[at.group].only(at.member) for at in of_forces]
-            found = [group.wrenches(now)[0] for group in alone]
+            of_parts = [group.wrenches(now)[0] for group in alone]
         # A force element may have several components.
-        return add_up(values[np.array(at.on_bodies)] for values, at in zip(found, of_laws or of_forces, strict=True))
+        return add_up(values[np.array(at.on_bodies)] for values, at in zip(of_parts, of_laws or of_forces, strict=True))
 
     return jax.vmap(single)(ts, ys, multipliers)
 
@@ -105,15 +105,15 @@ def applied_wrenches(system: Any, place: Any, ts: Any, ys: State, multipliers: A
 def _reaction(constraints, places, now, multipliers) -> Reaction:
     """Reaction of one joint at one state."""
     of_groups = constraints.of_groups(multipliers)
-    force, moment, found = 0.0, 0.0, []
+    force, moment, of_joint = 0.0, 0.0, []
     for place in places:
         group, values = of_groups[place.group]
         alone, values = group.only(place.member), values[place.member]
         wrenches = jnp.einsum("r,rkv->kv", values, alone.jacobian(now)[0])
         f, m = _on_last_body(alone.group, place, now.poses, wrenches)
         force, moment = force + f, moment + m
-        found.append(values)
-    return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(found))
+        of_joint.append(values)
+    return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(of_joint))
 
 
 def _with_slip(stick, laws, places, now, wrenches) -> Reaction:

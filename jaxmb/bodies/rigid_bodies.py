@@ -29,7 +29,7 @@ from .force_set import ForceSet
 from .groups import ConstraintGroup, CoordinateGroup, FrameGroup, Kinematics
 from .host import host_scene
 from .joint_coordinates import held_groups
-from .joint_graph import joint_order_with_more
+from .joint_graph import extended_joint_order
 from .layout import Layout
 from .motion import coordinate_names, rate_names
 from .parameters import SceneParameters
@@ -186,7 +186,7 @@ class RigidBodySystem(AbstractSystem):
     def velocity_scale(self):
         return jnp.where(self.layout.velocity_lengths, lax.stop_gradient(self.length), 1.0)
 
-    def known_scales(self) -> tuple[Float[np.ndarray, "nq"], Float[np.ndarray, "nu"]]:
+    def concrete_scales(self) -> tuple[Float[np.ndarray, "nq"], Float[np.ndarray, "nu"]]:
         """The scales of coordinates and velocities of a system that is not traced: NumPy, also within a trace."""
         lengths = self.layout.coordinate_lengths, self.layout.velocity_lengths
         of_coordinates, of_velocities = (np.where(is_length, np.asarray(self.length), 1.0) for is_length in lengths)
@@ -319,7 +319,9 @@ class RigidBodySystem(AbstractSystem):
     def gaps_seen(self, t, q, u):
         now = self.kinematics(t, q, u)
         seen = [g.gaps(now) for g in self.forces.with_gaps]
-        gaps, rates, widths, paces = (jnp.concatenate([x.ravel() for x in own]) for own in zip(*seen, strict=True))
+        gaps, rates, widths, paces = (
+            jnp.concatenate([x.ravel() for x in values]) for values in zip(*seen, strict=True)
+        )
         return GapsSeen(gaps, rates, widths, jnp.max(paces))
 
     @eqx.filter_jit
@@ -327,7 +329,7 @@ class RigidBodySystem(AbstractSystem):
         groups = self.constraints.frictions
         reactions = self.constraints.reactions([g.law for g in groups], self.kinematics(t, q, u), multipliers)
         d, both = self.layout.space.dimension, zip(groups, reactions, strict=True)
-        return jnp.concatenate([_of_rows(own[:, g.group.part.last, :d], g.rows) for g, own in both])
+        return jnp.concatenate([_of_rows(reaction[:, g.group.part.last, :d], g.rows) for g, reaction in both])
 
     # Motions and assembly
 
@@ -350,11 +352,11 @@ class RigidBodySystem(AbstractSystem):
         held = held_groups(self.measured, self.joint_coordinates(), values, rates, t)
         rows = sum(g.rows for g in held)
         constraints = dataclasses.replace(self.constraints, position=(*self.constraints.position, *held))
-        more = Ranks(*(rank + rows for rank in dataclasses.astuple(self.ranks)))
-        out = dataclasses.replace(self, constraints=constraints, ranks=more, elimination=None)
+        ranks = Ranks(*(rank + rows for rank in dataclasses.astuple(self.ranks)))
+        out = dataclasses.replace(self, constraints=constraints, ranks=ranks, elimination=None)
         if self.elimination is None:
             return out
-        return dataclasses.replace(out, elimination=joint_order_with_more(out, self, self.elimination))
+        return dataclasses.replace(out, elimination=extended_joint_order(out, self, self.elimination))
 
     # Implicit methods
 

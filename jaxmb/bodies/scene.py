@@ -134,7 +134,7 @@ class Scene(eqx.Module):
         for name in without:
             if name not in names:
                 raise unknown("part", name, names, "without")
-        kept = lambda parts, more: (*(part for part in parts if part.name not in without), *more)
+        kept = lambda parts, added: (*(part for part in parts if part.name not in without), *added)
         return Scene(
             kept(self.bodies, bodies),
             joints=kept(self.joints, joints),
@@ -144,7 +144,7 @@ class Scene(eqx.Module):
 
     def __repr__(self) -> str:
         parts = {name: getattr(self, name) for name in ("bodies", "joints", "forces", "frames")}
-        return f"Scene: {', '.join(f'{len(own)} {name}' for name, own in parts.items() if own)}"
+        return f"Scene: {', '.join(f'{len(listed)} {name}' for name, listed in parts.items() if listed)}"
 
     def __str__(self) -> str:
         lines = [f"{self!r}; compile() makes a system of it"]
@@ -186,11 +186,11 @@ class Scene(eqx.Module):
         frames = frames_by_name(self.frames, self.bodies)
         index |= {name: index[frame.of_body] for name, frame in frames.items()}
         observed = frozenset(frame.name for frame in self.frames)
-        known = KnownParts(space, index, of_parts, frames, observed, given, {})
-        parts, laws, gravity = _settled(self, known, layout)
+        resolved = KnownParts(space, index, of_parts, frames, observed, given, {})
+        parts, laws, gravity = _settled(self, resolved, layout)
 
         def kind(cls, check=check_kernels):
-            return stack([(part, own) for part, own in parts if isinstance(part, cls)], layout, check)
+            return stack([(part, bodies) for part, bodies in parts if isinstance(part, cls)], layout, check)
 
         def of_joints(group):
             return tuple(of_joint[name] for name in group.names)
@@ -215,7 +215,7 @@ class Scene(eqx.Module):
                 layout=layout,
             ),
             constraints=ConstraintSet(
-                position=tuple(ConstraintGroup(own) for own in constraints if own.rows),
+                position=tuple(ConstraintGroup(group) for group in constraints if group.rows),
                 velocity=tuple(map(between_velocities, kind(AbstractVelocityConstraint))),
                 servos=tuple(map(servo_group, kind(Servo, _check_program))),
                 nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
@@ -223,9 +223,9 @@ class Scene(eqx.Module):
             ),
             forces=forces.with_states(None),
             frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
-            free_joints=tuple(CoordinateGroup(own) for own in constraints if not own.rows),
+            free_joints=tuple(CoordinateGroup(group) for group in constraints if not group.rows),
             guess=dataclasses.replace(guess, z=forces.initial_states()),
-            length=_length([own for part, _ in parts for own in (part, *_held(part))], guess, layout),
+            length=_length([held for part, _ in parts for held in (part, *_held(part))], guess, layout),
             ranks=Ranks(0, 0, 0, 0),
             implied=(),
             elimination=None,
@@ -243,13 +243,13 @@ def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int],
     layout = Layout(space, tuple(body.rotates for body in scene.bodies), sum(scalars.values(), ()))
     index = {body.name: k for k, body in enumerate(scene.bodies)} | {GROUND: layout.ground}
     numbers = iter(range(layout.bodies, layout.ground))
-    return layout, index, {name: tuple(itertools.islice(numbers, len(own))) for name, own in scalars.items()}
+    return layout, index, {name: tuple(itertools.islice(numbers, len(of_part))) for name, of_part in scalars.items()}
 
 
 def _given_state(scene: Scene, layout: Layout) -> State:
     """The poses and velocities of the bodies, and zeros for scalar coordinates."""
     zeros = as_parameter(np.zeros(len(layout.scalars)))
-    moving = [k for k, own in enumerate(layout.scalars) if own.moves]
+    moving = [k for k, scalar in enumerate(layout.scalars) if scalar.moves]
     return State(
         jax.device_put(np.concatenate([*(_call(body, "pose") for body in scene.bodies), zeros])),
         jax.device_put(np.concatenate([*(_call(body, "velocities") for body in scene.bodies), zeros[moving]])),
@@ -277,7 +277,7 @@ def _scalars(system):
     return q, u
 
 
-def _settled(scene: Scene, known: KnownParts, layout: Layout):
+def _settled(scene: Scene, resolved: KnownParts, layout: Layout):
     """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity."""
     parts, laws = [], []
     acting = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractActor)]
@@ -286,16 +286,16 @@ def _settled(scene: Scene, known: KnownParts, layout: Layout):
     if gravity is not None:
         gravity.check(layout.space.dimension)
     for part in sorted(acting, key=_stage):
-        settled, own = _call(part, "settled", known)
+        settled, bodies = _call(part, "settled", resolved)
         if isinstance(settled, AbstractNonIdeal):
-            laws.append((settled, own))
+            laws.append((settled, bodies))
             continue
-        known.joints[part.name] = settled, own
+        resolved.joints[part.name] = settled, bodies
         frames = settled.body_frames
         components = [_call(one, "with_fields", body_frames=frames) for one in _call(settled, "components")]
         if not part.stage:
-            _check_rotation(settled, components, own, layout, known.poses[list(own)])
-        parts += [(component, own) for component in components]
+            _check_rotation(settled, components, bodies, layout, resolved.poses[list(bodies)])
+        parts += [(component, bodies) for component in components]
     return parts, laws, gravity
 
 
@@ -333,8 +333,8 @@ def _check_kinds(scene: Scene):
     dimension = scene.bodies[0].dimension
     for part in (*scene.bodies, *scene.joints, *scene.forces, *scene.frames):
         if dimension not in part.dimensions:
-            here, there = ("planar", "spatial") if dimension == 2 else ("spatial", "planar")
-            raise ValueError(f"{part.label} is {there}, but the scene is {here}; use the {here} part of that name.")
+            kind, other = ("planar", "spatial") if dimension == 2 else ("spatial", "planar")
+            raise ValueError(f"{part.label} is {other}, but the scene is {kind}; use the {kind} part of that name.")
 
 
 def _misplaced(part) -> str:
@@ -364,7 +364,7 @@ def _check_names(scene: Scene):
         if not name or "." in name:
             raise ValueError(f"{part.label}: a name must not be empty or contain a dot.")
         seen.add(name)
-    known = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
+    body_names = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
     # The program of a servo is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
     joints = dict.fromkeys(
@@ -373,13 +373,15 @@ def _check_names(scene: Scene):
         if isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not part.sources)
     )
     # Those of coordinates, as a stop is.
-    stops = {own.name: own for own in scene.joints if isinstance(own, AbstractUnilateralConstraint) and own.sources}
-    places = [*joints, *(name for name in known if name != GROUND)]
+    stops = {
+        stop.name: stop for stop in scene.joints if isinstance(stop, AbstractUnilateralConstraint) and stop.sources
+    }
+    places = [*joints, *(name for name in body_names if name != GROUND)]
     for part in (*scene.joints, *scene.forces):
         if isinstance(part, AbstractActor) and part.sources:
             what, allowed = ("joint, body or frame", places) if part.takes_bodies else ("joint", joints)
             for name in part.sources:
-                if name in known and name not in allowed and not part.takes_bodies:
+                if name in body_names and name not in allowed and not part.takes_bodies:
                     raise ValueError(
                         f"{part.label}: {name!r} is no joint; it acts on joints, and there are "
                         f"{', '.join(map(repr, joints)) or 'none'}."
@@ -391,23 +393,23 @@ def _check_names(scene: Scene):
                 if name not in allowed or name == part.name:
                     raise unknown(what, name, allowed, part.label)
         elif isinstance(part, AbstractLink):
-            own = part.bodies
-            for name in own:
-                if name not in known:
-                    raise unknown("body", name, known, part.label)
-            own = part.distinct(own)
-            twice = [name for name in own if own.count(name) > 1]
-            if twice and (twice[0] != GROUND or set(own) == {GROUND}):
+            bodies = part.bodies
+            for name in bodies:
+                if name not in body_names:
+                    raise unknown("body", name, body_names, part.label)
+            bodies = part.distinct(bodies)
+            twice = [name for name in bodies if bodies.count(name) > 1]
+            if twice and (twice[0] != GROUND or set(bodies) == {GROUND}):
                 raise ValueError(f"{part.label} connects {twice[0]!r} with itself.")
 
 
-def _check_rotation(part, components, own, layout, poses):
+def _check_rotation(part, components, bodies, layout, poses):
     """Refuse parts that act on the rotation of a point mass, which has none."""
-    points = [i for i, k in enumerate(own) if k < layout.bodies and not layout.rotates[k]]
+    points = [i for i, k in enumerate(bodies) if k < layout.bodies and not layout.rotates[k]]
     space = layout.space
     for component in components if points else ():
         with traced_by_jax(part.label, "an argument"):
-            now, kernels = captured(anonymous(_loaded(component)), space, len(own))
+            now, kernels = captured(anonymous(_loaded(component)), space, len(bodies))
             turned = _turned(now, space, poses, tuple(kernels.items()))
         if np.any(turned[points]):
             raise ValueError(
@@ -422,11 +424,11 @@ def _loaded(part):
     """
     filled = lambda x: np.ones_like(x) if isinstance(x, ARRAYS) and not np.any(x) else x
     ones = {}
-    for name, own in declarations(type(part)).items():
+    for name, declared in declarations(type(part)).items():
         value = values_of(part)[name]
         if isinstance(value, Mapping):
             ones[name] = {key: filled(x) for key, x in value.items()}
-        elif own.unit in ("N", "N m") and value is not None:
+        elif declared.unit in ("N", "N m") and value is not None:
             ones[name] = filled(value)
     return _call(part, "with_fields", **ones) if ones else part
 
@@ -447,8 +449,8 @@ def _turned(part, space, poses, kernels):
         least = 100 * float(np.finfo(poses.dtype).eps) * jnp.max(jnp.abs(poses[:, :d]))
         return jnp.any(strength[:, d:] > least * jnp.max(strength[:, :d]), axis=1)
 
-    others = jax.vmap(space.normalize)(poses + varied(space.pose_size))
-    return jnp.any(lax.map(turned, jnp.stack([poses, others])), axis=0)
+    displaced = jax.vmap(space.normalize)(poses + varied(space.pose_size))
+    return jnp.any(lax.map(turned, jnp.stack([poses, displaced])), axis=0)
 
 
 def _strength(part, space, poses, velocities):
@@ -471,8 +473,8 @@ def _length(parts, guess, layout):
         values[name]
         for part in parts
         for values in [values_of(part)]
-        for name, own in declarations(type(part)).items()
-        if own.sizes
+        for name, declared in declarations(type(part)).items()
+        if declared.sizes
     )
     sizes = [float(np.max(np.abs(value), initial=0.0)) for value in lengths if value is not None]
     size = max(sizes, default=0.0)

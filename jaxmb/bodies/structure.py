@@ -53,8 +53,8 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     invariants = system.coordinate_rows - system.position_rows
     if not system.acceleration_rows:
         return dataclasses.replace(system, ranks=Ranks(0, invariants, 0, 0))
-    others = tuple(range(system.position_rows, system.acceleration_rows))
-    of_positions = dataclasses.replace(system, elimination=joint_order(system, others))
+    other_rows = tuple(range(system.position_rows, system.acceleration_rows))
+    of_positions = dataclasses.replace(system, elimination=joint_order(system, other_rows))
     q, residual, at = _analysed(of_positions)
     if not float(residual) <= tolerance(q.dtype):
         listed = violated_joints(system, 0.0, q, least=0.0)
@@ -64,22 +64,24 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
             f"remain in {listed}. The assembly starts at the position and the {turn} of each body: give poses that are "
             "nearer to an assembled mechanism. Else check lengths, points and axes: joints may contradict each other."
         )
-    joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, system.known_scales()[1])
+    joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, system.concrete_scales()[1])
     check_gradients(system, _row_norms(system, at.blocks))
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
     absolute = joints.absolute_parts(_motions_as_one(system.layout, np.asarray(q)))
-    found = joints.subsets(level, absolute)
-    dropped = tuple(sorted(r for own in found for r in own.dropped.tolist()))
-    shares = [share for own in found for share in own.shares]
+    subsets = joints.subsets(level, absolute)
+    dropped = tuple(sorted(r for subset in subsets for r in subset.dropped.tolist()))
+    shares = [share for subset in subsets for share in subset.shares]
 
     order = joint_order(system, dropped, absolute)
     _check_contradictions(dataclasses.replace(system, elimination=order), q, shares)
-    _check_locked(system, joints, found)
+    _check_locked(system, joints, subsets)
     implied = _implied(system, shares)
     _check_determined(system, implied)
-    _check_nearby(dataclasses.replace(of_positions, elimination=order), q, joints, found)
-    position, velocity, acceleration = (sum(int(np.sum(level[own.kept] <= k)) for own in found) for k in range(3))
+    _check_nearby(dataclasses.replace(of_positions, elimination=order), q, joints, subsets)
+    position, velocity, acceleration = (
+        sum(int(np.sum(level[subset.kept] <= k)) for subset in subsets) for k in range(3)
+    )
     return dataclasses.replace(
         system,
         ranks=Ranks(position, position + invariants, velocity, acceleration),
@@ -91,13 +93,13 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
 def _parts(system):
     """Bodies, first row and number of rows of every part."""
     groups = [(g.group.bodies, g.rows) for g in system.constraints.groups]
-    sizes = [(own, rows) for bodies, rows in groups for own in bodies]
+    sizes = [(part_bodies, rows) for bodies, rows in groups for part_bodies in bodies]
     starts = itertools.accumulate((rows for _, rows in sizes), initial=0)
-    return [JointRows(own, first, rows) for (own, rows), first in zip(sizes, starts, strict=False)]
+    return [JointRows(part_bodies, first, rows) for (part_bodies, rows), first in zip(sizes, starts, strict=False)]
 
 
 def _of_parts(groups):
-    return [own for group in groups for own in np.asarray(group)]
+    return [block for group in groups for block in np.asarray(group)]
 
 
 class _Evaluation(NamedTuple):
@@ -128,8 +130,8 @@ def _numbers(tree):
 @eqx.filter_jit
 def _met(system):
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
-    at, still = _at_rest(system, t, q), np.zeros(system.nu, bool)
-    q = meet_in_blocks(at, still) if system.position_rows else at.normalized().q
+    at, fixed = _at_rest(system, t, q), np.zeros(system.nu, bool)
+    q = meet_in_blocks(at, fixed) if system.position_rows else at.normalized().q
     return q, *_evaluated(system, t, q)
 
 
@@ -146,9 +148,9 @@ def _of_host(on_host, q):
 
 def _row_norms(system, blocks):
     """The norm of each row of A, its columns multiplied by the scales of velocities."""
-    of_bodies = np.append(system.known_scales()[1], 0.0)[system.layout.velocity_index]
-    own = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.constraints.groups]
-    sizes = [np.sqrt(np.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, own, strict=True)]
+    of_bodies = np.append(system.concrete_scales()[1], 0.0)[system.layout.velocity_index]
+    scales = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.constraints.groups]
+    sizes = [np.sqrt(np.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, scales, strict=True)]
     return np.concatenate([size.reshape(-1) for size in sizes])
 
 
@@ -175,8 +177,8 @@ def _asked(system, q):
     t, u = jnp.zeros((), q.dtype), system.guess.u
     asked = system.velocity_residual(t, q, u)
     metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
-    more = jnp.zeros(system.acceleration_rows - system.velocity_rows, q.dtype)
-    u = u + system.structured_jacobian(t, q, u).projector(metric).cancel(jnp.concatenate([asked, more]))
+    zeros = jnp.zeros(system.acceleration_rows - system.velocity_rows, q.dtype)
+    u = u + system.structured_jacobian(t, q, u).projector(metric).cancel(jnp.concatenate([asked, zeros]))
     return asked, system.acceleration_residual(t, q, u, jnp.zeros_like(u))
 
 
@@ -191,8 +193,8 @@ def _motions_as_one(layout, q):
         axes: Any = np.eye(3)
         turned = np.array([[[*np.cross(axis, x[:3]), *unrotate(x[3:], axis)] for x in poses] for axis in axes])
     # Scalar coordinates and the ground stay.
-    still = layout.ground + 1 - layout.bodies
-    return np.pad(np.concatenate([moved, turned]), ((0, 0), (0, still), (0, 0)))
+    resting = layout.ground + 1 - layout.bodies
+    return np.pad(np.concatenate([moved, turned]), ((0, 0), (0, resting), (0, 0)))
 
 
 @eqx.filter_jit
@@ -227,31 +229,31 @@ def _check_contradictions(system, q, shares):
             )
 
 
-def _check_locked(system, joints, found):
+def _check_locked(system, joints, subsets):
     """Refuse bodies that only a small disagreement of redundant joints keeps from moving.
 
     Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble,
     if at all, where they lock. No row is implied there, but some nearly are.
     """
     independent = np.zeros(system.acceleration_rows, bool)
-    for subset in found:
+    for subset in subsets:
         independent[subset.kept] = True
     parts = joints.parts
-    for bodies, own in _connected(system, parts):
+    for bodies, numbers in _connected(system, parts):
         columns = system.layout.velocity_index[bodies].ravel()
         columns = np.sort(columns[columns < system.nu])
         # Joints that close no loop say nothing of one another, and long chains of them have small singular values too.
-        if len(own) == len(bodies) and all(len(parts[p].bodies) == 2 for p in own):
+        if len(numbers) == len(bodies) and all(len(parts[p].bodies) == 2 for p in numbers):
             continue
         # Where rows are fewer than columns, or some implied by others, the bodies move.
-        if sum(np.sum(independent[parts[p].numbers]) for p in own) < len(columns):
+        if sum(np.sum(independent[parts[p].numbers]) for p in numbers) < len(columns):
             continue
-        scaled = joints.dense(own, columns) * joints.scale[columns]
+        scaled = joints.dense(numbers, columns) * joints.scale[columns]
         scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)
         left, sizes, _ = np.linalg.svd(scaled)
         if _MOVES < sizes[-1] < _LOCKED:
             share = np.abs(left[:, len(columns) - 1])
-            rows = [r for p in own for r in parts[p].numbers]
+            rows = [r for p in numbers for r in parts[p].numbers]
             names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
             moving = ", ".join(system.body_names[k] for k in bodies if k < system.layout.bodies)
             raise ValueError(
@@ -272,30 +274,30 @@ def _connected(system, parts):
     bodies, of_parts, driven = ([[] for _ in first] for _ in range(3))
     for k in range(ground):
         bodies[first[k]].append(k)
-    for p, own in enumerate(moving):
-        if own:
-            of_parts[first[own[0]]].append(p)
-            driven[first[own[0]]].append(rheonomic[p])
+    for p, moving_bodies in enumerate(moving):
+        if moving_bodies:
+            of_parts[first[moving_bodies[0]]].append(p)
+            driven[first[moving_bodies[0]]].append(rheonomic[p])
     return [(b, p) for b, p, d in zip(bodies, of_parts, driven, strict=True) if d and not any(d)]
 
 
 def _bodies_of_joints(system):
     """Names of the bodies of each joint, without the ground."""
-    known = system.body_names
-    bodies = lambda own: tuple(known[k] for k in own if k < len(known))
+    names = system.body_names
+    bodies = lambda numbers: tuple(names[k] for k in numbers if k < len(names))
     groups = [g.group for g in system.constraints.groups]
-    return {name: bodies(own) for g in groups for name, own in zip(g.names, g.bodies, strict=True)}
+    return {name: bodies(numbers) for g in groups for name, numbers in zip(g.names, g.bodies, strict=True)}
 
 
 def _check_determined(system, implied):
     """Refuse friction laws of joints whose reaction is indeterminate."""
     for g in system.constraints.laws:
         for name, joint in zip(g.group.names, g.joints, strict=True):
-            others = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
-            if others:
+            involved = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
+            if involved:
                 raise ValueError(
                     f"{g.group.part.kind} {name!r} needs the force of {joint!r}, which is not determined: "
-                    f"rows of {', '.join(sorted(others))} imply one another. Remove the redundant ones."
+                    f"rows of {', '.join(sorted(involved))} imply one another. Remove the redundant ones."
                 )
 
 
@@ -310,46 +312,48 @@ def _implied(system, shares):
     return tuple(sorted(out, key=lambda item: (item.name, item.row)))
 
 
-def _check_nearby(system, q, joints, found):
+def _check_nearby(system, q, joints, subsets):
     """Refuse rows that are implied at this configuration, but not near it."""
-    groups = [own for own in found if own.dropped.size]
-    is_sparse = any(own.is_sparse for own in groups)
+    groups = [subset for subset in subsets if subset.dropped.size]
+    is_sparse = any(subset.is_sparse for subset in groups)
 
     def evaluate(t, moved):
         t = np.asarray(t, q.dtype)
         at = _displaced(system, t, q, moved)
-        there, unmet = joints._replace(blocks=_of_parts(at.blocks)), np.asarray(at.unmet)
+        displaced, unmet = joints._replace(blocks=_of_parts(at.blocks)), np.asarray(at.unmet)
         back: Any = np.asarray(_way_back(system, t, q, moved)) if is_sparse else None
 
-        def dense(own):
-            return there.dense(own.parts, own.columns) * joints.scale[own.columns]
+        def dense(subset):
+            return displaced.dense(subset.parts, subset.columns) * joints.scale[subset.columns]
 
         def step(k, rows):
-            own = groups[k]
-            if own.is_sparse:
-                return back[own.columns]
-            return smallest_step(dense(own)[np.searchsorted(own.rows, rows)], unmet[rows])
+            subset = groups[k]
+            if subset.is_sparse:
+                return back[subset.columns]
+            return smallest_step(dense(subset)[np.searchsorted(subset.rows, rows)], unmet[rows])
 
         def remains(k, kept, dropped):
-            own = groups[k]
-            if not own.is_sparse:
-                off, sizes, by = dense_remains(dense(own), *(np.searchsorted(own.rows, x) for x in (kept, dropped)))
-                return Remains(off, sizes, lambda bad: own.rows[by(bad)])
-            place, later = np.searchsorted(own.rows, dropped), np.isin(own.rows, dropped)
-            pivots, sizes = there.eliminate(own.parts, own.columns, later.astype(int), ZERO)
+            subset = groups[k]
+            if not subset.is_sparse:
+                off, sizes, by = dense_remains(
+                    dense(subset), *(np.searchsorted(subset.rows, x) for x in (kept, dropped))
+                )
+                return Remains(off, sizes, lambda bad: subset.rows[by(bad)])
+            place, later = np.searchsorted(subset.rows, dropped), np.isin(subset.rows, dropped)
+            pivots, sizes = displaced.eliminate(subset.parts, subset.columns, later.astype(int), ZERO)
             # What remains of a row is not zero where it became a pivot.
             off = np.isin(place, pivots.order[: pivots.rank]).astype(q.dtype)
-            implied_by = {share.row: share.by for share in own.shares}
+            implied_by = {share.row: share.by for share in subset.shares}
             by = lambda bad: np.unique(np.concatenate([implied_by[row] for row in dropped[bad].tolist()]))
             return Remains(off, sizes[place], by)
 
         return Nearby(unmet, step, remains)
 
-    holonomic = lambda own: own.kept[own.kept < system.position_rows]
+    holonomic = lambda subset: subset.kept[subset.kept < system.position_rows]
     check_implied(
         system,
-        [DependentRows(own.rows, own.kept, holonomic(own)) for own in groups],
-        [own.columns for own in groups],
+        [DependentRows(subset.rows, subset.kept, holonomic(subset)) for subset in groups],
+        [subset.columns for subset in groups],
         evaluate,
         system.nu,
         q.dtype,

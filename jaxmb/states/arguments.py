@@ -30,10 +30,10 @@ def check_precision(function: str, system: AbstractSystem) -> None:
     """Raise a `ValueError` for a system that was made before `jax_enable_x64` was switched: its numbers would keep the
     other precision, and a motion be no better than they are.
     """
-    own, now = system.guess.q.dtype, default_float()
-    if own != now:
+    old, now = system.guess.q.dtype, default_float()
+    if old != now:
         raise ValueError(
-            f"{function}: the system has numbers of {own}, and JAX now makes {now}: jax_enable_x64 was switched after "
+            f"{function}: the system has numbers of {old}, and JAX now makes {now}: jax_enable_x64 was switched after "
             'the system was made. Set jax.config.update("jax_enable_x64", …) first, and make the system after it.'
         )
 
@@ -105,24 +105,24 @@ def prescribe(
 
 
 def split_names(
-    what: str, system: AbstractSystem, own: Mapping[str, Any], values: Mapping[str, VectorLike] | None
+    what: str, system: AbstractSystem, names: Mapping[str, Any], values: Mapping[str, VectorLike] | None
 ) -> tuple[dict[str, VectorLike], dict[str, Any]]:
     """Prescribed values of the system's own coordinates or rates, and of coordinates of joints, which become arrays.
 
     **Raises:** `ValueError` for names of neither kind and for values of the wrong shape.
     """
-    if values is None or not isinstance(values, Mapping) or all(name in own for name in values):
+    if values is None or not isinstance(values, Mapping) or all(name in names for name in values):
         return ({} if values is None else values), {}  # pyright: ignore[reportReturnType]
-    known, dtype = system.joint_coordinates(), jnp.result_type(float)
+    joint_coordinates, dtype = system.joint_coordinates(), jnp.result_type(float)
     of_joints = {}
     for name, value in values.items():
-        if name not in own:
-            if name not in known:
-                raise unknown(what, name, (*own, *known, *system.state_names()))
+        if name not in names:
+            if name not in joint_coordinates:
+                raise unknown(what, name, (*names, *joint_coordinates, *system.state_names()))
             of_joints[name] = jnp.asarray(
-                real_array(f"{what.capitalize()} {name!r}", value, dtype, (known[name].shape,))
+                real_array(f"{what.capitalize()} {name!r}", value, dtype, (joint_coordinates[name].shape,))
             )
-    return {name: value for name, value in values.items() if name in own}, of_joints
+    return {name: value for name, value in values.items() if name in names}, of_joints
 
 
 def split_coordinates(
@@ -143,16 +143,16 @@ def split_coordinates(
                 raise UnknownNameError(
                     f"{name!r} is a rate, and fix holds coordinates: assemble takes it as rates={{{base!r}: …}}."
                 )
-    own, of_joints = split_names("coordinate", system, system.coordinate_names(), values)
-    if isinstance(own, Mapping):
-        for name, value in (*own.items(), *of_joints.items()):
+    of_system, of_joints = split_names("coordinate", system, system.coordinate_names(), values)
+    if isinstance(of_system, Mapping):
+        for name, value in (*of_system.items(), *of_joints.items()):
             is_angle = name.rpartition(".")[2].startswith("angle")
             if not is_angle or is_traced(value) or real_shape(f"Coordinate {name!r}", value) != ():
                 continue
-            if name in own or float(np.asarray(value)) % 5 == 0:
+            if name in of_system or float(np.asarray(value)) % 5 == 0:
                 # The user calls `assemble` and its like, which call this function.
                 warn_of_degrees(f"fix={{{name!r}: …}}", value, stacklevel=4)
-    return own, of_joints
+    return of_system, of_joints
 
 
 def split_rates(
@@ -166,16 +166,16 @@ def split_rates(
     """
     if values is None:
         return {}, {}
-    own = rates_of(system.rate_names())
+    names = rates_of(system.rate_names())
     if isinstance(values, Mapping):
         twice = [name for name in values if f"{name}_rate" in values]
         if twice:
             raise ValueError(f"{twice[0]!r} and '{twice[0]}_rate' are the same rate; prescribe one of them.")
         # Coordinates of joints are found by a trace of each, which most calls do not need.
-        if any(name not in own for name in values):
+        if any(name not in names for name in values):
             of_joints = {f"{name}_rate": name for name in system.joint_coordinates()}
             values = {of_joints.get(name, name): value for name, value in values.items()}
-    return split_names("rate", system, own, values)
+    return split_names("rate", system, names, values)
 
 
 def split_internal_states(
@@ -188,11 +188,11 @@ def split_internal_states(
     if z is None or not isinstance(values, Mapping):
         return z, values
     names = system.state_names()
-    own = {name: value for name, value in values.items() if name in names}
-    z, _ = prescribe("internal state", names, own, z)
+    given = {name: value for name, value in values.items() if name in names}
+    z, _ = prescribe("internal state", names, given, z)
     if not is_traced(z) and not np.all(np.isfinite(z)):
         raise ValueError(f"The guess or the fixed internal states are not finite: {np.asarray(z)}.")
-    return z, {name: value for name, value in values.items() if name not in own}
+    return z, {name: value for name, value in values.items() if name not in given}
 
 
 def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:

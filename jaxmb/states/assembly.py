@@ -99,12 +99,12 @@ def assemble(
     raises = throw is not False
     q, _, ok = configuration(holding(system, of_joints, {}, t), guess.q, fix, t, raises)
     if rates_of_joints:
-        known = system.joint_coordinates()
-        here = {name: _joint_coordinate(system, known[name], t, q) for name in rates_of_joints}
-        system = holding(system, here, rates_of_joints, t)
+        joint_coordinates = system.joint_coordinates()
+        values = {name: _joint_coordinate(system, joint_coordinates[name], t, q) for name in rates_of_joints}
+        system = holding(system, values, rates_of_joints, t)
     # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled.
-    known = not is_traced((system, guess, fix, u, t))
-    at_rest = known and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
+    is_concrete = not is_traced((system, guess, fix, u, t))
+    at_rest = is_concrete and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     at = Instant(system, t, q, u)
     u, ok_rates = (u, True) if at_rest else _velocities(at, fixed_rates)
     # Under a derivative it is known whether a state was found, but its numbers are traced.
@@ -126,24 +126,24 @@ def assemble(
     return state if throw else nan_where(jnp.logical_not(ok), state, (system, guess, fix, rates, t))
 
 
-def _warn_of_changed_velocities(system, given, found):
+def _warn_of_changed_velocities(system, given, assembled):
     """Warn where velocities that were given with bodies contradict the constraints."""
-    given, found = np.asarray(given), np.asarray(found)
+    given, assembled = np.asarray(given), np.asarray(assembled)
     least = np.min(np.abs(given[given != 0]), initial=np.inf)
-    if not np.any(given) or np.max(np.abs(found - given)) <= 0.5 * _CHANGED * least:
+    if not np.any(given) or np.max(np.abs(assembled - given)) <= 0.5 * _CHANGED * least:
         return
     changed = []
     for name, index in rates_of(system.rate_names()).items():
         size = np.linalg.norm(given[index])
-        if name.endswith("velocity") and np.linalg.norm(found[index] - given[index]) > _CHANGED * size > 0:
-            before, after = (", ".join(f"{value:.4g}" for value in x[index]) for x in (given, found))
+        if name.endswith("velocity") and np.linalg.norm(assembled[index] - given[index]) > _CHANGED * size > 0:
+            before, after = (", ".join(f"{value:.4g}" for value in x[index]) for x in (given, assembled))
             changed.append(f"{name} is {after} instead of {before}")
     if changed:
-        more = f", and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+        rest = f", and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
         first = changed[0].split(" is ")[0]
         warnings.warn(
             "The velocities given with the bodies, of which those left out are zero, contradict the constraints. Of "
-            f"the closest ones that do not, {'; '.join(changed[:_NAMED])}{more}. "
+            f"the closest ones that do not, {'; '.join(changed[:_NAMED])}{rest}. "
             f"assemble(system, rates={{{first!r}: …}}) prescribes a rate, from which the others follow.",
             stacklevel=4,
         )
@@ -164,14 +164,14 @@ def configuration(
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
     if not system.coordinate_rows:
         return q, fixed, jnp.array(True)
-    known = not is_traced((system, q, t))
-    on_host = system.on_host(t) if known else None
+    is_concrete = not is_traced((system, q, t))
+    on_host = system.on_host(t) if is_concrete else None
     if on_host is not None:
-        found = on_host.closest_configuration(np.asarray(q), fixed, system.coordinate_rank - whole)
-        if found is not None:
-            return jax.device_put(found), fixed, jnp.array(True)
+        closest = on_host.closest_configuration(np.asarray(q), fixed, system.coordinate_rank - whole)
+        if closest is not None:
+            return jax.device_put(closest), fixed, jnp.array(True)
     # The poses that a system was compiled at are often their own closest configuration; then nothing is compiled.
-    elif known and guess is system.guess.q and not fixed.any():
+    elif is_concrete and guess is system.guess.q and not fixed.any():
         met = _is_met(system, t, q)
         # Under a trace, results of concrete numbers are traced as well.
         if not is_traced(met) and met:
@@ -189,9 +189,9 @@ def _velocities(guess, fixed):
         return guess.u, jnp.array(True)
     on_host = None if is_traced(guess) else system.on_host(guess.t)
     if on_host is not None:
-        found = on_host.closest_velocities(np.asarray(guess.q), np.asarray(guess.u), fixed, system.velocity_rank)
-        if found is not None:
-            return jax.device_put(found), jnp.array(True)
+        closest = on_host.closest_velocities(np.asarray(guess.q), np.asarray(guess.u), fixed, system.velocity_rank)
+        if closest is not None:
+            return jax.device_put(closest), jnp.array(True)
     return closest_velocities(guess, tuple(fixed.tolist()))
 
 

@@ -115,8 +115,8 @@ class HostBalance:
     def of_rows_along(self, q, multipliers):
         """As of `Balance`."""
         pull = lambda q: (self.jacobian(q)).T @ multipliers
-        ways = [self._host.along(q, x) for x in np.diag(self._scale)]
-        return np.stack([pull(q + 1j * _IMAGINARY * x).imag / _IMAGINARY for x in ways], axis=1), pull(q)
+        displacements = [self._host.along(q, x) for x in np.diag(self._scale)]
+        return np.stack([pull(q + 1j * _IMAGINARY * x).imag / _IMAGINARY for x in displacements], axis=1), pull(q)
 
     def jacobian(self, q):
         """As of `Balance`."""

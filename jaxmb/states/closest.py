@@ -74,8 +74,8 @@ def tolerance(dtype) -> float:
 
 def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) -> Float[Array, ""]:
     """The largest residual, each row scaled to unit norm of its gradient times the system's size."""
-    xp, known = namespace(residual, row_norms), jnp.finfo(residual.dtype)
-    floor = known.eps**0.75 * xp.max(row_norms, initial=0.0) + known.tiny
+    xp, precision = namespace(residual, row_norms), jnp.finfo(residual.dtype)
+    floor = precision.eps**0.75 * xp.max(row_norms, initial=0.0) + precision.tiny
     return xp.max(xp.abs(residual) / xp.maximum(row_norms, floor), initial=0.0)
 
 
@@ -157,7 +157,7 @@ def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Arra
     step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
     lengths = 0.5 ** jnp.arange(8, dtype=step.dtype)
     reached = jax.vmap(lambda a: moved(a * step))(lengths)
-    sizes = jax.vmap(lambda there: jnp.sum(residual(there) ** 2))(reached)
+    sizes = jax.vmap(lambda configuration: jnp.sum(residual(configuration) ** 2))(reached)
     best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
     # Where the residuals hardly decrease, they cannot vanish: in a batch all members would wait for this one.
     size = jnp.where(sizes[best] < _PROGRESS * before, jnp.max(jnp.abs(step)), 0.0)
@@ -281,9 +281,9 @@ def _velocities_in_blocks(guess, held):
     """`closest_velocities` with some rates held."""
     # Rates that are held have an infinite mass.
     metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / guess.system.velocity_scale() ** 2))
-    here = guess.with_(u=jnp.zeros_like(guess.u)).binding_velocities.projector(metric)
-    u = guess.u + here.cancel(guess.velocity_rows)
-    return u, jnp.all(jnp.isfinite(u)) & (here.factor.smallest_pivot() > _INDEPENDENT)
+    projector = guess.with_(u=jnp.zeros_like(guess.u)).binding_velocities.projector(metric)
+    u = guess.u + projector.cancel(guess.velocity_rows)
+    return u, jnp.all(jnp.isfinite(u)) & (projector.factor.smallest_pivot() > _INDEPENDENT)
 
 
 class _Held(eqx.Module):
@@ -325,14 +325,14 @@ def _closest(guess, held, tol):
     start = guess.q, jnp.zeros(system.nu, dtype), none, none
     (q, _, length, residual), ahead = newton(correct, far, start, most=_STEPS, dtype=dtype)
     projector = _optimality(guess.with_(q=q), guess.q, fixed).projector
-    found = jnp.all(jnp.isfinite(q)) & (residual <= tol) & (ahead <= tol) & (length > 0)
-    return q, found & (projector.factor.smallest_pivot() > _INDEPENDENT)
+    ok = jnp.all(jnp.isfinite(q)) & (residual <= tol) & (ahead <= tol) & (length > 0)
+    return q, ok & (projector.factor.smallest_pivot() > _INDEPENDENT)
 
 
 @_closest.def_jvp
 def _closest_jvp(primals, tangents):
     guess, held, tol = primals
-    q, found = _closest(guess, held, tol)
+    q, ok = _closest(guess, held, tol)
     at, fixed = guess.with_(q=q), np.array(held.velocities)
     optimum = _optimality(at, guess.q, fixed)
     dguess = jnp.zeros_like(guess.q) if tangents[0].q is None else tangents[0].q
@@ -344,7 +344,7 @@ def _closest_jvp(primals, tangents):
     _, (gradient, unmet) = eqx.filter_jvp(equations, (at, guess.q), (tangents[0].with_(q=moved), dguess))
     step = _solve(at, guess.q, fixed, optimum, -gradient, -unmet)
     along = jax.jvp(lambda u: at.with_(u=u).rates, (jnp.zeros_like(step),), (step,))[1]
-    return (q, found), (moved + along, None)
+    return (q, ok), (moved + along, None)
 
 
 def _optimality(at, guess, fixed):

@@ -33,7 +33,7 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
     if is_traced(rows):
         off = jnp.any(rows[0]) | jnp.any(rows[1]) | jnp.any(rows[2])
         return nan_where(off, state, (system, t, state))
-    if not any(np.any(own) for own in rows):
+    if not any(np.any(violated) for violated in rows):
         return state
     if is_traced((system, t, state)):
         # A derivative is taken of known numbers.

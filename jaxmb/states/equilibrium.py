@@ -115,16 +115,16 @@ def equilibrium(
     start, fixed, assembled = configuration(system, guess.q, fix, time, raises)
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
-    still = jnp.array(True) if system.drift_free else _still(Instant(system, time, start, u))
+    at_rest = jnp.array(True) if system.drift_free else _drivers_at_rest(Instant(system, time, start, u))
     # Under a derivative the outcome is known, but the numbers that a message needs are traced.
-    errors = raises and not is_traced((system, time, start, z, still))
-    if errors and not bool(still):
+    errors = raises and not is_traced((system, time, start, z, at_rest))
+    if errors and not bool(at_rest):
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
-    found: Any = None if is_traced((system, time, start)) else _on_host(system, time, start, held, bool(stable))
-    found = _balanced(system, time, start, held, bool(stable)) if found is None else found
-    q, unbalanced, falling, ok, overlaps, pulls = found
+    outcome: Any = None if is_traced((system, time, start)) else _on_host(system, time, start, held, bool(stable))
+    outcome = _balanced(system, time, start, held, bool(stable)) if outcome is None else outcome
+    q, unbalanced, falling, ok, overlaps, pulls = outcome
     if errors and not bool(ok):
         unbalanced = np.asarray(unbalanced) / np.asarray(system.velocity_scale())
         raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, start, unbalanced))
@@ -137,7 +137,7 @@ def equilibrium(
         raise ValueError(_changing(at, np.asarray(steady)))
     if errors:
         return State(q, u, z)
-    ok = ok & still & assembled & jnp.all(jnp.asarray(steady)) & ~jnp.any(overlaps | pulls)
+    ok = ok & at_rest & assembled & jnp.all(jnp.asarray(steady)) & ~jnp.any(overlaps | pulls)
     if raises and not is_traced(ok) and ok:
         return State(q, u, z)
     if throw:
@@ -151,7 +151,7 @@ def equilibrium(
 
 
 @eqx.filter_jit
-def _still(at):
+def _drivers_at_rest(at):
     """Whether all prescribed motions are at rest."""
     speeds = jnp.concatenate([at.velocity_residual, at.rates])
     return jnp.max(jnp.abs(speeds), initial=0.0) <= tolerance(at.q.dtype)
@@ -211,8 +211,8 @@ def _linearise(balance: Balance | HostBalance, q: Coordinates) -> _Linearised:
 
     softness, applied = balance.applied_along(q)
     multipliers = -(inverse.T @ applied) / sizes
-    more, force = balance.of_rows_along(q, multipliers)
-    softness, force = softness + more, applied + force
+    row_softness, force = balance.of_rows_along(q, multipliers)
+    softness, force = softness + row_softness, applied + force
     stiffness = -allowed @ softness @ allowed
     largest, overall = xp.max(xp.abs(stiffness)), xp.max(xp.abs(softness))
     # Where the rows allow no displacement, or none that is resisted, what is left is rounding errors.
@@ -236,8 +236,8 @@ def _linearised(
     balance: Balance | HostBalance, q: Coordinates, z: Float[Array, "nu"]
 ) -> tuple[Float[Array, "nq"], _Linearised]:
     """The configuration after a small displacement, and the balance there."""
-    there = balance.moved(q, z)
-    return there, _linearise(balance, there)
+    moved = balance.moved(q, z)
+    return moved, _linearise(balance, moved)
 
 
 def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
@@ -271,9 +271,9 @@ def _balanced(
     which closed ones pull.
     """
     balance = Balance(system, t, start[np.array(held, int)], held)
-    found = _settled if stable else _nearest
+    search = _settled if stable else _nearest
     fixed = lax.stop_gradient(balance)
-    q, local, falling, ok = found(functools.partial(_linearised, fixed), lax.stop_gradient(start), _unknown(balance))
+    q, local, falling, ok = search(functools.partial(_linearised, fixed), lax.stop_gradient(start), _unknown(balance))
 
     # The equations of the equilibrium, for its derivatives. Loose directions and implied rows are made definite: the
     # configuration does not move along loose directions, and multipliers are the smallest ones.
@@ -283,15 +283,15 @@ def _balanced(
 
     def equations(x):
         z, multipliers = x[:n], x[n:]
-        there = balance.moved(q, z)
-        force = balance.forces(there, multipliers) - stiff * (loose @ z)
-        rows = balance.residual(there, jacobian, z) / local.sizes
+        moved = balance.moved(q, z)
+        force = balance.forces(moved, multipliers) - stiff * (loose @ z)
+        rows = balance.residual(moved, jacobian, z) / local.sizes
         rows += local.implied @ (local.sizes * multipliers) / stiff
         # Without an equilibrium the equations are replaced by ones with a solution, so that derivatives stay finite.
-        return jnp.where(ok, jnp.concatenate([force, rows]), x - known)
+        return jnp.where(ok, jnp.concatenate([force, rows]), x - initial)
 
-    known = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
-    solved = root(equations, known, lambda _, x: x)
+    initial = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
+    solved = root(equations, initial, lambda _, x: x)
     q = balance.moved(q, solved[:n])
     overlaps, pulls = lax.stop_gradient(_against(system, t, q, solved[n:], local.implied))
     return q, local.force, falling, ok, overlaps, pulls
@@ -313,8 +313,8 @@ def _on_host(system, t, start, held, stable):
     """`_balanced` with the search in NumPy, of concrete numbers; None where a matrix is singular or not finite."""
     start, time = jax.tree.map(np.asarray, (start, t))
     balance = Balance(system, time, start[np.array(held, int)], held)
-    known = balance_on_host(balance)
-    at = functools.partial(_linearised_alone, balance) if known is None else functools.partial(_linearised, known)
+    host = balance_on_host(balance)
+    at = functools.partial(_linearised_alone, balance) if host is None else functools.partial(_linearised, host)
     try:
         q, local, falling, ok = (_settled if stable else _nearest)(at, start, _unknown(balance))
     except np.linalg.LinAlgError:
@@ -327,8 +327,8 @@ def _on_host(system, t, start, held, stable):
 
 def _nearest(at: _At, start: Coordinates, unknown: _Linearised):
     """The equilibrium to which Newton's method leads from a guess."""
-    q, local, found = _search(at, start, unknown, downhill=False)
-    return q, local, namespace(start).zeros_like(local.force), found
+    q, local, balanced = _search(at, start, unknown, downhill=False)
+    return q, local, namespace(start).zeros_like(local.force), balanced
 
 
 def _settled(at: _At, start: Coordinates, unknown: _Linearised):
@@ -341,17 +341,17 @@ def _settled(at: _At, start: Coordinates, unknown: _Linearised):
 
     def start_again(carry):
         begin, beside, _, _, origin, falling, side, *_, k = carry
-        q, local, found = _search(at, begin, unknown, downhill=True, first=beside)
+        q, local, balanced = _search(at, begin, unknown, downhill=True, first=beside)
         stable, softest = _softest(local.stiffness)
-        ok = found & stable
-        leave, turn_round = found & ~ok, ~found & (side > 0)
+        ok = balanced & stable
+        leave, turn_round = balanced & ~ok, ~balanced & (side > 0)
         origin, falling = xp.where(leave, q, origin), xp.where(leave, softest, falling)
         side = xp.where(leave, 1.0, xp.where(turn_round, -1.0, side))
         begin, beside = xp.where(ok, q, origin), xp.where(ok, 0.0, side * _BESIDE * falling)
         return begin, beside, q, local, origin, falling, side, ok, ok | ~(leave | turn_round), k + 1
 
-    none, no, still = xp.zeros((), start.dtype), xp.asarray(False), xp.zeros_like(unknown.force)
-    begun = start, still, start, unknown, start, still, none, no, no, 0
+    none, no, zero = xp.zeros((), start.dtype), xp.asarray(False), xp.zeros_like(unknown.force)
+    begun = start, zero, start, unknown, start, zero, none, no, no, 0
     _, _, q, local, _, falling, _, ok, _, _ = _repeated(proceed, start_again, begun)
     return q, local, falling, ok
 
@@ -395,21 +395,21 @@ def _search(
     xp, close = namespace(start), float(np.finfo(start.dtype).eps) ** 0.5
 
     def proceed(carry):
-        *_, radius, found, k = carry
-        return ~found & (radius > close) & (k < _ITERATIONS)
+        *_, radius, balanced, k = carry
+        return ~balanced & (radius > close) & (k < _ITERATIONS)
 
     def advance(carry):
         q, local, step, radius, _, k = carry
         size, off = xp.max(xp.abs(step)), xp.max(xp.abs(local.correction))
-        trial, there = at(q, step + local.correction)
+        trial, ahead = at(q, step + local.correction)
         # A step is too long if the forces at its end push back at least half as hard as they pushed at its beginning.
         # The effect of the rows' correction on the forces is not counted.
         other = xp.max(xp.abs(local.curvatures)) * norm(local.correction) * norm(step)
-        back = xp.dot(there.force, step) < -0.5 * xp.abs(xp.dot(local.force, step)) - other
-        weaker = norm(there.force) < norm(local.force)
+        back = xp.dot(ahead.force, step) < -0.5 * xp.abs(xp.dot(local.force, step)) - other
+        weaker = norm(ahead.force) < norm(local.force)
         better = ~back | weaker if downhill else (size <= close) | weaker
-        good = (k == 0) | (better & xp.all(xp.isfinite(there.force)))
-        q, local = jax.tree.map(lambda new, old: xp.where(good, new, old), (trial, there), (q, local))
+        good = (k == 0) | (better & xp.all(xp.isfinite(ahead.force)))
+        q, local = jax.tree.map(lambda new, old: xp.where(good, new, old), (trial, ahead), (q, local))
         radius = xp.where(good, xp.minimum(2 * radius, _LONGEST), 0.25 * radius)
         step = _step(local, downhill=downhill)
         longest = xp.max(xp.abs(step))
@@ -421,8 +421,8 @@ def _search(
     # Before the first linearisation nothing is known, and only a step that is given is not zero.
     step = xp.zeros_like(unknown.force) if first is None else first
     begun = (start, unknown, step, xp.asarray(_FIRST, start.dtype), xp.asarray(False), 0)
-    q, local, _, _, found, _ = _repeated(proceed, advance, begun)
-    return q, local, found
+    q, local, _, _, balanced, _ = _repeated(proceed, advance, begun)
+    return q, local, balanced
 
 
 def _largest(system, values, least):

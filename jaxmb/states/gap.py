@@ -82,8 +82,8 @@ def _gap(system: AbstractSystem, t: Scalar, guess: Coordinates, held: tuple[bool
     met, jacobian = meet_constraints(frozen, t0, start, scale)
     closed = lax.stop_gradient(residual_size(frozen, t0, met, jacobian) <= tolerance(guess.dtype))
     weights = _weights(system, t, guess)
-    own = lax.stop_gradient(weights)
-    nearest = lax.stop_gradient(_nearest(lambda q: own * _residual(frozen, t0, q), start, scale))
+    fixed_weights = lax.stop_gradient(weights)
+    nearest = lax.stop_gradient(_nearest(lambda q: fixed_weights * _residual(frozen, t0, q), start, scale))
     square = jnp.sum((weights * _residual(system, t, nearest)) ** 2)
     open_ = ~closed & (square > 0)
     return jnp.where(open_, jnp.sqrt(jnp.where(open_, square, 1.0)), 0.0)
@@ -122,11 +122,11 @@ def _nearest(residual, start, scale):
         longest = jnp.max(jnp.abs(step))
         step = step / jnp.maximum(longest, 1.0)
         lengths = 0.5 ** jnp.arange(_HALVINGS, dtype=z.dtype)
-        found = lax.map(lambda a: squares(z + a * step), lengths)
-        best = jnp.argmin(jnp.where(jnp.isfinite(found), found, jnp.inf))
+        values = lax.map(lambda a: squares(z + a * step), lengths)
+        best = jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))
         # At the level of rounding errors no step decreases the squares, and Newton's own is the best.
         small = longest <= jnp.finfo(z.dtype).eps ** 0.5
-        better = (found[best] < value) | small
+        better = (values[best] < value) | small
         length = jnp.where(better, jnp.where(small, 1.0, lengths[best]), 0.0)
         return z + length * step, jnp.where(better, longest, 0.0)
 

@@ -32,8 +32,10 @@ def about_contacts(what: str, system: AbstractSystem, overlapped: Array, pulled:
     names, overlaps, pulls = np.array(system.contacts.contact_names), np.asarray(overlapped), np.asarray(pulled)
     texts = []
     if np.any(overlaps):
-        own = names[overlaps]
-        texts.append(f"{', '.join(own)} {'is' if own.size == 1 else 'are'} open and overlapped: close with mode 1")
+        open_names = names[overlaps]
+        texts.append(
+            f"{', '.join(open_names)} {'is' if open_names.size == 1 else 'are'} open and overlapped: close with mode 1"
+        )
     if np.any(pulls):
         texts.append(f"{', '.join(names[pulls])} would have to pull: open with mode 0")
     against = overlaps | pulls

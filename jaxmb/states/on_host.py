@@ -73,7 +73,7 @@ class AbstractHost(abc.ABC):
             # Shorter steps are no better than one that takes nearly all of the residuals away.
             if not np.sum(reached[0][1] ** 2) < _WHOLE * size:
                 reached += [
-                    (there, self.coordinate_residual(there)) for there in (q + 0.5**k * step for k in range(1, 8))
+                    (moved, self.coordinate_residual(moved)) for moved in (q + 0.5**k * step for k in range(1, 8))
                 ]
             sizes = [np.sum(residual**2) for _, residual in reached]
             best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
@@ -127,7 +127,7 @@ class AbstractHost(abc.ABC):
         for k in np.flatnonzero(free):
             step = np.zeros_like(q)
             step[k] = np.finfo(float).eps ** (1 / 3) * self.coordinate_scale[k]
-            ahead, behind = (multipliers @ self.coordinate_jacobian(there) for there in (q + step, q - step))
+            ahead, behind = (multipliers @ self.coordinate_jacobian(moved) for moved in (q + step, q - step))
             rows.append((ahead - behind)[free] / (2 * step[k]))
         out = np.array(rows).reshape(free.sum(), free.sum())
         return 0.5 * (out + out.T)

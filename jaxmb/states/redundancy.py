@@ -89,11 +89,11 @@ def dense_remains(
     jacobian: Float[np.ndarray, "m n"], kept: Int[np.ndarray, "r"], dropped: Int[np.ndarray, "d"]
 ) -> Remains:
     """`Nearby.remains`, with a full matrix."""
-    (own, _), (others, sizes) = (_unit_rows(jacobian[rows]) for rows in (kept, dropped))
-    share, *_ = np.linalg.lstsq(own.T, others.T, rcond=None)
+    (kept_rows, _), (dropped_rows, sizes) = (_unit_rows(jacobian[rows]) for rows in (kept, dropped))
+    share, *_ = np.linalg.lstsq(kept_rows.T, dropped_rows.T, rcond=None)
     zero = np.finfo(jacobian.dtype).eps ** ZERO
     by = lambda bad: kept[np.any(np.abs(share[:, bad]) > zero, axis=1)]
-    return Remains(np.linalg.norm(others - share.T @ own, axis=1), sizes, by)
+    return Remains(np.linalg.norm(dropped_rows - share.T @ kept_rows, axis=1), sizes, by)
 
 
 def check_implied(
@@ -178,7 +178,7 @@ def check_implied_as_one(
 
     def evaluate(t, moved):
         unmet, of_coordinates, jacobian = map(np.asarray, _evaluate(system, np.asarray(t, dtype), q, moved))
-        step = lambda _, own: smallest_step(of_coordinates[own], unmet[own])
+        step = lambda _, numbers: smallest_step(of_coordinates[numbers], unmet[numbers])
         return Nearby(unmet, step, lambda _, kept, dropped: dense_remains(jacobian, kept, dropped))
 
     # Coordinates may need more rows than velocities: those that keep invariants of the coordinates come last.
@@ -201,13 +201,13 @@ def _evaluate(system, t, q, moved):
 def _not_implied(system, t, rows, by, bodies):
     rows = [system.rows[r] for r in rows]
     first = dict.fromkeys(name for name, _ in rows)
-    others = dict.fromkeys(name for name, _ in (system.rows[r] for r in by) if name not in first)
+    implying = dict.fromkeys(name for name, _ in (system.rows[r] for r in by) if name not in first)
     listed = ", ".join(f"row {k} of {name}" for name, k in rows) + (" is" if len(rows) == 1 else " are") + " implied"
-    if others:
-        listed += f" by {', '.join(others)}"
+    if implying:
+        listed += f" by {', '.join(implying)}"
     if t != 0:
         return f"{listed} at t = 0, but no more at t = {t:g}. Remove one of these, or make their motions agree."
-    moving = ", ".join(dict.fromkeys(body for name in (*first, *others) for body in bodies.get(name, ())))
+    moving = ", ".join(dict.fromkeys(body for name in (*first, *implying) for body in bodies.get(name, ())))
     return (
         f"The given pose{f' of {moving}' if moving else ''} is singular: {listed} there, but not near it. Give a pose "
         "off this position; if there is none, the dimensions allow no motion."

@@ -111,24 +111,24 @@ def cannot_assemble(system: AbstractSystem, t: Scalar, q: Coordinates, fixed: In
     violated = violated_joints(system, t, q)
     remain = f"residuals{' [m, rad]' if system.body_names else ''} remain in {violated}"
     if held.names:
-        here, _ = held.dependent(_directions(system, t, q), _LOST_IN_SEARCH)
+        lost, _ = held.dependent(_directions(system, t, q), _LOST_IN_SEARCH)
         beside, _ = _beside(system, t, q, np.ones(q.size), rows)
         together, free = held.dependent(_directions(system, t, beside))
         if together:
             return f"{text}: {_dependence(together, free)}{f'; {remain}' if violated else ''}. Fix fewer of them."
-        if here and violated:
+        if lost and violated:
             if _beside(system, t, q, ~fixed)[1] < _ZERO * float(system.length):
                 return (
-                    f"{text}: the guess is at a dead centre of {' and '.join(here)}, from which both sides are near; "
+                    f"{text}: the guess is at a dead centre of {' and '.join(lost)}, from which both sides are near; "
                     f"there {remain}. Give a guess beside it."
                 )
             return (
                 f"{text}: {_values(listing)} out of reach; in the closest configuration {remain}. Give other values, "
                 "or check lengths, points and axes."
             )
-        if here:
+        if lost:
             return (
-                f"{text}: the configuration is singular there, at the end of the reach of {' and '.join(here)} or at a "
+                f"{text}: the configuration is singular there, at the end of the reach of {' and '.join(lost)} or at a "
                 "dead centre, so that the motion from it is not determined. Give a value beside it, or fix another "
                 "coordinate."
             )
@@ -174,12 +174,12 @@ def cannot_move(at: Instant, fixed: Int[np.ndarray, "nu"]) -> str:
     text += f" with the rates {', '.join(dict.fromkeys(held.names))} fixed"
     scale = np.asarray(system.velocity_scale())
     jacobian, rates = np.asarray(at.jacobian) * scale, np.asarray(at.velocity_residual)
-    still = np.linalg.norm(held.directions(_unit_rows(jacobian), _DEPENDENT), axis=1) < _ZERO
+    at_rest = np.linalg.norm(held.directions(_unit_rows(jacobian), _DEPENDENT), axis=1) < _ZERO
     # How the rates that are held change on the way to velocities that satisfy the constraints alone.
-    others = np.setdiff1d(np.arange(rates.size), rows)
-    change = np.linalg.lstsq(jacobian[others], -rates[others], rcond=_DEPENDENT)[0]
+    free_rows = np.setdiff1d(np.arange(rates.size), rows)
+    change = np.linalg.lstsq(jacobian[free_rows], -rates[free_rows], rcond=_DEPENDENT)[0]
     changes = np.abs(np.append((scale * change)[places], jacobian[rows] @ change + rates[rows]))
-    wrong = still & (changes > _ZERO * np.max(changes, initial=0.0))
+    wrong = at_rest & (changes > _ZERO * np.max(changes, initial=0.0))
     if np.any(wrong):
         names = dict.fromkeys(name for name, is_wrong in zip(held.names, wrong, strict=True) if is_wrong)
         return (

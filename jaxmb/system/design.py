@@ -61,14 +61,14 @@ def design(
     returns, and for derived parameters that are unknown, follow from other variables already, or have another shape.
     """
     check_kind("design: system", system, AbstractSystem, "a compiled scene or another system", "scene.compile()")
-    known = parameters(system)
+    existing = parameters(system)
     if not isinstance(variables, Mapping) or not variables:
         raise ValueError(f"variables must be Variables by name, at least one; got {variables!r}.")
     declared = {}
     for name, value in variables.items():
         if not isinstance(name, str) or not name:
             raise ValueError(f"A design variable's name is a string that is not empty, got {name!r}.")
-        if name in known:
+        if name in existing:
             raise ValueError(f"The system has a parameter {name!r} already; give the design variable another name.")
         try:
             # A concrete class: the declaration that users write, or a number in its place.
@@ -76,11 +76,11 @@ def design(
         except ValueError as error:
             raise ValueError(f"Design variable {name!r}: {error}") from None
     values = {name: as_jax(variable.value) for name, variable in declared.items()}
-    own = DesignVariables(values, tuple(declared.items()), derive, ())
-    derived = _checked(own, known)
+    added = DesignVariables(values, tuple(declared.items()), derive, ())
+    derived = _checked(added, existing)
     changed = with_parameters(system, derived)
-    own = DesignVariables(values, own.variables, derive, tuple(derived))
-    return eqx.tree_at(lambda s: s.design, changed, (*changed.design, own), is_leaf=lambda x: x is changed.design)
+    added = DesignVariables(values, added.variables, derive, tuple(derived))
+    return eqx.tree_at(lambda s: s.design, changed, (*changed.design, added), is_leaf=lambda x: x is changed.design)
 
 
 def design_bounds(system: AbstractSystem, bounds: Mapping[str, Bounds] | None = None) -> dict[str, Bounds]:
@@ -89,8 +89,8 @@ def design_bounds(system: AbstractSystem, bounds: Mapping[str, Bounds] | None = 
     **Raises:** `ValueError` for bounds that reach beyond those of a design variable.
     """
     out = dict(bounds or {})
-    for own in system.design:
-        for name, variable in own.variables:
+    for group in system.design:
+        for name, variable in group.variables:
             low, high = out.get(name, (None, None))
             low, high = (variable.low if low is None else low), (variable.high if high is None else high)
             if np.any(np.asarray(low) < variable.low) or np.any(np.asarray(high) > variable.high):
@@ -103,31 +103,31 @@ def design_bounds(system: AbstractSystem, bounds: Mapping[str, Bounds] | None = 
     return out
 
 
-def _checked(own: DesignVariables, known: Mapping[str, Array]) -> dict[str, Array]:
+def _checked(added: DesignVariables, existing: Mapping[str, Array]) -> dict[str, Array]:
     """The derived parameters of the first values."""
     try:
-        derived: Any = own.derive(dict(own.values))
+        derived: Any = added.derive(dict(added.values))
     except KeyError as error:
         if asked_argument(error) is None:
             raise
-        raise unknown("design variable", str(error.args[0]), own.values) from None
+        raise unknown("design variable", str(error.args[0]), added.values) from None
     if not isinstance(derived, Mapping) or not derived:
         raise ValueError(f"derive must return parameters by name, at least one; got {derived!r}.")
     for name, value in derived.items():
-        if name not in known:
-            raise unknown("parameter", name, known)
+        if name not in existing:
+            raise unknown("parameter", name, existing)
         shape = real_shape(f"The derived parameter {name!r}", value)
-        if shape != known[name].shape:
+        if shape != existing[name].shape:
             raise ValueError(
-                f"The derived parameter {name!r} has shape {shape}, but {known[name].shape} in the system."
+                f"The derived parameter {name!r} has shape {shape}, but {existing[name].shape} in the system."
             )
         if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
             raise ValueError(f"The derived parameter {name!r} is not finite: {np.asarray(value)}.")
     with traced_by_jax("derive", "a design variable"):
-        program = jax.make_jaxpr(own.derive)(dict(own.values)).jaxpr
+        program = jax.make_jaxpr(added.derive)(dict(added.values)).jaxpr
     used = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
     # As JAX orders the entries of a dictionary.
-    idle = [name for name, v in zip(sorted(own.values), program.invars, strict=True) if id(v) not in used]
+    idle = [name for name, v in zip(sorted(added.values), program.invars, strict=True) if id(v) not in used]
     if idle:
         raise ValueError(f"Nothing follows from the design variable {idle[0]!r}: use it in derive, or leave it out.")
     return {name: as_jax(value) for name, value in derived.items()}

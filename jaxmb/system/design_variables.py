@@ -96,10 +96,10 @@ class DesignVariables(eqx.Module):
 
         **Raises:** `ValueError` for a wrong shape, and for known values out of bounds.
         """
-        known = dict(self.variables)
+        declared = dict(self.variables)
         new = dict(self.values)
         for name, value in values.items():
-            array, variable = as_jax(value), known[name]
+            array, variable = as_jax(value), declared[name]
             if array.shape != variable.low.shape:
                 raise ValueError(f"Design variable {name!r} has shape {variable.low.shape}, got {array.shape}.")
             if not is_traced(array) and not np.all(_within(np.asarray(array), variable.low, variable.high)):
@@ -133,9 +133,9 @@ class DesignVariables(eqx.Module):
 def variables_in_range(design: tuple[DesignVariables, ...]) -> bool | Bool[Array, ""]:
     """Whether all traced design variables are within their bounds; True if none are traced."""
     ok: Any = True
-    for own in design:
-        for name, variable in own.variables:
-            value = own.values[name]
+    for group in design:
+        for name, variable in group.variables:
+            value = group.values[name]
             if is_traced(value):
                 ok = ok & jnp.all(_within(value, variable.low, variable.high))
     return ok
@@ -143,7 +143,7 @@ def variables_in_range(design: tuple[DesignVariables, ...]) -> bool | Bool[Array
 
 def description_rows(design: tuple[DesignVariables, ...]) -> list[tuple[str, str, str]]:
     """Name, value and remark of all design variables."""
-    return [row for own in design for row in own.rows()]
+    return [row for group in design for row in group.rows()]
 
 
 def _within(value, low, high):

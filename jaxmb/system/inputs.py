@@ -50,20 +50,20 @@ def with_inputs(system: System, inputs: Signals) -> System:
     """
     if not isinstance(inputs, Mapping):
         raise ValueError(f"inputs must be a dictionary of series by name, {{'motor.torque': series}}; got {inputs!r}.")
-    known, signals = parameters(system), {}
+    existing, signals = parameters(system), {}
     for name, value in inputs.items():
-        if name not in known:
-            raise unknown("parameter", name, known)
-        if any(name in own.values for own in system.design):
+        if name not in existing:
+            raise unknown("parameter", name, existing)
+        if any(name in group.values for group in system.design):
             raise ValueError(f"The design variable {name!r} must be constant; make a parameter an input instead.")
         signals[name] = as_signal(name, value)
-        t: Any = np.zeros((), known[name].dtype)
+        t: Any = np.zeros((), existing[name].dtype)
         with traced_by_jax(f"the input {name!r}", "the time"):
             shape = signals[name].shape(t)
         signals[name].keep()
-        if shape != known[name].shape:
+        if shape != existing[name].shape:
             raise ValueError(
-                f"The input {name!r} must have shape {known[name].shape} at each time, as the parameter has; got "
+                f"The input {name!r} must have shape {existing[name].shape} at each time, as the parameter has; got "
                 f"{shape}."
             )
     return system.parameter_table.with_signals(signals)
@@ -77,8 +77,8 @@ def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndar
     signals = system.parameter_table.signals
     for name, (signal, _) in signals.items():
         signal.check_interval(name, t0, t1)
-    own = [signal.break_times(of_rates=binding) for signal, binding in signals.values()]
-    return np.unique(np.concatenate([np.zeros(0), *own])) if own else np.zeros(0)
+    times = [signal.break_times(of_rates=binding) for signal, binding in signals.values()]
+    return np.unique(np.concatenate([np.zeros(0), *times])) if times else np.zeros(0)
 
 
 def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
@@ -86,9 +86,9 @@ def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
     ended: Any = False
     for numbers, signal in of_one_kind([signal for signal, _ in system.parameter_table.signals.values()]):
         of_signal = lambda signal: signal.is_known(t0, t1)
-        known = of_signal(signal) if len(numbers) == 1 else jnp.all(jax.vmap(of_signal)(signal))
-        if known is not True:
-            ended = ended | ~known
+        covered = of_signal(signal) if len(numbers) == 1 else jnp.all(jax.vmap(of_signal)(signal))
+        if covered is not True:
+            ended = ended | ~covered
     return ended
 
 
@@ -101,8 +101,8 @@ def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) 
     of its range between t0 and t1 at most. A series is followed from value to value, a function at 513 times.
     """
     # Where a motion restarts, steps end as well.
-    known = system.parameter_table.signals.values()
-    signals = [signal for signal, binding in known if not signal.break_times(of_rates=binding).size]
+    pairs = system.parameter_table.signals.values()
+    signals = [signal for signal, binding in pairs if not signal.break_times(of_rates=binding).size]
     if not signals and not system.of_time:
         return None
     return _turning_times(of_one_kind(signals), system.at(state) if system.of_time else None, state, t0, t1)
@@ -125,8 +125,8 @@ def _turning_times(signals, system, state, t0, t1):
     kinds = [(of_kind(sampled, numbers)(signal), signal, of_kind(turns, numbers)) for numbers, signal in signals]
     if system is not None:
         kinds.append((sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u), turns))
-    found = [jnp.ravel(turned(ts, function)) for ts, function, turned in kinds]
-    return jnp.sort(jnp.concatenate(found))
+    times = [jnp.ravel(turned(ts, function)) for ts, function, turned in kinds]
+    return jnp.sort(jnp.concatenate(times))
 
 
 def _has_turned(values):

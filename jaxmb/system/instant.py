@@ -40,10 +40,10 @@ class kept(Generic[T]):
         if values is None:
             values = {}
             object.__setattr__(instant, "_kept", values)
-        found = values.get(self)
-        if found is None or found[0] != trace:
-            found = values[self] = trace, self._compute(instant)
-        return found[1]
+        entry = values.get(self)
+        if entry is None or entry[0] != trace:
+            entry = values[self] = trace, self._compute(instant)
+        return entry[1]
 
 
 class Keeper:

@@ -34,8 +34,8 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
         where, index = paths[0]
         value = where(system)
         leaves[name] = value if index is None else _of(value, index)
-    for own in system.design:
-        leaves |= own.values
+    for group in system.design:
+        leaves |= group.values
     return leaves
 
 
@@ -48,8 +48,8 @@ def modules(system: AbstractSystem) -> dict[str, eqx.Module]:
 
     **Returns:** the modules with their weights, as `with_parameters` takes them.
     """
-    own = parameters(system)
-    return {name: with_weights(like, own[name]) for name, like in system.parameter_table.modules().items()}
+    values = parameters(system)
+    return {name: with_weights(like, values[name]) for name, like in system.parameter_table.modules().items()}
 
 
 def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module]) -> System:
@@ -74,14 +74,14 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
     `RESULTS.invalid_parameters`, before the first step.
     """
     paths = system.parameter_paths()
-    variables = {name: own for own in system.design for name in own.values}
+    variables = {name: group for group in system.design for name in group.values}
     for name in values:
         if name not in paths and name not in variables:
             raise unknown("parameter", name, [*paths, *variables])
-        for own in system.design:
-            if name in own.derived:
-                several = "s" * (len(own.variables) > 1)
-                names = ", ".join(variable for variable, _ in own.variables)
+        for group in system.design:
+            if name in group.derived:
+                several = "s" * (len(group.variables) > 1)
+                names = ", ".join(variable for variable, _ in group.variables)
                 raise ValueError(
                     f"Parameter {name!r} follows from the design variable{several} {names}; set "
                     f"{'those' if several else 'that'} instead."
@@ -89,12 +89,12 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
     given: dict[str, Any] = dict(values)
     design, before, inputs = [], system, system.parameter_table.input_names()
     # Variables of a design may follow from those of a later one.
-    for own in reversed(system.design):
-        mine = {name: given.pop(name) for name in own.values if name in given}
+    for group in reversed(system.design):
+        mine = {name: given.pop(name) for name in group.values if name in given}
         if mine:
-            own = own.replaced(mine)
-            given |= own.parameters()
-        design.insert(0, own)
+            group = group.replaced(mine)
+            given |= group.parameters()
+        design.insert(0, group)
     for name, value in given.items():
         if name in inputs:
             raise ValueError(

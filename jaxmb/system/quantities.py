@@ -79,10 +79,10 @@ def view_of_motion(view: Callable[..., Any]) -> Callable[..., Any]:
     of one kind share a program.
     """
 
-    def of_all(system, place, ts, *more):
+    def of_all(system, place, ts, *arrays):
         if ts.ndim <= 1:
-            return view(system, place, ts, *more)
-        return eqx.filter_vmap(lambda system, *own: of_all(system, place, *own))(system, ts, *more)
+            return view(system, place, ts, *arrays)
+        return eqx.filter_vmap(lambda system, *batched: of_all(system, place, *batched))(system, ts, *arrays)
 
     return jitted(functools.wraps(view)(of_all))
 

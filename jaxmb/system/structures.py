@@ -22,7 +22,7 @@ def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], d
     """
 
     @functools.lru_cache(_MOST)
-    def found(kind, structure, leaves):
+    def computed(kind, structure, leaves):
         zeros = lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape) if isinstance(x, jax.ShapeDtypeStruct) else x
         return function(kind(jax.tree.unflatten(structure, map(zeros, leaves))))
 
@@ -30,6 +30,6 @@ def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], d
     def called(of: Any) -> dict[str, Any]:
         (leaves, structure), batch = jax.tree.flatten(of.system), of.system.length.ndim
         shapes = (jax.ShapeDtypeStruct(x.shape[batch:], x.dtype) if isinstance(x, ARRAYS) else x for x in leaves)
-        return dict(found(type(of), structure, tuple(shapes)))
+        return dict(computed(type(of), structure, tuple(shapes)))
 
     return called
