@@ -21,7 +21,7 @@ from .layout import Layout
 class BodySet(eqx.Module):
     """Groups of bodies.
 
-    **Fields:** `groups` of bodies; groups of `tendons`, some of which count turns in scalar coordinates; `names` of the
+    **Fields:** `groups` of bodies; groups of `tendons`, some with scalar coordinates that count turns; `names` of the
     bodies; the `layout` of bodies and scalar coordinates.
     """
 
@@ -57,7 +57,7 @@ class BodySet(eqx.Module):
         """Prepared poses of the bodies, of scalar coordinates and of the ground."""
         prepare = self.layout.space.prepare
         ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
-        # Computed once: what is cheap XLA would compute anew in each kernel that uses it.
+        # A barrier: XLA would compute cheap values anew in each kernel that uses them.
         return lax.optimization_barrier(jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]]))
 
     def all_velocities(self, u: Velocities) -> BodyVelocities:
@@ -107,11 +107,11 @@ class BodySet(eqx.Module):
 
     @property
     def turn_counts(self) -> tuple[ConstraintGroup, ...]:
-        """The groups of tendons that have scalar coordinates; their residuals vanish as coordinates are normalised."""
+        """The groups of tendons with scalar coordinates. Normalised coordinates make their residuals vanish."""
         return tuple(ConstraintGroup(g.group) for g in self.tendons if g.group.part.rows)
 
     def _places(self, group):
-        """Where the counts of turns of stacked tendons stand in q, shape (parts, rows)."""
+        """Indices in q of the counts of turns of stacked tendons, shape (parts, rows)."""
         return self.layout.pose_index[group.group.body_index[:, -group.rows :], 0]
 
     # Invariants of the coordinates: counts of turns, and Euler parameters of length one
@@ -122,18 +122,18 @@ class BodySet(eqx.Module):
         return sum(g.row_count for g in self.turn_counts) + len(self.layout.turning)
 
     def invariants(self, t: Scalar, q: Coordinates) -> list[Float[Array, "_"]]:
-        """Residuals of the invariants, in space, in pieces that follow each other."""
+        """Residuals of the invariants in space, as consecutive pieces."""
         p, poses = self.poses(q)[self.layout.turning, 3:], self.prepared_poses(q)
         counts = [g.residual(t, poses).reshape(-1) for g in self.turn_counts]
         return [*counts, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)]
 
     def attitude_gradients(self, q: Coordinates) -> Float[Array, "turning nq"]:
-        """Derivatives of the residuals of Euler parameters."""
+        """Derivatives of the residuals of Euler parameters with respect to q."""
         index = self.layout.pose_index[self.layout.turning, 3:]
         return jnp.where((index[:, :, None] == np.arange(self.layout.nq)).any(1), q[None], 0.0)
 
     def normalize_fixed(self, q: Coordinates, fixed: np.ndarray) -> tuple[Float[Array, "nq"], int]:
-        """Coordinates whose fixed Euler parameters have length one, and the number of bodies that these belong to."""
+        """Coordinates with fixed Euler parameters of length one, and the number of bodies with such parameters."""
         turns = self.layout.pose_index[self.layout.turning, 3:]
         whole = turns[np.all(fixed[turns], axis=1)]
         for index in whole:
@@ -141,9 +141,7 @@ class BodySet(eqx.Module):
         return q, len(whole)
 
     def held_velocities(self, held: np.ndarray) -> np.ndarray | None:
-        """The velocities in space along which held coordinates do not move; None where some of a rotation is held but
-        not all of it.
-        """
+        """The velocities in space that leave held coordinates unchanged; None where a rotation is held in part."""
         d = self.layout.space.dimension
         of_pose = np.append(held, np.ones(self.layout.space.pose_size, bool))[self.layout.pose_index[:-1]]
         turns = of_pose[:, d:]
@@ -153,7 +151,7 @@ class BodySet(eqx.Module):
         return of_bodies.reshape(-1)[self.layout.velocity_place]
 
     def shifted(self, guess: State, moved: Sequence[tuple[BodyGroup, Float[Array, "parts d"]]]) -> State:
-        """A state after the mass centres of some groups moved within their bodies."""
+        """The state after the mass centres of some groups moved within their bodies."""
         space, q, u = self.layout.space, guess.q, guess.u
         poses, velocities = self.poses(q), self.velocities(u)
         for group, shift in moved:
@@ -166,14 +164,13 @@ class BodySet(eqx.Module):
     # Inertia and forces
 
     def inertia(self, of_scalars: Sequence[tuple[np.ndarray, Array]]) -> AbstractInertia:
-        """M, with the inertias `of_scalars`, each with the numbers of the coordinates."""
+        """M, from the bodies and pairs `of_scalars`: numbers of scalar coordinates, and their inertias."""
         if self.layout.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.moments_of_inertia)
         mass = self._masses_of_coordinates(of_scalars)
         if self.layout.spatial:
             points = np.array([not rotates for rotates in self.layout.rotates])[:, None, None]
-            # A point mass gets a unit moment of inertia, which has no effect, to make the matrix regular; a scalar
-            # coordinate as well.
+            # A unit moment of inertia makes the matrix regular for point masses and scalar coordinates, without effect.
             moments = self.moments_of_inertia
             unit = jnp.eye(3, dtype=moments.dtype)
             units = jnp.tile(unit, (len(self.layout.scalars), 1, 1))
@@ -187,8 +184,9 @@ class BodySet(eqx.Module):
         return DiagonalInertia(bodies.reshape(-1)[self.layout.velocity_place])
 
     def _masses_of_coordinates(self, of_scalars):
-        """The entry of each body and scalar coordinate in the mass matrix, [kg] or [kg m²]; one, which has no effect,
-        for coordinates that do not move.
+        """The entry of each body and scalar coordinate in the mass matrix, [kg] or [kg m²].
+
+        Coordinates that do not move have the entry 1, which has no effect.
         """
         if not self.layout.scalars:
             return self.mass
@@ -199,7 +197,7 @@ class BodySet(eqx.Module):
         return jnp.concatenate([self.mass, inertias])
 
     def wrenches(self, now: Kinematics, gravity: Float[Array, "d"] | None) -> list[Acting]:
-        """Gravity and the gyroscopic moment `−ω × J ω`, together; empty where there is neither."""
+        """The sum of gravity and the gyroscopic moment `−ω × J ω`; empty without both."""
         size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
         parts = []
         if gravity is not None:
@@ -223,9 +221,7 @@ class BodySet(eqx.Module):
         return of_bodies if self.layout.uniform else unchecked_take(of_bodies, self.layout.velocity_place)
 
     def gyroscopic_damping(self, now: Kinematics) -> Float[Array, "ground v v"]:
-        """The derivative of each body's gyroscopic moment with respect to its own velocity; zeros for scalar
-        coordinates.
-        """
+        """Derivatives of each body's gyroscopic moment by its velocity; zeros for scalar coordinates."""
         size = self.layout.space.velocity_size
         if not self.layout.spatial:
             return jnp.zeros((self.layout.ground, size, size), now.poses.dtype)
@@ -255,8 +251,9 @@ class BodySet(eqx.Module):
 
 
 class _MixedInertia(AbstractInertia):
-    """Spatial bodies, point masses and scalar coordinates together. `blocks` has unit blocks for the rotations of
-    bodies that do not rotate.
+    """Inertia of spatial bodies, point masses and scalar coordinates.
+
+    **Fields:** `blocks`, with unit blocks for the rotations of bodies that do not rotate; the `layout`.
     """
 
     blocks: BlockInertia

@@ -28,11 +28,11 @@ from .layout import Layout
 
 
 class ConstraintSet(eqx.Module):
-    """Groups of constraints, whose rows are numbered through, and the laws of their joints.
+    """Groups of constraints with consecutive row numbers, and the laws of their joints.
 
     **Fields:** groups of `position` constraints, of `velocity` constraints, which include dry friction, and of
-    `servos`; groups of `nonideal` laws; the `layout` of the bodies; `elements`: the rows of the position groups that
-    consist of elementary joints, None where all rows are computed group by group.
+    `servos`; groups of `nonideal` laws; the `layout` of the bodies; `elements`: the rows of elementary joints in the
+    position groups, None where all rows are computed group by group.
     """
 
     position: tuple[ConstraintGroup, ...]
@@ -56,7 +56,7 @@ class ConstraintSet(eqx.Module):
 
     @property
     def laws(self) -> tuple[NonIdealGroup, ...]:
-        """The groups of non-ideal laws, with those of dry friction that slips."""
+        """The groups of non-ideal laws, then the laws of dry friction that slips."""
         return (*self.nonideal, *(g.law for g in self.frictions))
 
     @property
@@ -66,8 +66,8 @@ class ConstraintSet(eqx.Module):
 
     @property
     def scalar_inertias(self) -> list[tuple[np.ndarray, Array]]:
-        """The numbers of scalar coordinates that move, and their inertias, group by group."""
-        # The mode of friction has a velocity that no force changes.
+        """Pairs for each group with moving scalar coordinates: the coordinates' numbers, and their inertias."""
+        # No force changes the velocity of a friction mode, so any inertia will do.
         modes = [
             (g.group.body_index[:, k], jnp.ones_like(g.group.part.coefficient))
             for g in self.frictions
@@ -76,7 +76,7 @@ class ConstraintSet(eqx.Module):
         return [*((g.group.body_index[:, -1], g.group.part.inertia) for g in self.inertial), *modes]
 
     def prepared(self) -> "ConstraintSet":
-        """The same, with the rows of elementary joints together."""
+        """The same set, with the rows of all elementary joints computed together."""
         elements = elementary_rows(self.position, self.layout.ground)
         return ConstraintSet(self.position, self.velocity, self.servos, self.nonideal, self.layout, elements)
 
@@ -96,24 +96,24 @@ class ConstraintSet(eqx.Module):
     def acceleration_residual(
         self, now: Kinematics, accelerations: BodyVelocities
     ) -> Float[Array, "acceleration_rows"]:
-        """The time derivatives of the same, and residuals of servos."""
+        """Time derivatives of `velocity_residual`, and residuals of servos."""
         of_elements = lambda elements: elements.acceleration(now.poses, now.velocities, accelerations)
         of_group = lambda g: g.acceleration(now, accelerations)
         return joined(self._pieces(self.groups, of_elements, of_group), now.poses.dtype)
 
     def half_turned(self, poses: BodyPoses) -> Bool[Array, "position_rows"]:
-        """Which rows of elementary joints vanish at these poses with the joint turned away from where it closes."""
+        """Which rows of elementary joints vanish at these poses although the joint is turned away from closing."""
         mask, turned = self._is_elementary(self.position), half_turned(self.position, poses)
         return turned if mask.all() else jnp.zeros(mask.size, bool).at[np.flatnonzero(mask)].set(turned)
 
     def _is_elementary(self, groups):
-        """Which rows of some groups are rows of elementary joints."""
+        """A mask of the rows of elementary joints among the rows of `groups`."""
         return np.concatenate([np.full(g.row_count, is_elementary(g)) for g in groups])
 
     # Jacobians
 
     def blocks(self, now: Kinematics, groups: Sequence[AbstractConstraintGroup]) -> Float[Array, "entries"]:
-        """Derivatives with respect to the velocities of the bodies of each row, group by group, followed by a zero."""
+        """Derivatives of each row by the velocities of its bodies, group by group; a zero follows."""
         pieces = self._pieces(groups, lambda elements: elements.jacobian(now.poses), lambda g: g.jacobian(now))
         return joined([*pieces, jnp.zeros(1, now.poses.dtype)], now.poses.dtype)
 
@@ -124,7 +124,7 @@ class ConstraintSet(eqx.Module):
     def jacobian_of_poses(
         self, t: Scalar, poses: BodyPoses, counts: Sequence[ConstraintGroup]
     ) -> Float[Array, "rows nq"]:
-        """Derivatives of position residuals, and of `counts` of turns, with respect to the coordinates."""
+        """Derivatives of position residuals and of the `counts` of turns by the coordinates."""
         space, moves = self.layout.space, None
 
         def along(x):
@@ -158,12 +158,12 @@ class ConstraintSet(eqx.Module):
     def reactions(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
     ) -> list[Float[Array, "parts k v"]]:
-        """The wrenches of the joints of non-ideal laws on the bodies of these, law group by law group."""
+        """Reaction wrenches of the joints of non-ideal laws on the joints' bodies, one array for each law group."""
         named, wrenches, bodies = {name for g in laws for name in g.joints}, [], []
         jacobian = None if self.elements is None else self.elements.jacobian(now.poses)
         first = 0
         for g, of_group in self.of_groups(multipliers):
-            # From the matrix A, which the equation needs as well.
+            # A is computed already: the equation needs it too.
             if jacobian is not None and is_elementary(g):
                 blocks = lambda jacobian=jacobian, at=first, n=of_group.size: jacobian[at : at + n]
                 first += of_group.size
@@ -178,7 +178,7 @@ class ConstraintSet(eqx.Module):
         # A joint may be made of several constraints, all between the same bodies.
         take = lambda g: unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints))
         of_joints = [jnp.sum(take(g), axis=1) for g in laws]
-        # Scalar coordinates that a law has beyond those of its joint take no reaction.
+        # A law may have more scalar coordinates than its joint; these take no reaction.
         missing = [len(g.group.bodies[0]) - reaction.shape[1] for g, reaction in zip(laws, of_joints, strict=True)]
         return [jnp.pad(reaction, ((0, 0), (0, k), (0, 0))) for reaction, k in zip(of_joints, missing, strict=True)]
 
@@ -190,7 +190,7 @@ class ConstraintSet(eqx.Module):
         return [(g.wrenches(now, reaction), g.group.body_index) for g, reaction in zip(laws, reactions, strict=True)]
 
     def of_groups(self, multipliers: Float[Array, "rows"]) -> list[tuple[Any, Float[Array, "parts rows"]]]:
-        """The groups with the multipliers of their parts."""
+        """Each group with the multipliers of its parts."""
         ends = np.cumsum([g.row_count for g in self.groups])
         pieces = jnp.split(multipliers, ends[:-1]) if self.groups else []
         return [(g, piece.reshape(-1, g.rows)) for g, piece in zip(self.groups, pieces, strict=True)]
@@ -201,7 +201,7 @@ class ConstraintSet(eqx.Module):
         of_elements: Callable[[ElementaryRows], Array],
         of_group: Callable[[Any], Array],
     ) -> list[Array]:
-        """Values of rows, in pieces that follow each other."""
+        """Values of the rows of `groups`, as consecutive pieces."""
         if self.elements is None:
             return [of_group(g) for g in groups]
         of_rows, out, first = of_elements(self.elements), [], 0

@@ -1,4 +1,4 @@
-"""Where the rows and the modes of contacts and dry friction are among those of a scene."""
+"""Places of contacts and dry friction in a scene: their rows of A, and their modes in q."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from .groups import AbstractConstraintGroup, ConstraintGroup, VelocityConstraint
 def contact_set(
     constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[VelocityConstraintGroup]
 ) -> ContactSet:
-    """The contacts and the dry friction among all groups of constraints on positions, and on velocities."""
+    """The contacts among the groups of position constraints, and the dry friction among the velocity constraints."""
     contacts = [g for g in constraints if isinstance(g.group.part, AbstractUnilateralConstraint)]
     frictions = [g for g in velocity_constraints if g.joints]
     if not contacts and not frictions:
@@ -41,6 +41,6 @@ def _count(group: AbstractConstraintGroup) -> int:
 
 
 def _places(group: AbstractConstraintGroup) -> list[int]:
-    """Where the modes of stacked parts are in q: each part has one for each of its rows, behind its bodies."""
+    """Indices in q of the modes of stacked parts; each part has a mode for each row, after its bodies."""
     modes = group.group.body_index[:, -group.rows :].reshape(-1)
     return group.group.layout.pose_index[modes, 0].tolist()

@@ -1,4 +1,4 @@
-"""A compiled scene in words: parts, rows, degrees of freedom, redundant rows, and what is left out."""
+"""A compiled scene in words: parts, rows, degrees of freedom, redundant rows, and computations left out."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from ..system.design_variables import description_rows
 
 
 def describe_scene(system: Any) -> Description:
-    """Describe a compiled scene; from its static structure alone, so it works on traced systems as well."""
+    """Describe a compiled scene by its static structure; also a traced scene."""
     kinds = {}
     for g in system.bodies.groups:
         kinds.setdefault(g.group.part.kind, []).extend(g.group.names)
@@ -79,7 +79,7 @@ def _facts(system) -> list[tuple[str, str]]:
 
 
 def _left_out_by_elimination(system) -> list[str]:
-    """The dense matrices that an elimination in blocks makes unnecessary."""
+    """Remarks on dense matrices that elimination in blocks replaces."""
     order, out = system.elimination, []
     if order is not None:
         out.append(f"the dense Jacobian and charts, with Adams: {order}")

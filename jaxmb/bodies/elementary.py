@@ -1,12 +1,12 @@
-"""Rows of joints that consist of elementary constraints, all of them together, whatever the joints' types.
+"""Rows of joints that consist of elementary constraints, computed together for all types of joints.
 
-There are two kinds: points that coincide (two or three rows) and products X · Y of two vectors. Both need the world
-components of body-fixed vectors and of their rates, `R v`, `R (ω × v)` and `R (ω × (ω × v) + α × v)`, which is one
-product of matrices. The rows, their rates and second rates, Jacobians and wrenches then are a few sums and products.
+Elements are of two kinds: points that coincide (two or three rows), and products X · Y of two vectors. Both need world
+components of body-fixed vectors and their rates, `R v`, `R (ω × v)` and `R (ω × (ω × v) + α × v)`: one product of
+matrices. Rows, their first and second rates, Jacobians and wrenches are then a few sums and products.
 
-The rows vanish where the residuals of the joints do, and have the same derivatives there; elsewhere they may vanish
-where those do not, as the sine of an angle does half a turn away. So they serve motions, which stay close to their
-constraints, and not the assembly.
+Where the residual of a joint vanishes, its rows vanish too, with the same derivatives. Rows may vanish at other poses
+as well, like the sine of an angle half a turn away. So rows of elements serve motions, which stay close to their
+constraints, but not the assembly.
 """
 
 import dataclasses
@@ -31,15 +31,15 @@ from ..parts.elements import Element, on_bodies
 from .groups import AbstractConstraintGroup, BodyPoses, BodyVelocities
 
 _DOT = {d: BilinearMap.of(np.eye(d)[None]) for d in (2, 3)}
-# Rows of elements and of residuals may differ by this fraction of their sizes.
+# Largest relative difference between rows of elements and rows of residuals.
 _AGREE = 1e-9
 
 
 class Listed(NamedTuple):
-    """An element of each of some joints of one type.
+    """One element of stacked joints of one type.
 
-    **Fields:** the `element`, whose vectors have a leading axis for the joints; `bodies` of the joints, (joints, 2);
-    the first of its `rows` in each joint.
+    **Fields:** the `element`, with a leading axis for the joints on its vectors; `bodies` of the joints, (joints, 2);
+    `rows`: the number of the element's first row in each joint.
     """
 
     element: Element
@@ -49,12 +49,12 @@ class Listed(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Places:
-    """Where bodies and rows of stacked elements stand; static, compared by its `key`.
+    """Bodies and row numbers of stacked elements; static, compared by `key`.
 
-    **Fields:** the body of each vector, `of_vectors`; of points that coincide and of products, one after the other, the
-    bodies A and B (`pairs`); those between which a vector goes, the ground twice where there is none (`between`); where
-    products have an X of their own, `with_x`, and a vector between points, `with_points`; the places of the rows in the
-    joints' order, `order`; the number of all bodies but the ground.
+    **Fields:** `of_vectors`: the body of each vector; `pairs`: bodies A and B of all points that coincide, then of all
+    products; `between`: the two bodies that an element's vector connects, the ground twice without such a vector;
+    `with_x`: which products have a vector X; `with_points`: which products have a vector between points; `order`: the
+    permutation of rows into the joints' order; `ground`: the number of the ground.
     """
 
     key: Any
@@ -77,7 +77,7 @@ class Places:
 
     @property
     def ends(self) -> list[int]:
-        """Where the vectors of points of B end, those of points of A, X, Y in B."""
+        """Ends of the vectors' sections: points of B, points of A, X, and Y in B; Y in A follows."""
         s, d = self.points, self.products
         return [s, 2 * s, 2 * s + d, 2 * s + 2 * d]
 
@@ -86,7 +86,7 @@ class _Motion(NamedTuple):
     """World vectors of elements, or their rates.
 
     **Fields:** `of_b` and `of_a`, from the bodies' origins to points that coincide; `x`; `y_b` and `y_a`, the parts of
-    Y in B and in A; the `distances` of points that coincide, B from A, and `y`, the whole of Y.
+    Y in B and in A; `distances` from A to B of points that coincide; `y`, the whole vector Y.
     """
 
     of_b: Array
@@ -99,10 +99,10 @@ class _Motion(NamedTuple):
 
 
 class _Turning(NamedTuple):
-    """What turning bodies do to vectors in the plane, or in space.
+    """Functions of rotations in the plane, or in space.
 
-    **Fields:** matrices R of prepared poses; the rate of body-fixed vectors, `rate(spin, v)`, in the body; the `moment`
-    of forces at arms, in the world; moments `in_bodies`, from matrices and world moments; `dimension`.
+    **Fields:** `matrices(poses)`: R of prepared poses; `rate(spin, v)`: rates of body-fixed vectors, in the body;
+    `moment(arm, force)` in world axes; `in_bodies(matrices, moments)`: world moments in body axes; `dimension`.
     """
 
     matrices: Callable[[Array], Array]
@@ -140,7 +140,7 @@ _TURNING = {2: _PLANE, 3: _SPACE}
 
 
 class _Rows:
-    """What the rows of elements are made of; methods of a plain class, which NumPy's code calls often."""
+    """The rows of elements. A plain class, whose methods are cheap to call from NumPy code."""
 
     vectors: Any
     turns: Any
@@ -165,30 +165,30 @@ class _Rows:
         return self._ordered(now.distances, products)
 
     def velocity(self, poses: BodyPoses, velocities: BodyVelocities) -> Float[Array, "rows"]:
-        """Their rates."""
+        """Rates of the rows."""
         now, rate = self._moving(poses, velocities)
         return self._ordered(rate.distances, self._dot(self._x(now), rate.y) + self._dot(rate.x, now.y))
 
     def acceleration(
         self, poses: BodyPoses, velocities: BodyVelocities, accelerations: BodyVelocities
     ) -> Float[Array, "rows"]:
-        """Their second rates."""
+        """Second rates of the rows."""
         now, rate, second = self._moving(poses, velocities, accelerations)
-        # Of a length X = Y / length only one of the two vectors counts.
+        # The row of a length is (Y² / length − length) / 2; its second rate contains Ẏ² / length once, not twice.
         x_rate = rate.x if self.inverses is None else rate.x + 0.5 * self.inverses * rate.y
         products = self._dot(second.x, now.y) + 2.0 * self._dot(x_rate, rate.y) + self._dot(self._x(now), second.y)
         return self._ordered(second.distances, products)
 
     def jacobian(self, poses: BodyPoses) -> Float[Array, "rows 2 v"]:
-        """Derivatives with respect to the velocities of the two bodies of each row."""
+        """Derivatives of each row by the velocities of its two bodies."""
         (now,) = self._moving(poses)
         return self._take_ordered(self._blocks(poses, now))
 
     def jacobian_of_poses(self, poses: BodyPoses) -> Float[Array, "rows 2 7"]:
-        """Derivatives with respect to the poses, with Euler parameters whose length may change."""
+        """Derivatives of each row by the poses of its two bodies, with Euler parameters of any length."""
         xp, (now,) = namespace(poses), self._moving(poses)
         blocks, x = self._blocks(poses, now), self._x(now)
-        # Matrices R are quadratic in Euler parameters: rows change by twice this along their direction.
+        # R is quadratic in Euler parameters, so a change of their length alone changes rows by twice this.
         of_points = xp.stack([-now.of_a, now.of_b], axis=-1).reshape(-1, 2, 1)
         of_products = self._dot(xp.stack([x, x]), xp.stack([self._with_x(now.y) - now.y_a, now.y_b]))
         along = xp.concatenate([of_points, of_products.swapaxes(0, 1)])
@@ -199,7 +199,7 @@ class _Rows:
         return self._take_ordered(xp.concatenate([r, 4.0 * rot.rates(p, turn) + 2.0 * along * p], axis=-1))
 
     def wrenches(self, poses: BodyPoses, multipliers: Float[Array, "rows"]) -> Float[Array, "ground v"]:
-        """The wrenches of all rows on each body, `Aᵀ λ`."""
+        """Wrenches of all rows on each body, `Aᵀ λ`."""
         places, s, turning, d = self.places, self.places.points, self._turning, self._turning.dimension
         (now,) = self._moving(poses)
         of_points, of_products = _cut(unchecked_take(multipliers, np.argsort(places.order)), [d * s], axis=0)
@@ -216,7 +216,7 @@ class _Rows:
         return jnp.concatenate([force, turning.in_bodies(matrices, moment)], axis=-1)
 
     def _moving(self, poses, *rates) -> list[_Motion]:
-        """The world vectors at poses, and their first and second rates where velocities and accelerations are given."""
+        """World vectors at poses, then their first and second rates if velocities and accelerations are given."""
         places, v, bodies = self.places, self.vectors, self.places.of_vectors
         rate, d = self._turning.rate, self._turning.dimension
         columns, spins = [v], [unchecked_take(_cut(rate_values, [d])[1], bodies) for rate_values in rates]
@@ -236,22 +236,22 @@ class _Rows:
         return motions
 
     def _x(self, now: _Motion):
-        """X, also of products that have a length in place of it."""
+        """X of all products; `Y / length` for products with a length."""
         return now.x if self.inverses is None else now.x + self.inverses * now.y
 
     def _with_x(self, values):
-        """Those of products that have an X fixed in A; zero for others."""
+        """Values of products with an X fixed in A; zero for other products."""
         return values if self.places.with_x.all() else self.places.with_x[:, None].astype(values.dtype) * values
 
     def _of_products(self, now: _Motion):
-        """Forces, and moments in world axes, on A and on B, of products with unit multipliers, (2, d, 3) each."""
+        """Forces and world moments on A and B of products with unit multipliers, (2, d, 3) each."""
         xp, x, with_points = namespace(now.x), self._x(now), self.places.with_points
         force = x if with_points.all() else with_points[:, None].astype(x.dtype) * x
         arms = xp.stack([self._with_x(now.y) + now.y_a, -now.y_b])
         return xp.stack([-force, force]), self._turning.moment(xp.stack([x, x]), arms)
 
     def _blocks(self, poses, now: _Motion):
-        """The Jacobian, row after row of the elements."""
+        """The Jacobian, in the order of the elements."""
         xp, places, s, d = namespace(poses), self.places, self.places.points, self._turning.dimension
         matrices = self._turning.matrices(poses)
         points = matrix_products(unchecked_take(matrices, places.of_vectors[: 2 * s]), self.turns)
@@ -278,9 +278,9 @@ class _Rows:
 class ElementaryRows(_Rows, eqx.Module):
     """The rows of all joints that consist of elements.
 
-    **Fields:** body-fixed `vectors`: of points of B, of points of A, X, Y in B, Y in A; `turns`: the rates of points of
-    B and of A for unit angular velocities; `lengths` of products, and their inverses, zero where there are none, None
-    where no product has a length.
+    **Fields:** body-fixed `vectors`: points of B, points of A, X, Y in B, Y in A; `turns`: rates of the points of B and
+    A for unit angular velocities; `lengths` of products and their `inverses`, zero for products without a length, None
+    if no product has a length.
     """
 
     vectors: Float[Array, "n d"]
@@ -292,7 +292,7 @@ class ElementaryRows(_Rows, eqx.Module):
 
 @dataclasses.dataclass
 class HostRows(_Rows):
-    """The same in NumPy; no module, whose methods take a hundred times as long to be called."""
+    """The same rows in NumPy. Not a module: methods of modules take a hundred times as long to call."""
 
     vectors: np.ndarray
     turns: np.ndarray
@@ -307,21 +307,21 @@ class HostRows(_Rows):
 
 
 def is_elementary(group: AbstractConstraintGroup) -> bool:
-    """Whether the rows of stacked joints are those of elements."""
+    """Whether elements give the rows of stacked joints."""
     return group.is_position and not group.group.inputs and group.group.part.declares_elements()
 
 
 def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> ElementaryRows | None:
-    """The rows of those groups that are elementary, in their order; None without any.
+    """The rows of the elementary groups in `groups`; None without such groups.
 
-    **Arguments:** `ground`: the number of the ground, which is that of all bodies and scalar coordinates.
+    **Arguments:** `ground`: the number of the ground.
     """
     listed = _listed(groups)
     return stacked(listed, ground, groups[0].group.layout.space.dimension) if listed else None
 
 
 def _listed(groups: Sequence[AbstractConstraintGroup]) -> list[Listed]:
-    """The elements of those groups that are elementary; their rows are numbered through."""
+    """The elements of the elementary groups in `groups`, with consecutive row numbers."""
     listed, first = [], 0
     for g in filter(is_elementary, groups):
         group = g.group
@@ -335,8 +335,9 @@ def _listed(groups: Sequence[AbstractConstraintGroup]) -> list[Listed]:
 
 
 def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> Bool[Array, "rows"]:
-    """Which rows of elementary joints belong to a product that vanishes at these poses, but not where its joint closes:
-    half a turn away, or a third of one about a diagonal.
+    """Which rows of elementary joints vanish at these poses although the joint is open.
+
+    Such a joint is turned by half a turn, or by a third of a turn about a diagonal.
     """
     space, listed = groups[0].group.layout.space, _listed(groups)
     rows = sum(item.element.rows(space.dimension) * len(item.rows) for item in listed)
@@ -348,20 +349,20 @@ def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> 
     of_a, of_b = (jnp.concatenate([getattr(item.element, name) for item in pairs]) for name in ("along_a", "along_b"))
     a, b = turned(unchecked_take(poses, bodies[:, 0]), of_a), turned(unchecked_take(poses, bodies[:, 1]), of_b)
     sizes = rot.norm(of_a) * rot.norm(of_b)
-    # They are parallel where the joint closes.
+    # The two directions are parallel where the joint closes.
     opposite = _DOT[space.dimension](a, b)[:, 0] < 0.5 * sizes
     return jnp.zeros(rows, bool).at[np.concatenate([item.rows for item in pairs])].set(opposite)
 
 
 def stacked(listed: Sequence[Listed], ground: int, d: int) -> ElementaryRows:
-    """The rows of elements in the plane or in space, of d dimensions."""
+    """The rows of elements in `d` dimensions."""
     points = [item for item in listed if item.element.coincide]
     products = [item for item in listed if not item.element.coincide]
     xp = namespace(*jax.tree.leaves([item.element for item in listed]))
     dtype = xp.result_type(*jax.tree.leaves([item.element for item in listed]))
 
     def numbers(of_element: Callable[[Any], Any], among: Sequence[Listed], shape: tuple[int, ...] = (d,)):
-        """The vectors of elements, zero where they have none."""
+        """A field of the elements `among`, zeros where it is None."""
         entries = [(of_element(item.element), (len(item.bodies), *shape)) for item in among]
         return xp.concatenate(
             [xp.zeros((0, *shape), dtype), *(np.zeros(size) if x is None else x.reshape(size) for x, size in entries)],
@@ -369,7 +370,7 @@ def stacked(listed: Sequence[Listed], ground: int, d: int) -> ElementaryRows:
         )
 
     def of_joints(of_element: Callable[[Any], Any], among: Sequence[Listed]):
-        """What is known of elements, once for each joint."""
+        """A boolean of the elements `among`, once for each joint."""
         values = [np.full(len(item.bodies), of_element(item.element)) for item in among]
         return np.concatenate([np.zeros(0, bool), *values])
 
@@ -405,13 +406,13 @@ def stacked(listed: Sequence[Listed], ground: int, d: int) -> ElementaryRows:
 
 
 def check_elements(system: Any, state: State, t: float = 0.0) -> None:
-    """Raise a `ValueError` if joints that declare their `elements` have other rows than those of their residuals.
+    """Raise a `ValueError` if the `elements` that a joint declares disagree with its residual.
 
     ```python
     jaxmb.report.check_elements(system, jaxmb.assemble(system))
     ```
 
-    Give a state at which no row happens to vanish in its derivatives, and velocities that are not zero.
+    Give a generic state, with velocities that are not zero: a row whose derivatives vanish there is not tested.
 
     **Arguments:** `system`: a compiled scene; a consistent `state`; the time `t` [s].
     """
@@ -429,7 +430,7 @@ def check_elements(system: Any, state: State, t: float = 0.0) -> None:
 
 @eqx.filter_jit
 def _compared(system, t, state):
-    """The rows of a system by elements and by residuals."""
+    """The rows of a system, from elements and from residuals."""
     near, (q, u) = system.prepared(), (state.q, state.u)
     other = jnp.linspace(-1.0, 1.0, u.size, dtype=u.dtype)
     both = lambda rows_of: (rows_of(near), rows_of(system))
@@ -442,7 +443,7 @@ def _compared(system, t, state):
 
 
 def _cut(values: Any, places: Any, axis: int = -1) -> list[Any]:
-    """Parts of an array; derivatives of these are joined, where those of slices would be padded and added."""
+    """`values` split at `places`. The derivative is a concatenation; slices would be padded and added."""
     if isinstance(values, np.ndarray):
         ends = [0, *places, values.shape[axis]]
         every = (slice(None),) * (axis % values.ndim)

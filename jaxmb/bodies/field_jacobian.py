@@ -1,7 +1,7 @@
 """The derivative of the equations of motion along the constraints, with the structure of a scene's graph.
 
-A part acts on its own bodies only, so the derivatives of its wrenches are a small matrix of blocks; parts of one type
-are differentiated together.
+A part acts on its bodies only, so derivatives of its wrenches are a small matrix of blocks. Parts of one type are
+differentiated together.
 """
 
 from typing import Any
@@ -29,9 +29,10 @@ from .motion_graph import MotionOrder, motion_order
 def contributions(
     system: Any, now: Kinematics, multipliers: Float[Array, "m"]
 ) -> tuple[Float[Array, "e v v"], Float[Array, "e v v"]]:
-    """K and D: derivatives of the wrenches of forces and of constraints with given multipliers, with respect to
-    displacements along velocities and to the velocities. Each part contributes a block for each pair of its bodies,
-    the one that the wrench acts on first; the gyroscopic moments of bodies follow.
+    """K and D: derivatives of the wrenches of forces and constraints, at fixed multipliers.
+
+    K is the derivative by displacements along velocities, D by velocities. Each part contributes a block for each
+    ordered pair of its bodies, with the loaded body first. Blocks of gyroscopic moments follow.
     """
     size = system.layout.space.velocity_size
     stiffness, damping = [], []
@@ -54,11 +55,11 @@ def _by_pairs(blocks: Float[Array, "parts k v k v"]) -> Float[Array, "parts k k 
 
 
 class MotionJacobian(AbstractFieldJacobian):
-    """J of `q̇ = N u, M u̇ = F + Aᵀ λ` at a state. What is left out are the changes of A and N along the motion.
+    """J of `q̇ = N u, M u̇ = F + Aᵀ λ` at a state, without the changes of A and N along the motion.
 
-    **Fields:** `stiffness` K and `damping` D (pairs, v, v): derivatives of forces, and of constraint forces with given
+    **Fields:** `stiffness` K and `damping` D (pairs, v, v): derivatives of forces and of constraint forces at fixed
     multipliers, for pairs of bodies; `mass` M (bodies, v, v); `moves` N (bodies, v, p), a row for each velocity;
-    `projector` on the constraints, None where there are none; `rows`: the blocks of A, None likewise; the number of
+    `projector` on the constraints, and `rows`: the blocks of A, both None without constraints; the number of
     `position_rows`; the `order` of elimination; the `layout` of the bodies.
     """
 
@@ -82,13 +83,13 @@ class MotionJacobian(AbstractFieldJacobian):
         residual = jnp.stack([product(both[0]), product(both[1])])
         binds_positions = np.arange(residual.shape[1]) < self.position_rows
         residual = residual.at[0].set(jnp.where(binds_positions, residual[0], 0.0))
-        # A loop, so that it is compiled once for both.
+        # A loop, to compile the projection once for displacement and velocity.
         both = both + lax.map(self.projector.cancel, residual)
         move, velocity = (unchecked_take(jnp.append(values, 0.0), index) for values in both)
         return self.raveled(move, velocity)
 
     def of_bodies(self, x: Array) -> tuple[Array, Array]:
-        """Displacements along velocities, and changes of velocities, (bodies, v) each, from those of a state."""
+        """Displacements along velocities, and changes of velocities, (bodies, v) each, from a change of the state."""
         nq = self.layout.nq
         zero = jnp.zeros(self.layout.space.pose_size, x.dtype)
         poses = unchecked_take(jnp.concatenate([x[:nq], zero]), self.layout.pose_index[:-1])
@@ -113,7 +114,7 @@ class MotionJacobian(AbstractFieldJacobian):
         bodies, size, _ = self.mass.shape
         widest = self.widest
         pairs = _padded(r * self.damping.astype(dtype) + r**2 * self.stiffness.astype(dtype), widest)
-        # The identity for what a body without rotation lacks.
+        # The identity stands for the rotations of point masses.
         missing = np.ones((bodies, widest))
         missing[:, :size] = self.layout.velocity_index[:-1] == self.layout.nu
         diagonal = _padded(self.mass, widest) + missing[:, :, None] * np.eye(widest)
@@ -162,7 +163,7 @@ class MotionResolvent(AbstractResolvent):
 
     def transpose_solve(self, x):
         jacobian = self.jacobian
-        # The transposes of the maps between a state and its bodies.
+        # Transposes of the maps between a state and its bodies.
         pull = jax.linear_transpose(lambda both: jacobian.raveled(*both), jacobian.of_bodies(x))
         push = jax.linear_transpose(jacobian.of_bodies, x)
         move, velocity = pull(x)[0]
@@ -176,7 +177,7 @@ class MotionResolvent(AbstractResolvent):
         return factor.solve(jnp.pad(load, ((0, nodes - bodies), (0, widest - size))))[:bodies, :size]
 
     def _stiff(self, move, transpose=False):
-        """K along displacements of the bodies, or its transpose."""
+        """K, or its transpose, times displacements of the bodies."""
         order, K = self.jacobian.order, self.jacobian.stiffness.astype(move.dtype)
         if transpose:
             return order.by_column(transpose_vector_products(K, unchecked_take(move, order.row)))

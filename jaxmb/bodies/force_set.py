@@ -1,7 +1,7 @@
-"""The forces of a scene: gravity and stacked force elements, with the internal states of these.
+"""The forces of a scene: gravity and stacked force elements, with their internal states.
 
-The kernels of a part find the current value of an internal state in the field that declares it. Between evaluations the
-field holds no number, so that a state that was forgotten shows.
+Kernels of a part read an internal state from the field that declares it. Between evaluations the field is NaN, so a
+forgotten state shows.
 """
 
 from typing import Any, NamedTuple, Self
@@ -20,8 +20,10 @@ from .groups import Acting, BodyPoses, ForceGroup, Kinematics, joined
 
 
 class StateField(NamedTuple):
-    """An internal state of stacked parts: field `name`, which `keys` lead to in group number `group`; the names of the
-    parts, `members`; `shape` of one part, and the `start` of all of them in z.
+    """An internal state of stacked parts.
+
+    **Fields:** the number of the `group`; the field's `name`, and the `keys` that lead to it; names of the parts,
+    `members`; the state's `shape` in one part; `start`: the index in z of the first part's state.
     """
 
     group: int
@@ -33,7 +35,7 @@ class StateField(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Of one part."""
+        """The number of entries of one part."""
         return int(np.prod(self.shape))
 
     @property
@@ -41,7 +43,7 @@ class StateField(NamedTuple):
         return self.start + len(self.members) * self.size
 
     def of_parts(self) -> dict[str, int]:
-        """Where the state of each part begins in z, by name, `"motor.torque"`."""
+        """The first index in z of each part's state, by name, `"motor.torque"`."""
         return {f"{part}.{self.name}": self.start + k * self.size for k, part in enumerate(self.members)}
 
 
@@ -57,12 +59,12 @@ class ForceSet(eqx.Module):
 
     @property
     def gravity_part(self) -> tuple[Gravity, ...]:
-        """The part that gives gravity; empty without any."""
+        """Gravity as a part; empty without gravity."""
         return () if self.gravity is None else (Gravity(self.gravity, name=self.gravity_name),)
 
     @property
     def with_gaps(self) -> tuple[ForceGroup, ...]:
-        """The groups of forces that act where a gap is closed only."""
+        """The groups of forces that act only at closed gaps."""
         return tuple(g for g in self.groups if g.group.part.has_gaps)
 
     def wrenches(self, now: Kinematics) -> list[Acting]:
@@ -90,9 +92,9 @@ class ForceSet(eqx.Module):
         return [entry(self.groups[state.group].group.part, state.keys) for state in states]
 
     def initial_states(self) -> Float[Array, "nz"] | None:
-        """The values that the parts were given; None without internal states.
+        """Initial values of the parts' internal states; None without internal states.
 
-        **Raises:** `ValueError` naming those that are not finite.
+        **Raises:** `ValueError` naming the states with values that are not finite.
         """
         if not self.states:
             return None
@@ -103,7 +105,7 @@ class ForceSet(eqx.Module):
         return jax.device_put(z)
 
     def with_states(self, z: Float[Array, "nz"] | None) -> Self:
-        """The same, with parts that have these internal states; not numbers where `z` is None."""
+        """The same set with internal states `z` in its parts; NaN if `z` is None."""
         states = self.states
         if not states:
             return self
@@ -115,12 +117,12 @@ class ForceSet(eqx.Module):
         return eqx.tree_at(lambda forces: forces._in_parts(states), self, values)
 
     def state_rates(self, now: Kinematics) -> Float[Array, "nz"]:
-        """ż of parts that have their internal states."""
+        """ż; the parts must hold their internal states."""
         rates = {g: self.groups[g].state_rates(now) for g in dict.fromkeys(state.group for state in self.states)}
         return joined([rates[state.group][state.name] for state in self.states], now.poses.dtype)
 
     def state_scale(self, dtype: Any) -> Float[Array, "nz"]:
-        """The typical size of every internal state."""
+        """Typical size of every internal state."""
         out = []
         for state in self.states:
             sizes = self.groups[state.group].group.map(lambda at: at(0.0).state_sizes()).get(state.name)

@@ -29,17 +29,15 @@ BodyPoses: TypeAlias = Float[Array, "b_ground p"]
 BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 
 
-# Of more parts than this with functions of time only a combination is looked at.
+# For more parts than this, `given_in_time` gives one combination of the parts' functions of time.
 _MOST_OF_TIME = 32
 
-# Wrenches of some parts, shape (parts, k, v), and the numbers of the bodies that they act on, shape (parts, k).
+# Wrenches of parts, shape (parts, k, v), and the numbers of the loaded bodies, shape (parts, k).
 Acting: TypeAlias = tuple[Float[Array, "parts k v"], np.ndarray]
 
 
 class Kinematics(NamedTuple):
-    """A scene in motion at an instant: the time `t` [s], and prepared `poses` and `velocities` of all bodies, scalar
-    coordinates and the ground.
-    """
+    """A scene in motion: time `t` [s], prepared `poses` and `velocities` of bodies, scalar coordinates and ground."""
 
     t: Scalar
     poses: BodyPoses
@@ -47,9 +45,10 @@ class Kinematics(NamedTuple):
 
 
 class Input(eqx.Module):
-    """A number of some stacked parts that is a function of time, or several functions of one kind: the parameters'
-    names, the keys that lead to the number in a part, the numbers of the parts, and whether it `moves` what the part
-    measures, so that its rate counts as well.
+    """A parameter of stacked parts that is a function of time, or several functions of one kind.
+
+    **Fields:** the `signal`; `names` of the parameters; `keys` that lead to the parameter in a part; the numbers of the
+    parts, `members`; `moves`: whether the parameter moves points, axes or joints, so that its rate counts too.
     """
 
     signal: AbstractSignal
@@ -59,13 +58,13 @@ class Input(eqx.Module):
     moves: bool = eqx.field(static=True)
 
     def alone(self) -> "list[Input]":
-        """The same of each part."""
+        """One input for each part."""
         signals = of_each(self.signal, len(self.names))
         entries = zip(signals, self.names, self.members, strict=True)
         return [Input(signal, (name,), self.keys, (member,), self.moves) for signal, name, member in entries]
 
     def value(self, member: Any, t: Scalar) -> Array:
-        """The number of a part that is among these; of one kind all are computed, once for all parts."""
+        """The value for one of the `members`. Functions of one kind are all computed, once for all parts."""
         if len(self.members) == 1:
             return self.signal(t)
         values = jax.vmap(lambda signal: signal(t))(self.signal)
@@ -73,18 +72,18 @@ class Input(eqx.Module):
         return values.at[place].get(mode="clip", wrap_negative_indices=False)
 
     def drives(self, member: Any) -> Any:
-        """Whether the number of a part is among these."""
+        """Whether a part is among the `members`."""
         return member == self.members[0] if len(self.members) == 1 else self._entry(True, False, member)
 
     def _entry(self, of_members, of_others, member):
-        """An entry of the parts that are among these, or of the other parts, the last ones of which have the last."""
+        """`of_members[k]` for member number k, `of_others` for other parts; their large indices are clipped."""
         entries = np.full(max(self.members) + 2, of_others)
         entries[list(self.members)] = of_members
         return jnp.asarray(entries).at[member].get(mode="clip", wrap_negative_indices=False)
 
 
 def together(inputs: Sequence[Input]) -> tuple[Input, ...]:
-    """Inputs of single parts with those of one kind together."""
+    """Inputs of single parts, combined by kind of function."""
     kinds: dict[Any, list[Input]] = {}
     for single in inputs:
         kinds.setdefault((single.keys, single.moves), []).append(single)
@@ -97,10 +96,12 @@ def together(inputs: Sequence[Input]) -> tuple[Input, ...]:
 
 
 class Group(eqx.Module):
-    """Stacked parts. `part` has the structure of one part with a leading axis on every number; `inputs` replace some
-    numbers by functions of time; `inner`: where the parts hold other parts, the keys that lead there and the names of
-    these; `chosen`: the numbers of the parts, None where they are all; `kernels` of a class of the user's by name, as
-    they were when the scene was compiled.
+    """Stacked parts.
+
+    **Fields:** `part`: the structure of one part, with a leading axis on every number; `names` and `bodies` of the
+    parts; the `layout`; `inputs`, which replace numbers by functions of time; `inner`: for parts within the parts, the
+    keys that lead there and the inner parts' names; `kernels` of a user's class by name, captured when the scene was
+    compiled; `chosen`: the numbers of the parts, None for all parts.
     """
 
     part: Any
@@ -113,12 +114,12 @@ class Group(eqx.Module):
     chosen: Int[Array, "parts"] | None = None
 
     def only(self, member: Any) -> Self:
-        """The group of one of its parts, whose number may be traced; names and bodies stay those of all."""
+        """The group of one part, whose number may be traced. `names` and `bodies` still list all parts."""
         part = jax.tree.map(lambda leaf: leaf[member][None], self.part)
         return dataclasses.replace(self, part=part, chosen=jnp.asarray(member)[None])
 
     def map(self, kernel: Callable[..., Any], *per_part: Array) -> Any:
-        """`kernel(at, …)` of every part with its rows of some arrays, where `at(t)` is the part at a time."""
+        """`kernel(at, …)` of every part, with the part's rows of the arrays; `at(t)` is the part at a time."""
         if not self.inputs:
             return jax.vmap(lambda part, *rows: kernel(lambda t: part, *rows))(self.part, *per_part)
         single = lambda member, part, *rows: kernel(lambda t: self._at(member, part, t), *rows)
@@ -126,13 +127,13 @@ class Group(eqx.Module):
         return jax.vmap(single)(members, self.part, *per_part)
 
     def kernel(self, name: str) -> Callable[..., Any]:
-        """A kernel as a function of one part and of what it takes after `space`; without that it is a property."""
+        """A kernel as a function of one part and of the arguments after `space`; without arguments a property."""
         space = self.layout.space
         plain = lambda part, *arguments: getattr(part, name)(space, *arguments) if arguments else getattr(part, name)
         return dict(self.kernels).get(name, plain)
 
     def coordinates(self, part: Any, poses: Float[Array, "k p"]) -> dict[str, Array]:
-        """The coordinates of one part at these poses of its bodies."""
+        """The coordinates of one part, from the poses of its bodies."""
         return self.kernel("coordinates")(part, part.seen_poses(self.layout.space, poses))
 
     def single(self, member: int, t: Scalar) -> Any:
@@ -140,7 +141,7 @@ class Group(eqx.Module):
         return self._at(member, jax.tree.map(lambda leaf: leaf[member], self.part), t)
 
     def _at(self, member, part, t):
-        """One part with its inputs at a time, and their rates."""
+        """One part with the values of its inputs at a time, and with their rates as `drift`."""
         drift = jax.tree.map(lambda _: None, part)
         for driven in self.inputs:
             where = lambda part, keys=driven.keys: entry(part, keys)
@@ -166,7 +167,7 @@ class Group(eqx.Module):
         return self.part.rows
 
     def gather(self, of_bodies: Float[Array, "b_ground _"]) -> Float[Array, "parts k _"]:
-        """Rows of each part's bodies, from those of all bodies and the ground."""
+        """The rows of each part's bodies, from an array of all bodies and the ground."""
         index: Any = self.body_index if self.chosen is None else jnp.asarray(self.body_index)[self.chosen]
         return unchecked_take(of_bodies, index)
 
@@ -176,10 +177,10 @@ def stack(
     layout: Layout,
     check: Callable[[Any, AbstractSpace, int], None] | None = None,
 ) -> tuple[Group, ...]:
-    """Group parts that share type, static fields and shapes; order of first appearance.
+    """Group parts that share type, static fields and shapes, in order of first appearance.
 
-    **Arguments:** `parts` with the numbers of their bodies; `check(part, space, bodies)`: called for one part of each
-    group, whose functions are those of all others.
+    **Arguments:** `parts` with the numbers of their bodies; `check(part, space, bodies)`: called for the first part of
+    each group, since all parts of a group share their functions.
     """
     groups: dict[Any, list] = {}
     structures: dict[Any, tuple[Any, Any]] = {}
@@ -207,7 +208,7 @@ def stack(
 
 
 def _not_numbers(part: AbstractPart) -> str:
-    """What is wrong with a part that holds other things than numbers in fields that are not static."""
+    """A message about a part with a non-static field that is not a number."""
     wrong = [(path, leaf) for path, leaf in jtu.tree_flatten_with_path(part)[0] if not eqx.is_array_like(leaf)]
     path, leaf = wrong[0]
     field = jtu.keystr(path).removeprefix(".")
@@ -224,25 +225,26 @@ class AbstractGroup(eqx.Module):
 
     @property
     def is_position(self) -> bool:
-        """Whether its rows are position constraints, and no more."""
+        """Whether all rows are plain position constraints."""
         return False
 
     def part(self, name: str = "") -> AbstractPart:
-        """The part of a group of one without the leading axis; of others a part with that axis on every number."""
+        """The part under a name, with a leading axis on its numbers unless the group's arrays have none."""
         return self.group.part.named(name)
 
     def only(self, member: Any) -> Self:
-        """The group of one of its parts, whose number may be traced."""
+        """The group of one part, whose number may be traced."""
         rest = jax.tree.map(lambda leaf: leaf[member][None], dataclasses.replace(self, group=None))
         return dataclasses.replace(rest, group=self.group.only(member))
 
     def coordinates(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
-        """The parts' own coordinates, by name within the part."""
+        """The coordinates of the parts, by name within the part."""
         return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
 
     def given_in_time(self, now: Kinematics) -> Float[Array, "n"]:
-        """The values of functions of time in parts that have them, while nothing moves; of many parts a combination,
-        with weights that let no two of them cancel.
+        """Values of the parts' functions of time while nothing moves.
+
+        Of many parts a combination, with random weights so that no two values cancel.
         """
         given = self._of_motion("given_in_time", now)
         parts = given.shape[0]
@@ -256,7 +258,7 @@ class AbstractGroup(eqx.Module):
         return self.group.layout.space
 
     def _map(self, kernel, *of_bodies, per_part=()):
-        """`kernel(at, …)` of every part, with the rows of its bodies, and with `more` per part."""
+        """`kernel(at, …)` of every part, with the rows of its bodies, and with the arrays `per_part`."""
         return self.group.map(kernel, *map(self.group.gather, of_bodies), *per_part)
 
     def _of_motion(self, name, now):
@@ -285,7 +287,7 @@ class BodyGroup(AbstractGroup):
 
 
 class CoordinateGroup(AbstractGroup):
-    """Stacked parts that have coordinates and no rows: tendons, and joints that leave all motions free."""
+    """Stacked parts with coordinates and without rows: tendons, and joints that leave all motions free."""
 
     @property
     def rows(self) -> int:
@@ -314,7 +316,7 @@ class AbstractConstraintGroup(AbstractGroup):
 
     @abc.abstractmethod
     def jacobian(self, now: Kinematics) -> Float[Array, "parts rows k v"]:
-        """Derivative with respect to velocities, body by body."""
+        """Derivatives by velocities, body by body."""
 
     @abc.abstractmethod
     def wrenches(self, now: Kinematics, multipliers: Float[Array, "parts rows"]) -> Float[Array, "parts k v"]:
@@ -324,7 +326,7 @@ class AbstractConstraintGroup(AbstractGroup):
     def wrench_derivatives(
         self, now: Kinematics, multipliers: Float[Array, "parts rows"]
     ) -> Float[Array, "parts k v k v"]:
-        """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies."""
+        """Derivatives of `wrenches` by displacements along the velocities of the parts' bodies."""
 
     @abc.abstractmethod
     def acceleration(self, now: Kinematics, accelerations: BodyVelocities) -> Float[Array, "parts rows"]:
@@ -332,7 +334,7 @@ class AbstractConstraintGroup(AbstractGroup):
 
     @property
     def of_poses(self) -> bool:
-        """Whether its rows are derivatives of residuals of poses."""
+        """Whether the rows come from residuals of poses."""
         return False
 
     @property
@@ -346,8 +348,9 @@ class AbstractConstraintGroup(AbstractGroup):
 
 
 class ConstraintGroup(AbstractConstraintGroup):
-    """Kernels of stacked position constraints; with the gains `damping` and `stiffness`, of the programs of servos,
-    which act on accelerations.
+    """Kernels of stacked position constraints, or of the programs of servos.
+
+    Programs have the gains `damping` and `stiffness`, and act on accelerations.
     """
 
     damping: Float[Array, "parts"] | None = None
@@ -378,16 +381,15 @@ class ConstraintGroup(AbstractConstraintGroup):
         return self._map(lambda at, x: self._residual(at, t, x), poses)
 
     def along(self, t: Scalar, poses: BodyPoses, moves: Float[Array, "b_ground n p"]) -> Float[Array, "parts rows k n"]:
-        """Derivatives along `n` motions of every body, one at a time."""
+        """Derivatives along `n` motions of every body. One body moves, the others rest."""
 
         def single(at, x, moves):
             def along_one(body):
-                # The residuals themselves are the same for every body, and computed once.
+                # The residual's value is the same for every body, so XLA computes it once.
                 residual = lambda pose: self._residual(at, t, jnp.stack([*x[:body], pose, *x[body + 1 :]]))
                 push = lambda dx: jax.jvp(residual, (x[body],), (dx,))[1]
                 return jax.vmap(push, out_axes=-1)(moves[body])
 
-            # One body moves, the others rest.
             return jnp.stack([along_one(body) for body in range(len(moves))], axis=1)
 
         return self._map(single, poses, moves)
@@ -429,7 +431,7 @@ class ConstraintGroup(AbstractConstraintGroup):
         return jax.vmap(self._space.rates)(poses, velocities)
 
     def _rate(self, at, t, x, xdot):
-        """Velocity residuals of one part, from the rates of its bodies' poses."""
+        """The rate of the residuals of one part, from the rates of its bodies' poses."""
         if self.rheonomic:
             residual = lambda t, x: self._residual(at, t, x)
             return jax.jvp(residual, (t, x), (jnp.ones_like(t), xdot))[1]
@@ -437,15 +439,16 @@ class ConstraintGroup(AbstractConstraintGroup):
 
 
 class VelocityConstraintGroup(AbstractConstraintGroup):
-    """Kernels of stacked velocity constraints; of dry friction, which is one where it sticks, `joints` are the names of
-    its joints.
+    """Kernels of stacked velocity constraints, among them dry friction that sticks.
+
+    **Fields:** `joints`: for dry friction the name of each part's joint; otherwise empty.
     """
 
     joints: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def law(self) -> "NonIdealGroup":
-        """Dry friction where it slips."""
+        """The law of dry friction that slips."""
         return NonIdealGroup(self.group, self.joints)
 
     @property
@@ -508,7 +511,7 @@ class ForceGroup(AbstractGroup):
     ) -> tuple[
         Float[Array, "parts gaps"], Float[Array, "parts gaps"], Float[Array, "parts gaps"], Float[Array, "parts"]
     ]:
-        """Gaps, their rates, the widths in which forces set in, and the pace of each part."""
+        """Gaps, their rates, the widths over which forces set in, and the pace of each part."""
         space, t = self._space, now.t
 
         def single(at, x, v):
@@ -525,9 +528,7 @@ class ForceGroup(AbstractGroup):
         return self._of_motion("state_rates", now)
 
     def derivatives(self, now: Kinematics) -> tuple[Float[Array, "parts k v k v"], Float[Array, "parts k v k v"]]:
-        """Derivatives of `wrenches` with respect to displacements along the velocities of the parts' bodies, and to the
-        velocities.
-        """
+        """Derivatives of `wrenches` by displacements along the velocities of the parts' bodies, and by velocities."""
 
         def single(at, x, v):
             of_positions = along_moves(self._space, lambda x: self._wrenches(at, now.t, x, v), x)
@@ -547,12 +548,15 @@ class ForceGroup(AbstractGroup):
 
 
 class NonIdealGroup(AbstractGroup):
-    """Kernels of stacked non-ideal laws; `joints`: the joint's name for each."""
+    """Kernels of stacked non-ideal laws.
+
+    **Fields:** `joints`: the name of each law's joint.
+    """
 
     joints: tuple[str, ...] = eqx.field(static=True)
 
     def wrenches(self, now: Kinematics, reactions: Float[Array, "parts k v"]) -> Float[Array, "parts k v"]:
-        """Wrenches of the laws on the bodies of their joints; `reactions`: those of the joints."""
+        """Wrenches of the laws on the bodies of their joints, from the joints' `reactions`."""
         space, kernel = self._space, self.group.kernel("wrenches")
 
         def single(at, x, v, reaction):
@@ -564,7 +568,7 @@ class NonIdealGroup(AbstractGroup):
 
 
 def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:
-    """Derivatives of a function of the poses of some bodies along their unit velocities, (…, k, v)."""
+    """Derivatives of a function of poses along unit velocities of the bodies, (…, k, v)."""
     moves = jax.vmap(space.moves)(x)
     k, size, _ = moves.shape
     _, push = jax.linearize(function, x)
@@ -574,5 +578,5 @@ def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Flo
 
 
 def joined(pieces: Sequence[Array], dtype: Any) -> Float[Array, "n"]:
-    """Arrays in one vector."""
+    """All pieces in one vector."""
     return jnp.concatenate([piece.reshape(-1) for piece in pieces]) if pieces else jnp.zeros(0, dtype)

@@ -1,5 +1,6 @@
-"""The constraints of a scene in NumPy: joints that consist of elements without any program, and all others by a program
-of their rows alone.
+"""The constraints of a scene in NumPy.
+
+Joints of elements need no compiled program. The other joints share a program of their rows alone.
 """
 
 from collections.abc import Iterable
@@ -19,8 +20,10 @@ from .groups import Kinematics
 
 
 class _Rows(NamedTuple):
-    """Of a group: Φ, or ψ where it binds velocities; how this changes while nothing moves; and derivatives along the
-    poses of the parts' bodies, or along their velocities.
+    """Rows of a group.
+
+    **Fields:** `values`: Φ, or ψ of a group that binds velocities; `drift`: the rate of Φ while nothing moves, empty
+    without time; `blocks`: derivatives along the poses of the parts' bodies, or along their velocities.
     """
 
     values: Float[Array, "parts rows"]
@@ -79,14 +82,14 @@ class HostScene(AbstractHost):
         poses = self._poses(q)
         size = poses.shape[1]
         if self._layout.spatial:
-            # Matrices are quadratic in Euler parameters, so that these differences are exact.
+            # Rotation matrices are quadratic in Euler parameters, so these differences are exact.
             return np.stack([0.5 * (self._prepare(poses + x) - self._prepare(poses - x)) for x in np.eye(size)], axis=1)
         moves = np.tile(np.eye(size, size + 2), (len(poses), 1, 1))
         moves[:, 2, size:] = np.stack([-np.sin(poses[:, 2]), np.cos(poses[:, 2])], axis=1)
         return moves
 
     def _rates(self, q, of_bodies):
-        """The rates of poses of all bodies at these velocities."""
+        """The rates of poses, from the velocities of all bodies."""
         if not self._layout.spatial:
             return of_bodies
         poses = self._poses(q)
@@ -94,7 +97,7 @@ class HostScene(AbstractHost):
         return np.concatenate([of_bodies[:, :3], [rot.rates(p, w) for p, w in turned]], axis=1)
 
     def _evaluated(self, q, u=None) -> list[_Rows]:
-        """Rows of constraints that are not known as elements, by default at the given velocities."""
+        """Rows of the compiled groups, by default at the guess's velocities."""
         if not self._compiled:
             return []
         u = self._u if u is None else u
@@ -106,7 +109,7 @@ class HostScene(AbstractHost):
         return self._last[1]
 
     def _joined(self, groups, of_elements: Any, of_compiled: Iterable[Any]) -> list[Any]:
-        """What is known of elements and of other constraints, group by group."""
+        """Values of elements and of the compiled groups, in the order of `groups`."""
         compiled, out, first = iter(of_compiled), [], 0
         for g, listed in zip(groups, self._listed, strict=False):
             if not listed:
@@ -126,7 +129,7 @@ class HostScene(AbstractHost):
         return np.concatenate([self.residual(q), 0.5 * (np.sum(p * p, axis=1) - 1.0)])
 
     def blocks(self, q, u=None) -> list[Float[np.ndarray, "parts rows k v"]]:
-        """A, group by group, for the bodies of each part; by default at the given velocities."""
+        """Blocks of A, group by group, for the bodies of each part; by default at the guess's velocities."""
         listed = None if self._elements is None else self._elements.jacobian(self._prepared(q))
         compiled = zip(self._compiled, self._evaluated(q, u), strict=True)
         joined = self._joined(self._groups, listed, (self._along_velocities(q, g, x.blocks) for g, x in compiled))
@@ -134,11 +137,11 @@ class HostScene(AbstractHost):
         return [x.reshape(len(g.group.names), g.rows, *x.shape[-2:]) for g, x in pairs]
 
     def jacobian(self, q):
-        """A at the given velocities."""
+        """A at the guess's velocities."""
         return np.append(_flat(self.blocks(q)), 0.0)[self._of_velocities]
 
     def _along_velocities(self, q, group, blocks):
-        """Derivatives along velocities, from those along poses."""
+        """Derivatives along velocities, from derivatives along poses."""
         if not (self._layout.spatial and group.of_poses):
             return blocks
         units = np.eye(self._layout.space.velocity_size)
@@ -183,7 +186,7 @@ class HostScene(AbstractHost):
         return q
 
     def along(self, q, step):
-        """The rates of coordinates at these velocities."""
+        """The rates of coordinates with the velocities `step`."""
         moved = self._rates(q, np.append(step, 0.0)[self._layout.velocity_index])
         return moved[:-1].ravel()[self._layout.coordinate_place]
 
@@ -192,7 +195,7 @@ class HostScene(AbstractHost):
         return self.normalize(q + self.along(q, step))
 
     def holds(self, q):
-        """Whether the constraints hold, and no joint is turned by half a turn."""
+        """Whether the constraints hold, without a joint that is half a turn away from closing."""
         if not super().holds(q):
             return False
         poses, turned = self._prepared(q), self._layout.space.direction
@@ -208,7 +211,7 @@ def _flat(pieces):
 
 
 def host_scene(system: Any, t: Any) -> HostScene | None:
-    """The constraints of a system in NumPy; None where there are none, or many."""
+    """The constraints of a system in NumPy; None for a system without constraints, or with many."""
     small = 0 < system.acceleration_rows <= MOST and system.nq <= MOST and system.guess.q.dtype == np.float64
     return HostScene(system, t) if small and not system.bodies.turn_counts else None
 
@@ -218,8 +221,9 @@ def _in_numpy(group):
 
 
 def _elements(system) -> tuple[HostRows | None, list[tuple[np.ndarray, Any, Any]]]:
-    """The rows of joints that consist of elements; and where these have directions with a positive product, the bodies
-    of joints and the directions.
+    """The rows of joints that consist of elements.
+
+    Also, for elements with directions that are parallel in a closed joint, the joints' bodies and these directions.
     """
     space, listed, along, first = system.layout.space, [], [], 0
     for g in filter(_in_numpy, system.constraints.position):

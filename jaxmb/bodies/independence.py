@@ -1,8 +1,8 @@
-"""Which rows of the constraints are independent, part by part of the joint graph.
+"""The independent rows of the constraints, by biconnected components of the joint graph.
 
 The rows of a joint depend on the relative motion of its bodies only. So the rank of all rows is the sum of the ranks of
-the biconnected components of the joint graph, each with one of its bodies held, and rows that others imply are implied
-by rows of their own component. A part that binds a body to the world has the ground among its bodies.
+the biconnected components, each with one body held. An implied row is implied by rows of its component. A part that
+binds a body to the world has the ground among its bodies.
 """
 
 import math
@@ -16,16 +16,16 @@ from ..linalg.graphs import components
 from ..linalg.independent_rows import SparsePivots, dense_pivots, least_size, sparse_pivots
 from .layout import Layout
 
-# An equilibrated pivot below this power of eps is zero: implied rows give 1e-16, the nearest of true ranks 1e-4.
+# An equilibrated pivot below this power of eps is zero: implied rows give 1e-16, the smallest true pivots 1e-4.
 _ZERO = 0.5
-# A dense component of so many rows takes 0.1 s, and the time grows with the cube.
+# Largest number of rows of a dense component: it takes 0.1 s, and the time grows with the cube.
 _DENSE = 300
-# A row is implied by others whose share of it, both of unit norm, exceeds this.
+# Smallest share of a row that counts in an implied row, both of unit norm.
 _NEGLIGIBLE = 1e-6
 
 
 class JointRows(NamedTuple):
-    """A constraint of one kernel: its bodies, and the first and the number of its rows among all."""
+    """A constraint of one kernel: its bodies, the number of its `first` row in A, and the number of its `rows`."""
 
     bodies: tuple[int, ...]
     first: int
@@ -33,16 +33,16 @@ class JointRows(NamedTuple):
 
     @property
     def numbers(self) -> Int[np.ndarray, "rows"]:
-        """Those of its rows."""
+        """The numbers of its rows in A."""
         return np.arange(self.first, self.first + self.rows)
 
 
 class Subset(NamedTuple):
     """Rows of A that depend on each other only, in columns that determine their rank.
 
-    **Fields:** `parts`: their numbers; `rows` and `columns` of A; `kept`: those of the rows that are independent, of
-    low levels first; `dropped`: the others; `is_sparse`: whether there are too many rows for dense matrices; then
-    `shares` of kept rows in those that are dropped.
+    **Fields:** numbers of the `parts`; `rows` and `columns` of A; `kept`: independent rows, low levels first;
+    `dropped`: the remaining rows; `is_sparse`: whether the rows are too many for dense matrices; `shares` of kept rows
+    in dropped rows.
     """
 
     parts: tuple[int, ...]
@@ -55,7 +55,7 @@ class Subset(NamedTuple):
 
 
 class Share(NamedTuple):
-    """A `row` that is the sum of these multiples of the rows `by`."""
+    """A `row` that is the sum of `multiples` of the rows `by`."""
 
     row: int
     by: Int[np.ndarray, "k"]
@@ -65,7 +65,7 @@ class Share(NamedTuple):
 class JointBlocks(NamedTuple):
     """The rows of the constraints as blocks of joints on bodies.
 
-    **Fields:** the `parts`, and their `blocks`; the `layout` of the bodies; the `scale` of the columns.
+    **Fields:** the `parts` and their `blocks`; the `layout` of the bodies; the `scale` of the columns.
     """
 
     parts: Sequence[JointRows]
@@ -74,7 +74,7 @@ class JointBlocks(NamedTuple):
     scale: Float[np.ndarray, "nu"]
 
     def dense(self, numbers: Sequence[int], columns: Int[np.ndarray, "n"]) -> Float[np.ndarray, "m n"]:
-        """Rows of some parts in some columns."""
+        """The rows of the parts with these `numbers`, in some `columns`, as a dense matrix."""
         out = np.zeros((sum(self.parts[p].rows for p in numbers), columns.size), self.scale.dtype)
         row = 0
         for p in numbers:
@@ -87,10 +87,10 @@ class JointBlocks(NamedTuple):
         return out
 
     def subsets(self, level: Int[np.ndarray, "rows"], absolute: frozenset[int], dense: int = _DENSE) -> list[Subset]:
-        """The rows of each component, and which of them are independent.
+        """The rows of each component, with a choice of independent rows.
 
-        **Arguments:** `level` of each row: rows of low levels are kept first; `absolute`: parts that do not depend on
-        relative motions alone; `dense`: components of more rows than this are eliminated as sparse matrices.
+        **Arguments:** `level` of each row: rows of low levels are kept first; `absolute`: parts that bind bodies to the
+        world; `dense`: components of more rows than this are eliminated as sparse matrices.
         """
         ground = self.layout.ground
         vertices = [{*part.bodies, *([ground] if p in absolute else ())} for p, part in enumerate(self.parts)]
@@ -120,8 +120,9 @@ class JointBlocks(NamedTuple):
     def eliminate(
         self, numbers: Sequence[int], columns: Int[np.ndarray, "n"], level: Int[np.ndarray, "m"], zero: float
     ) -> tuple[SparsePivots, Float[np.ndarray, "m"]]:
-        """Independent rows of some parts in some columns without a dense matrix, and the norms of the rows. Pivots
-        follow from sparsity; those below this power `zero` of eps are none.
+        """Independent rows of some parts in some columns, without a dense matrix; and the norms of the rows.
+
+        Sparsity decides the pivots; a pivot below this power `zero` of eps counts as zero.
         """
         rows: list[dict[int, float]] = []
         wanted, scales = set(columns.tolist()), self.scale.tolist()
@@ -140,11 +141,9 @@ class JointBlocks(NamedTuple):
         return sparse_pivots(unit, level.tolist(), zero=eps**zero, rounding=4 * eps), sizes
 
     def absolute_parts(self, motions: Float[np.ndarray, "d b v"]) -> frozenset[int]:
-        """Parts whose rows change in motions of all bodies as one, and those of a single body, which are bound to the
-        world.
+        """Parts that bind bodies to the world: rows of one body, and rows that change as all bodies move as one.
 
-        **Arguments:** `motions`: velocities of all bodies, and zeros of scalar coordinates and the ground, in some
-            motions as one.
+        **Arguments:** `motions`: velocities in motions of all bodies as one, zeros for scalar coordinates and ground.
         """
         ground = motions.shape[1] - 1
         out = set()
@@ -157,7 +156,7 @@ class JointBlocks(NamedTuple):
         return frozenset(out)
 
     def _alike(self, numbers):
-        """Parts with blocks of one shape: their numbers, bodies (parts, k), and blocks (parts, rows, k, v)."""
+        """For each shape of blocks the parts' numbers, bodies (parts, k), and blocks (parts, rows, k, v)."""
         groups: dict[tuple[int, ...], list[int]] = {}
         for p in numbers:
             groups.setdefault(self.blocks[p].shape, []).append(p)
@@ -169,8 +168,9 @@ class JointBlocks(NamedTuple):
             )
 
     def _regular_parts(self, held):
-        """Those of some parts whose rows are all independent, each with one of its bodies held: `dense_pivots` of many
-        matrices at once.
+        """Parts whose rows are all independent while one body is held: `dense_pivots` of many matrices at once.
+
+        **Arguments:** `held`: the held body of each part, by the part's number.
         """
         out = set()
         of_bodies = np.append(self.scale, 0.0)[np.minimum(self.layout.velocity_index, self.layout.nu)]

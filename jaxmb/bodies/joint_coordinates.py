@@ -1,4 +1,4 @@
-"""The own coordinates of joints by name, `"hip.angle"`, `"slide.displacement"`, with rates and accelerations."""
+"""Coordinates of joints by name, `"hip.angle"`, `"slide.displacement"`, with rates and accelerations."""
 
 import dataclasses
 import math
@@ -18,13 +18,15 @@ from ..system.quantities import Measure, view_of_motion
 from .groups import ConstraintGroup, CoordinateGroup, Group
 from .layout import Layout
 
-# A coordinate and its derivatives with respect to time, by the ends of their names.
+# Ends of the names of a coordinate, of its rate and of its acceleration.
 ORDERS = ("", "_rate", "_acceleration")
 
 
 class JointCoordinate(NamedTuple):
-    """A coordinate of a joint: the numbers of the joint's group and of the joint in it, the name within the joint, its
-    shape, and whether it is an angle known up to full turns.
+    """A coordinate of a joint.
+
+    **Fields:** the number of the joint's `group`; the joint's number in the group, `member`; the name within the joint,
+    `field`; the `shape`; `periodic`: whether the coordinate is an angle known up to full turns.
     """
 
     group: int
@@ -40,7 +42,7 @@ def joint_coordinates(
     """The coordinates of all joints, by name."""
     space, out, dtype = layout.space, {}, default_float()
     ground = np.asarray(space.ground, dtype)
-    # Shapes only: nothing is computed.
+    # Only shapes are evaluated.
     poses = jax.eval_shape(lambda ground: jnp.tile(space.prepare(ground), (layout.ground + 1, 1)), ground)
     time = jax.ShapeDtypeStruct((), dtype)
     for g, group in enumerate(groups):
@@ -55,8 +57,8 @@ def joint_coordinates(
 def joint_measures(coordinates: Mapping[str, JointCoordinate]) -> dict[str, Measure]:
     """Coordinates of joints, their rates and accelerations, as quantities of a motion.
 
-    Angles known up to full turns are continued from time to time: a change in one interval is taken to be that by which
-    the angle and the trapezoidal rule of its rate differ least.
+    Angles known up to full turns are unwrapped: of all possible changes in an interval, the nearest to the trapezoidal
+    rule of the rate counts.
     """
     out = {}
     for name, coordinate in coordinates.items():
@@ -71,7 +73,7 @@ def _of_joint(system, place, ts, ys, solved):
     coordinate, order = place
 
     def with_rate(t, q, u):
-        """The coordinate and its rate."""
+        """The coordinate, and its rate."""
         value = lambda t, q: system.catalogue.joint_coordinate(coordinate, t, q)
         return jax.jvp(value, (t, q), (jnp.ones_like(t), system.rates(t, q, u)))
 
@@ -89,10 +91,10 @@ def _of_joint(system, place, ts, ys, solved):
 
 
 def _continued(ts, angles, rates):
-    """Angles with full turns added."""
+    """Unwrapped angles."""
     predicted = jnp.diff(ts) * (rates[1:] + rates[:-1]) / 2
     turns = jnp.round((predicted - jnp.diff(angles)) / (2 * np.pi))
-    # Entries after the end of a run are not finite; the earlier ones do not depend on them.
+    # Entries after the end of a run are not finite; earlier entries do not depend on them.
     turns = lax.stop_gradient(jnp.where(jnp.isfinite(turns), turns, 0.0))
     return angles + 2 * np.pi * jnp.concatenate([jnp.zeros(1, angles.dtype), jnp.cumsum(turns)])
 
@@ -104,7 +106,7 @@ def held_groups(
     rates: Mapping[str, Array],
     t: Scalar,
 ) -> tuple[ConstraintGroup, ...]:
-    """Constraints that hold coordinates of joints at values, which change at some rates, from a time on."""
+    """Constraints that hold coordinates of joints at `values` at time `t`; the values change at `rates`."""
     out = []
     for name, value in values.items():
         coordinate = coordinates[name]

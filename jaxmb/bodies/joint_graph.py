@@ -1,11 +1,12 @@
-"""The joint graph of a scene, and the order in which its joints are eliminated.
+"""The joint graph of a scene, and the order of elimination of its joints.
 
-Bodies and the ground are the vertices of the graph and joints its edges. The Gram matrix `A M⁻¹ Aᵀ` couples the joints
-that share a body, but not those that share the ground only, so joints are the nodes of its elimination. Joints between
-the same bodies are one node where their rows fit in. A body of many joints is a node too, so that it does not couple
-all of these with each other: the joints that hang on it are eliminated while it is held, then the body, then the others
-at it. The rows of joints are independent with one body of a biconnected component held if they are at all, so every
-pivot is regular.
+Bodies and the ground are the vertices of the graph, joints its edges. The Gram matrix `A M⁻¹ Aᵀ` couples joints that
+share a body, not joints that share the ground only. So joints are the nodes of its elimination. Joints between the same
+bodies are one node if their rows fit in.
+
+A body with many joints, a hub, is a node too, since it would couple all its joints. Joints that hang on the hub are
+eliminated first, while the hub is held; then the hub; then its remaining joints. Every pivot is regular: independent
+rows of a biconnected component stay independent while one of its bodies is held.
 """
 
 import dataclasses
@@ -22,23 +23,21 @@ from ..linalg.graphs import components
 from ..linalg.sums import placed_sums
 from .layout import Layout
 
-# A body on which this many joints hang is a node of the elimination. (A step of two coupled carriers, each with five
-# arms: 49 µs, and 57 where only the front one is such a node.)
+# A body with this many hanging joints is a hub. (A step of two coupled carriers with five arms each: 49 µs, and 57 µs
+# with the front carrier as the only hub.)
 _HUB = 5
-# From this number of rows on block elimination is faster; see jaxmb.linalg for the measurement.
+# From this number of rows on, block elimination is faster; see jaxmb.linalg for the measurement.
 _LEAST_ROWS = 30
-# The same where rows are implied by others: a chart finds others to leave out on the way, block elimination does not.
+# The same number for systems with implied rows: a chart may change the rows that it leaves out, elimination may not.
 _LEAST_ROWS_WITH_IMPLIED = 150
-# The largest share of rows whose reactions friction depends on: these are solved for as one full matrix. (A chain of 50
-# pins, an evaluation in µs where two of them rub: 61, and 3800 by dense matrices; where all do, 36000 and 28000.)
+# The largest share of rows whose reactions friction depends on: these rows are solved for as one full matrix. (An
+# evaluation of a chain of 50 pins, in blocks and by dense matrices: 61 and 3800 µs if two pins rub, 36000 and 28000 µs
+# if all do.)
 _MOST_FRICTION = 0.5
 
 
 def elimination_order(system: Any, left_out: tuple[int, ...], absolute: frozenset[int]) -> JointOrder | None:
-    """The order of elimination of a scene's joints; None where a dense matrix is faster.
-
-    **Arguments:** as in `joint_order`.
-    """
+    """The order of elimination of a scene's joints, as `joint_order`; None if a dense matrix is faster."""
     least = _LEAST_ROWS_WITH_IMPLIED if left_out else _LEAST_ROWS
     if not system.linear or system.velocity_rows < least:
         return None
@@ -50,15 +49,18 @@ def elimination_order(system: Any, left_out: tuple[int, ...], absolute: frozense
 def joint_order(system: Any, left_out: tuple[int, ...] = (), absolute: frozenset[int] = frozenset()) -> JointOrder:
     """The order of elimination of a scene's joints.
 
-    **Arguments:** `left_out`: rows of A that are not eliminated, such as those that others imply; `absolute`: numbers
-    of parts that bind bodies to the world, not only to each other.
+    **Arguments:** `left_out`: rows of A that are not eliminated, such as implied rows; `absolute`: numbers of parts
+    that bind bodies to the world, not only to each other.
     """
     parts = tuple((g.group.bodies, g.rows) for g in system.constraints.groups)
     return _joint_order(system.layout, parts, left_out, absolute)
 
 
 def extended_joint_order(system: Any, before: Any, order: JointOrder) -> JointOrder:
-    """The order of elimination of a scene that has more position constraints, after those of one with a known order."""
+    """The order of elimination of a `system` that extends the system `before`, whose `order` is given.
+
+    The additional position constraints follow the position constraints of `before`.
+    """
     count = lambda scene: sum(len(g.group.names) for g in scene.constraints.position)
     new_parts, new_rows = count(system) - count(before), system.position_rows - before.position_rows
     left_out = tuple(row if row < before.position_rows else row + new_rows for row in order.left_out)
@@ -113,7 +115,7 @@ def _joint_order(
 
 
 def _indices(parts, joints, ground, size):
-    """Rows, bodies and entries of the blocks of each joint, padded to the largest."""
+    """Rows, bodies and entries of the blocks of each joint, padded to the largest joint."""
     first_row = [0, *itertools.accumulate(rows for _, rows in parts)]
     first_entry = [0, *itertools.accumulate(rows * len(bodies) * size for bodies, rows in parts)]
     widest = max(sum(parts[p][1] for p in numbers) for _, numbers in joints)
@@ -152,8 +154,9 @@ def _nodes(joints, of_body, hubs, below, size):
 
 
 def _gram(joints, of_body, hubs, nodes, most):
-    """The blocks, by joint and body raveled, whose products make up the matrix, with the places of these among its
-    stored blocks; and the blocks of joints on hubs with their places.
+    """Pairs of blocks, by joint and body raveled, whose products make up the Gram matrix, and their places in it.
+
+    Also the blocks of joints on hubs, and their places. Places are numbers of stored blocks.
     """
     stored = {pair: k for k, pair in enumerate(zip(nodes.row.tolist(), nodes.column.tolist(), strict=True))}
     block = lambda joint, body: joint * most + joints[joint][0].index(body)
@@ -175,7 +178,7 @@ def _gram(joints, of_body, hubs, nodes, most):
 
 
 def _merged(parts, ground):
-    """Joints as their moving bodies and their parts: parts of the same bodies, as many as fit in the rows of one."""
+    """Joints as moving bodies and numbers of parts; a joint takes parts of the same bodies while their rows fit in."""
     widest = max(rows for _, rows in parts)
     joints: list[tuple[tuple[int, ...], list[int]]] = []
     open_joints: dict[frozenset[int], int] = {}
@@ -195,10 +198,10 @@ def _merged(parts, ground):
 
 
 def _hubs(joints, parts, absolute, ground):
-    """Bodies that are nodes of the elimination, each with the joints that are eliminated before it."""
+    """Hubs, each with its hanging joints, which are eliminated before it."""
     if max(np.bincount([body for bodies, _ in joints for body in bodies], minlength=1)) < _HUB:
         return {}
-    # The ground counts as well.
+    # The ground is a vertex too.
     bound = lambda p: {*parts[p][0], *([ground] if p in absolute else ())}
     vertices = [set().union(*map(bound, numbers)) for _, numbers in joints]
     below: dict[int, set[int]] = {}

@@ -1,4 +1,4 @@
-"""Indices of each body's entries in the vectors of coordinates and velocities; static."""
+"""Static indices of each body's entries in the vectors of coordinates and velocities."""
 
 import dataclasses
 import functools
@@ -12,10 +12,10 @@ from ..parts.space import AbstractSpace
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Bodies in order, each with its pose and velocity contiguous; then scalar coordinates; the ground is the last.
+    """Bodies in order, each with contiguous entries in q and u; then scalar coordinates; then the ground.
 
-    A body that does not rotate (a point mass) has only the translations; the rest of its pose is constant. A scalar
-    coordinate is like a body that has only the first entry of the pose and, if it moves, of the velocity.
+    A body that does not rotate (a point mass) has translations only; the rest of its pose is constant. A scalar
+    coordinate is like a body with the first entry of the pose only and, if it moves, of the velocity.
     """
 
     space: AbstractSpace
@@ -28,7 +28,7 @@ class Layout:
 
     @property
     def ground(self) -> int:
-        """The number of the ground: that of bodies and scalar coordinates."""
+        """The number of the ground, equal to the count of bodies and scalar coordinates."""
         return len(self.rotates) + len(self.scalars)
 
     @property
@@ -37,18 +37,18 @@ class Layout:
         return self.space.dimension == 3
 
     def is_place(self, numbers: Sequence[int]) -> np.ndarray:
-        """Which of some numbers are those of bodies or of the ground, and not of scalar coordinates."""
+        """Which numbers belong to bodies or the ground, not to scalar coordinates."""
         index = np.array(numbers)
         return (index < self.bodies) | (index == self.ground)
 
     @property
     def uniform(self) -> bool:
-        """Whether there are only bodies that rotate, so that poses are a plain reshape of the coordinates."""
+        """Whether all bodies rotate, without scalar coordinates. Then poses are a reshape of the coordinates."""
         return all(self.rotates) and not self.scalars
 
     @functools.cached_property
     def turning(self) -> list[int]:
-        """The numbers of the bodies that have Euler parameters: in space all that rotate."""
+        """Numbers of the bodies with Euler parameters: in space all bodies that rotate."""
         return [k for k, rotates in enumerate(self.rotates) if rotates and self.spatial]
 
     @functools.cached_property
@@ -115,8 +115,8 @@ class Layout:
         **Arguments:** `groups`: for each group of parts its bodies (parts, k) and its rows; `of_poses`: columns are
         coordinates rather than velocities.
 
-        **Returns:** shape (all rows, columns), indices into the groups' blocks (parts, rows, k, size), raveled one
-        after the other and followed by a zero.
+        **Returns:** shape (all rows, columns), indices into the raveled blocks (parts, rows, k, size) of all groups,
+        followed by a zero.
         """
         index = self.pose_index if of_poses else self.velocity_index
         columns = self.nq if of_poses else self.nu
@@ -135,11 +135,12 @@ class Layout:
     def reaction_source(
         self, joints: list[tuple[tuple[str, ...], tuple[tuple[int, ...], ...]]], names: tuple[str, ...]
     ) -> np.ndarray:
-        """Which wrench entries add up to the reactions of some joints: shape (names, largest count, k, velocity size).
+        """Indices of the wrench entries that add up to reactions: shape (names, largest count, k, velocity size).
 
         **Arguments:** `joints`: for each group of constraints the names of its parts and their bodies (parts, k);
-        `names`: of these joints, all between the same number of bodies. Indices are into the groups' wrenches (parts,
-        k, velocity size), raveled one after the other and followed by a zero.
+        `names` of the joints with the reactions, all between the same number of bodies.
+
+        Indices are into the raveled wrenches (parts, k, velocity size) of all groups, followed by a zero.
         """
         size, start = self.space.velocity_size, 0
         sources: dict[str, list[np.ndarray]] = {name: [] for name in names}
@@ -154,7 +155,7 @@ class Layout:
 
 
 def _index(sizes: list[int], constant: list[int]) -> np.ndarray:
-    """The entries of bodies of these sizes, one after the other, and constants for what they lack and the ground."""
+    """Consecutive indices of entries for bodies of these `sizes`; `constant` for missing entries and the ground."""
     index, start = [], 0
     for size in sizes:
         index.append([*range(start, start + size), *constant[size:]])

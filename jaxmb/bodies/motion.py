@@ -1,4 +1,4 @@
-"""Bodies, scalar coordinates and frames by name: their entries in q and u, their motions, and quantities of these."""
+"""Bodies, scalar coordinates and frames by name: their entries in q and u, their motions and their quantities."""
 
 import functools
 from collections.abc import Sequence
@@ -17,8 +17,8 @@ from .layout import Layout
 
 
 def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
-    """Indices in q of every name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`,
-    `position`, `orientation` of spatial ones; and of scalar coordinates that move.
+    """Indices in q by name: `x`, `y`, `angle`, `position` of planar bodies; `x`, `y`, `z`, `e0` … `e3`, `position`,
+    `orientation` of spatial bodies; and names of scalar coordinates that move.
     """
     if layout.space.dimension == 3:
         fields = ["x", "y", "z", "e0", "e1", "e2", "e3"]
@@ -28,8 +28,8 @@ def coordinate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[
 
 
 def rate_names(layout: Layout, bodies: tuple[str, ...]) -> dict[str, list[int]]:
-    """Indices in u of every name: `x_rate`, `y_rate`, `angle_rate`, `velocity` of planar bodies; `x_rate`, `y_rate`,
-    `z_rate`, `wx`, `wy`, `wz`, `velocity`, `angular_velocity` of spatial ones; and rates of scalar coordinates.
+    """Indices in u by name: `x_rate`, `y_rate`, `angle_rate`, `velocity` of planar bodies; `x_rate`, `y_rate`,
+    `z_rate`, `wx`, `wy`, `wz`, `velocity`, `angular_velocity` of spatial bodies; and rates of scalar coordinates.
     """
     if layout.space.dimension == 3:
         fields = ["x_rate", "y_rate", "z_rate", "wx", "wy", "wz"]
@@ -59,7 +59,7 @@ def body_motion(layout: Layout, body: int, ys: State) -> BodyMotion:
 
 
 def _starts(layout: Layout, body: int) -> np.ndarray:
-    """Where the entries of a body or scalar coordinate begin in q and u, in which they are contiguous."""
+    """First indices in q and u of the entries of a body or scalar coordinate; the entries are contiguous."""
     return np.array([layout.pose_index[body][0], layout.velocity_index[body][0]])
 
 
@@ -103,7 +103,7 @@ def body_measures(layout: Layout, names: Sequence[str]) -> dict[str, Measure]:
 def _of_body(system, place, ts, ys, solved):
     del ts
     field, rotates, of_rate, starts = place
-    # Velocities of a body are its own entries of u.
+    # Velocities of a body are entries of u, so their rates are entries of u̇.
     u = solved.accelerations if of_rate else ys.u
     return getattr(_cut(system.layout.space.dimension, rotates, starts, ys.q, u), field)
 

@@ -5,12 +5,14 @@ An implicit step solves
     [ M − r D − r² K   −Aᵀ ] [z]   [b]
     [       A           0  ] [l] = [c]
 
-with the derivatives K and D of the forces with respect to positions and velocities, for a complex number r. Bodies and
-joints are the nodes of the elimination, and a body is a neighbour of those that share a force or a joint with it. For
-dissipative forces the values of `xᴴ (M − r D − r² K) x` are in a sector of the complex plane with an opening below 180
-degrees, and so are those of every Schur complement, so the pivots of bodies are regular. The pivot of a joint is if the
-rows of the joints that have been eliminated are independent for the bodies that have been. A joint of a spanning tree
-therefore waits for the body below it, and a joint that closes a loop for all bodies of a shortest loop.
+with the derivatives K and D of the forces by positions and velocities, for a complex number r. Bodies and joints are
+the nodes of the elimination. A body is a neighbour of all bodies and joints with which it shares a force or a joint.
+
+Pivots of bodies are regular. For dissipative forces the values of `xᴴ (M − r D − r² K) x` lie in a sector of the
+complex plane with an opening below 180 degrees. The values of every Schur complement lie in it too.
+
+The pivot of a joint is regular if the rows of eliminated joints are independent for the eliminated bodies. So a joint
+of a spanning tree waits for the body below it. A joint that closes a loop waits for all bodies of a shortest loop.
 
 Source: J. Brüdigam and Z. Manchester, "Linear-time variational integrators in maximal coordinates", 2021 (elimination
 over the graph of bodies and joints).
@@ -39,11 +41,11 @@ class MotionOrder:
 
     **Fields:**
 
-    - `joints`: the order of the joints alone, which holds their rows; None of a scene without joints.
-    - `row`, `column` (pairs,): the bodies that act on each other, first each body with itself; `sums`: sums of what
-        forces and joints contribute, for each pair; `by_row` and `by_column`: sums of pairs for each body.
-    - `lower`, `upper` (stored blocks,): where the blocks are found among those of pairs, of joints on bodies, their
-        transposes, the identities of joints, and a zero.
+    - `joints`: the order of the joints alone, with their rows; None for a scene without joints.
+    - `row`, `column` (pairs,): bodies that act on each other, first each body with itself; `sums`: sums of the
+        contributions of forces and joints for each pair; `by_row` and `by_column`: sums of pairs for each body.
+    - `lower`, `upper` (stored blocks,): indices into blocks of pairs, blocks of joints on bodies, their transposes,
+        identities of joints, and a zero, one after the other.
     - `nodes`: the order of elimination, bodies first.
     """
 
@@ -73,7 +75,7 @@ def _motion_order(
     layout: Layout, acting: tuple[tuple[tuple[int, ...], ...], ...], joints: JointOrder | None
 ) -> MotionOrder:
     ground, size = layout.ground, layout.space.velocity_size
-    # Every pair of bodies of a part, row by row, as `contributions` of `jaxmb.bodies.field_jacobian` lists them.
+    # Every pair of bodies of a part, row by row, in the order of `contributions` of `jaxmb.bodies.field_jacobian`.
     rows = [bodies[i] for group in acting for bodies in group for i in range(len(bodies)) for _ in bodies]
     columns = [bodies[j] for group in acting for bodies in group for _ in bodies for j in range(len(bodies))]
     rows, columns = [*rows, *range(ground)], [*columns, *range(ground)]

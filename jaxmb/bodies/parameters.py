@@ -1,4 +1,4 @@
-"""Parameters of stacked parts by name, `"part.field"` and `"part.field.field"`: their arrays, checks, and inputs."""
+"""Parameters of stacked parts by name, `"part.field"` or `"part.field.key"`: their arrays, checks and inputs."""
 
 import dataclasses
 import itertools
@@ -20,7 +20,7 @@ from ..system.parameter_table import ParameterTable
 from ..system.structures import of_structure
 from .groups import Input, together
 
-# The paths to the groups of a system; of constraints that bind positions, and of all constraints.
+# Paths to the groups of a system: of position constraints, of all constraints, and of all parts.
 _BIND_POSITIONS = "constraints.position"
 _BIND = (_BIND_POSITIONS, "constraints.velocity", "constraints.servos")
 _GROUPS = (
@@ -35,8 +35,10 @@ _GROUPS = (
 
 
 class StackedNumber(NamedTuple):
-    """A parameter in a group of stacked parts: `keys` lead to it in group number `group` at a `path` in the system,
-    `member` is the number of its part.
+    """A parameter in a group of stacked parts.
+
+    **Fields:** `name`; the `path` of the groups in the system; the number of the `group`; `keys` that lead to the
+    parameter in a part; the part's number, `member`; the field as `declared`.
     """
 
     name: str
@@ -48,10 +50,10 @@ class StackedNumber(NamedTuple):
 
 
 def stacked_numbers(groups: Mapping[str, Sequence[Any]]) -> Iterator[StackedNumber]:
-    """Every parameter of some groups, which are given by their paths."""
+    """Every parameter of groups, given by their paths."""
     for path, of_path in groups.items():
         for g, group in enumerate(of_path):
-            # Numbers of another part that these parts hold keep the name of that part.
+            # Numbers of an inner part have the inner part's name.
             stacked = group.group
             sources = [((), stacked.part, stacked.names)]
             sources += [(keys, entry(stacked.part, keys), names) for keys, names in stacked.inner]
@@ -133,7 +135,7 @@ class SceneParameters(ParameterTable):
 
     @property
     def signals(self):
-        # The rates of inputs count in constraints, or in velocities that forces depend on.
+        # Rates of inputs count in constraints, and in velocities that forces depend on.
         out: dict[str, tuple[AbstractSignal, bool]] = {}
         for path, groups in self._groups.items():
             for single in (single for g in groups for driven in g.group.inputs for single in driven.alone()):
@@ -160,9 +162,9 @@ def _accessor(path: str, group: int, keys: tuple[str, ...]):
 def _inputs(
     groups: Mapping[str, Sequence[Any]], signals: Mapping[str, AbstractSignal]
 ) -> dict[tuple[str, int], list[Input]]:
-    """Numbers that are functions of time, by the path and the number of their group.
+    """Parameters that are functions of time, by the path and the number of their group.
 
-    **Raises:** `ValueError` for a number that must be constant, and for one that jumps where positions depend on it.
+    **Raises:** `ValueError` for a parameter that must be constant, and for a jump in a position constraint.
     """
     new: dict[tuple[str, int], list[Input]] = {}
     varying, of_frames = set(), {number.name for number in stacked_numbers({"frames": groups["frames"]})}
@@ -187,7 +189,7 @@ def _inputs(
                 "points that are fixed in their bodies. Put the part on a body that a JointDriver moves."
             )
         varying.add(number.name)
-        # All numbers of a joint place the coordinate that other parts measure.
+        # Every number of a joint moves the coordinate that other parts measure.
         moves = places or number.keys[0] == "joints" or number.keys[0] in part.moving
         driven = Input(signal, (number.name,), number.keys, (number.member,), moves)
         new.setdefault((number.path, number.group), []).append(driven)

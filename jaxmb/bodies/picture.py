@@ -1,4 +1,4 @@
-"""The picture of a motion of bodies: where they are, the shapes of their parts, and where these act."""
+"""The picture of a motion: poses of the bodies, and shapes and points of the parts."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,10 +16,10 @@ from .groups import Group
 
 
 def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys: State) -> Picture:
-    """The picture of a system of bodies and of these stacked parts."""
+    """The picture of a system of bodies and of stacked parts."""
     layout, names = system.layout, (*system.body_names, GROUND)
     space, groups = layout.space, [_pictured(group) for group in groups]
-    # Scalar coordinates are at no place.
+    # Scalar coordinates have no place in the picture.
     body_names = dict(zip((*range(layout.bodies), layout.ground), names, strict=True))
     position, orientation = (np.asarray(values)[list(body_names)] for values in _placements(system, ys))
     single = [
@@ -61,7 +61,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
 
 
 def _pictured(group):
-    """The parts as a picture shows them; what acts on the ground keeps the place that it was given there."""
+    """The parts as a picture shows them; parts on the ground keep their given places."""
     moved = jax.vmap(lambda part: part.pictured(group.layout.space))(group.part)
     on_ground = group.body_index[:, -1] == group.layout.ground
     kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)
@@ -69,7 +69,7 @@ def _pictured(group):
 
 
 def _shapes(part, space, width):
-    """The shapes of a part, each with the number of its body, in the frame of the body."""
+    """The shapes of a part in the frames of their bodies, each with the number of its body."""
     for k, shape in part.shapes(space, width):
         frame = part.body_frames.get(str(k))
         rest = np.asarray(space.ground)
@@ -77,19 +77,19 @@ def _shapes(part, space, width):
 
 
 def _centres(group):
-    """The mass centres of bodies with their names, where they are not the origins."""
+    """Names and mass centres of bodies whose origin is elsewhere."""
     given = group.part.mass_centre
     return () if given is None else zip(group.names, np.asarray(given), strict=True)
 
 
 def _unstacked(group):
-    """The parts of a group, their numbers as NumPy arrays."""
+    """The parts of a group, with numbers in NumPy."""
     stacked = jax.tree.map(np.asarray, group.part)
     return [jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(group.names))]
 
 
 def _width(length, parts):
-    """The radius of a bar, to the system's size and to that of a typical body."""
+    """The radius of a bar, from the sizes of the system and of a typical body."""
     reach: dict[str, float] = {}
     for part in parts.values():
         for body, point in zip(part.bodies, part.points, strict=True):
@@ -117,7 +117,7 @@ def _placements(system, ys):
 
 @eqx.filter_jit
 def _world_paths(system, group, ts, ys):
-    """World points of the lines of the parts, shape (times, parts, points, d), or None."""
+    """World points of the parts' lines, shape (times, parts, points, d); None without lines."""
 
     def at_time(t, y):
         poses = group.gather(system.bodies.prepared_poses(y.q))
@@ -128,7 +128,7 @@ def _world_paths(system, group, ts, ys):
 
 
 def _up(space, gravity):
-    """Against gravity, along a coordinate axis of the world."""
+    """The world axis against gravity."""
     vertical = np.zeros(3)
     if space.dimension == 2 or gravity is None or not np.any(gravity):
         vertical[space.dimension - 1] = 1.0

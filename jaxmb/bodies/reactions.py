@@ -17,8 +17,10 @@ from .groups import AbstractGroup, Group
 
 
 class Place(NamedTuple):
-    """Where a part with a name stands among groups: the number of its group, its number there, and as static numbers
-    which of its bodies is the last one that is not the ground, and which are no scalar coordinates.
+    """The place of a part among groups.
+
+    **Fields:** the number of the `group`; the part's number in the group, `member`; the position of its `last` moving
+    body; `on_bodies`: which of its bodies are not scalar coordinates.
     """
 
     group: int
@@ -28,20 +30,20 @@ class Place(NamedTuple):
 
 
 def places(groups: Sequence[AbstractGroup], name: str) -> tuple[Place, ...]:
-    """Where the parts of a name stand: the components of a part in several groups or more than once in one."""
+    """Places of all parts with a name: the components of a part may stand in several groups, or twice in a group."""
     numbers = ((g, k) for g, group in enumerate(groups) for k, other in enumerate(group.group.names) if other == name)
     return tuple(_place(g, k, groups[g].group) for g, k in numbers)
 
 
 def _place(number: int, member: int, group: Group) -> Place:
     layout, bodies = group.layout, group.bodies[member]
-    # Scalar coordinates and the ground are no bodies.
+    # Scalar coordinates and the ground have larger numbers than bodies.
     last = max((i for i, body in enumerate(bodies) if body < layout.bodies), default=0)
     return Place(number, np.array(member), last, tuple(layout.is_place(bodies).tolist()))
 
 
 def joint_places(constraints: ConstraintSet, name: str) -> tuple[tuple[Place, ...], tuple[Place, ...]]:
-    """Where the constraints of a joint stand among all constraints, and its dry friction among all dry friction."""
+    """Places of a joint's constraints among all constraints, and of its dry friction among all dry friction."""
     return places(constraints.groups, name), places(constraints.frictions, name)
 
 
@@ -65,7 +67,7 @@ def _field_of_reaction(system, place, ts, ys, solved):
 
 @view_of_motion
 def reactions(system: Any, place: Any, ts: Any, ys: State, multipliers: Any) -> Reaction:
-    """Reactions of a joint along a motion, from the multipliers of the rows of all joints; `place`: `joint_places`."""
+    """Reactions of a joint at its `joint_places` along a motion, from the multipliers of all rows."""
     of_constraints, of_frictions = place
 
     def single(t, y, multipliers):
@@ -82,8 +84,9 @@ def reactions(system: Any, place: Any, ts: Any, ys: State, multipliers: Any) -> 
 
 @view_of_motion
 def applied_wrenches(system: Any, place: Any, ts: Any, ys: State, multipliers: Any) -> Array:
-    """Wrenches of a force element, or of a non-ideal law, along a motion; `place`: where it stands among forces, and
-    among laws.
+    """Wrenches of a force element or of a non-ideal law along a motion.
+
+    **Arguments:** `place`: its places among forces, and among laws.
     """
     of_forces, of_laws = place
 
@@ -103,7 +106,7 @@ def applied_wrenches(system: Any, place: Any, ts: Any, ys: State, multipliers: A
 
 
 def _reaction(constraints, places, now, multipliers) -> Reaction:
-    """Reaction of one joint at one state."""
+    """The reaction of one joint at one state."""
     of_groups = constraints.of_groups(multipliers)
     force, moment, of_joint = 0.0, 0.0, []
     for place in places:
@@ -117,8 +120,9 @@ def _reaction(constraints, places, now, multipliers) -> Reaction:
 
 
 def _with_slip(stick, laws, places, now, wrenches) -> Reaction:
-    """The reaction of dry friction, of stick and of slip together, of which one is zero; of each place the group of its
-    law, and the wrenches of this group.
+    """The sum of the reactions of stick and of slip; one of them is zero.
+
+    **Arguments:** `laws` and `wrenches`: for each place the group of its law, and the wrenches of the group.
     """
     force, moment = stick.force, stick.moment
     for place, law, (values, _) in zip(places, laws, wrenches, strict=True):
@@ -128,7 +132,7 @@ def _with_slip(stick, laws, places, now, wrenches) -> Reaction:
 
 
 def _on_last_body(alone: Group, place: Place, poses: Any, wrenches: Any) -> tuple[Array, Array]:
-    """What acts on the last body of the part of a group of one."""
+    """Force and moment on the last moving body, for the part of a group of one."""
     space, last = alone.layout.space, place.last
     pose, wrench = alone.gather(poses)[0, last], wrenches[last]
     point = jax.tree.map(lambda leaf: leaf[0], alone.part).anchor(last)

@@ -35,12 +35,12 @@ from .motion import coordinate_names, rate_names
 from .parameters import SceneParameters
 
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
-# velocities, takes 0.5 ms so and 6.4 ms with dense matrices; small machines with joints have cheap dense ones.)
+# velocities: 0.5 ms in blocks, 6.4 ms with dense matrices. Dense matrices of small machines with joints are cheap.)
 _LEAST_VELOCITIES = 40
 
 
 class Implied(NamedTuple):
-    """A row that other joints imply: `row` of part `name` follows from the joints `by`."""
+    """An implied row: `row` of part `name` follows from the joints `by`."""
 
     name: str
     row: int
@@ -56,10 +56,9 @@ class RigidBodySystem(AbstractSystem):
     system.body_names, system.coordinate_names(), system.joint_coordinates()
     ```
 
-    **Fields:** the sets of `bodies`, of `constraints` and of `forces`; the groups of `frames`, and of `free_joints`,
-    which have no rows; `guess`, the state given with the bodies; `length` [m], the scene's size; `ranks`; `implied`
-    rows; `elimination`, the order in which the joints are eliminated, or None; `design`; the `contacts` and dry
-    friction among the rows.
+    **Fields:** the sets of `bodies`, `constraints` and `forces`; the groups of `frames`, and of `free_joints`, which
+    have no rows; `guess`, the state given with the bodies; `length` [m], the scene's size; `ranks`; `implied` rows;
+    `elimination`, the joints' order of elimination, or None; `design` variables; the `contacts` and dry friction.
     """
 
     bodies: BodySet
@@ -82,7 +81,7 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def layout(self) -> Layout:
-        """Where the entries of the bodies stand in the coordinates and velocities."""
+        """Indices of the bodies' entries in coordinates and velocities."""
         return self.bodies.layout
 
     @property
@@ -187,12 +186,12 @@ class RigidBodySystem(AbstractSystem):
         return jnp.where(self.layout.velocity_lengths, lax.stop_gradient(self.length), 1.0)
 
     def concrete_scales(self) -> tuple[Float[np.ndarray, "nq"], Float[np.ndarray, "nu"]]:
-        """The scales of coordinates and velocities of a system that is not traced: NumPy, also within a trace."""
+        """Scales of coordinates and velocities in NumPy, also within a trace, of a system that is not traced."""
         lengths = self.layout.coordinate_lengths, self.layout.velocity_lengths
         of_coordinates, of_velocities = (np.where(is_length, np.asarray(self.length), 1.0) for is_length in lengths)
         return of_coordinates, of_velocities
 
-    # Forces. Each kernel is a compiled function, so that it is traced once for all its uses in a program.
+    # Forces. Each kernel is jitted, so a program with many uses traces it once.
 
     @eqx.filter_jit
     def force(self, t, q, u):
@@ -337,7 +336,7 @@ class RigidBodySystem(AbstractSystem):
         return dataclasses.replace(self, constraints=self.constraints.prepared())
 
     def closing(self):
-        # In the plane a residual tells whole turns, which no product does.
+        # In the plane a residual distinguishes full turns; a product of vectors does not.
         return self.prepared() if self.spatial else self
 
     def half_turned(self, q):
@@ -410,5 +409,5 @@ class RigidBodySystem(AbstractSystem):
 
 
 def _of_rows(values: Array, count: int) -> Array:
-    """The numbers of parts, once for each of their rows."""
+    """Values of parts, repeated for each of their rows."""
     return values if count == 1 else jnp.repeat(values, count, axis=0)

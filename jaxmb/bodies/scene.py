@@ -85,7 +85,7 @@ class Scene(eqx.Module):
     ```
 
     A scene is planar or spatial, never both; its bodies decide. Joints are position or velocity constraints, in any
-    order; closed loops and redundant joints are the normal case. A scene does not change: `extended` makes a new one.
+    order; closed loops and redundant joints are the normal case. A scene does not change: `extended` makes a new scene.
 
     **Arguments:** `bodies`: `planar.Body`, `planar.PointMass` or their spatial namesakes; `joints`: constraints,
     including drivers, rolling, `Stop`, rigid contacts and `Servo`, tendons, and inertias of joints; `forces`: force
@@ -118,7 +118,7 @@ class Scene(eqx.Module):
         frames: Sequence[Any] = (),
         without: Sequence[str] = (),
     ) -> "Scene":
-        """A scene with more parts, for one from a file or of a mechanism as well.
+        """Add parts to a scene, or leave some out; also for a scene from a file or of a mechanism.
 
         ```python
         scene = jaxmb.mechanisms.get("four_bar").scene
@@ -127,6 +127,8 @@ class Scene(eqx.Module):
         ```
 
         **Arguments:** `bodies`, `joints`, `forces`, `frames`: parts to add; `without`: names of parts to leave out.
+
+        **Returns:** a new scene.
 
         **Raises:** `ValueError` for a name in `without` that no part has, and as `Scene` does.
         """
@@ -162,14 +164,14 @@ class Scene(eqx.Module):
     def compile(self) -> RigidBodySystem:
         """Check the scene, find its structure (ranks, implied rows), and stack its parts.
 
-        Functions of the scene count with the values that they read now: after a change of a global variable, of an
-        attribute or of an array that a function reads, compile the scene anew.
+        Functions of the scene are captured with the values that they read now. After a change of a global variable,
+        an attribute or an array that a function reads, compile the scene anew.
 
         **Returns:** the system, a pytree whose leaves are the parameters.
 
-        **Raises:** `ValueError` for numbers out of range, for a mechanism that cannot be assembled from the given
-        poses, for constraints that contradict each other, and for singular poses, near which other rows are independent
-        than there; the message names the parts. Also within a function under `jit`: change parameters there instead.
+        **Raises:** `ValueError` for numbers out of range, a mechanism that cannot be assembled from the given poses,
+        contradictory constraints, and singular poses: there rows are dependent that are independent nearby. The message
+        names the parts. Also within a function under `jit`: change parameters there instead.
         """
         for part in (*self.bodies, *self.joints, *self.forces, *self.frames):
             if is_traced(part):
@@ -234,9 +236,7 @@ class Scene(eqx.Module):
 
 
 def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int], dict[str, tuple[int, ...]]]:
-    """The layout of bodies and scalar coordinates; the numbers of the bodies and of the ground by name, and of the
-    scalar coordinates of parts.
-    """
+    """The layout; numbers of bodies and ground by name; numbers of the scalar coordinates of parts by name."""
     joints = {part.name: part for part in scene.joints}
     links = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractLink)]
     scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
@@ -247,7 +247,7 @@ def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int],
 
 
 def _given_state(scene: Scene, layout: Layout) -> State:
-    """The poses and velocities of the bodies, and zeros for scalar coordinates."""
+    """The given poses and velocities of the bodies, and zeros for scalar coordinates."""
     zeros = as_parameter(np.zeros(len(layout.scalars)))
     moving = [k for k, scalar in enumerate(layout.scalars) if scalar.moves]
     return State(
@@ -257,7 +257,7 @@ def _given_state(scene: Scene, layout: Layout) -> State:
 
 
 def _with_initial_scalars(system: RigidBodySystem) -> RigidBodySystem:
-    """The system with the scalar coordinates and their rates in its guess that satisfy their constraints there."""
+    """The system, with a guess whose scalar coordinates and rates satisfy their constraints."""
     if not system.layout.scalars:
         return system
     q, u = jax.device_put(_scalars(system))
@@ -278,10 +278,10 @@ def _scalars(system):
 
 
 def _settled(scene: Scene, resolved: KnownParts, layout: Layout):
-    """Parts and laws of joints with every number filled in, each with the numbers of its bodies; and gravity."""
+    """Parts and laws of joints with every number resolved, each with the numbers of its bodies; and gravity."""
     parts, laws = [], []
     acting = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractActor)]
-    # Gravity is of no kind but its own, since it acts on every body.
+    # Gravity acts on every body, so it is not an actor on named bodies.
     gravity = next((part for part in scene.forces if not isinstance(part, AbstractActor)), None)
     if gravity is not None:
         gravity.check(layout.space.dimension)
@@ -308,7 +308,7 @@ def _check_program(servo, space, bodies):
 
 
 def _call(part, name, *arguments, **fields):
-    """Call a method through the class: binding it creates a module, too slow for thousands of parts."""
+    """Call a method through the class: bound methods are modules, too slow for thousands of parts."""
     return getattr(type(part), name)(part, *arguments, **fields)
 
 
@@ -322,7 +322,7 @@ def _check_kinds(scene: Scene):
         if not isinstance(part, AbstractLink) or isinstance(part, AbstractForce | AbstractDryFriction):
             raise ValueError(f"joints must hold constraints, got {_misplaced(part)}.")
     for part in scene.forces:
-        # A concrete class: gravity is of no kind but its own, since it acts on every body.
+        # A concrete class: gravity acts on every body, so it shares no abstract class with force elements.
         if not isinstance(part, AbstractForce | AbstractNonIdeal | AbstractDryFriction | Gravity):
             raise ValueError(f"forces must hold force elements, friction, or Gravity, got {_misplaced(part)}.")
     if sum(not isinstance(part, AbstractActor) for part in scene.forces) > 1:
@@ -338,7 +338,7 @@ def _check_kinds(scene: Scene):
 
 
 def _misplaced(part) -> str:
-    """What is in the wrong list of a scene, and in which one it belongs."""
+    """The label of a part in the wrong list of a scene, and the right list."""
     if not isinstance(part, AbstractPart):
         return repr(part)
     if isinstance(part, AbstractBody):
@@ -365,14 +365,14 @@ def _check_names(scene: Scene):
             raise ValueError(f"{part.label}: a name must not be empty or contain a dot.")
         seen.add(name)
     body_names = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
-    # The program of a servo is not a joint and has no friction.
+    # A servo's program is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
     joints = dict.fromkeys(
         part.name
         for part in scene.joints
         if isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not part.sources)
     )
-    # Those of coordinates, as a stop is.
+    # Unilateral constraints of coordinates, such as stops, have no point of contact.
     stops = {
         stop.name: stop for stop in scene.joints if isinstance(stop, AbstractUnilateralConstraint) and stop.sources
     }
@@ -404,7 +404,7 @@ def _check_names(scene: Scene):
 
 
 def _check_rotation(part, components, bodies, layout, poses):
-    """Refuse parts that act on the rotation of a point mass, which has none."""
+    """Refuse parts that act on the rotation of a point mass."""
     points = [i for i, k in enumerate(bodies) if k < layout.bodies and not layout.rotates[k]]
     space = layout.space
     for component in components if points else ():
@@ -419,8 +419,9 @@ def _check_rotation(part, components, bodies, layout, poses):
 
 
 def _loaded(part):
-    """The part with ones in place of forces and moments that are zero, as those of inputs may be, and of zeros among
-    the parameters of a user's function.
+    """The part with unit values for zero forces and moments, since inputs may replace them.
+
+    So do zeros among the parameters of a user's function.
     """
     filled = lambda x: np.ones_like(x) if isinstance(x, ARRAYS) and not np.any(x) else x
     ones = {}
@@ -435,9 +436,9 @@ def _loaded(part):
 
 @on_host
 def _turned(part, space, poses, kernels):
-    """Which bodies a part turns, at the given poses or at others, where springs are stretched and contacts closed.
+    """Which bodies a part turns, at the given poses or at displaced poses with stretched springs and closed contacts.
 
-    **Arguments:** `kernels`: of a class of the user's, which tell it from what it was before.
+    **Arguments:** `kernels` of a user's class; they are part of the cache key, since the class may have changed.
     """
     del kernels
     d, k = space.dimension, poses.shape[0]
@@ -445,7 +446,7 @@ def _turned(part, space, poses, kernels):
 
     def turned(poses):
         strength = _strength(part, space, poses, varied(space.velocity_size))
-        # An arm that is due to rounding.
+        # The length of an arm that is due to rounding.
         least = 100 * float(np.finfo(poses.dtype).eps) * jnp.max(jnp.abs(poses[:, :d]))
         return jnp.any(strength[:, d:] > least * jnp.max(strength[:, :d]), axis=1)
 
@@ -454,7 +455,7 @@ def _turned(part, space, poses, kernels):
 
 
 def _strength(part, space, poses, velocities):
-    """The size of a part's wrenches, or of its Jacobian, for each velocity of its bodies."""
+    """The absolute wrenches of a part, or column sums of its absolute Jacobian, by body and velocity."""
     if isinstance(part, AbstractForce):
         wrenches = part.wrenches(space, *part.seen(space, poses, velocities), jnp.zeros((), poses.dtype))
         return jnp.abs(part.wrenches_on_bodies(space, poses, wrenches))
@@ -463,7 +464,7 @@ def _strength(part, space, poses, velocities):
 
 
 def _held(part):
-    """The parts that a part holds."""
+    """The inner parts of a part."""
     return (inner for _, inner in inner_parts(part))
 
 

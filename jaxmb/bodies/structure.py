@@ -1,8 +1,7 @@
-"""The structure of a compiled scene: numbers of independent rows, which rows are implied by which joints, and the order
-in which joints are eliminated.
+"""The structure of a compiled scene: ranks of the constraint rows, implied rows, and the joints' order of elimination.
 
-Everything follows the joint graph: constraints are met by sparse elimination, and independent rows are found component
-by component, so that the time is proportional to the number of bodies where loops are local.
+All steps follow the joint graph: sparse elimination meets the constraints, and independent rows are found component by
+component. So the time is proportional to the number of bodies if loops are local.
 """
 
 import dataclasses
@@ -36,16 +35,17 @@ from .independence import JointBlocks, JointRows
 from .joint_graph import elimination_order, joint_order
 from .rigid_bodies import Implied, RigidBodySystem
 
-# Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom: below the first the
-# bodies do move, and between the two they would with slightly different dimensions. (Three rockers of 1 m with a pin 1
-# mm out of place: 6e-5.)
+# Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom. Below the first the
+# bodies do move; between the two they would move with slightly different dimensions. (Three rockers of 1 m with a pin
+# 1 mm out of place: 6e-5.)
 _MOVES = 1e-8
 _LOCKED = 5e-3
 
 
 def with_structure(system: RigidBodySystem) -> RigidBodySystem:
-    """The system with its ranks, implied rows and order of elimination. They are found once, by assembling from the
-    given poses and eliminating on concrete numbers; afterwards they are static.
+    """The system with its ranks, implied rows and order of elimination.
+
+    They are found once, by assembly from the given poses and elimination of concrete numbers; then they are static.
 
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
     accelerations, or if the given pose is singular.
@@ -91,7 +91,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
 
 
 def _parts(system):
-    """Bodies, first row and number of rows of every part."""
+    """The rows of every part."""
     groups = [(g.group.bodies, g.rows) for g in system.constraints.groups]
     sizes = [(part_bodies, rows) for bodies, rows in groups for part_bodies in bodies]
     starts = itertools.accumulate((rows for _, rows in sizes), initial=0)
@@ -103,14 +103,14 @@ def _of_parts(groups):
 
 
 class _Evaluation(NamedTuple):
-    """Φ, and the blocks of A group by group."""
+    """Φ, `unmet`, and the blocks of A group by group."""
 
     unmet: Array
     blocks: Any
 
 
 def _analysed(system):
-    """The configuration where constraints are met, the size of the residuals that remain, and what is known there."""
+    """The assembled configuration, the size of its remaining residuals, and the evaluation there."""
     on_host, guess = system.on_host(0.0), np.asarray(system.guess.q)
     met = None if on_host is None else on_host.met(on_host.normalize(guess))
     if on_host is not None and on_host.holds(met):
@@ -136,7 +136,7 @@ def _met(system):
 
 
 def _evaluated(system, t, q):
-    """At coordinates on the constraints or near them, and the given velocities."""
+    """The evaluation at coordinates near the constraints, with the guess's velocities."""
     u = system.guess.u
     now = system.kinematics(t, q, u)
     return _Evaluation(system.position_residual(t, q), [g.jacobian(now) for g in system.constraints.groups])
@@ -147,7 +147,7 @@ def _of_host(on_host, q):
 
 
 def _row_norms(system, blocks):
-    """The norm of each row of A, its columns multiplied by the scales of velocities."""
+    """The norm of each row of A, with columns multiplied by the scales of velocities."""
     of_bodies = np.append(system.concrete_scales()[1], 0.0)[system.layout.velocity_index]
     scales = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.constraints.groups]
     sizes = [np.sqrt(np.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, scales, strict=True)]
@@ -155,7 +155,7 @@ def _row_norms(system, blocks):
 
 
 def _displaced(system, t, q, moved):
-    """The same after displacements along velocities, in multiples of their scales."""
+    """The evaluation after displacements along velocities, in multiples of their scales."""
     on_host = system.on_host(t)
     if on_host is None:
         return _Evaluation(*_numbers(_displaced_by_jax(system, t, q, moved)))
@@ -173,7 +173,7 @@ def _displaced_by_jax(system, t, q, moved):
 
 @eqx.filter_jit
 def _asked(system, q):
-    """What constraints ask of the given velocities, and of accelerations where velocities satisfy the constraints."""
+    """Residuals of the guess's velocities, and of zero accelerations after the velocities are corrected."""
     t, u = jnp.zeros((), q.dtype), system.guess.u
     asked = system.velocity_residual(t, q, u)
     metric = DiagonalInertia(1 / system.velocity_scale() ** 2)
@@ -183,7 +183,7 @@ def _asked(system, q):
 
 
 def _motions_as_one(layout, q):
-    """Velocities of all bodies, and zeros of the ground, in translations and rotations of all bodies as one."""
+    """Velocities in translations and rotations of all bodies as one, with zeros for scalar coordinates and ground."""
     poses: Any = np.append(q, layout.space.ground)[layout.pose_index[: layout.bodies]]
     d = layout.space.dimension
     moved = np.tile(np.eye(d, layout.space.velocity_size)[:, None], (1, len(poses), 1))
@@ -192,23 +192,22 @@ def _motions_as_one(layout, q):
     else:
         axes: Any = np.eye(3)
         turned = np.array([[[*np.cross(axis, x[:3]), *unrotate(x[3:], axis)] for x in poses] for axis in axes])
-    # Scalar coordinates and the ground stay.
     resting = layout.ground + 1 - layout.bodies
     return np.pad(np.concatenate([moved, turned]), ((0, 0), (0, resting), (0, 0)))
 
 
 @eqx.filter_jit
 def _way_back(system, t, q, moved):
-    """The smallest displacement from there to the constraints, in multiples of scales."""
+    """The smallest displacement from the displaced configuration to the constraints, in multiples of scales."""
     scale = system.velocity_scale()
     at = _at_rest(system, t, q).moved(scale * moved)
     return at.binding_velocities.projector(DiagonalInertia(1 / scale**2)).cancel(at.position_rows) / scale
 
 
 def _check_contradictions(system, q, shares):
-    """Refuse rows that contradict those that imply them, in velocities or accelerations.
+    """Refuse dropped rows that contradict the rows that imply them, in velocities or accelerations.
 
-    **Arguments:** `shares` of kept rows in those that are dropped.
+    **Arguments:** `shares` of kept rows in dropped rows.
     """
     if not shares or not system.linear or (system.drift_free and not system.constraints.servos):
         return
@@ -230,10 +229,10 @@ def _check_contradictions(system, q, shares):
 
 
 def _check_locked(system, joints, subsets):
-    """Refuse bodies that only a small disagreement of redundant joints keeps from moving.
+    """Refuse bodies that are locked only by a small disagreement of redundant joints.
 
-    Three parallel rockers move, and one of their rows is implied; with one pin slightly out of place they assemble,
-    if at all, where they lock. No row is implied there, but some nearly are.
+    Three parallel rockers move, and one of their rows is implied. With one pin slightly out of place they assemble, if
+    at all, at a pose where they lock: there a row is nearly implied.
     """
     independent = np.zeros(system.acceleration_rows, bool)
     for subset in subsets:
@@ -242,10 +241,10 @@ def _check_locked(system, joints, subsets):
     for bodies, numbers in _connected(system, parts):
         columns = system.layout.velocity_index[bodies].ravel()
         columns = np.sort(columns[columns < system.nu])
-        # Joints that close no loop say nothing of one another, and long chains of them have small singular values too.
+        # Open chains are skipped: they have no redundant joints, but long chains have small singular values too.
         if len(numbers) == len(bodies) and all(len(parts[p].bodies) == 2 for p in numbers):
             continue
-        # Where rows are fewer than columns, or some implied by others, the bodies move.
+        # With fewer independent rows than columns the bodies move.
         if sum(np.sum(independent[parts[p].numbers]) for p in numbers) < len(columns):
             continue
         scaled = joints.dense(numbers, columns) * joints.scale[columns]
@@ -264,9 +263,7 @@ def _check_locked(system, joints, subsets):
 
 
 def _connected(system, parts):
-    """Sets of bodies that position constraints connect without the ground, with these parts, except sets with a
-    driver.
-    """
+    """Sets of bodies that position constraints connect without the ground, with their parts; sets with a driver not."""
     ground = system.layout.ground
     rheonomic = [moving for g in system.constraints.position for moving in [g.rheonomic] * len(g.group.bodies)]
     moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]
@@ -282,7 +279,7 @@ def _connected(system, parts):
 
 
 def _bodies_of_joints(system):
-    """Names of the bodies of each joint, without the ground."""
+    """Names of each joint's bodies, without the ground."""
     names = system.body_names
     bodies = lambda numbers: tuple(names[k] for k in numbers if k < len(names))
     groups = [g.group for g in system.constraints.groups]
@@ -290,7 +287,7 @@ def _bodies_of_joints(system):
 
 
 def _check_determined(system, implied):
-    """Refuse friction laws of joints whose reaction is indeterminate."""
+    """Refuse friction laws of joints with an indeterminate reaction."""
     for g in system.constraints.laws:
         for name, joint in zip(g.group.names, g.joints, strict=True):
             involved = {other for item in implied for other in (item.name, *item.by) if joint in (item.name, *item.by)}
@@ -302,7 +299,7 @@ def _check_determined(system, implied):
 
 
 def _implied(system, shares):
-    """The names of rows that are dropped, and of the joints that imply them."""
+    """Names of the dropped rows, and of the joints that imply them."""
     out, rows = [], system.rows
     for row, by, _ in shares:
         if row < system.velocity_rows:
@@ -313,7 +310,7 @@ def _implied(system, shares):
 
 
 def _check_nearby(system, q, joints, subsets):
-    """Refuse rows that are implied at this configuration, but not near it."""
+    """Refuse rows that are implied at the configuration but not near it."""
     groups = [subset for subset in subsets if subset.dropped.size]
     is_sparse = any(subset.is_sparse for subset in groups)
 
@@ -341,7 +338,7 @@ def _check_nearby(system, q, joints, subsets):
                 return Remains(off, sizes, lambda bad: subset.rows[by(bad)])
             place, later = np.searchsorted(subset.rows, dropped), np.isin(subset.rows, dropped)
             pivots, sizes = displaced.eliminate(subset.parts, subset.columns, later.astype(int), ZERO)
-            # What remains of a row is not zero where it became a pivot.
+            # A row that became a pivot is not implied.
             off = np.isin(place, pivots.order[: pivots.rank]).astype(q.dtype)
             implied_by = {share.row: share.by for share in subset.shares}
             by = lambda bad: np.unique(np.concatenate([implied_by[row] for row in dropped[bad].tolist()]))

@@ -1,5 +1,6 @@
-"""The arguments of `assemble`, `equilibrium` and `assembly_gap`: checks, and coordinates that are prescribed by name,
-those of the system and the own coordinates of joints.
+"""The arguments of `assemble`, `equilibrium` and `assembly_gap`: checks, and coordinates prescribed by name.
+
+A name denotes a coordinate of the system, or a coordinate of a joint.
 """
 
 from collections.abc import Mapping
@@ -20,15 +21,16 @@ from ..system.quantities import rates_of
 
 
 def check_system(function: str, system: Any) -> None:
-    """Raise a `ValueError` for anything but a compiled scene or another system, of the precision of JAX."""
+    """Raise a `ValueError` unless `system` is a compiled scene or another system, in JAX's precision."""
     cure = "compile the scene first, scene.compile()" if hasattr(system, "compile") else "scene.compile() makes one"
     check_kind(f"{function}: system", system, AbstractSystem, "a compiled scene or another system", cure)
     check_precision(function, system)
 
 
 def check_precision(function: str, system: AbstractSystem) -> None:
-    """Raise a `ValueError` for a system that was made before `jax_enable_x64` was switched: its numbers would keep the
-    other precision, and a motion be no better than they are.
+    """Raise a `ValueError` for a system that was made before `jax_enable_x64` was switched.
+
+    Its numbers keep the other precision, which would limit the accuracy of a motion.
     """
     old, now = system.guess.q.dtype, default_float()
     if old != now:
@@ -39,20 +41,20 @@ def check_precision(function: str, system: AbstractSystem) -> None:
 
 
 def check_no_states(function: str, system: AbstractSystem) -> None:
-    """Raise a `ValueError` for a system with internal states, where they are not supported."""
+    """Raise a `ValueError` for a system with internal states, in functions that do not support them."""
     if system.nz:
         names = ", ".join(system.state_names())
         raise ValueError(f"{function} does not support internal states; the system has {names}.")
 
 
 def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
-    """The guess as arrays, or the system's own where none is given."""
+    """The guess as arrays; by default the system's guess."""
     if guess is None:
         return system.guess
     check_kind(f"{function}: guess", guess, State, "a State(q, u)", "assemble returns one")
     if guess.z is not None and system.nz == 0:
         raise ValueError(f"{function}: guess.z: the system has no internal states.")
-    # A guess without internal states takes those of the system's own.
+    # A guess without internal states takes the internal states of the system's guess.
     z: Any = system.guess.z
     if guess.z is not None:
         z = _vector(f"{function}: guess.z", guess.z, z)
@@ -71,7 +73,7 @@ def checked_time(function: str, t: Scalar, dtype: Any) -> Any:
 def _vector(label: str, value: Any, like: Array) -> Array:
     array = real_array(label, value, like.dtype, (like.shape,))
     if isinstance(value, jax.Array):
-        # As it is: under a trace a copy of known numbers would be traced as well.
+        # Without a copy: under a trace a copy of concrete numbers would be traced.
         return value
     return array if is_traced(array) else jax.device_put(array)
 
@@ -83,7 +85,7 @@ def prescribe(
 
     **Returns:** the vector, and a static mask of the entries that were prescribed.
 
-    **Raises:** `ValueError` for unknown names, wrong shapes, values that are no real numbers, and entries that have two
+    **Raises:** `ValueError` for unknown names, wrong shapes, values that are not real numbers, and entries with two
     values.
     """
     if not isinstance(values, Mapping):
@@ -107,7 +109,7 @@ def prescribe(
 def split_names(
     what: str, system: AbstractSystem, names: Mapping[str, Any], values: Mapping[str, VectorLike] | None
 ) -> tuple[dict[str, VectorLike], dict[str, Any]]:
-    """Prescribed values of the system's own coordinates or rates, and of coordinates of joints, which become arrays.
+    """Split prescribed values: `names` of the system, and coordinates of joints, whose values become arrays.
 
     **Raises:** `ValueError` for names of neither kind and for values of the wrong shape.
     """
@@ -128,8 +130,9 @@ def split_names(
 def split_coordinates(
     system: AbstractSystem, values: Mapping[str, VectorLike] | None
 ) -> tuple[dict[str, VectorLike], dict[str, Any]]:
-    """As `split_names` of coordinates; of an angle of more than a full turn it is warned, as of one in degrees. Joints
-    may count turns: of theirs only where it is a multiple of five.
+    """`split_names` of coordinates, with a warning about angles beyond a full turn, which may be in degrees.
+
+    Angles of joints may count turns, so the warning is for multiples of five only.
 
     **Raises:** `ValueError` for a rate, and as `split_names`.
     """
@@ -150,7 +153,7 @@ def split_coordinates(
             if not is_angle or is_traced(value) or real_shape(f"Coordinate {name!r}", value) != ():
                 continue
             if name in of_system or float(np.asarray(value)) % 5 == 0:
-                # The user calls `assemble` and its like, which call this function.
+                # The caller of this function is `assemble` or its like, which the user calls.
                 warn_of_degrees(f"fix={{{name!r}: …}}", value, stacklevel=4)
     return of_system, of_joints
 
@@ -158,9 +161,9 @@ def split_coordinates(
 def split_rates(
     system: AbstractSystem, values: Mapping[str, VectorLike] | None
 ) -> tuple[dict[str, VectorLike], dict[str, Any]]:
-    """As `split_names` of rates, which are known by the names of their coordinates as well.
+    """`split_names` of rates, also by the names of their coordinates.
 
-    **Returns:** the values of the system's own rates, and those of coordinates of joints by the coordinates' names.
+    **Returns:** values of the system's rates, and of rates of joints, by the names of the joints' coordinates.
 
     **Raises:** `ValueError` for a rate that is named twice, and as `split_names`.
     """
@@ -171,7 +174,7 @@ def split_rates(
         twice = [name for name in values if f"{name}_rate" in values]
         if twice:
             raise ValueError(f"{twice[0]!r} and '{twice[0]}_rate' are the same rate; prescribe one of them.")
-        # Coordinates of joints are found by a trace of each, which most calls do not need.
+        # Names of joints' coordinates cost a trace of each joint, which most calls can spare.
         if any(name not in names for name in values):
             of_joints = {f"{name}_rate": name for name in system.joint_coordinates()}
             values = {of_joints.get(name, name): value for name, value in values.items()}
@@ -181,9 +184,9 @@ def split_rates(
 def split_internal_states(
     system: AbstractSystem, z: Float[Array, "nz"] | None, values: Mapping[str, VectorLike] | None
 ) -> tuple[Float[Array, "nz"] | None, Mapping[str, VectorLike] | None]:
-    """Internal states with some of them prescribed by name, and the prescribed values of all else.
+    """Internal states with some of them prescribed by name, and the remaining prescribed values.
 
-    **Raises:** `ValueError` for values of the wrong shape and for those that are not finite.
+    **Raises:** `ValueError` for values of the wrong shape, and for values that are not finite.
     """
     if z is None or not isinstance(values, Mapping):
         return z, values
@@ -196,7 +199,7 @@ def split_internal_states(
 
 
 def holding(system: AbstractSystem, values: Mapping[str, Any], rates: Mapping[str, Any], t: Scalar) -> AbstractSystem:
-    """The system with coordinates of joints held at values from t on, which change at rates, zero by default."""
+    """The system with coordinates of joints held at `values` at time t; they change at `rates`, zero by default."""
     if not values:
         return system
     rates = {name: rates.get(name, jnp.zeros_like(value)) for name, value in values.items()}

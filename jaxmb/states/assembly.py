@@ -1,7 +1,7 @@
 """Consistent initial states: the closest configuration and velocities that satisfy every constraint.
 
-The first step finds the configuration closest to the guess that satisfies `Φ(t, q) = 0` and the coordinates fixed by
-name, the second the velocities closest to the guess that satisfy `ψ(t, q, u) = 0` and the rates fixed by name; see
+The first step finds the configuration closest to the guess with `Φ(t, q) = 0` and the coordinates fixed by name. The
+second step finds the velocities closest to the guess with `ψ(t, q, u) = 0` and the rates fixed by name. See
 `states/closest.py`.
 """
 
@@ -38,7 +38,7 @@ from .refusals import cannot_assemble, cannot_move
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
 _ROUNDING = 4.0
-# Velocities that were given count as changed by more than this fraction; this many of them are named.
+# The fraction by which given velocities must change for a warning, and the largest number of names in it.
 _CHANGED, _NAMED = 0.01, 3
 
 
@@ -61,26 +61,25 @@ def assemble(
     **Arguments:**
 
     - `system`: a compiled scene, or another system.
-    - `guess`: where to start, default the poses and velocities given with the bodies; those that were not given are
-        zero there, so that a lone `angular_velocity` of a body that a joint holds is changed, with a warning:
-        prescribe it by `rates`.
-    - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, or `{"hip.angle": 0.3}`
-        of a joint's own; `{"floor.mode": 1}` closes a contact, 0 opens it; and values of internal states,
-        `{"motor.torque": 2.0}`. Other internal states are those of the guess.
-    - `rates`: rates that must have these values, by their names or those of their coordinates: `{"crank.angle": 2.0}`
-        is `{"crank.angle_rate": 2.0}`, also of a joint's own coordinates, `"hip.angle_rate"`; in space
-        `"body.angular_velocity"` (body frame) and `"body.velocity"`; of a `LagrangianSystem` `"theta_rate"`, or the
-        quasi-velocities `u0`, `u1`, ….
+    - `guess`: the start, default the poses and velocities given with the bodies; velocities that were not given are
+        zero. So a lone `angular_velocity` of a body that a joint holds is changed, with a warning: prescribe it by
+        `rates`.
+    - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, `{"hip.angle": 0.3}` of
+        a joint. `{"floor.mode": 1}` closes a contact, 0 opens it. Values of internal states, `{"motor.torque": 2.0}`;
+        other internal states are taken from the guess.
+    - `rates`: rates that must have these values, by the names of rates or of coordinates: `{"crank.angle": 2.0}` is
+        `{"crank.angle_rate": 2.0}`. Also rates of joints, `"hip.angle_rate"`; in space `"body.angular_velocity"` (body
+        frame) and `"body.velocity"`; of a `LagrangianSystem` `"theta_rate"`, or the quasi-velocities `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
-    - `throw`: whether a mechanism that cannot be assembled is an error. By default it is, but under `jit`, `vmap` or
-        a derivative the state is NaN instead, so that one member of a batch does not spoil the others, as it is with
-        `False` everywhere; `assembly_gap` says how far it is from closing. With `True` it is an error under `jit` as
-        well, by a call of Python from the program, which JAX then does not keep on disk.
+    - `throw`: whether to raise an error if the mechanism cannot be assembled. By default an error is raised, except
+        under `jit`, `vmap` or a derivative. There, and with `False` everywhere, the state is NaN, so that one member of
+        a batch does not spoil the others; `assembly_gap` measures the remaining gap. `True` raises under `jit` as well,
+        by a callback to Python; JAX does not cache such programs on disk.
 
-    **Returns:** a `State`, differentiable with respect to the parameters, the guess and the prescribed values. It is
-    the closest one: the sum of the squares of all changes is the least, of positions and velocities in units of the
-    system's size, of angles in radians. Where a parameter moves the mechanism, coordinates that
-    `fix` does not hold change as well, and a derivative by the parameter contains that.
+    **Returns:** a `State`, differentiable by the parameters, the guess and the prescribed values. It is the closest
+    state to the guess: the sum of the squares of all changes is the least, of positions and velocities in units of the
+    system's size, of angles in radians. Coordinates that `fix` does not hold may depend on a parameter, and a
+    derivative by the parameter contains their change.
 
     **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, the
     coordinates that cannot be fixed together, or rates that contradict each other; consistent rates may outnumber the
@@ -102,14 +101,14 @@ def assemble(
         joint_coordinates = system.joint_coordinates()
         values = {name: _joint_coordinate(system, joint_coordinates[name], t, q) for name in rates_of_joints}
         system = holding(system, values, rates_of_joints, t)
-    # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled.
+    # A scleronomic mechanism at rest needs no solve for velocities, so nothing is compiled for it.
     is_concrete = not is_traced((system, guess, fix, u, t))
     at_rest = is_concrete and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     at = Instant(system, t, q, u)
     u, ok_rates = (u, True) if at_rest else _velocities(at, fixed_rates)
-    # Under a derivative it is known whether a state was found, but its numbers are traced.
+    # Under a derivative `ok` and `ok_rates` may be concrete although the state is traced.
     traced = is_traced((system, q, u, t))
-    # Under a trace, results of concrete numbers are traced as well.
+    # Within a trace, results from concrete numbers are traced too.
     if raises and not is_traced((ok, ok_rates)):
         if not ok_rates and not traced:
             raise ValueError(cannot_move(at.with_(u=u), fixed_rates))
@@ -127,7 +126,7 @@ def assemble(
 
 
 def _warn_of_changed_velocities(system, given, assembled):
-    """Warn where velocities that were given with bodies contradict the constraints."""
+    """Warn about velocities that were given with bodies and contradict the constraints."""
     given, assembled = np.asarray(given), np.asarray(assembled)
     least = np.min(np.abs(given[given != 0]), initial=np.inf)
     if not np.any(given) or np.max(np.abs(assembled - given)) <= 0.5 * _CHANGED * least:
@@ -152,14 +151,15 @@ def _warn_of_changed_velocities(system, given, assembled):
 def configuration(
     system: AbstractSystem, guess: Coordinates, fix: Mapping[str, VectorLike] | None, t: Scalar, throw: bool
 ) -> tuple[Float[Array, "nq"], Bool[np.ndarray, "nq"], Bool[Array, ""]]:
-    """The first half of `assemble`: the coordinates, a mask of those that were prescribed, and whether the constraints
-    hold; an error if not, with `throw` and where nothing is traced.
+    """The first half of `assemble`: coordinates, a mask of prescribed coordinates, and whether the constraints hold.
+
+    With `throw` violated constraints raise a `ValueError`, unless something is traced.
     """
     q, fixed = prescribe("coordinate", system.coordinate_names() if fix else {}, {} if fix is None else fix, guess)
     if not is_traced(q):
         _check_modes(system, q, fixed)
         _check_finite(q, "coordinates")
-    # A contact that is open determines its own mode.
+    # The row of an open contact determines its mode.
     fixed[list(system.contacts.contact_places)] = False
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
     if not system.coordinate_rows:
@@ -170,10 +170,10 @@ def configuration(
         closest = on_host.closest_configuration(np.asarray(q), fixed, system.coordinate_rank - whole)
         if closest is not None:
             return jax.device_put(closest), fixed, jnp.array(True)
-    # The poses that a system was compiled at are often their own closest configuration; then nothing is compiled.
+    # The poses of compilation often satisfy the constraints already; then no search is compiled.
     elif is_concrete and guess is system.guess.q and not fixed.any():
         met = _is_met(system, t, q)
-        # Under a trace, results of concrete numbers are traced as well.
+        # Within a trace, results from concrete numbers are traced too.
         if not is_traced(met) and met:
             return q, fixed, jnp.array(True)
     q, ok = closest_configuration(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
@@ -208,7 +208,7 @@ def _joint_coordinate(system, coordinate, t, q):
 
 @jitted
 def _is_met(system, t, q):
-    """Whether the constraints hold up to the rounding errors of their terms."""
+    """Whether the constraints hold up to rounding errors of their terms."""
     size = jnp.max(jnp.abs(q), initial=0.0) + jnp.max(system.coordinate_scale(), initial=0.0)
     return jnp.max(jnp.abs(system.coordinate_residual(t, q)), initial=0.0) <= _ROUNDING * jnp.finfo(q.dtype).eps * size
 

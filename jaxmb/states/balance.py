@@ -1,6 +1,6 @@
 """The equilibrium equations of a system, in scaled velocities.
 
-Rows are those of the constraints and of held coordinates.
+Rows are rows of the constraints, then rows of held coordinates.
 """
 
 from collections.abc import Callable
@@ -16,12 +16,12 @@ from ..linalg.jitted import on_host
 from ..system import AbstractSystem
 from ..system.instant import Instant
 
-# The change of a coordinate, imaginary, by which derivatives are found.
+# The imaginary step of complex-step derivatives.
 _IMAGINARY = 1e-30
 
 
 class Balance(eqx.Module):
-    """The equations in programs of JAX.
+    """The equations in JAX.
 
     **Fields:** the `system`, the time `t` [s], and the `values` of the `held` coordinates.
     """
@@ -33,7 +33,7 @@ class Balance(eqx.Module):
 
     @property
     def rank(self) -> int:
-        """The largest possible rank of the rows, without implied ones."""
+        """The largest possible rank of the rows, without implied rows."""
         return self.system.velocity_rank + len(self.held)
 
     @property
@@ -61,28 +61,28 @@ class Balance(eqx.Module):
         return self.system.velocity_scale() * force
 
     def forces(self, q, multipliers):
-        """All forces, those of the rows with these multipliers."""
+        """The sum of applied forces and forces of the rows."""
         return self.applied(q) + self.of_rows(q, multipliers)
 
     def applied_along(self, q: Array) -> tuple[Array, Array]:
-        """How the applied forces change with displacements, and these forces."""
+        """The derivative of the applied forces by displacements, and the forces."""
         return self._along(q, self.applied)
 
     def of_rows_along(self, q: Array, multipliers: Array) -> tuple[Array, Array]:
-        """The same of the forces of the rows."""
+        """The derivative of the forces of the rows by displacements, and the forces."""
         return self._along(q, lambda q: self.of_rows(q, multipliers))
 
     def _along(self, q, force: Callable[[Array], Array]):
         return jax.jacfwd(lambda z: (force(self.moved(q, z)),) * 2, has_aux=True)(jnp.zeros(self.system.nu, q.dtype))
 
     def jacobian(self, q):
-        """Derivatives of the rows with respect to displacements."""
+        """Derivatives of the rows by displacements."""
         held = jax.jacfwd(lambda u: self._held_rates(q, u))(self.rest)
         rows = jnp.concatenate([self.at(q).velocity_jacobian, held])
         return rows * self.system.velocity_scale()[None, :]
 
     def residual(self, q, jacobian, z):
-        """Residuals of the rows; those of velocity constraints depend on the displacement alone."""
+        """Residuals of the rows; residuals of velocity constraints depend on the displacement z alone."""
         constraints = slice(self.system.position_rows, self.system.velocity_rows)
         rolled = jacobian[constraints] @ z
         held = q[np.array(self.held, int)] - self.values
@@ -98,7 +98,7 @@ def _applied_along(balance: Balance, q: Any) -> Any:
 
 
 class HostBalance:
-    """The same of a system all of whose constraints NumPy computes: only its applied forces are a program."""
+    """The equations in NumPy, except a compiled program of the applied forces."""
 
     def __init__(self, balance: Balance, host: Any):
         self._balance, self._host, self.rank = balance, host, balance.rank
@@ -120,7 +120,7 @@ class HostBalance:
 
     def jacobian(self, q):
         """As of `Balance`."""
-        # Held coordinates are velocities.
+        # The rates of held coordinates are velocities.
         held = np.eye(self._scale.size)[self._held]
         return np.concatenate([self._host.jacobian(q), held]) * self._scale
 
@@ -131,7 +131,7 @@ class HostBalance:
 
 
 def balance_on_host(balance: Balance) -> HostBalance | None:
-    """The equations in NumPy, where these serve."""
+    """The equations in NumPy; None for systems with rows that NumPy does not compute."""
     system = balance.system
     host = system.on_host(balance.t)
     suits = host is not None and host.analytic and (system.rates_are_velocities or not balance.held)

@@ -1,17 +1,17 @@
-"""The configuration and the velocities that are closest to a guess among those that satisfy the constraints.
+"""The closest configuration and the closest velocities to a guess that satisfy the constraints.
 
-The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, q) = 0`, with some coordinates held; the
+The configuration minimises `½ Σ ((q − q_guess)/scale)²` subject to `Φ(t, q) = 0`, with some coordinates held. The
 velocities minimise `½ Σ ((u − u_guess)/scale)²` subject to `ψ(t, q, u) = 0`, with some rates held. Gauss–Newton steps
-lead to the constraints, and Newton's method along them to the minimiser. Derivatives are those of the minimisers, by
-the implicit function theorem.
+lead to the constraints, then Newton's method along the constraints to the minimiser. The minimisers are differentiated
+by the implicit function theorem.
 
-If the system has an order of elimination and very many rows, no dense matrix is formed. With the rates `q̇ = K u` and
-the scales S the closest configuration satisfies
+No dense matrix is formed for a system with an order of elimination and very many rows. With the rates `q̇ = K u` and the
+scales S the closest configuration satisfies
 
     g(q, μ) = Kᵀ S⁻² (q − q_guess) + Aᵀ μ = 0,    Φ(q) = 0.
 
-The linear systems of Newton's method are solved by conjugate gradients in the null space of A, with the metric
-`M = Kᵀ S⁻² K` as the preconditioner, which the elimination of `A M⁻¹ Aᵀ` projects.
+The linear systems of Newton's method are solved by conjugate gradients in the null space of A. The preconditioner is
+the metric `M = Kᵀ S⁻² K`, projected by the elimination of `A M⁻¹ Aᵀ`.
 """
 
 from collections.abc import Callable
@@ -34,35 +34,32 @@ from ..linalg.newton import newton, root, solve_linear
 from ..system import AbstractEquation
 from ..system.instant import Instant
 
-# From this number of rows on, the closest states of systems with an order of elimination are found by blocks.
+# From this number of rows on, closest states of systems with an order of elimination are found in blocks.
 _MANY_ROWS = 300
 
-# Largest number of Gauss–Newton steps to the constraints; each must reduce the squares of the residuals to less than
-# this share.
+# Largest number of Gauss–Newton steps to the constraints; each must reduce the squared residuals below this share.
 _ITERATIONS = 400
 _PROGRESS = 0.999
-# Implied rows get this share of the largest entry of the diagonal as a pivot.
+# Pivots of implied rows, relative to the largest entry of the diagonal.
 _SHIFT = 1e-13
-# In blocks the share is this multiple of the largest residual, as in the method of Levenberg and Marquardt, and at
-# least this power of eps, 1e-11 in double precision.
+# In blocks this share is a multiple of the largest residual, as in the method of Levenberg and Marquardt. It is at least
+# this power of eps, 1e-11 in double precision.
 #
-# Away from the constraints implied rows contradict each other in the square of the distance, and multipliers are that
-# over the pivot, with errors of eps over the pivot again. Bennett's linkage from poses that are off by 1e-9 to 1e-1
-# ended at residuals of 1e-12 to 1 where all pivots were 1e-13, and ends below 3e-14 with these.
+# Off the constraints implied rows contradict each other by the square of the distance. Multipliers are this square over
+# the pivot, with errors of eps over the pivot again. (Bennett's linkage, from poses that are off by 1e-9 to 1e-1:
+# residuals of 1e-12 to 1 with all pivots 1e-13, below 3e-14 with these.)
 _OF_RESIDUAL = 1e-3
 _LEAST = 0.7
 
-# Newton's method on the optimality conditions, started near their solution: size of its last step, and largest number
-# of steps.
+# Newton's method on the optimality conditions, from nearby: size of the last step, and largest number of steps.
 _REFINED = 1e-10
 _REFINEMENTS = 16
 
 # In blocks, rows are independent if every pivot of the elimination (a squared distance between rows of unit norm)
-# exceeds this. A row of n four-bars with its crank held has a pivot of 0.7 / n³, and 5e-14 where 333 of them are held
-# twice.
+# exceeds this. A row of n four-bars with its crank held has a pivot of 0.7 / n³; 333 four-bars held twice have 5e-14.
 _INDEPENDENT = 1e-12
-# Newton's method along the constraints in blocks: largest number of steps and halvings of steps together, and a step
-# that is small enough to be the last but one.
+# Newton's method along the constraints in blocks: largest number of steps plus halvings, and the size of steps that are
+# accepted without a decrease of the distance.
 _STEPS = 60
 _LAST = 1e-6
 
@@ -73,7 +70,7 @@ def tolerance(dtype) -> float:
 
 
 def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) -> Float[Array, ""]:
-    """The largest residual, each row scaled to unit norm of its gradient times the system's size."""
+    """The largest residual, with each row divided by the norm of its scaled gradient."""
     xp, precision = namespace(residual, row_norms), jnp.finfo(residual.dtype)
     floor = precision.eps**0.75 * xp.max(row_norms, initial=0.0) + precision.tiny
     return xp.max(xp.abs(residual) / xp.maximum(row_norms, floor), initial=0.0)
@@ -82,7 +79,7 @@ def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) 
 def residual_size(
     system: AbstractEquation, t: Scalar, q: Coordinates, jacobian: Float[Array, "m nq"]
 ) -> Float[Array, ""]:
-    """`largest_residual` of the coordinates; `jacobian`: theirs at this configuration or near it."""
+    """`largest_residual` of `coordinate_residual`; `jacobian`: its Jacobian at q or near it."""
     jacobian = jacobian * system.coordinate_scale()[None, :]
     return largest_residual(system.coordinate_residual(t, q), jnp.sqrt(jnp.sum(jacobian * jacobian, axis=1)))
 
@@ -121,8 +118,10 @@ def meet_constraints(
 
 
 def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array, "nq"]:
-    """The same along the velocities, without motion along fixed ones, and without a dense matrix where the system has
-    an order of elimination. The normal equations are regularised in the measure of the residuals.
+    """Gauss–Newton from a guess to the constraints along velocities, without motion along fixed velocities.
+
+    Without a dense matrix if the system has an order of elimination. The regularisation of the normal equations is
+    proportional to the residuals.
 
     **Arguments:** `start`: a guess at rest.
     """
@@ -149,8 +148,9 @@ def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array
 
 
 def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Array], q, step, longest):
-    """The best configuration along a Gauss–Newton step, the size of the step, zero where next to nothing is gained, and
-    whether anything is.
+    """The best configuration along a Gauss–Newton step, the step's size, and whether it reduces the residuals.
+
+    The size is zero if the residuals hardly decrease.
     """
     before = jnp.sum(residual(q) ** 2)
     # Rotations by more than about a radian leave the region where the linearisation is valid.
@@ -159,7 +159,7 @@ def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Arra
     reached = jax.vmap(lambda a: moved(a * step))(lengths)
     sizes = jax.vmap(lambda configuration: jnp.sum(residual(configuration) ** 2))(reached)
     best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
-    # Where the residuals hardly decrease, they cannot vanish: in a batch all members would wait for this one.
+    # Residuals that hardly decrease cannot vanish, and in a batch all members would wait for this search.
     size = jnp.where(sizes[best] < _PROGRESS * before, jnp.max(jnp.abs(step)), 0.0)
     return reached[best], size, sizes[best] < before
 
@@ -168,7 +168,7 @@ def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Arra
 
 
 def _in_blocks(system, given):
-    """Whether closest states are found without dense matrices, if nothing is given."""
+    """`given`, by default whether closest states should be found without dense matrices."""
     only_positions = system.velocity_rows == system.position_rows
     suits = system.elimination is not None and only_positions and system.position_rows >= _MANY_ROWS
     return suits if given is None else given
@@ -183,11 +183,10 @@ def closest_configuration(
     rank: int,
     in_blocks: bool | None = None,
 ) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
-    """The configuration closest to the guess with some coordinates held; and whether every residual is at rounding
-    level.
+    """The configuration closest to the guess with some coordinates held, and whether residuals are at rounding level.
 
-    **Arguments:** `rank`: of the rows in the columns that are not held; `in_blocks`: whether no dense matrix is formed,
-    default where there are very many rows.
+    **Arguments:** `rank` of the rows in the columns that are not held; `in_blocks`: whether to work without dense
+    matrices, by default for very many rows.
     """
     if system.coordinate_rows == 0:
         return guess, jnp.array(True)
@@ -207,8 +206,7 @@ def closest_configuration(
     rows = pivots.order.rows[:rank]
     square = jnp.where(fixed, 1.0, scale) ** 2
 
-    # Where there is no minimiser, the equations are replaced by ones with a solution, so that their derivatives stay
-    # finite.
+    # Without a minimiser, equations with a solution replace the optimality conditions, so that derivatives stay finite.
     closed = ok
 
     def optimality(z):
@@ -239,9 +237,9 @@ def _refine(residual, x):
 def closest_velocities(
     guess: Instant, held: tuple[bool, ...], in_blocks: bool | None = None
 ) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
-    """The velocities closest to the guess with some rates held; and whether every residual is at rounding level.
+    """The velocities closest to the guess with some rates held, and whether residuals are at rounding level.
 
-    More rates may be held than there are degrees of freedom, as long as they agree with each other.
+    Held rates may outnumber the degrees of freedom if they agree with each other.
     """
     system, u = guess.system, guess.u
     if system.velocity_rows == 0:
@@ -258,7 +256,7 @@ def closest_velocities(
         if not fixed.any():
             ok = ok & (pivots.rank == rank)
         rows = pivots.order.rows[:rank]
-        # Rows without a pivot have no free column: only the held rates can satisfy them.
+        # Rows without a pivot have no free column, so only the held rates can satisfy them.
         bound = jnp.arange(rank) >= pivots.rank
         selected = jnp.where(bound[:, None], 0.0, jacobian[rows] * scale[None, :])
         gram = selected @ selected.T + jnp.diag(bound.astype(u.dtype))
@@ -271,15 +269,15 @@ def closest_velocities(
 
 
 def _configuration_in_blocks(system, t, guess, held, fixed):
-    """`closest_configuration` with some coordinates held, and so some velocities fixed."""
+    """`closest_configuration` in blocks, with some coordinates held, and so some velocities fixed."""
     where = _Held(tuple(held.tolist()), tuple(fixed.tolist()))
     at_rest = Instant(system, jnp.asarray(t, guess.dtype), guess, jnp.zeros(system.nu, guess.dtype))
     return _closest(at_rest, where, tolerance(guess.dtype))
 
 
 def _velocities_in_blocks(guess, held):
-    """`closest_velocities` with some rates held."""
-    # Rates that are held have an infinite mass.
+    """`closest_velocities` in blocks, with some rates held."""
+    # Held rates have an infinite mass.
     metric = DiagonalInertia(jnp.where(held, jnp.inf, 1 / guess.system.velocity_scale() ** 2))
     projector = guess.with_(u=jnp.zeros_like(guess.u)).binding_velocities.projector(metric)
     u = guess.u + projector.cancel(guess.velocity_rows)
@@ -292,7 +290,10 @@ class _Held(eqx.Module):
 
 
 class _Optimality(NamedTuple):
-    """The equations of the closest configuration; `projector` in their metric."""
+    """The optimality conditions of the closest configuration.
+
+    **Fields:** the `projector` in the metric M; the `multipliers` μ; the `gradient` g.
+    """
 
     projector: MassProjector
     multipliers: Float[Array, "m"]
@@ -312,7 +313,7 @@ def _closest(guess, held, tol):
         residual = largest_residual(at.position_residual, norms[: system.position_rows])
         before, after = distance(q), distance(new)
         size = length * jnp.max(jnp.abs(step) / system.velocity_scale())
-        # The first step leads to the constraints, and the last ones change the distance by rounding errors only.
+        # The first step leads to the constraints; the last steps change the distance by rounding errors only.
         better = (length == 0.0) | (after < before) | (size <= _LAST)
         go_on = lambda: (new, _newton_step(at, guess.q, fixed), jnp.ones_like(length), residual)
         halve = lambda: (q, step, 0.5 * length, residual)
@@ -356,7 +357,7 @@ def _optimality(at, guess, fixed):
 
 
 def _gradient(at, guess, multipliers):
-    """`g`, of a configuration that the multipliers do not depend on."""
+    """`g`, for constant multipliers."""
     rates, scale = lambda u: at.with_(u=u).rates, at.system.coordinate_scale()
     (pulled,) = jax.linear_transpose(rates, jnp.zeros(at.system.nu, guess.dtype))((at.q - guess) / scale**2)
     return pulled + at.constraint_force(multipliers)
@@ -376,7 +377,7 @@ def _newton_step(at, guess, fixed):
 
 
 def _curvature(at, guess, fixed, multipliers):
-    """How g changes with a displacement along velocities that are not fixed."""
+    """The derivative of g, as a function of displacements along free velocities."""
 
     def along(v):
         v = jnp.where(fixed, 0.0, v)
@@ -388,13 +389,13 @@ def _curvature(at, guess, fixed, multipliers):
 
 
 def _solve(at, guess, fixed, optimum, gradient, unmet):
-    """The displacement that changes g and Φ by this much: `H v + Aᵀ δμ`, `A v`."""
+    """The displacement v that changes g and Φ by given amounts: `H v + Aᵀ δμ = gradient`, `A v = unmet`."""
     projector, order, nu = optimum.projector, optimum.projector.jacobian, at.system.nu
     curved = _curvature(at, guess, fixed, optimum.multipliers)
     free = ~fixed
     independent = order.active
 
-    # One vector of both: the transpose of a solution needs every part of the right-hand side to have a derivative.
+    # One vector of v and δμ: the transpose of a solution needs derivatives of all parts of the right-hand side.
     join = lambda v, multipliers: jnp.concatenate([v, multipliers])
 
     def matrix(x):
@@ -410,7 +411,7 @@ def _solve(at, guess, fixed, optimum, gradient, unmet):
         forces, rows = b[:nu], b[nu:]
         particular = displacement(rows)
         v = particular + projector.null_space_solution(curved, forces - curved(particular))
-        # Both are refined once: the last pivots of long loops are small.
+        # Displacement and multipliers are refined once: the last pivots of long loops are small.
         v = v + displacement(rows - projector.jacobian.product(v))
         left = forces - curved(v)
         multipliers = projector.balancing(left)

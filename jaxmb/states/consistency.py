@@ -1,4 +1,4 @@
-"""Consistency of a state with the constraints of its system, before a motion starts from it."""
+"""Consistency of a state with the constraints of its system, before the start of a motion."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -15,16 +15,16 @@ from ..linalg.jitted import jitted
 from ..system import AbstractSystem, parameters, with_parameters
 from ..system.instant import Instant
 
-# The largest violation of states that count as consistent, relative to the system's size and to the largest velocity;
-# at least this power of eps, 3e-4 in single precision.
+# The largest violation of a consistent state, relative to the system's size and to the largest velocity; at least this
+# power of eps, 3e-4 in single precision.
 _TOLERANCE = 1e-5
 _ROUNDING = 0.5
 
 
 def consistent(system: AbstractSystem, t: Any, state: State) -> State:
-    """The state, if it satisfies the constraints.
+    """The state, after a check that it satisfies the constraints.
 
-    **Raises:** `ValueError` naming the joints with their residuals, if it does not. Under a trace the state is NaN
+    **Raises:** `ValueError` naming the violated joints with their residuals. Under a trace a bad state becomes NaN
     instead, so that a simulation from it fails.
     """
     if system.velocity_rows == 0:
@@ -36,7 +36,7 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
     if not any(np.any(violated) for violated in rows):
         return state
     if is_traced((system, t, state)):
-        # A derivative is taken of known numbers.
+        # Under a derivative the checks are concrete although the state is traced.
         return nan_where(jnp.array(True), state, (system, t, state))
     positions, velocities, overlaps = map(np.asarray, rows)
     if np.any(overlaps):
@@ -60,7 +60,7 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
 
 
 def constraints_depend_on(system: AbstractSystem, t: Any, state: State, names: Iterable[str]) -> bool:
-    """Whether constraints depend on some of these parameters, whatever their values are."""
+    """Whether constraints depend on some of the named parameters, for any values."""
     start = parameters(system)
 
     def rows(values):
@@ -71,7 +71,7 @@ def constraints_depend_on(system: AbstractSystem, t: Any, state: State, names: I
 
 
 def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
-    """A message about implied rows that are violated at the end of a motion."""
+    """A message about violated implied rows at the end of a motion."""
     at = Instant.of(system, t, state)
     residual = np.abs(np.asarray(at.velocity_residual))
     residual[: system.position_rows] = np.abs(np.asarray(at.position_residual))
@@ -83,7 +83,7 @@ def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
 
 
 def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
-    """Whether a state satisfies the constraints; True without any."""
+    """Whether a state satisfies the constraints; True without constraints."""
     if system.velocity_rows == 0:
         return True
     positions, velocities, overlaps = _violated(*lax.stop_gradient((system, t, state)))
@@ -101,7 +101,7 @@ def _violated(system, t, y) -> Any:
 
 
 def listed(system: AbstractSystem, violated: Any, residual: Any) -> str:
-    """The constraints of some rows with their largest residuals, the largest first, for messages."""
+    """Names of violated constraints with their largest residuals, the largest first, for messages."""
     worst: dict[str, float] = {}
     for (name, _), bad, value in zip(system.rows, violated, np.abs(np.asarray(residual)), strict=False):
         if bad:

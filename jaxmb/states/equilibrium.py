@@ -2,9 +2,8 @@
 
 At rest the applied forces and the constraint forces balance, `F(t, q, 0) + Aᵀ λ = 0`, `Φ(t, q) = 0`. The search follows
 the forces along the displacements that the constraints allow, by Newton's method with positive curvatures and bounded
-steps, so that a conservative system reaches a minimum of its potential. Where it ends at an equilibrium from which
-forces lead away, because there are none at the guess, it starts again beside that. Derivatives are those of the
-balance, by the implicit function theorem.
+steps. So a conservative system reaches a minimum of its potential. If the guess is an unstable equilibrium, the search
+starts again beside it. The balance is differentiated by the implicit function theorem.
 """
 
 import functools
@@ -42,8 +41,8 @@ _FIRST, _LONGEST = 0.025, 0.5
 # Singular values and curvatures below this fraction of the largest are rounding errors.
 _NEGLIGIBLE = 1e-12
 
-# An equilibrium is left if an eigenvalue of the stiffness is negative and larger than this fraction of the largest. The
-# search starts again at this distance from it, in units of the system's size and radians, at most so often.
+# An equilibrium is unstable if the stiffness has a negative eigenvalue larger than this fraction of the largest. The
+# search restarts at a distance from it, in units of the system's size and radians, for a limited number of times.
 _FALLS = 1e-10
 _BESIDE = 0.05
 _STARTS = 10
@@ -59,47 +58,46 @@ def equilibrium(
     stable: bool = True,
     throw: bool | None = None,
 ) -> State:
-    """Find a static equilibrium near a guess, by default one that is stable: a pendulum hangs.
+    """Find a static equilibrium near a guess, by default a stable equilibrium: a pendulum hangs.
 
     ```python
     hanging = jaxmb.equilibrium(system)
     upright = jaxmb.equilibrium(system, jaxmb.assemble(system, fix={"bar.angle": 1.5}), stable=False)
     ```
 
-    An equilibrium is stable here if the forces lead back from displacements that the constraints allow: if no
-    eigenvalue of the stiffness has a negative real part, which for conservative forces are those of a minimum of the
-    potential. One that is not is left along the displacement from which the forces lead away, on one side and if need
-    be on the other. Whether motions about an equilibrium are damped, `linearise` tells.
+    An equilibrium is stable here if the forces lead back from all displacements that the constraints allow: no
+    eigenvalue of the stiffness has a negative real part. With conservative forces the potential then has a minimum. The
+    search leaves an unstable equilibrium along the displacement from which forces lead away, on one side and, if need
+    be, on the other. `linearise` tells whether motions about an equilibrium are damped.
 
-    Where displacements meet no resistance (a vehicle may roll along level ground, its wheels may turn) equilibria form
-    a family. One near the guess is found, by the shortest steps in the scales of the velocities; `fix` selects another.
-    Wheels that roll without slipping reach it by rolling.
+    Equilibria form a family if some displacements meet no resistance: a vehicle may roll along level ground, its wheels
+    may turn. The search finds a member near the guess, by the shortest steps in the scales of the velocities; `fix`
+    selects another. Wheels that roll without slipping reach it by rolling.
 
     **Arguments:**
 
     - `system`: a compiled scene, or another system; its forces must be able to balance at zero velocity.
-    - `guess`: where to start, default the poses given with the bodies; assembled first.
+    - `guess`: the start, default the poses given with the bodies; assembled first.
     - `fix`: coordinates that must have these values, by name, as in `assemble`; the prescription may exert a force.
-        Internal states have the values that it gives, or those of the guess, and must rest at them.
+        Internal states take values from `fix`, else from the guess, and must rest at these values.
     - `t`: the time, for forces and drivers that depend on it [s].
-    - `stable`: with `False` the search is Newton's method on the balance of forces, which goes to an equilibrium near
-        the guess whether it is stable or not, such as that of a pendulum upright.
-    - `throw`: whether a failed search is an error. By default it is, but under `jit`, `vmap` or a derivative the state
-        is NaN instead, so that one member of a batch does not spoil the others, as it is with `False` everywhere. With
-        `True` it is an error under `jit` as well, by a call of Python from the program, which JAX then does not keep
+    - `stable`: with `False` the search is Newton's method on the balance of forces. It goes to an equilibrium near the
+        guess, stable or not, such as a pendulum upright.
+    - `throw`: whether to raise an error if the search fails. By default an error is raised, except under `jit`, `vmap`
+        or a derivative. There, and with `False` everywhere, the state is NaN, so that one member of a batch does not
+        spoil the others. `True` raises under `jit` as well, by a callback to Python; JAX does not cache such programs
         on disk.
 
-    **Returns:** a `State` with velocities zero, differentiable with respect to the parameters and the fixed values.
+    **Returns:** a `State` with velocities zero, differentiable by the parameters and the fixed values.
 
-    Contacts (`Stop`, `RigidContact`, `Slack`, …) stay as they are in the guess, open or closed; `fix` closes one,
-    `{"floor.mode": 1}`, or opens it, 0. A state in which an open one is overlapped or a closed one would have to pull
-    is none, and the error says so.
+    Contacts (`Stop`, `RigidContact`, `Slack`, …) stay open or closed as in the guess; `fix` closes a contact,
+    `{"floor.mode": 1}`, or opens it, 0. In an equilibrium no open contact is overlapped and no closed contact pulls.
 
     **Raises:** `ValueError` if the mechanism cannot be assembled, if a prescribed motion has a velocity at time t, if
-    internal states change, if there is no equilibrium, or only one that is not stable, or not one of the contacts; the
-    message names the coordinates that are unbalanced, or along which the equilibrium falls. Also for a system with dry
-    friction, other constraints that are not ideal, or servos. With `throw=True` under `jit`, a run-time error without
-    the names.
+    internal states change, or if no equilibrium is found: none at all, none that is stable, or none that agrees with
+    the contacts. The message names the coordinates that are unbalanced, or along which the equilibrium falls. Also for
+    a system with dry friction, other constraints that are not ideal, or servos. With `throw=True` under `jit`, a
+    run-time error without the names.
     """
     check_system("equilibrium", system)
     if not system.ideal_on_velocities:
@@ -116,7 +114,7 @@ def equilibrium(
     held = tuple(np.flatnonzero(fixed).tolist())
     u = jax.device_put(np.zeros(system.nu, start.dtype))
     at_rest = jnp.array(True) if system.drift_free else _drivers_at_rest(Instant(system, time, start, u))
-    # Under a derivative the outcome is known, but the numbers that a message needs are traced.
+    # Under a derivative the outcome is concrete, but numbers for a message are traced.
     errors = raises and not is_traced((system, time, start, z, at_rest))
     if errors and not bool(at_rest):
         raise ValueError(
@@ -174,12 +172,11 @@ def _changing(at, steady):
 
 
 class _Linearised(NamedTuple):
-    """The balance for small displacements z from a configuration, `force − stiffness z` along those that the rows
-    allow.
+    """The balance for small displacements z from a configuration: `force − stiffness z` along allowed displacements.
 
-    `curvatures` and `directions` of the symmetric part of the stiffness, in which forbidden directions count as stiff;
-    `loose`, the directions without stiffness; `multipliers` of the rows; `correction`, the displacement back to
-    the rows; `sizes` of the rows, and `implied`, the projector on combinations of them that vanish.
+    **Fields:** `curvatures` and `directions` of the symmetric part of the stiffness, in which forbidden directions
+    count as stiff; `loose`: which directions have no stiffness; `multipliers` of the rows; `correction`: the
+    displacement back to the rows; `sizes` of the rows; `implied`: the projector on vanishing combinations of rows.
     """
 
     force: Float[Array, "n"]
@@ -203,7 +200,7 @@ def _linearise(balance: Balance | HostBalance, q: Coordinates) -> _Linearised:
     sizes = norm(jacobian)
     sizes = xp.where(sizes > 0, sizes, 1.0)
     left, values, right = xp.linalg.svd(jacobian / sizes[:, None], full_matrices=False)
-    # Rows that are implied on the constraints are only nearly implied off them: the rank tells how many to drop.
+    # Off the constraints implied rows are only nearly implied: the rank tells how many to drop.
     kept = (xp.arange(values.size) < balance.rank) & (values > _NEGLIGIBLE * xp.max(values, initial=0.0))
     left, right = xp.where(kept[None, :], left, 0.0), xp.where(kept[:, None], right, 0.0)
     inverse = right.T @ (left / xp.where(kept, values, 1.0)[None, :]).T
@@ -215,7 +212,7 @@ def _linearise(balance: Balance | HostBalance, q: Coordinates) -> _Linearised:
     softness, force = softness + row_softness, applied + force
     stiffness = -allowed @ softness @ allowed
     largest, overall = xp.max(xp.abs(stiffness)), xp.max(xp.abs(softness))
-    # Where the rows allow no displacement, or none that is resisted, what is left is rounding errors.
+    # If the rows allow no displacement, or none that is resisted, the stiffness consists of rounding errors.
     largest = xp.where(largest > _NEGLIGIBLE * overall, largest, overall)
     stiffness = stiffness + xp.where(largest > 0, largest, 1.0) * (right.T @ right)
     curvatures, directions = xp.linalg.eigh(0.5 * (stiffness + stiffness.T))
@@ -241,7 +238,7 @@ def _linearised(
 
 
 def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
-    """Newton's step, with curvatures made positive if it leads downhill; none along loose directions without force."""
+    """Newton's step, downhill with positive curvatures; zero along loose directions without force."""
     xp = namespace(local.force)
     along = local.directions.T @ local.force
     largest = lambda x: xp.max(xp.abs(x), initial=0.0)
@@ -266,17 +263,18 @@ def _balanced(
     Bool[Array, "contacts"],
     Bool[Array, "contacts"],
 ]:
-    """The equilibrium, the residual forces there in the scales of velocities, the displacement along which one that was
-    left falls, zero if none was, and whether the equilibrium was found; which open contacts are overlapped there, and
-    which closed ones pull.
+    """The equilibrium, and facts about it.
+
+    These are the residual forces in the scales of velocities; the displacement along which a discarded equilibrium
+    falls, else zero; whether the search succeeded; which open contacts are overlapped; which closed contacts pull.
     """
     balance = Balance(system, t, start[np.array(held, int)], held)
     search = _settled if stable else _nearest
     fixed = lax.stop_gradient(balance)
     q, local, falling, ok = search(functools.partial(_linearised, fixed), lax.stop_gradient(start), _unknown(balance))
 
-    # The equations of the equilibrium, for its derivatives. Loose directions and implied rows are made definite: the
-    # configuration does not move along loose directions, and multipliers are the smallest ones.
+    # The equations of the equilibrium, for its derivatives, with a unique solution: the configuration does not move
+    # along loose directions, and the multipliers of implied rows are as small as possible.
     n, stiff = system.nu, jnp.max(jnp.abs(local.curvatures))
     loose = jnp.where(local.loose[None, :], local.directions, 0.0) @ local.directions.T
     jacobian = lax.stop_gradient(balance).jacobian(q)
@@ -287,7 +285,7 @@ def _balanced(
         force = balance.forces(moved, multipliers) - stiff * (loose @ z)
         rows = balance.residual(moved, jacobian, z) / local.sizes
         rows += local.implied @ (local.sizes * multipliers) / stiff
-        # Without an equilibrium the equations are replaced by ones with a solution, so that derivatives stay finite.
+        # Without an equilibrium, equations with a solution replace these, so that derivatives stay finite.
         return jnp.where(ok, jnp.concatenate([force, rows]), x - initial)
 
     initial = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
@@ -298,7 +296,7 @@ def _balanced(
 
 
 def _against(system, t, q, multipliers, implied):
-    """Which open contacts are overlapped, and which closed ones pull."""
+    """Which open contacts are overlapped, and which closed contacts pull."""
     contacts = system.contacts
     if not contacts:
         return (jnp.zeros(0, bool),) * 2
@@ -310,7 +308,7 @@ _linearised_alone, _against_alone = on_host(_linearised), on_host(_against)
 
 
 def _on_host(system, t, start, held, stable):
-    """`_balanced` with the search in NumPy, of concrete numbers; None where a matrix is singular or not finite."""
+    """`_balanced` with the search in NumPy, for concrete numbers; None if a matrix is singular or not finite."""
     start, time = jax.tree.map(np.asarray, (start, t))
     balance = Balance(system, time, start[np.array(held, int)], held)
     host = balance_on_host(balance)
@@ -326,13 +324,13 @@ def _on_host(system, t, start, held, stable):
 
 
 def _nearest(at: _At, start: Coordinates, unknown: _Linearised):
-    """The equilibrium to which Newton's method leads from a guess."""
+    """The equilibrium that Newton's method reaches from a guess."""
     q, local, balanced = _search(at, start, unknown, downhill=False)
     return q, local, namespace(start).zeros_like(local.force), balanced
 
 
 def _settled(at: _At, start: Coordinates, unknown: _Linearised):
-    """The equilibrium to which the forces lead from a guess, or from beside an equilibrium that is not stable."""
+    """The equilibrium to which forces lead from a guess, or from beside an unstable equilibrium."""
     xp = namespace(start)
 
     def proceed(carry):
@@ -357,7 +355,7 @@ def _settled(at: _At, start: Coordinates, unknown: _Linearised):
 
 
 def _repeated(proceed: Callable[[Any], Any], advance: Callable[[Any], Any], carry: Any) -> Any:
-    """A loop of Python for arrays of NumPy, else of XLA."""
+    """A while loop: in Python for NumPy arrays, else in XLA."""
     if namespace(carry[0]) is not np:
         return lax.while_loop(proceed, advance, carry)
     while proceed(carry):
@@ -366,12 +364,12 @@ def _repeated(proceed: Callable[[Any], Any], advance: Callable[[Any], Any], carr
 
 
 def _softest(stiffness: Float[Array, "n n"]) -> tuple[Bool[Array, ""], Float[Array, "n"]]:
-    """Whether no eigenvalue has a negative real part, and the direction of the least, its largest entry about one."""
+    """Whether no eigenvalue has a negative real part; and the softest direction, with largest entry about one."""
     xp = namespace(stiffness)
     values, vectors = xp.linalg.eig(stiffness)
     direction = vectors[:, xp.argmin(values.real)].real
     size = xp.abs(direction)
-    # Of entries of about the same size the first one has the sign, so that rounding errors do not decide.
+    # The first of several large entries decides the sign, so that rounding errors do not.
     first = direction[xp.argmax(size > 0.5 * xp.max(size))]
     stable = xp.min(values.real) >= -_FALLS * xp.max(xp.abs(values))
     return stable, direction / xp.where(first != 0, first, 1.0)
@@ -388,9 +386,9 @@ def _unknown(balance: Balance) -> _Linearised:
 def _search(
     at: _At, start: Coordinates, unknown: _Linearised, *, downhill: bool, first: Float[Array, "n"] | None = None
 ) -> tuple[Float[Array, "nq"], _Linearised, Bool[Array, ""]]:
-    """Follow the forces until they vanish, or the steps of Newton's method; also returns whether they do.
+    """Follow the forces, or the steps of Newton's method, until the forces vanish; also returns whether they vanish.
 
-    **Arguments:** `first`: a displacement from the start, default none.
+    **Arguments:** `first`: a displacement from the start, default zero.
     """
     xp, close = namespace(start), float(np.finfo(start.dtype).eps) ** 0.5
 
@@ -402,8 +400,8 @@ def _search(
         q, local, step, radius, _, k = carry
         size, off = xp.max(xp.abs(step)), xp.max(xp.abs(local.correction))
         trial, ahead = at(q, step + local.correction)
-        # A step is too long if the forces at its end push back at least half as hard as they pushed at its beginning.
-        # The effect of the rows' correction on the forces is not counted.
+        # A step is too long if forces at its end push back at least half as hard as they pushed at its beginning. The
+        # effect of the rows' correction on the forces is not counted.
         other = xp.max(xp.abs(local.curvatures)) * norm(local.correction) * norm(step)
         back = xp.dot(ahead.force, step) < -0.5 * xp.abs(xp.dot(local.force, step)) - other
         weaker = norm(ahead.force) < norm(local.force)
@@ -414,11 +412,11 @@ def _search(
         step = _step(local, downhill=downhill)
         longest = xp.max(xp.abs(step))
         step = step * xp.minimum(1.0, radius / xp.where(longest > 0, longest, 1.0))
-        # The error after a small step of Newton's method is of the size of its square, and of that of the correction,
-        # whose effect on the forces is not counted.
+        # After a small Newton step the error is of the order of the step's square, plus the rows' correction, whose
+        # effect on the forces is not counted.
         return q, local, step, radius, good & (size <= close) & (off <= close**1.5) & (k > 0), k + 1
 
-    # Before the first linearisation nothing is known, and only a step that is given is not zero.
+    # Without a linearisation yet, the first step is zero unless it is given.
     step = xp.zeros_like(unknown.force) if first is None else first
     begun = (start, unknown, step, xp.asarray(_FIRST, start.dtype), xp.asarray(False), 0)
     q, local, _, _, balanced, _ = _repeated(proceed, advance, begun)
@@ -426,7 +424,7 @@ def _search(
 
 
 def _largest(system, values, least):
-    """The rates with the largest values, those above a fraction of the largest, with these."""
+    """The rates with the largest values, above a fraction `least` of the largest, as text."""
     size = np.abs(np.asarray(values))
     names = directions(system.rate_names())
     return ", ".join(f"{names[k]} ({values[k]:.3g})" for k in np.argsort(-size)[:4] if size[k] > least * np.max(size))

@@ -1,4 +1,4 @@
-"""The gap of a mechanism that does not close: a smooth distance for optimisers, where `assemble` only fails."""
+"""The gap of a mechanism that does not close: a smooth distance for optimisers where `assemble` fails."""
 
 from collections.abc import Mapping
 
@@ -23,12 +23,12 @@ from .arguments import (
 )
 from .closest import meet_constraints, residual_size, tolerance
 
-# Newton's method on the squares: largest number of steps, size of the last one, and halvings of a step.
+# Newton's method on the squares: largest number of steps, size of the last step, and halvings of a step.
 _ITERATIONS = 200
 _LAST = 1e-12
 _HALVINGS = 12
 
-# Curvatures below this share of the largest one count as this share.
+# Curvatures below this share of the largest curvature count as this share.
 _FLAT = 1e-8
 
 
@@ -39,28 +39,27 @@ def assembly_gap(
     fix: Mapping[str, VectorLike] | None = None,
     t: Scalar = 0.0,
 ) -> Float[Array, ""]:
-    """How far a mechanism is from closing, zero where `assemble` finds a configuration.
+    """The distance of a mechanism from closing, zero if `assemble` finds a configuration.
 
     ```python
     gap = jaxmb.assembly_gap(system, fix={"bar.x": 0.8})  # The pin holds the bar's centre at 0.5 m.
     ```
 
     A coupler that is too short leaves a gap between its joint and the rocker. `assemble(..., throw=False)` then returns
-    a state of NaN, which an optimiser learns nothing from. The gap tells it which way to go: as a
-    constraint of `optimise`, `{"gap": (None, 0)}`, and as what to make small first where a start cannot be assembled.
+    a state of NaN, which tells an optimiser nothing. The gap tells it the way: as a constraint of `optimise`,
+    `{"gap": (None, 0)}`, or as a first objective if a start cannot be assembled.
 
-    The gap is the norm of the residuals of all position constraints at the configuration, found from the guess by
-    Newton's method, where it is smallest. Each residual is relative to the norm of its gradient at the guess, with
-    translations in units of `system.length`, so the gap is about the open distance divided by the system's size.
+    The gap is the least norm of the residuals of all position constraints, near the guess, by Newton's method. Each
+    residual is relative to the norm of its gradient at the guess, with translations in units of `system.length`. So the
+    gap is about the open distance divided by the system's size.
 
-    It grows in proportion to what is missing, so at its zero it has a kink; its square is smooth. Derivatives with
-    respect to parameters, guess and prescribed values are exact to first order: the smallest value of a function
-    changes with its parameters as the function does, at the configuration kept (the envelope theorem). Second
-    derivatives are not those of the gap.
+    The gap is proportional to the missing length, so it has a kink at zero; its square is smooth. First derivatives by
+    parameters, guess and prescribed values are exact: a minimum changes with parameters as the function does at a fixed
+    configuration (the envelope theorem). Second derivatives are wrong.
 
-    **Arguments:** as those of `assemble`. Coordinates in `fix` keep their values; rates have no part in it.
+    **Arguments:** as for `assemble`. Coordinates in `fix` keep their values; rates do not matter.
 
-    **Returns:** the gap, dimensionless; exactly zero where the constraints can be met.
+    **Returns:** the gap, dimensionless; exactly zero if the constraints can be met.
     """
     check_system("assembly_gap", system)
     guess = checked_guess("assembly_gap", system, guess)
@@ -90,7 +89,7 @@ def _gap(system: AbstractSystem, t: Scalar, guess: Coordinates, held: tuple[bool
 
 
 def _weights(system, t, q):
-    """One over the norms of the rows of the scaled Jacobian; a row without a gradient counts as the largest one."""
+    """One over the norms of the rows of the scaled Jacobian; rows without a gradient take the largest norm."""
     jacobian = system.coordinate_jacobian(t, q) * system.coordinate_scale()[None, :]
     squares = jnp.sum(jacobian * jacobian, axis=1)
     some = squares > jnp.finfo(q.dtype).eps ** 1.5 * jnp.max(squares)
@@ -98,7 +97,7 @@ def _weights(system, t, q):
 
 
 def _residual(system, t, q):
-    """Φ of rotations of unit size, and the invariants of the coordinates: no gap is closed by shrinking a body."""
+    """Φ of normalised coordinates, and the coordinates' invariants, so that no body shrinks to close a gap."""
     position = system.position_residual(t, system.normalize(q))
     return jnp.concatenate([position, system.coordinate_residual(t, q)[system.position_rows :]])
 
@@ -124,7 +123,7 @@ def _nearest(residual, start, scale):
         lengths = 0.5 ** jnp.arange(_HALVINGS, dtype=z.dtype)
         values = lax.map(lambda a: squares(z + a * step), lengths)
         best = jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))
-        # At the level of rounding errors no step decreases the squares, and Newton's own is the best.
+        # At the level of rounding errors no step decreases the squares, and the full Newton step is the best.
         small = longest <= jnp.finfo(z.dtype).eps ** 0.5
         better = (values[best] < value) | small
         length = jnp.where(better, jnp.where(small, 1.0, lengths[best]), 0.0)

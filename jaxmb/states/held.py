@@ -1,4 +1,4 @@
-"""Contacts that do not hold at a state: open ones that are overlapped, and closed ones that would have to pull."""
+"""Contacts that do not hold at a state: open contacts that are overlapped, and closed contacts that would pull."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,10 +12,10 @@ from .closest import tolerance
 def contacts_against(
     at: Instant, multipliers: Float[Array, "rows"], alone: Bool[Array, "contacts"]
 ) -> tuple[Bool[Array, "contacts"], Bool[Array, "contacts"]]:
-    """Which open contacts are overlapped, and which closed ones pull; of a system without contacts, none is asked.
+    """Which open contacts are overlapped, and which closed contacts pull.
 
-    **Arguments:** the `multipliers` of all rows; which contacts are `alone`: of those that imply each other only the
-    sum of the forces is known.
+    **Arguments:** the `multipliers` of all rows; `alone`: which contacts have a determinate force, since of contacts
+    that imply each other only the sum of the forces is determinate.
     """
     contacts, is_open = at.system.contacts, at.system.contacts.modes(at.q).open
     if not is_open.size:
@@ -28,7 +28,7 @@ def contacts_against(
 
 
 def about_contacts(what: str, system: AbstractSystem, overlapped: Array, pulled: Array) -> tuple[str, str]:
-    """That `what` is found only where contacts do not hold, and what to fix instead, as an argument of a call."""
+    """A message that `what` is found only with contacts that do not hold; and the cure, as an argument `fix=`."""
     names, overlaps, pulls = np.array(system.contacts.contact_names), np.asarray(overlapped), np.asarray(pulled)
     texts = []
     if np.any(overlaps):

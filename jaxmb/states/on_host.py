@@ -1,7 +1,7 @@
-"""Consistent positions and velocities of a system found in NumPy, so that of its equations only the rows of the
-constraints and their derivatives are ever compiled.
+"""Consistent positions and velocities of a system in NumPy, with small dense matrices.
 
-The equations are those of `states/closest.py`. Matrices are dense and small.
+The equations are the same as in `states/closest.py`. At most the rows of the constraints and their derivatives are
+compiled.
 """
 
 import abc
@@ -14,20 +14,20 @@ from .closest import largest_residual, tolerance
 
 # The largest numbers of rows and coordinates whose dense matrices are cheap.
 MOST = 150
-# Largest numbers of Gauss–Newton and of Newton steps, and of steps to velocities that constraints are not linear in; a
-# share of the residuals that a Gauss–Newton step takes away; the power of the precision at which a step is the last.
+# Largest numbers of Gauss–Newton steps, of Newton steps, and of steps to the velocities of constraints that are not
+# linear; the largest share of squared residuals after a useful step; the size of the last step, as a power of eps.
 _STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.999, 0.75
-# A full step is not shortened where it reduces the squares of the residuals to less than this share.
+# A full step is not shortened if it reduces the squared residuals below this share.
 _WHOLE = 0.01
-# Coordinates satisfy constraints exactly up to so many units of rounding; singular values below this fraction are zero.
+# Largest rounding error of residuals, in units of eps; singular values below this fraction of the largest are zero.
 _ROUNDING, _ZERO = 4.0, 1e-9
 
 
 class AbstractHost(abc.ABC):
     """The constraints of a system at a time, in NumPy.
 
-    **Fields:** scales as those of the system; whether ψ is `linear` in velocities; the number of `velocity_rows`;
-    whether residuals and Jacobians are `analytic`: positions alone, also for coordinates that are complex.
+    **Fields:** scales of the system; whether ψ is `linear` in velocities; the number of `velocity_rows`; whether the
+    constraints are `analytic`: only position constraints, whose residuals and Jacobians accept complex coordinates.
     """
 
     analytic: bool = False
@@ -39,11 +39,11 @@ class AbstractHost(abc.ABC):
 
     @abc.abstractmethod
     def coordinate_residual(self, q: Float[np.ndarray, "nq"]) -> Float[np.ndarray, "m"]:
-        """Φ, and the invariants of coordinates."""
+        """Φ, and the coordinates' invariants."""
 
     @abc.abstractmethod
     def coordinate_jacobian(self, q: Float[np.ndarray, "nq"]) -> Float[np.ndarray, "m nq"]:
-        """Its derivative."""
+        """The derivative of `coordinate_residual`."""
 
     @abc.abstractmethod
     def velocity_rows_at(
@@ -58,7 +58,7 @@ class AbstractHost(abc.ABC):
         return bool(largest_residual(residual, norms) <= tolerance(q.dtype))
 
     def met(self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None) -> Float[np.ndarray, "nq"]:
-        """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of those that are held."""
+        """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of `held` coordinates."""
         scale = self.coordinate_scale if held is None else np.where(held, 0.0, self.coordinate_scale)
         before, small = self.coordinate_residual(q), float(np.finfo(q.dtype).eps) ** _SMALL
         for _ in range(_STEPS if before.size and np.all(np.isfinite(before)) else 0):
@@ -70,7 +70,7 @@ class AbstractHost(abc.ABC):
             step = step * min(1.0, 1.0 / longest if longest > 0 else 1.0)
             size = before @ before
             reached = [(q + step, self.coordinate_residual(q + step))]
-            # Shorter steps are no better than one that takes nearly all of the residuals away.
+            # Shorter steps are not better than a full step that removes nearly all of the residuals.
             if not np.sum(reached[0][1] ** 2) < _WHOLE * size:
                 reached += [
                     (moved, self.coordinate_residual(moved)) for moved in (q + 0.5**k * step for k in range(1, 8))
@@ -88,9 +88,9 @@ class AbstractHost(abc.ABC):
     def closest_configuration(
         self, guess: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"], rank: int
     ) -> Float[np.ndarray, "nq"] | None:
-        """The configuration closest to the guess with some coordinates held; None where it is not found.
+        """The configuration closest to the guess with some coordinates held; None if the search fails.
 
-        **Arguments:** `rank`: of the rows in the columns that are not held.
+        **Arguments:** `rank` of the rows in the columns that are not held.
         """
         scale = np.where(held, 0.0, self.coordinate_scale)
         size = np.max(np.abs(guess), initial=0.0) + np.max(self.coordinate_scale, initial=0.0)
@@ -122,7 +122,7 @@ class AbstractHost(abc.ABC):
         return None
 
     def _curvature(self, q, multipliers, free):
-        """The second derivatives of rows along multipliers, by differences; errors slow the last steps only."""
+        """Second derivatives of the rows times multipliers, by differences, whose errors slow the last steps only."""
         rows = []
         for k in np.flatnonzero(free):
             step = np.zeros_like(q)
@@ -135,10 +135,10 @@ class AbstractHost(abc.ABC):
     def closest_velocities(
         self, q: Float[np.ndarray, "nq"], guess: Float[np.ndarray, "nu"], held: Bool[np.ndarray, "nu"], rank: int
     ) -> Float[np.ndarray, "nu"] | None:
-        """The velocities closest to the guess with some rates held; None where they are not found."""
+        """The velocities closest to the guess with some rates held; None if the search fails."""
         if not self.velocity_rows:
             return guess
-        # Of rows that are implied, and not linear, some must be chosen.
+        # Implied nonlinear rows need a choice of independent rows, which this search does not make.
         if not self.linear and rank < self.velocity_rows:
             return None
         scale, u = np.where(held, 0.0, self.velocity_scale), guess

@@ -1,9 +1,9 @@
-"""Checks that rows that others imply at the given pose are implied near it as well.
+"""Checks that rows implied at the given pose are also implied near it.
 
-Where rows lose rank, some of them are implied by the others. Near a regular pose they stay so, and may be left out; at
-a singular one (a straight truss, a four-bar with all joints on one line, q₀ q₁ = 0 at the origin) they do not, and the
-mechanism without them is another one. The kept rows are independent, so nearby states of them are found by Newton's
-method: there the rows left out must hold, and their gradients must depend on those of the kept rows.
+Near a regular pose implied rows stay implied, and may be dropped. Near a singular pose they do not, and dropping them
+changes the mechanism: a straight truss, a four-bar with all joints on one line, q₀ q₁ = 0 at the origin.
+The kept rows are independent, so Newton's method finds nearby states that satisfy them. There the dropped rows must
+hold, and their gradients must depend on the gradients of the kept rows.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,15 +19,15 @@ from ..linalg.independent_rows import independent_in_order
 from ..system import AbstractSystem
 
 # Number of displaced poses, and the displacement in scales of the coordinates as a power of eps: 1e-2 in double
-# precision. A row that is implied at a singular pose only differs by the displacement or its square.
+# precision. A row that is implied only at the singular pose differs by the displacement or its square.
 _POSES = 3
 _DISPLACEMENT = 1 / 8
 # The largest relative difference that counts as zero, as a power of eps: 1e-6.
 ZERO = 3 / 8
-# Rows that depend on time are followed to these times [s], as far as the coordinates move less than this.
+# Rows that depend on time are checked at these times [s], as long as coordinates move less than this.
 _TIMES = tuple(10.0**k for k in range(-9, 7))
 _NEAR = 0.2
-# Largest number of steps of Newton's method.
+# Largest number of Newton steps.
 _ITERATIONS = 10
 
 
@@ -45,8 +45,8 @@ def check_gradients(system: AbstractSystem, sizes: Float[np.ndarray, "m"]) -> No
 class DependentRows(NamedTuple):
     """Rows of A that depend on each other only.
 
-    **Fields:** the `rows`; `independent` ones among them; `positions`: independent rows of Φ, also those that keep
-    invariants of the coordinates; all by their numbers among the rows of A, or of the coordinates.
+    **Fields:** the `rows`, and the `independent` rows among them, as numbers among the rows of A; `positions`:
+    independent rows of Φ and of the coordinates' invariants, as numbers among the rows of `coordinate_residual`.
     """
 
     rows: Int[np.ndarray, "m"]
@@ -55,11 +55,11 @@ class DependentRows(NamedTuple):
 
 
 class Nearby(NamedTuple):
-    """What is known at a displaced configuration.
+    """The constraints at a displaced configuration.
 
-    **Fields:** `unmet`: Φ, and the coordinates' invariants; `step(number, rows)`: the smallest displacement of a group,
-    to first order, to where these of its positions are met; `remains(number, kept, dropped)`: what remains of rows of A
-    that are no sum of others.
+    **Fields:** `unmet`: Φ and the coordinates' invariants; `step(number, rows)`: the smallest displacement of a group,
+    to first order, that satisfies these rows of its `positions`; `remains(number, kept, dropped)`: the parts of dropped
+    rows of A that kept rows do not explain.
     """
 
     unmet: Float[np.ndarray, "mq"]
@@ -68,9 +68,10 @@ class Nearby(NamedTuple):
 
 
 class Remains(NamedTuple):
-    """Residuals of rows of unit norm after least squares by other rows.
+    """Residuals of dropped rows of unit norm after least squares by kept rows.
 
-    **Fields:** its norms `off`; the `sizes` of the rows; `by(bad)`: the others that have a share in some of them.
+    **Fields:** norms of the residuals, `off`; the `sizes` of the rows; `by(bad)`: kept rows that have a share in the
+    dropped rows `bad`.
     """
 
     off: Float[np.ndarray, "d"]
@@ -79,7 +80,7 @@ class Remains(NamedTuple):
 
 
 def smallest_step(jacobian: Float[np.ndarray, "m n"], unmet: Float[np.ndarray, "m"]) -> Float[np.ndarray, "n"]:
-    """`Nearby.step`, with a full matrix of derivatives."""
+    """`Nearby.step` with a dense Jacobian."""
     if not np.all(np.isfinite(jacobian)):
         return np.full(jacobian.shape[1], np.nan, jacobian.dtype)
     return np.linalg.lstsq(jacobian, -unmet, rcond=None)[0]
@@ -88,7 +89,7 @@ def smallest_step(jacobian: Float[np.ndarray, "m n"], unmet: Float[np.ndarray, "
 def dense_remains(
     jacobian: Float[np.ndarray, "m n"], kept: Int[np.ndarray, "r"], dropped: Int[np.ndarray, "d"]
 ) -> Remains:
-    """`Nearby.remains`, with a full matrix."""
+    """`Nearby.remains` with a dense Jacobian."""
     (kept_rows, _), (dropped_rows, sizes) = (_unit_rows(jacobian[rows]) for rows in (kept, dropped))
     share, *_ = np.linalg.lstsq(kept_rows.T, dropped_rows.T, rcond=None)
     zero = np.finfo(jacobian.dtype).eps ** ZERO
@@ -105,11 +106,11 @@ def check_implied(
     dtype: Any,
     bodies: Mapping[str, Iterable[str]] = MappingProxyType({}),
 ) -> None:
-    """Raise a `ValueError` naming the rows that others imply at a configuration on the constraints, but not near it.
+    """Raise a `ValueError` naming the rows that are implied at a configuration on the constraints, but not near it.
 
-    **Arguments:** `groups` with implied rows; `places`: for each the entries of a displacement that determine its rows;
-    `evaluate(t, moved)`: after a displacement of this `size` in multiples of scales; `bodies` of each joint, for
-    messages.
+    **Arguments:** `groups` with implied rows; `places`: for each group the entries of a displacement that determine its
+    rows; `evaluate(t, moved)`: the constraints after a displacement in multiples of scales; `size` and `dtype` of
+    displacements; `bodies` of each joint, for messages.
     """
     if not groups:
         return
@@ -124,9 +125,8 @@ def check_implied(
 
 
 def _settled(groups, places, evaluate, t, moved):
-    """A state near a displaced one that satisfies the independent rows of Φ, and for each group whether it was found.
-
-    Places that cannot be reached, or only far away, say nothing.
+    """The constraints near a displaced configuration where the independent rows of Φ hold, and whether each group
+    reached such a configuration. An unreachable or distant configuration decides nothing.
     """
     small = np.finfo(moved.dtype).eps ** 0.75
     going, reached = set(range(len(groups))), set()
@@ -149,7 +149,7 @@ def _settled(groups, places, evaluate, t, moved):
 
 
 def _check_near(system, t, group, number, near, zero, bodies):
-    """Raise the error where rows of a group that are not independent do not follow from the others."""
+    """Raise the error if dropped rows of a group do not follow from its independent rows."""
     dropped = np.setdiff1d(group.rows, group.independent)
     off, sizes, by = near.remains(number, group.independent, dropped)
     of_positions = near.unmet[: system.position_rows]
@@ -167,9 +167,9 @@ def _unit_rows(jacobian):
 def check_implied_as_one(
     system: AbstractSystem, q: Coordinates, positions: Int[np.ndarray, "p"], independent: Int[np.ndarray, "r"]
 ) -> None:
-    """`check_implied` of all rows as one group, by full matrices.
+    """`check_implied` of all rows as one group, with dense matrices.
 
-    **Arguments:** `q` on the constraints; `positions`: independent rows of Φ; `independent`: those of A.
+    **Arguments:** `q` on the constraints; `positions`: independent rows of Φ; `independent`: independent rows of A.
     """
     rows = np.arange(system.acceleration_rows)
     if independent.size == rows.size:
@@ -181,7 +181,7 @@ def check_implied_as_one(
         step = lambda _, numbers: smallest_step(of_coordinates[numbers], unmet[numbers])
         return Nearby(unmet, step, lambda _, kept, dropped: dense_remains(jacobian, kept, dropped))
 
-    # Coordinates may need more rows than velocities: those that keep invariants of the coordinates come last.
+    # Rows that keep the coordinates' invariants come last, after the independent rows of Φ.
     coordinate_rows = np.arange(system.coordinate_rows)
     first = np.append(positions, np.arange(system.position_rows, system.coordinate_rows)).astype(int)
     of_coordinates = np.asarray(_evaluate(system, np.zeros((), dtype), q, np.zeros(q.size, dtype))[1])
@@ -191,7 +191,7 @@ def check_implied_as_one(
 
 @eqx.filter_jit
 def _evaluate(system, t, q, moved):
-    """Constraints, and their Jacobians with scaled columns, after coordinates have changed by multiples of a scale."""
+    """Constraints, and Jacobians with scaled columns, after a displacement in multiples of the scales."""
     scale = system.coordinate_scale()
     q = q + scale * moved
     jacobian = system.jacobian(t, q, system.guess.u) * system.velocity_scale()[None, :]

@@ -1,4 +1,4 @@
-"""Why a mechanism cannot be assembled or moved as it was asked for, and where its constraints lose rank."""
+"""Messages why a mechanism cannot be assembled or moved as prescribed, and where its constraints lose rank."""
 
 from typing import Any, NamedTuple
 
@@ -13,35 +13,35 @@ from ..system.instant import Instant
 from ..system.quantities import directions
 from .consistency import listed
 
-# Singular values, of rows of unit length, that count as zero.
+# Singular values of rows of unit length below this count as zero.
 _DEPENDENT = 1e-8
-# Entries of a vector of unit length that count as zero.
+# Entries of a vector of unit length below this count as zero.
 _ZERO = 1e-6
-# A mechanism is displaced by this part of its size to a pose beside a singular one, in so many Newton steps.
+# The displacement to a pose beside a singular pose, relative to the mechanism's size, and its number of Newton steps.
 _BESIDE, _ITERATIONS = 0.03, 8
-# Constraints are losing rank where rows of unit length have a singular value below this: at the end of a motion, and
-# where a search for a configuration that does not exist has come to.
+# Constraints lose rank if rows of unit length have a singular value below this: at the end of a motion, and at the end
+# of a search for a configuration that does not exist.
 _LOST, _LOST_IN_SEARCH = 1e-3, 1e-2
-# Joints take part in a loss of rank whose share of it is at least this part of the largest.
+# The smallest share of a joint that counts in a loss of rank, relative to the largest share.
 _SHARE = 0.05
-# No matrix of more rows is decomposed for a message.
+# The largest number of rows of a matrix that is decomposed for a message.
 _MOST_ROWS = 2000
 
 
 def violated_joints(system: AbstractSystem, t: Scalar, q: Coordinates, least: float = 1e-9) -> str:
-    """The joints that a configuration violates with their largest residuals, the largest first, for messages.
+    """The violated joints of a configuration with their largest residuals, the largest first, for messages.
 
-    `least`: residuals below it, relative to the system's size, do not count.
+    **Arguments:** `least`: the smallest residual that counts, relative to the system's size.
     """
     residual = np.nan_to_num(np.abs(np.asarray(system.position_residual(t, q))), nan=np.inf)
     return listed(system, residual >= least * float(system.length), residual)
 
 
 class _Held(NamedTuple):
-    """Coordinates or rates that a user prescribed.
+    """Coordinates or rates that a user prescribed: first of the system, then of joints.
 
-    **Fields:** the `names` of all; the `places` of the first of them in the vector; the `rows` of the constraints that
-    hold the others, which are those of joints.
+    **Fields:** all `names`; `places`: indices of the system's numbers in the vector; `rows`: constraint rows that hold
+    the joints' numbers.
     """
 
     names: list[str]
@@ -49,15 +49,16 @@ class _Held(NamedTuple):
     rows: list[int]
 
     def directions(self, jacobian: Float[np.ndarray, "m n"], least: float) -> Float[np.ndarray, "held free"]:
-        """How they change in the motions that the constraints admit, from the Jacobian of all rows; singular values
-        below the `least` are zero.
+        """Rates of the prescribed numbers in the motions that the constraints admit.
+
+        **Arguments:** the `jacobian` of all rows; `least`: the smallest singular value that is not zero.
         """
         _, sizes, right = np.linalg.svd(np.delete(jacobian, self.rows, axis=0))
         motions = right[np.sum(sizes > least) :].T
         return np.concatenate([motions[self.places], jacobian[self.rows] @ motions])
 
     def dependent(self, jacobian: Float[np.ndarray, "m n"], least: float = _DEPENDENT) -> tuple[list[str], int]:
-        """Those that the constraints determine, alone or from each other, and how many of them can be chosen.
+        """Names of numbers that the constraints determine, alone or from each other, and how many of them are free.
 
         Rows of `directions` that depend on each other, or vanish, belong to numbers that cannot be chosen together.
         """
@@ -74,19 +75,19 @@ def _unit_rows(matrix):
 
 @eqx.filter_jit
 def _linearised(system, t, q):
-    """Residuals of coordinates, and their Jacobian in scaled coordinates."""
+    """The coordinates' residual, and its Jacobian in scaled coordinates."""
     return system.coordinate_residual(t, q), system.coordinate_jacobian(t, q) * system.coordinate_scale()[None, :]
 
 
 def _directions(system, t, q):
-    """Rows of the Jacobian of coordinates, in scaled coordinates and of unit length."""
+    """Rows of unit length of the coordinates' Jacobian, in scaled coordinates."""
     return _unit_rows(np.asarray(_linearised(system, t, q)[1]))
 
 
 def _beside(system, t, q, free, rows=()):
-    """A configuration near one that may be singular, on the constraints without these rows, and what remains of them.
+    """A configuration beside a possibly singular configuration, and the largest remaining residual.
 
-    **Arguments:** `free`: a mask of the coordinates that may change.
+    **Arguments:** `free`: a mask of the coordinates that may change; `rows`: constraint rows that need not hold.
     """
     scale = np.asarray(system.coordinate_scale()) * free
     q = np.asarray(q) + _BESIDE * scale * np.random.default_rng(0).uniform(-1.0, 1.0, q.size)
@@ -97,13 +98,14 @@ def _beside(system, t, q, free, rows=()):
 
 
 def cannot_assemble(system: AbstractSystem, t: Scalar, q: Coordinates, fixed: Int[np.ndarray, "nq"]) -> str:
-    """Why no configuration has the prescribed coordinates, from the closest one that was found.
+    """A message why no configuration has the prescribed coordinates.
 
-    **Arguments:** the `system` with coordinates of joints held; `fixed`: a mask of the other prescribed coordinates.
+    **Arguments:** the `system` with coordinates of joints held; `q`: the closest configuration of the search; `fixed`:
+    a mask of the prescribed coordinates of the system.
     """
     names = system.coordinate_names()
     of_bodies = [name for name, index in names.items() if len(index) == 1 and fixed[index[0]]]
-    # Coordinates of joints that are held are rows of their names.
+    # Held coordinates of joints are rows with the coordinates' names.
     rows = [k for k, (name, _) in enumerate(system.rows) if name in system.joint_coordinates()]
     held = _Held([*of_bodies, *(system.rows[k][0] for k in rows)], [names[name][0] for name in of_bodies], rows)
     listing = ", ".join(dict.fromkeys(held.names))
@@ -152,9 +154,7 @@ def _dependence(together, free):
 
 
 def cannot_move(at: Instant, fixed: Int[np.ndarray, "nu"]) -> str:
-    """Why no velocities have the prescribed rates, from the closest ones that were found; arguments as in
-    `cannot_assemble`.
-    """
+    """A message why no velocities have the prescribed rates; arguments as in `cannot_assemble`."""
     system: Any = at.system
     of_system = directions(system.rate_names())
     places = [k for k in of_system if fixed[k]]
@@ -175,7 +175,7 @@ def cannot_move(at: Instant, fixed: Int[np.ndarray, "nu"]) -> str:
     scale = np.asarray(system.velocity_scale())
     jacobian, rates = np.asarray(at.jacobian) * scale, np.asarray(at.velocity_residual)
     at_rest = np.linalg.norm(held.directions(_unit_rows(jacobian), _DEPENDENT), axis=1) < _ZERO
-    # How the rates that are held change on the way to velocities that satisfy the constraints alone.
+    # Changes of the held rates on the way to velocities that satisfy the constraints alone.
     free_rows = np.setdiff1d(np.arange(rates.size), rows)
     change = np.linalg.lstsq(jacobian[free_rows], -rates[free_rows], rcond=_DEPENDENT)[0]
     changes = np.abs(np.append((scale * change)[places], jacobian[rows] @ change + rates[rows]))
@@ -190,10 +190,10 @@ def cannot_move(at: Instant, fixed: Int[np.ndarray, "nu"]) -> str:
 
 
 class LostRank(NamedTuple):
-    """Where constraints lose rank.
+    """A loss of rank of constraints.
 
-    **Fields:** the `joints` whose rows become dependent there, the largest share first; those of them that are `drives`
-    and prescribe a motion that the others cannot follow.
+    **Fields:** the `joints` whose rows become dependent, the largest share first; `drives`: joints among them with a
+    prescribed motion that the remaining joints cannot follow.
     """
 
     joints: list[str]
@@ -201,10 +201,10 @@ class LostRank(NamedTuple):
 
 
 def lost_rank(system: AbstractSystem, t: Scalar, y: State) -> LostRank | None:
-    """Which rows become dependent at a state; None where the constraints keep their rank, or are too many.
+    """The rows that become dependent at a state; None if the constraints keep their rank, or are too many.
 
-    Rows n·A that nearly vanish are the combination of rows that is lost. Its right side is n·b, b the rates that drives
-    prescribe: where it does not vanish with them, speeds grow without bound, and the drives are at the end of a reach.
+    A nearly vanishing combination n·A of rows is lost. Its right side is n·b, with the rates b that drives prescribe.
+    If n·b does not vanish, speeds grow without bound, and the drives are at the end of their reach.
     """
     if not 0 < system.acceleration_rank <= system.acceleration_rows <= _MOST_ROWS:
         return None
@@ -221,7 +221,7 @@ def lost_rank(system: AbstractSystem, t: Scalar, y: State) -> LostRank | None:
     if system.linear and not system.drift_free:
         prescribed[: system.velocity_rows] = np.asarray(system.velocity_residual(t, q, jnp.zeros_like(y.u)))
     asked = np.abs(share * prescribed / lengths)
-    # What the rows ask for together, relative to its terms.
+    # Whether n·b is not zero, relative to its terms.
     leaves = np.abs(np.sum(share * prescribed / lengths)) > _SHARE * np.sum(asked)
     of_drives = asked > _SHARE * np.max(asked, initial=0.0) if leaves else np.zeros(share.size, bool)
     by_share = lambda chosen: list(dict.fromkeys(system.rows[k][0] for k in np.argsort(-np.abs(share)) if chosen[k]))

@@ -1,4 +1,4 @@
-"""The equation of constrained motion, and what can be asked of any model by name."""
+"""The equation of constrained motion; parameters, inputs and quantities of any model by name."""
 
 from ..linalg.inertia import (
     AbstractInertia as AbstractInertia,

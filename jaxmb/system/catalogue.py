@@ -15,14 +15,14 @@ from .quantities import Measure, Reaction, entries_along, view_of_motion
 from .structures import of_structure
 
 
-# No module, whose methods take many times as long to be called.
+# Not a module: methods of modules take many times as long to call.
 @dataclasses.dataclass(frozen=True)
 class Catalogue:
     """Motions, quantities and forces by name, along a motion with time as axis 0: `ts` of shape (times,), `ys` a
     `State`, `multipliers` of shape (times, rows).
 
-    Methods have the values of a system without bodies, whose motion is that of its coordinates. The names follow from
-    the structure of the system, and are found once for all systems of this structure.
+    This base class describes systems without bodies: their motion is the motion of their coordinates. Names follow from
+    the structure of the system, and are cached for all systems of one structure.
     """
 
     system: Any
@@ -32,12 +32,12 @@ class Catalogue:
         return tuple(self.system.coordinate_names())
 
     def motion(self, name: str, ys: State) -> Any:
-        """The motion of one of `motion_names`: a `BodyMotion`, or the values of a coordinate, shape (times,)."""
+        """The motion under a name of `motion_names`: a `BodyMotion`, or values of a coordinate, shape (times,)."""
         return _coordinate(np.array(self.system.coordinate_names()[name][0]), ys.q)
 
     @of_structure
     def measures(self) -> dict[str, Measure]:
-        """The quantities that can be measured of a motion."""
+        """All quantities of a motion, by name."""
         names, out = self.system.coordinate_names(), {}
         for name in self.motion_names():
             out[name] = Measure((), entries_along, ("q", np.array(names[name][0]), ()))
@@ -49,15 +49,15 @@ class Catalogue:
 
     @of_structure
     def joint_coordinates(self) -> dict[str, Any]:
-        """The own coordinates of joints; each has a `shape`."""
+        """The coordinates of joints by name; each has a `shape`."""
         return {}
 
     def joint_coordinate(self, coordinate: Any, t: Scalar, q: Coordinates) -> Float[Array, "*shape"]:
-        """The value of one of `joint_coordinates`; an angle known up to full turns is in (−π, π]."""
+        """The value of a joint coordinate; an angle known up to full turns is in (−π, π]."""
         raise ValueError("This system has no joints between bodies, and so no coordinates of joints.")
 
     def position_quantities(self) -> tuple[str, ...]:
-        """Names of the quantities that determine the configuration up to the attitude of bodies."""
+        """Names of quantities that determine the configuration up to the attitudes of bodies."""
         return self.motion_names()
 
     def rates_along(self, ts: Float[Array, "times"], ys: State) -> Float[Array, "times nq"]:
@@ -74,7 +74,7 @@ class Catalogue:
     def constraint_force(
         self, name: str, ts: Float[Array, "times"], ys: State, multipliers: Float[Array, "times rows"]
     ) -> Float[Array, "times nu"]:
-        """The contribution of one constraint to `Aᵀ λ`."""
+        """The part of one constraint in `Aᵀ λ`."""
         return _forces_along(self.system, self._rows_of(name), ts, ys, multipliers)
 
     # Forces on bodies; a system without bodies raises a `ValueError`.
@@ -96,13 +96,14 @@ class Catalogue:
     def applied_wrenches(
         self, name: str, ts: Float[Array, "times"], ys: State, multipliers: Float[Array, "times rows"] | None
     ) -> Float[Array, "times bodies v"]:
-        """Wrenches of one force element, or of the friction of one joint, on its bodies. `multipliers` of the rows may
-        be None if the constraints are ideal.
+        """Wrenches of one force element, or of the friction of one joint, on its bodies.
+
+        `multipliers` may be None if the constraints are ideal.
         """
         raise ValueError(_NO_FORCES)
 
     def picture(self, ts: Float[Array, "times"], ys: State) -> Picture:
-        """The bodies and parts that a picture shows.
+        """The bodies and parts in a picture.
 
         **Raises:** `ValueError` for a system without bodies.
         """
@@ -110,7 +111,7 @@ class Catalogue:
         raise ValueError(f"A picture shows bodies, and a {kind} has none; viz.plot_motion shows its coordinates.")
 
     def not_finite(self, t: Scalar, q: Coordinates, u: Velocities) -> tuple[str, ...]:
-        """The forces, residuals and rates of internal states that are not finite at a state, by name, for messages."""
+        """Names of forces, residuals and rates of internal states that are not finite at a state, for messages."""
         system, t = self.system, jnp.asarray(t, q.dtype)
         residuals = (system.position_residual(t, q), system.acceleration_residual(t, q, u, jnp.zeros_like(u)))
         wrong = [system.rows[k][0] for values in residuals for k in np.flatnonzero(~np.isfinite(np.asarray(values)))]

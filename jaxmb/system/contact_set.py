@@ -1,6 +1,4 @@
-"""The contacts and the dry friction of a system: where their rows and modes are, and their gaps and slips, also where
-contacts are closed and friction sticks, with their derivatives.
-"""
+"""The contacts and the dry friction of a system: places of their rows and modes, gaps and slips with derivatives."""
 
 import dataclasses
 import functools
@@ -20,8 +18,9 @@ from ..parts.modes import CLOSED, STICK, Modes
 class ContactNumbers(NamedTuple):
     """The numbers of contacts and dry friction.
 
-    **Fields:** of contacts coefficients of `restitution`, and the `peaks` of gaps that rise to a kink and fall again,
-    infinite for others; of friction, for each direction, the `coefficient` of slip, and the `limit` of stick.
+    **Fields:** for each contact, the coefficient of `restitution`, and in `peaks` the kink of a gap that rises and
+    falls again, infinite for other gaps; for each direction of friction, the `coefficient` of slip and the `limit` of
+    stick.
     """
 
     restitution: Float[Array, "contacts"]
@@ -32,20 +31,23 @@ class ContactNumbers(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ContactSet:
-    """The unilateral constraints of a system, gaps that stay non-negative, and its dry friction, which sticks or slips;
-    without any it is false.
+    """The unilateral constraints of a system and its dry friction; false without any.
 
-    Each contact has a law, and each direction of slip; contacts come first. A law has a row of A and a coordinate, its
-    mode, see `parts.modes`. The row says `gap = 0` where the contact is closed, `slip = 0` where friction sticks, and
-    otherwise that the mode stays what it is. So the number and the rank of rows never change, and the mode, which no
-    force acts on, is a number of the state like any other. The direction of a law is that of its force: normal to a
-    contact, along the slip of friction.
+    A unilateral constraint is a gap that stays non-negative; dry friction sticks or slips.
 
-    **Fields:** for each law its name, the number of its row of A in `rows`, the index of its mode in q in `places`; of
-    contacts whether their impacts are `by_poisson`, or by Newton's law; of friction, for each direction, the number of
-    its contact in `contact_of`, -1 in a joint, and whether the coefficients of slip and of stick differ, so that
-    accelerations jump where it `releases`; `pairs`: the numbers of the first directions of friction that has two, one
-    after the other.
+    Each contact has a law, and so has each direction of slip; contacts come first. A law has a row of A and a
+    coordinate, its mode, see `parts.modes`. The row is `gap = 0` of a closed contact and `slip = 0` of sticking
+    friction; otherwise it keeps the mode constant. So the number and the rank of rows never change. No force acts on a
+    mode, which is a number of the state like any other. A law acts along its force: normal to a contact, along the slip
+    of friction.
+
+    **Fields:**
+
+    - For each law: its name in `names`; the number of its row of A in `rows`; the index of its mode in q in `places`.
+    - For each contact: whether impacts follow Poisson's law, `by_poisson`, or Newton's.
+    - For each direction of friction: the number of its contact in `contact_of`, -1 in a joint; and in `releases`,
+        whether coefficients of slip and stick differ, so that accelerations jump as slip begins.
+    - `pairs`: for friction with two directions, the number of the first; the second follows.
     """
 
     names: tuple[str, ...] = ()
@@ -84,32 +86,32 @@ class ContactSet:
 
     @functools.cached_property
     def in_joints(self) -> Bool[np.ndarray, "frictions"]:
-        """Which friction is that of a joint, whose normal force is the size of its reaction."""
+        """Which directions of friction belong to joints, where the size of the reaction is the normal force."""
         return np.array(self.contact_of, int) < 0
 
     @functools.cached_property
     def in_pairs(self) -> Bool[np.ndarray, "frictions"]:
-        """Which friction has two directions."""
+        """Which directions of friction belong to a pair."""
         return np.isin(np.arange(self.m), of_pairs(self.pairs))
 
     def at_rows(self, values: Float[Array, "acceleration_rows *k"]) -> Float[Array, "laws *k"]:
-        """The values of the laws, from those of all rows of A."""
+        """Values of the laws, from values of all rows of A."""
         return values[np.array(self.rows, int)]
 
     # Modes
 
     def modes(self, q: Coordinates) -> Modes:
-        """The modes in some coordinates."""
+        """The modes in q."""
         if not self:
             return self.as_modes(jnp.zeros(0, q.dtype))
         return Modes.of(unchecked_take(q, np.array(self.places, int)), self.n, self.pairs)
 
     def as_modes(self, numbers: Float[Array, "laws"]) -> Modes:
-        """The modes that are numbers of modes already."""
+        """Modes from their numbers."""
         return Modes(numbers, self.n, self.pairs)
 
     def with_modes(self, q: Coordinates, modes: ArrayLike) -> Float[Array, "nq"]:
-        """The coordinates with other modes, one number for each law, or one for all."""
+        """The coordinates with other modes, a number for each law or a common number."""
         places = np.array(self.places, int)
         return with_entries(q, places, jnp.broadcast_to(jnp.asarray(modes, q.dtype), places.shape))
 
@@ -117,7 +119,7 @@ class ContactSet:
         """The coordinates with all contacts closed and all friction sticking."""
         return self.with_modes(q, np.repeat([CLOSED, STICK], [self.n, self.m]).astype(float))
 
-    # Gaps and slips of a `system` that these are the contacts of
+    # Gaps and slips of the `system` with these contacts, as if all contacts were closed and all friction stuck
 
     def gaps(self, system: Any, t: Scalar, q: Coordinates) -> Float[Array, "contacts"]:
         """The gaps [m, rad], negative where bodies are inside each other."""
@@ -136,15 +138,13 @@ class ContactSet:
         return _taken(system.acceleration_residual(t, self.bound(q), u, udot), self.rows)
 
     def gradients(self, system: Any, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "laws nu"]:
-        """Derivatives of the rates with respect to velocities: the rows of A of contacts that are closed, and of
-        friction that sticks.
-        """
+        """Derivatives of the rates by velocities: the rows of A with contacts closed and friction sticking."""
         rates, pull = jax.vjp(lambda u: self.rates(system, t, q, u), u)
         return jax.vmap(lambda row: pull(row)[0])(jnp.eye(rates.size, dtype=rates.dtype))
 
 
 def _taken(values, numbers):
-    # Slices of rows that follow one another, so that the compiler leaves out those of other parts.
+    # Slices of consecutive rows, so that the compiler can leave out rows of other parts.
     rows = np.array(numbers, int)
     runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) != 1)) if rows.size else []
     return jnp.concatenate([*(values[run[0] : run[-1] + 1] for run in runs), values[:0]])

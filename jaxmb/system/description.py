@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from .equation import AbstractEquation
 
-# The title of remarks on what is left out.
+# The title of remarks on computations left out.
 LEFT_OUT = "left out of the computation, since nothing here needs it"
 
 
@@ -15,8 +15,7 @@ class Description:
     """Tables of a system; prints as text, shows as HTML in a notebook.
 
     **Fields:** `facts`: (name, value) pairs; `tables`: rows of (type, names or count, remark) by title, of bodies,
-    joints, forces, or constraints; `remarks`: sentences by title, on redundant rows and on computations that are
-    left out.
+    joints, forces, or constraints; `remarks`: sentences by title, on redundant rows and on computations left out.
     """
 
     facts: tuple[tuple[str, str], ...]
@@ -50,7 +49,7 @@ class Description:
 
 
 def count_rows(system: AbstractEquation) -> str:
-    """The number of constraint rows, of independent ones among them, and of those that do not bind positions."""
+    """Numbers of constraint rows, of independent rows, and of rows that do not bind positions."""
     text = f"{system.acceleration_rows}, of which {system.acceleration_rank} independent"
     kinds = {
         "nonholonomic": system.velocity_rows - system.position_rows,
@@ -61,8 +60,8 @@ def count_rows(system: AbstractEquation) -> str:
 
 
 def count_independent(system: AbstractEquation) -> str:
-    """The numbers of coordinates and velocities that the constraints leave free."""
-    # A mode of friction is no coordinate that moves.
+    """Numbers of coordinates and velocities that the constraints leave free."""
+    # A mode of friction is not a coordinate that moves.
     coordinates = system.nq - system.coordinate_rank - system.contacts.m
     velocities = system.nu - system.velocity_rank
     return f"{counted(coordinates, 'coordinate')}, {counted(velocities, 'velocity', 'velocities')}"
@@ -71,9 +70,7 @@ def count_independent(system: AbstractEquation) -> str:
 def remarks(
     system: AbstractEquation, left_out: Iterable[str] = (), redundant: Iterable[str] = ()
 ) -> dict[str, tuple[str, ...]]:
-    """The remarks of a description: on freedom, on `redundant` rows, and on what is left out, by the constraints and
-    besides.
-    """
+    """The remarks of a description: on freedom, on `redundant` rows, and on computations left out."""
     return {
         "no degree of freedom": _held_in_place(system),
         "redundant rows": tuple(redundant),
@@ -82,7 +79,7 @@ def remarks(
 
 
 def _held_in_place(system: AbstractEquation) -> tuple[str, ...]:
-    """A sentence on a system that the constraints leave no degree of freedom."""
+    """A sentence on a system without degrees of freedom."""
     if system.nu > system.velocity_rank:
         return ()
     if system.drift_free:
@@ -91,7 +88,7 @@ def _held_in_place(system: AbstractEquation) -> tuple[str, ...]:
 
 
 def _left_out_of_constraints(system: AbstractEquation) -> list[str]:
-    """The computations that this system's constraints, or their absence, make unnecessary, and why."""
+    """Computations that the constraints, or their absence, make unnecessary, with the reasons."""
     if not system.acceleration_rows:
         return ["elimination, Newton iteration and charts: there are no constraints"]
     out = []
@@ -107,11 +104,11 @@ def _left_out_of_constraints(system: AbstractEquation) -> list[str]:
 
 
 def counted(number: int, one: str, many: str | None = None) -> str:
-    """A number of things, which are called `many`, by default `one` with an s, where they are not one."""
+    """A number with its noun: `one` in the singular, else `many`, by default `one` with an s."""
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
 def shorten(names: Iterable[str]) -> str:
-    """Names in one line, abbreviated if there are many."""
+    """Names in one line, abbreviated if they are many."""
     names = list(names)
     return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:4])}, … {names[-1]} ({len(names)})"

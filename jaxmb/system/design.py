@@ -1,4 +1,4 @@
-"""Design variables for a system: one name for what is one thing, however many parameters depend on it."""
+"""Design variables for a system: one name for a number on which several parameters depend."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -26,9 +26,9 @@ def design(
     variables: Mapping[str, Variable | VectorLike],
     derive: Callable[[dict[str, Array]], Mapping[str, VectorLike]],
 ) -> System:
-    """Give a system design variables, from which several of its parameters follow.
+    """Give a system design variables that determine several of its parameters.
 
-    The length of a coupler stands in the points of two joints and in a moment of inertia. As a design variable it has
+    The length of a coupler appears in the points of two joints and in a moment of inertia. As a design variable it has
     one name:
 
     ```python
@@ -44,21 +44,21 @@ def design(
     longer = mb.with_parameters(machine, {"rod": 3.2})
     ```
 
-    The result is a system like the given one, with the variables among its parameters: `with_parameters`, `identify`
+    The result is the same system, with the variables among its parameters: `with_parameters`, `identify`
     and `optimise` take them by name, with their bounds. States change with lengths, so `assemble` them anew.
 
     **Arguments:**
 
-    - `system`: a compiled scene, or another system; also one with design variables, which may then follow from the new
-        ones.
+    - `system`: a compiled scene, or another system. If it has design variables already, these may follow from the new
+        variables.
     - `variables`: `Variable`s by name, or values alone.
-    - `derive(values)`: parameters by name from the values of all variables by name, in JAX functions of them alone. It
-        is static: systems that share it share their compiled programs.
+    - `derive(values)`: parameters by name from the values of all variables by name, a pure JAX function. It is static:
+        systems that share it share their compiled programs.
 
     **Returns:** the system, with all parameters that `derive` gives.
 
-    **Raises:** `ValueError` for a name that the system has already, for a variable without effect on what `derive`
-    returns, and for derived parameters that are unknown, follow from other variables already, or have another shape.
+    **Raises:** `ValueError` for a name that the system has already, and for a variable that `derive` does not use. Also
+    for derived parameters that are unknown, follow from other variables already, or have another shape.
     """
     check_kind("design: system", system, AbstractSystem, "a compiled scene or another system", "scene.compile()")
     existing = parameters(system)
@@ -84,9 +84,9 @@ def design(
 
 
 def design_bounds(system: AbstractSystem, bounds: Mapping[str, Bounds] | None = None) -> dict[str, Bounds]:
-    """Bounds by name: those given, and those of the design variables where none are given.
+    """The given bounds by name, completed by the bounds of design variables.
 
-    **Raises:** `ValueError` for bounds that reach beyond those of a design variable.
+    **Raises:** `ValueError` for bounds that reach beyond the bounds of a design variable.
     """
     out = dict(bounds or {})
     for group in system.design:
@@ -104,7 +104,7 @@ def design_bounds(system: AbstractSystem, bounds: Mapping[str, Bounds] | None = 
 
 
 def _checked(added: DesignVariables, existing: Mapping[str, Array]) -> dict[str, Array]:
-    """The derived parameters of the first values."""
+    """The checked parameters that follow from the initial values of design variables."""
     try:
         derived: Any = added.derive(dict(added.values))
     except KeyError as error:
@@ -126,7 +126,7 @@ def _checked(added: DesignVariables, existing: Mapping[str, Array]) -> dict[str,
     with traced_by_jax("derive", "a design variable"):
         program = jax.make_jaxpr(added.derive)(dict(added.values)).jaxpr
     used = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
-    # As JAX orders the entries of a dictionary.
+    # JAX sorts the entries of a dictionary.
     idle = [name for name, v in zip(sorted(added.values), program.invars, strict=True) if id(v) not in used]
     if idle:
         raise ValueError(f"Nothing follows from the design variable {idle[0]!r}: use it in derive, or leave it out.")

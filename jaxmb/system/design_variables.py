@@ -1,4 +1,4 @@
-"""Design variables: numbers by name from which several parameters of a system follow."""
+"""Design variables: named numbers that determine several parameters of a system."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -14,13 +14,13 @@ from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
 
-# Rounding of a value at its bound, in units of the spacing of numbers there.
+# Rounding of a value at its bound, in units of the spacing of floating-point numbers there.
 _ROUNDING = 16
 
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """A design variable: its value, and what a study needs to know of it.
+    """A design variable: its value, and its bounds, scale and unit for studies.
 
     ```python
     length = jaxmb.Variable(1.0, bounds=(0.5, 2.0), unit="m")
@@ -31,8 +31,8 @@ class Variable:
     **Arguments:**
 
     - `value`: a number, or an array of numbers.
-    - `bounds`: `(low, high)`, either of them None; numbers, or arrays of the value's shape. No other values are
-        accepted, and studies search between them.
+    - `bounds`: `(low, high)`, either of them None; numbers, or arrays of the value's shape. Values beyond the bounds
+        are refused, and studies search between the bounds.
     - `scale`: the size of a typical change, positive; default the distance of the bounds, or the value's size.
     - `unit`: for printing.
 
@@ -70,20 +70,20 @@ class Variable:
 
     @property
     def low(self) -> np.ndarray:
-        """The lower bound, −∞ without one; of the value's shape."""
+        """The lower bound, by default −∞; of the value's shape."""
         return np.asarray(self.bounds[0])
 
     @property
     def high(self) -> np.ndarray:
-        """The upper bound, ∞ without one; of the value's shape."""
+        """The upper bound, by default ∞; of the value's shape."""
         return np.asarray(self.bounds[1])
 
 
 class DesignVariables(eqx.Module):
     """Design variables of a system with their present values, and the function that gives parameters from them.
 
-    **Fields:** `values` by name; `variables`: names with what was declared of them; `derive(values)`: parameters by
-    name; `derived`: their names.
+    **Fields:** `values` by name; `variables`: names with their declarations; `derive(values)`: parameters by name;
+    `derived`: names of these parameters.
     """
 
     values: dict[str, Array]
@@ -92,9 +92,9 @@ class DesignVariables(eqx.Module):
     derived: tuple[str, ...] = eqx.field(static=True)
 
     def replaced(self, values: Mapping[str, VectorLike]) -> "DesignVariables":
-        """The same with other values of some variables.
+        """The same variables, some with other values.
 
-        **Raises:** `ValueError` for a wrong shape, and for known values out of bounds.
+        **Raises:** `ValueError` for a wrong shape, and for concrete values out of bounds.
         """
         declared = dict(self.variables)
         new = dict(self.values)
@@ -131,7 +131,7 @@ class DesignVariables(eqx.Module):
 
 
 def variables_in_range(design: tuple[DesignVariables, ...]) -> bool | Bool[Array, ""]:
-    """Whether all traced design variables are within their bounds; True if none are traced."""
+    """Whether all traced design variables are within their bounds; True without traced variables."""
     ok: Any = True
     for group in design:
         for name, variable in group.variables:

@@ -7,7 +7,7 @@
 `Φ` holds the position constraints; `ψ` their time derivatives, followed by the nonholonomic rows. The first rows of A
 are ∂ψ/∂u; rows of constraints on accelerations alone may follow. Coordinates may have invariants (unit Euler
 parameters), which follow `Φ` in `coordinate_residual`. `C` holds the non-ideal constraint forces, which do virtual
-work; M depends on u only where velocities are nonlinear in q̇.
+work. M depends on u only if velocities are nonlinear in q̇.
 """
 
 import abc
@@ -43,21 +43,22 @@ class Ranks(eqx.Module):
 
 
 class AbstractEquation(eqx.Module):
-    """The equation of a constrained mechanical system, as formulations, manifolds and the search for states see it; a
-    pytree with every number a leaf and every choice static.
+    """The equation of a constrained mechanical system; a pytree with every number a leaf and every choice static.
 
-    A class gives `nq`, `nu`, `length`, `inertia`, `force` and the scales, and with constraints the residuals of their
-    positions, velocities and accelerations, whose derivatives are found automatically. Everything else has the values
-    of a system without constraints, without internal states, and with velocities that are the rates of its coordinates.
+    Formulations, manifolds and the search for states see a system as this equation.
+
+    A class gives `nq`, `nu`, `length`, `inertia`, `force` and the scales. With constraints it gives residuals of
+    positions, velocities and accelerations, which are differentiated automatically. All other members have the values
+    of a system without constraints and internal states, where velocities are the rates of coordinates.
 
     Ranks are found once, on concrete numbers, and are static, so that index sets have static shapes.
 
     - `nq`, `nu`: numbers of coordinates and of velocities.
     - `length` [m]: the scale of position residuals.
     - `ranks`: the numbers of independent rows.
-    - `positive_definite_mass`: whether M is positive definite for all velocities, also those that violate constraints.
+    - `positive_definite_mass`: whether M is positive definite for all velocities, even if they violate constraints.
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
-    - `elimination`: the order in which blocks of A are eliminated; None where A is one dense matrix. Static.
+    - `elimination`: the order of elimination of the blocks of A; None for one dense matrix. Static.
     - `contacts`: the unilateral constraints and dry friction. Static.
     """
 
@@ -81,7 +82,7 @@ class AbstractEquation(eqx.Module):
 
     @property
     def coordinate_rows(self) -> int:
-        """The same with the coordinates' own invariants."""
+        """The number of rows of Φ and of the coordinates' invariants."""
         return self.position_rows
 
     @property
@@ -122,16 +123,16 @@ class AbstractEquation(eqx.Module):
         return u
 
     def normalize(self, q: Coordinates) -> Float[Array, "nq"]:
-        """The nearest coordinates that satisfy the coordinates' own invariants."""
+        """The nearest coordinates that satisfy the coordinates' invariants."""
         return q
 
     @abc.abstractmethod
     def coordinate_scale(self) -> Float[Array, "nq"]:
-        """Size of a typical change of each coordinate; without derivative."""
+        """The size of a typical change of each coordinate; without derivative."""
 
     @abc.abstractmethod
     def velocity_scale(self) -> Float[Array, "nu"]:
-        """Size of a typical displacement along each velocity; without derivative."""
+        """The size of a typical displacement along each velocity; without derivative."""
 
     @abc.abstractmethod
     def inertia(self, t: Scalar, q: Coordinates, u: Velocities) -> AbstractInertia:
@@ -139,10 +140,10 @@ class AbstractEquation(eqx.Module):
 
     @abc.abstractmethod
     def force(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nu"]:
-        """`F(t, q, u)`, applied forces and the bias of inertia."""
+        """`F(t, q, u)`: applied forces and the bias of inertia."""
 
-    # Internal states z, for which ż = h(t, q, u, z). Forces depend on them, constraints do not, so the equations above
-    # hold as they are for a system that has its states.
+    # Internal states z with ż = h(t, q, u, z). Forces depend on z, constraints do not. So the equations above hold as
+    # they are for a system that holds values of its states.
 
     @property
     def nz(self) -> int:
@@ -150,21 +151,21 @@ class AbstractEquation(eqx.Module):
         return 0
 
     def with_states(self, z: Float[Array, "nz"]) -> Self:
-        """The same system with values of its internal states, which its forces and `state_rates` need."""
+        """The same system with values of its internal states, for its forces and `state_rates`."""
         del z
         return self
 
     def at(self, y: State) -> Self:
-        """The same system with the internal states of a state, if there are any."""
+        """The same system with the internal states of a state, if any."""
         return self if y.z is None else self.with_states(y.z)
 
     def state_rates(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nz"]:
-        """ż, of a system that has its internal states."""
+        """ż; the system must hold values of its internal states."""
         del t, u
         return jnp.zeros(0, q.dtype)
 
     def state_scale(self) -> Float[Array, "nz"]:
-        """Typical size of each internal state; without derivative."""
+        """The typical size of each internal state; without derivative."""
         return jnp.zeros(0)
 
     # Constraints
@@ -175,12 +176,12 @@ class AbstractEquation(eqx.Module):
         return jnp.zeros(0, q.dtype)
 
     def coordinate_residual(self, t: Scalar, q: Coordinates) -> Float[Array, "coordinate_rows"]:
-        """`Φ(t, q)` and the coordinates' own invariants."""
+        """`Φ(t, q)` and the coordinates' invariants."""
         return self.position_residual(t, q)
 
     @eqx.filter_jit
     def coordinate_jacobian(self, t: Scalar, q: Coordinates) -> Float[Array, "coordinate_rows nq"]:
-        """Derivative of `coordinate_residual` with respect to q."""
+        """The derivative of `coordinate_residual` by q."""
         return jax.jacfwd(self.coordinate_residual, 1)(t, q)
 
     def velocity_residual(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "velocity_rows"]:
@@ -198,7 +199,7 @@ class AbstractEquation(eqx.Module):
     @eqx.filter_jit
     def jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "acceleration_rows nu"]:
         """`A`."""
-        # Residuals are linear in accelerations, so that their derivative is the same anywhere.
+        # Residuals are linear in accelerations, so their derivative is the same at all accelerations.
         return jax.jacfwd(self.acceleration_residual, 3)(t, q, u, jnp.zeros_like(u))
 
     def velocity_jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "velocity_rows nu"]:
@@ -206,7 +207,7 @@ class AbstractEquation(eqx.Module):
         return self.jacobian(t, q, u)[: self.velocity_rows]
 
     def structured_jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> AbstractJacobian:
-        """`A` in blocks where the system has an order of `elimination`, else as a dense matrix without a factor."""
+        """`A` in blocks if the system has an order of `elimination`, else a dense matrix without a factor."""
         return DenseJacobian(self.jacobian(t, q, u))
 
     @eqx.filter_jit
@@ -218,9 +219,7 @@ class AbstractEquation(eqx.Module):
         return pull(multipliers)[0]
 
     def held_velocities(self, held: Bool[np.ndarray, "nq"]) -> Bool[np.ndarray, "nu"] | None:
-        """The velocities along which held coordinates do not move; None where some of a rotation is held but not all
-        of it.
-        """
+        """The velocities that leave held coordinates unchanged; None where a rotation is held in part."""
         return held if self.rates_are_velocities else None
 
     # Constraints that are not ideal
@@ -237,18 +236,18 @@ class AbstractEquation(eqx.Module):
 
     @property
     def ideal_without_friction(self) -> bool:
-        """The same, where no dry friction slips."""
+        """The same, if no dry friction slips."""
         return self.ideal_on_velocities
 
     @property
     def friction_rows(self) -> Int[np.ndarray, "k"]:
-        """Numbers of the rows of A that C depends on the multipliers of."""
+        """Numbers of the rows of A with multipliers on which C depends."""
         return np.zeros(0, int)
 
     def nonideal_force(
         self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "nu"]:
-        """`C`, from the multipliers λ of the same equation."""
+        """`C`, from the multipliers λ."""
         del t, q, multipliers
         return jnp.zeros_like(u)
 
@@ -256,24 +255,24 @@ class AbstractEquation(eqx.Module):
 
     @property
     def has_gaps(self) -> bool:
-        """Whether some forces act where a gap is closed only, for `gaps_seen`."""
+        """Whether some forces act only at closed gaps, for `gaps_seen`."""
         return False
 
     def gaps_seen(self, t: Scalar, q: Coordinates, u: Velocities) -> GapsSeen:
-        """The gaps of these forces."""
+        """The gaps of forces that act only at closed gaps."""
         raise ValueError(f"{type(self).__name__} has no forces with gaps.")
 
     # Unilateral constraints
 
     @property
     def contact_numbers(self) -> ContactNumbers:
-        """The numbers of `contacts`, which are parameters."""
+        """The numbers of `contacts`; they are parameters."""
         return ContactNumbers(*[jnp.zeros(0)] * 4)
 
     def friction_reactions(
         self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "frictions d"]:
-        """The reaction forces [N] of the joints or contacts that have dry friction, without it."""
+        """The reaction forces [N] of the joints or contacts with dry friction, without the friction."""
         del t, q, multipliers
         return jnp.zeros((0, 0), u.dtype)
 
@@ -281,12 +280,12 @@ class AbstractEquation(eqx.Module):
 
     @property
     def has_field_jacobian(self) -> bool:
-        """Whether the equation knows the structure of its derivative, so that implicit methods eliminate in blocks."""
+        """Whether `field_jacobian` exists, so that implicit methods can eliminate in blocks."""
         return False
 
     @property
     def implicit_in_blocks(self) -> bool:
-        """Whether implicit methods do so by default, since that is faster than dense matrices."""
+        """Whether implicit methods eliminate in blocks by default, as the faster way."""
         return False
 
     def field_jacobian(self, t: Scalar, y: State) -> AbstractFieldJacobian:

@@ -1,4 +1,4 @@
-"""Parameters of a system that are functions of time."""
+"""Inputs: parameters of a system that are functions of time."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
@@ -19,9 +19,9 @@ from .parameters import parameters
 from .system import AbstractSystem
 
 System = TypeVar("System", bound=AbstractSystem)
-# How far an input may come and go between two steps, relative to its range.
+# The largest excursion of an input that may be missed between two steps, relative to its range.
 _HIDDEN = 0.1
-# For how many coordinates, of all times together, functions of time are computed at once.
+# The largest number of coordinates, over all times, for which functions of time are computed in one batch.
 _AT_ONCE = 2**17
 
 Signals = Mapping[str, AbstractSignal | Callable[[Scalar], Array]]
@@ -35,18 +35,17 @@ def with_inputs(system: System, inputs: Signals) -> System:
     start = jaxmb.assemble(shaken, fix={"bar.angle": 0.5})
     ```
 
-    Torques, forces, coefficients, lengths, points and the numbers of drivers and of user functions may be inputs. Their
-    rates take part in the velocities and accelerations that constraints prescribe, and in the rates of coordinates and
-    of points that forces act against; those of a terrain are velocities of the ground. Masses, moments of inertia,
-    gravity, the gains of servos, and points of compliant contacts and of joints that rub (`Friction`) may not.
-    Derivatives with respect to the values of a series work as those with respect to parameters.
+    Torques, forces, coefficients, lengths, points and the numbers of drivers and of user functions may be inputs.
+    Masses, moments of inertia, gravity, the gains of servos, and points of compliant contacts and of joints that rub
+    (`Friction`) may not. Rates of inputs count: in the velocities and accelerations that constraints prescribe, in the
+    rates of coordinates and points that forces depend on, and as velocities of a moving terrain. The values of a series
+    can be differentiated like parameters.
 
-    **Arguments:** `inputs`: a `Series`, or a function of time [s] that JAX can differentiate, by the name of the
-    parameter that it replaces, `{"motor.torque": Series(ts, torques)}`. A function counts with the values that it reads
-    now.
+    **Arguments:** `inputs`: a `Series`, or a function of time [s] that JAX can differentiate, by the parameter's name,
+    `{"motor.torque": Series(ts, torques)}`. A function is captured with the values that it reads now.
 
     **Raises:** `ValueError` for an unknown name, a parameter that cannot be an input, a value of the wrong shape, and
-    a value that jumps where a position constraint depends on it.
+    a jump of a parameter of a position constraint.
     """
     if not isinstance(inputs, Mapping):
         raise ValueError(f"inputs must be a dictionary of series by name, {{'motor.torque': series}}; got {inputs!r}.")
@@ -70,9 +69,9 @@ def with_inputs(system: System, inputs: Signals) -> System:
 
 
 def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndarray:
-    """Times [s] at which inputs jump, or their rates where these count.
+    """Times [s] of jumps of inputs, and of jumps of their rates if the rates count.
 
-    **Raises:** `ValueError` that names an input which is not known from `t0` to `t1`.
+    **Raises:** `ValueError` naming an input that does not cover the times from `t0` to `t1`.
     """
     signals = system.parameter_table.signals
     for name, (signal, _) in signals.items():
@@ -82,7 +81,7 @@ def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndar
 
 
 def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
-    """Whether an input is not known from `t0` to `t1`, which may be traced; False without inputs."""
+    """Whether an input does not cover the times from `t0` to `t1`, which may be traced; False without inputs."""
     ended: Any = False
     for numbers, signal in of_one_kind([signal for signal, _ in system.parameter_table.signals.values()]):
         of_signal = lambda signal: signal.is_known(t0, t1)
@@ -93,14 +92,15 @@ def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
 
 
 def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) -> Float[Array, "n"] | None:
-    """Times [s] that no step may pass, for no input or function of time to come and go unseen, and infinite ones; None
-    where nothing depends on time.
+    """Times [s] at which steps must end so that no pulse of an input or function of time is missed.
 
-    A machine at rest, or in free flight, allows steps of any length: one that passes a pulse would miss it. From one of
-    these times to the next, what depends on time moves hardly further than from its first value to its last: by a tenth
-    of its range between t0 and t1 at most. A series is followed from value to value, a function at 513 times.
+    A machine at rest or in free flight allows steps of any length, and a long step may skip a pulse. Between two of
+    these times no input makes an excursion of more than a tenth of its range from `t0` to `t1`. A series is sampled at
+    its values, a function at 513 times.
+
+    **Returns:** sorted times, padded by infinity; None if nothing depends on time.
     """
-    # Where a motion restarts, steps end as well.
+    # Inputs with break times are left out: a motion restarts at these times, so steps end there anyway.
     pairs = system.parameter_table.signals.values()
     signals = [signal for signal, binding in pairs if not signal.break_times(of_rates=binding).size]
     if not signals and not system.of_time:
@@ -130,7 +130,7 @@ def _turning_times(signals, system, state, t0, t1):
 
 
 def _has_turned(values):
-    """Whether a value has turned before the next, since the last that has; of any column of values."""
+    """At which values some column has turned since the last turn: its path is longer than the net change."""
     range_ = jnp.max(values, axis=0) - jnp.min(values, axis=0)
     rounding = 16 * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), axis=0)
     most = jnp.where(range_ > rounding, _HIDDEN * range_, jnp.inf)

@@ -1,7 +1,7 @@
-"""The system at an instant: time, coordinates, velocities and internal states, and everything that follows from them.
+"""The system at an instant: time, coordinates, velocities, internal states, and the equation's quantities there.
 
-Each quantity is computed when it is first asked for, and kept on the instant for the rest of the trace that asked. A
-copy by flattening, as transformations of JAX make, keeps nothing.
+Each quantity is computed at its first use, and cached on the instant for the rest of the trace. JAX's transformations
+copy an instant by flattening; the copy has an empty cache.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,9 @@ T = TypeVar("T")
 
 
 class kept(Generic[T]):
-    """A property that is computed once in each trace. A value of another trace is never used: it may be a tracer of a
-    branch or a loop that has ended.
+    """A property that is computed once in each trace.
+
+    A value from another trace is never used: it may be a tracer of a finished branch or loop.
     """
 
     def __init__(self, compute: Callable[[Any], T]):
@@ -47,27 +48,27 @@ class kept(Generic[T]):
 
 
 class Keeper:
-    """An object with room for the values of its `kept` properties, which are no part of it as a pytree."""
+    """An object with a cache for its `kept` properties; the cache is not part of the pytree."""
 
     __slots__ = ("_kept",)
 
 
 def _of_state(method: Callable[..., T]) -> kept[T]:
-    """The value of a function of (t, q, u) of the equation."""
+    """The value of the equation's function of (t, q, u)."""
     name = method.__name__
     return kept(lambda at: getattr(at.system, name)(at.t, at.q, at.u))
 
 
 def _of_configuration(method: Callable[..., T]) -> kept[T]:
-    """The value of a function of (t, q)."""
+    """The value of the equation's function of (t, q)."""
     name = method.__name__
     return kept(lambda at: getattr(at.system, name)(at.t, at.q))
 
 
 class Instant(eqx.Module, Keeper):
-    """A system at a time, in a state; a pytree. Of a system with internal states its forces have those of the state.
+    """A system at a time, in a state; a pytree.
 
-    **Fields:** the `system`; `t` [s]; `q`, `u`; `z`: internal states, None without any.
+    **Fields:** the `system`, with values of its internal states; `t` [s]; `q`, `u`; `z`: internal states, or None.
     """
 
     system: AbstractEquation
@@ -78,7 +79,7 @@ class Instant(eqx.Module, Keeper):
 
     @classmethod
     def of(cls, system: AbstractEquation, t: Scalar, y: State) -> Self:
-        """The system in a state, whose internal states it gets."""
+        """The system in a state, with the state's internal states."""
         return cls(system.at(y), t, y.q, y.u, y.z)
 
     @property
@@ -91,7 +92,7 @@ class Instant(eqx.Module, Keeper):
         return type(self)(self.system, self.t, self.q if q is None else q, self.u if u is None else u, self.z)
 
     def normalized(self) -> Self:
-        """The same instant with the coordinates' own invariants satisfied."""
+        """The same instant with the coordinates' invariants satisfied."""
         return self.with_(q=self.system.normalize(self.q))
 
     def moved(self, step: Float[Array, "nu"]) -> Self:
@@ -103,10 +104,10 @@ class Instant(eqx.Module, Keeper):
         return self.with_(q=self.system.normalize(self.q + change))
 
     def motion(self, udot: Float[Array, "nu"]) -> State:
-        """The rate of the state with these accelerations."""
+        """The rate of the state with accelerations `udot`."""
         return State(self.rates, udot, None if self.z is None else self.state_rates)
 
-    # Functions of the equation, see there.
+    # Functions of the equation, see `AbstractEquation`.
     rates = _of_state(AbstractEquation.rates)
     state_rates = _of_state(AbstractEquation.state_rates)
     inertia = _of_state(AbstractEquation.inertia)
@@ -133,7 +134,7 @@ class Instant(eqx.Module, Keeper):
         return self.system.constraint_force(self.t, self.q, self.u, multipliers)
 
     def friction_force(self, multipliers: Float[Array, "k"]) -> Float[Array, "nu"]:
-        """C, from the multipliers of the `friction_rows` that it depends on."""
+        """C, from the multipliers of the `friction_rows`."""
         of_rows = placed_sums(self.system.friction_rows, self.system.acceleration_rows)
         return self.system.nonideal_force(self.t, self.q, self.u, of_rows(multipliers))
 
@@ -141,12 +142,12 @@ class Instant(eqx.Module, Keeper):
 
     @property
     def position_rows(self) -> Float[Array, "m"]:
-        """Φ, and zeros for the rows that bind velocities or accelerations only."""
+        """Φ, then zeros for rows that bind velocities or accelerations only."""
         return self._as_rows(self.position_residual)
 
     @property
     def velocity_rows(self) -> Float[Array, "m"]:
-        """ψ, and zeros for the rows that bind accelerations only."""
+        """ψ, then zeros for rows that bind accelerations only."""
         return self._as_rows(self.velocity_residual)
 
     def _as_rows(self, residual):
@@ -154,7 +155,7 @@ class Instant(eqx.Module, Keeper):
 
     @property
     def binding_velocities(self) -> AbstractJacobian:
-        """A whose independent rows are those that bind positions or velocities."""
+        """A, with only rows that bind positions or velocities as its independent rows."""
         system = self.system
         if system.acceleration_rows == system.velocity_rows:
             return self.structured_jacobian
@@ -166,10 +167,11 @@ class Instant(eqx.Module, Keeper):
         return jnp.maximum(sizes, jnp.finfo(sizes.dtype).eps ** 0.75 * jnp.max(sizes) + jnp.finfo(sizes.dtype).tiny)
 
     def violations(self, sizes: Float[Array, "mv"]) -> tuple[Float[Array, "mp"], Float[Array, "mv"]]:
-        """For each row of Φ the change of the coordinates, in their scales, that restores it; for each row of ψ the
-        change of the velocities that does, relative to the largest velocity.
+        """For each row of Φ and of ψ, the size of the correction that would satisfy it.
 
-        **Arguments:** `sizes`: those of the rows, at this instant or another.
+        Corrections of coordinates are in their scales, corrections of velocities relative to the largest velocity.
+
+        **Arguments:** `sizes`: `row_sizes` of this instant or another.
         """
         speed = jnp.max(jnp.abs(self.u) / self.system.velocity_scale())
         rate = jnp.abs(self.velocity_residual) / sizes
@@ -178,14 +180,14 @@ class Instant(eqx.Module, Keeper):
         return positions, jnp.where(rate > jnp.finfo(rate.dtype).eps ** 0.75, rate / speed, 0.0)
 
     def violation_of_dropped_rows(self, sizes: Float[Array, "mv"]) -> Float[Array, ""]:
-        """The largest violation of a state that satisfies the independent rows: that of rows that are left out."""
+        """The largest violation of a state that satisfies the independent rows, so the violation of dropped rows."""
         (positions, velocities), system = self.violations(sizes), self.system
-        # Where all rows left out are of positions, their velocities follow.
+        # If all dropped rows are position constraints, their velocities follow.
         follow = system.velocity_rank - system.position_rank == system.velocity_rows - system.position_rows
         largest = jnp.max(positions, initial=0.0)
         return largest if follow else jnp.maximum(largest, jnp.max(velocities))
 
 
 def drops_rows(system: AbstractEquation) -> bool:
-    """Whether rows of ψ are left out because others imply them."""
+    """Whether implied rows of ψ are dropped."""
     return system.velocity_rank < system.velocity_rows

@@ -1,4 +1,4 @@
-"""The numbers of a system by name: where they stand, their ranges, and which are functions of time."""
+"""The numbers of a system by name: their ranges, and the functions of time among them."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
@@ -14,36 +14,34 @@ from ..parts.series import AbstractSignal
 from .design_variables import variables_in_range
 from .structures import of_structure
 
-# An accessor of an array of the system, and the index of the parameter along axis 0 where parts are stacked.
+# An accessor of an array of the system, and the parameter's index along axis 0 of stacked parts, else None.
 ParameterPath = tuple[Callable[[Any], Array], int | None]
 
 
-# No module, whose methods take many times as long to be called.
+# Not a module: methods of modules take many times as long to call.
 @dataclasses.dataclass(frozen=True)
 class ParameterTable:
-    """The parameters of a system, `parameter_paths`, as numbers in a range and as functions of time."""
+    """The parameters of a system: their ranges, and the functions of time among them."""
 
     system: Any
 
     def modules(self) -> dict[str, eqx.Module]:
-        """The modules whose weights are parameters, with shapes in place of the weights."""
+        """Modules whose weights are parameters, with shapes in place of the weights."""
         return {}
 
     def positive(self) -> frozenset[str]:
-        """Names of the parameters that must stay positive or, if they are matrices, positive definite."""
+        """Names of parameters that must stay positive or, as matrices, positive definite."""
         return frozenset()
 
     def check(self, names: Collection[str]) -> None:
-        """Raise a `ValueError` for values of these parameters that are out of range; traced ones are left to
-        `in_range`.
-        """
+        """Raise a `ValueError` for parameters out of range; `in_range` checks traced values."""
         for name in self.positive() & set(names):
             value = self._value(name)
             if not is_traced(value) and not np.all(np.asarray(value) > 0):
                 raise ValueError(f"Parameter {name!r} must be positive, got {np.asarray(value)}.")
 
     def in_range(self) -> bool | Bool[Array, ""]:
-        """Whether all parameters that are traced are in their ranges; True if none are traced."""
+        """Whether all traced parameters are in their ranges; True without traced parameters."""
         values = [self._value(name) for name in sorted(self.positive())]
         traced = [jnp.all(value > 0) for value in values if is_traced(value)]
         return (jnp.all(jnp.stack(traced)) if traced else True) & variables_in_range(self.system.design)
@@ -53,22 +51,22 @@ class ParameterTable:
         return where(self.system) if index is None else where(self.system)[index]
 
     def with_frames_of(self, before: Any) -> Any:
-        """The system with its bodies' frames where they were in the system `before`."""
+        """The system with its bodies' frames at their places in the system `before`."""
         del before
         return self.system
 
     @property
     def signals(self) -> dict[str, tuple[AbstractSignal, bool]]:
-        """The parameters that are functions of time; and whether constraints depend on them."""
+        """The parameters that are functions of time, each with whether its rate counts."""
         return {}
 
     @of_structure
     def input_names(self) -> dict[str, None]:
-        """The names of these parameters."""
+        """Names of the parameters that are functions of time."""
         return dict.fromkeys(self.signals)
 
     def with_signals(self, signals: Mapping[str, AbstractSignal]) -> Any:
-        """The system with some parameters as functions of time; shapes have been checked.
+        """The system with some parameters as functions of time, of checked shapes.
 
         **Raises:** `ValueError` for parameters that must be constant.
         """

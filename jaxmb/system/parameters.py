@@ -26,8 +26,8 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
     ```
 
     **Returns:** a dictionary `{"crank.mass": …, "A.point_b": …, "gravity.acceleration": …}`, in SI units and the
-    shapes of the parts' fields. Numbers of a user function keep their own key, `"drive.speed"`, and the variables of
-    `design` their own names. The weights of a module, `"friction.net"`, are a vector; see `modules`.
+    shapes of the parts' fields. Numbers of a user function are listed by their keys, `"drive.speed"`, and variables of
+    `design` by their names. The weights of a module, `"friction.net"`, are a vector; see `modules`.
     """
     leaves = {}
     for name, paths in system.parameter_paths().items():
@@ -40,7 +40,7 @@ def parameters(system: AbstractSystem) -> dict[str, Array]:
 
 
 def modules(system: AbstractSystem) -> dict[str, eqx.Module]:
-    """Every module, such as a neural network, whose weights are a parameter of a system, by the parameter's name.
+    """The modules of a system, such as neural networks, whose weights are a parameter, by the parameter's name.
 
     ```python
     net = jaxmb.modules(jaxmb.with_parameters(system, fit.parameters))["friction.net"]
@@ -53,24 +53,25 @@ def modules(system: AbstractSystem) -> dict[str, eqx.Module]:
 
 
 def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module]) -> System:
-    """The same system with some parameters replaced; differentiable, and usable under `jit` and `vmap`.
+    """Replace some parameters of a system; differentiable, and usable under `jit` and `vmap`.
 
     ```python
     heavier = jaxmb.with_parameters(system, {"bar.mass": 2.0, "bar.inertia": 2.0 / 12.0})
     ```
 
     Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew. The guess of
-    the bodies' frames is kept as well: where `"rod.centre"` moves a mass centre, the guess of that follows. The length
-    of a bar stands in the points of its joints and in its inertia: change all of them, or give it one name by
-    `design`.
+    the bodies' frames is kept as well: if `"rod.centre"` moves a mass centre, its guess moves too. The length of a bar
+    appears in the points of its joints and in its inertia: change all of them, or give it one name by `design`.
 
-    **Arguments:** `values`: new numbers by name, as in `parameters`; shapes must be those of the old ones. For the
-    weights of a module, a vector or a module that differs in nothing but its weights. Where design variables are among
-    them, all parameters that follow from them are computed anew.
+    **Arguments:** `values`: new numbers by name, as in `parameters`, of the same shapes. For the weights of a module, a
+    vector or a module that differs in its weights only. New design variables change all parameters that follow from
+    them.
 
-    **Raises:** `ValueError` for an unknown name (with the nearest ones), a wrong shape, another module, numbers with
-    which the scene would not compile, design variables out of bounds, and a parameter that follows from design
-    variables. Under `jit`, `vmap` or a derivative the numbers are not known yet; `simulate` then ends with
+    **Returns:** the system with the new parameters.
+
+    **Raises:** `ValueError` for an unknown name (with the nearest names), a wrong shape, another module, numbers that
+    `compile` would refuse, design variables out of bounds, and a parameter that follows from design variables. Under
+    `jit`, `vmap` or a derivative values cannot be checked at once; `simulate` then ends with
     `RESULTS.invalid_parameters`, before the first step.
     """
     paths = system.parameter_paths()
@@ -88,7 +89,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
                 )
     given: dict[str, Any] = dict(values)
     design, before, inputs = [], system, system.parameter_table.input_names()
-    # Variables of a design may follow from those of a later one.
+    # Design variables may follow from later design variables.
     for group in reversed(system.design):
         mine = {name: given.pop(name) for name in group.values if name in given}
         if mine:
@@ -116,7 +117,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
 
 
 def _as_array(system: AbstractSystem, name: str, value: Any) -> Array:
-    """A number, or the weights of a module."""
+    """A number as an array, or the weights of a module as a vector."""
     if not isinstance(value, eqx.Module):
         try:
             return as_jax(value)

@@ -10,29 +10,29 @@ from ..parts.shapes import AbstractShape
 
 
 class Anchors(NamedTuple):
-    """Where a part acts: its bodies, and its point [m] on each, in that body's frame, None if it has none."""
+    """The bodies of a part, and its point [m] on each in the body's frame, None for a part without points."""
 
     bodies: tuple[str, ...]
     points: tuple[Float[np.ndarray, "3"] | None, ...]
 
 
 class Line(NamedTuple):
-    """The line of a part: how it is drawn, and its points [m] along a motion, shape (times, points, 3)."""
+    """The line of a part: the `kind` of drawing, and its points [m] along a motion, shape (times, points, 3)."""
 
     kind: PathKind
     points: Float[np.ndarray, "times points 3"]
 
 
 class Picture(NamedTuple):
-    """A motion of bodies, everything in three dimensions; the plane is z = 0.
+    """A motion of bodies in three dimensions; planar motions are in z = 0.
 
     **Fields:**
 
     - `planar`; `up`, the unit vector that is upright in the picture; `width` [m]: the radius of a bar.
-    - `positions` [m], shape (times, 3), and `orientations`, Euler parameters, shape (times, 4), of the bodies by name,
-        those of the ground last.
-    - `parts` by name; `shapes` of parts, with the names of the bodies that they are fixed in; `paths` of parts by name.
-    - `centres` [m]: the mass centres of bodies whose frame has its origin elsewhere, in that frame.
+    - `positions` [m], shape (times, 3), and `orientations`, Euler parameters, shape (times, 4), of the bodies by name;
+        the ground is last.
+    - `parts` by name; `shapes` of parts, with the names of their bodies; `paths` of parts by name.
+    - `centres` [m]: mass centres in the bodies' frames, of bodies with their origin elsewhere.
     - `inertias`: mass [kg] and moments of inertia [kg m²], shape (3, 3), of the bodies by name, zero for point masses.
     """
 

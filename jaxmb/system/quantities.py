@@ -1,11 +1,10 @@
-"""Quantities that can be measured of a motion, and the names of rates.
+"""Quantities of a motion, and the names of rates.
 
-One grammar of rates holds wherever names are given or read. The rate of a coordinate has the coordinate's name and
-`_rate`: `"hip.angle_rate"` of a joint, `"crank.angle_rate"` and `"crank.x_rate"` of a body, `"theta_rate"` of a
-`LagrangianSystem`. It is what `trajectory["hip"].angle_rate` shows, a state of `linearise`, and what `rates=`,
-`free_initial`, `Sensor` and measured data name. The velocities of a body are `"crank.velocity"` and
-`"crank.angular_velocity"`, and in space single components of the latter, in body axes, `"frame.wx"`, `"frame.wy"`,
-`"frame.wz"`. Only `rates=`, which takes nothing but rates, knows them by the names of coordinates as well, as in
+Rates have the same names everywhere: in `rates=`, `free_initial`, `Sensor`, measured data, states of `linearise`, and
+`trajectory["hip"].angle_rate`. The rate of a coordinate has the coordinate's name and `_rate`: `"hip.angle_rate"` of a
+joint, `"crank.angle_rate"` and `"crank.x_rate"` of a body, `"theta_rate"` of a `LagrangianSystem`. The velocities of a
+body are `"crank.velocity"` and `"crank.angular_velocity"`; in space `"frame.wx"`, `"frame.wy"` and `"frame.wz"` are
+components of the angular velocity in body axes. Only `rates=` takes names of coordinates too, as in
 `rates={"crank.angle": 2.0}`.
 """
 
@@ -23,17 +22,17 @@ from ..linalg.jitted import jitted
 
 
 class Solved(NamedTuple):
-    """What the equations of motion give along a motion: accelerations u̇ and multipliers, axis 0 is time."""
+    """Accelerations u̇ and multipliers λ along a motion, from the equations of motion; axis 0 is time."""
 
     accelerations: Float[Array, "times nu"]
     multipliers: Float[Array, "times rows"]
 
 
 class Quantity(NamedTuple):
-    """A quantity that can be measured of a motion, such as the position of a body or the force of a joint.
+    """A quantity of a motion, such as the position of a body or the force of a joint.
 
-    **Fields:** `shape` at one time; `value(ts, ys, solved)`: its values along a motion, axis 0 is time; `of_forces`:
-    whether the values depend on accelerations or multipliers, `solved`, which is None otherwise.
+    **Fields:** `shape` at one time; `value(ts, ys, solved)`: values along a motion, axis 0 is time; `of_forces`:
+    whether the values depend on the accelerations or multipliers in `solved`, which is None otherwise.
     """
 
     shape: tuple[int, ...]
@@ -44,8 +43,8 @@ class Quantity(NamedTuple):
 class Measure(NamedTuple):
     """A quantity of all systems of one structure.
 
-    **Fields:** `shape` at one time; `view(system, place, ts, ys, solved)`, made by `view_of_motion`; `place`: which
-    quantity of the view it is, and as arrays the numbers of the part; `of_forces` as in `Quantity`.
+    **Fields:** `shape` at one time; `view(system, place, ts, ys, solved)`, made by `view_of_motion`; `place`: static
+    values that choose a quantity of the view, and the numbers of the part as arrays; `of_forces` as in `Quantity`.
     """
 
     shape: tuple[int, ...]
@@ -55,7 +54,7 @@ class Measure(NamedTuple):
 
 
 class Quantities(Mapping[str, Quantity]):
-    """The quantities of a system by name, from those of its structure."""
+    """The quantities of a system by name, from the measures of its structure."""
 
     def __init__(self, system: Any, measures: Mapping[str, Measure]):
         self._system, self._measures = system, measures
@@ -72,11 +71,10 @@ class Quantities(Mapping[str, Quantity]):
 
 
 def view_of_motion(view: Callable[..., Any]) -> Callable[..., Any]:
-    """`view(system, place, ts, ys, …)` of a motion, compiled, as the same view of any batch of motions too: in a batch
-    all arrays have its axes before their own, but for those of `place`.
+    """Compile `view(system, place, ts, ys, …)` of a motion, and vectorise it over batches of motions.
 
-    The program depends on what `place` holds besides arrays. The numbers of a part are arrays there, so that all parts
-    of one kind share a program.
+    The axes of a batch come first in all arrays, except arrays in `place`. The static values in `place` belong to the
+    program. The numbers of a part are arrays in `place`, so that all parts of one kind share a program.
     """
 
     def of_all(system, place, ts, *arrays):
@@ -89,7 +87,7 @@ def view_of_motion(view: Callable[..., Any]) -> Callable[..., Any]:
 
 @view_of_motion
 def entries_along(system: Any, place: tuple[str, Any, tuple[int, ...]], ts: Any, ys: Any, solved: Any) -> Array:
-    """Entries of q, u, z or the accelerations: where they are, the first of them, and their shape."""
+    """Entries along a motion; `place`: one of q, u, z or accelerations, the first index, and the entries' shape."""
     del system, ts
     where, first, shape = place
     values = solved.accelerations if where == "accelerations" else getattr(ys, where)
@@ -126,11 +124,10 @@ class BodyMotion(NamedTuple):
 
 
 class Reaction(NamedTuple):
-    """The force that a joint exerts on the last of its bodies that is not the ground.
+    """The force that a joint exerts on its last body that is not the ground; the other body receives the opposite.
 
-    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on that body (its mass centre where the
-    joint has none), world axes, a scalar in the plane; `multipliers` of the joint's rows. The other body receives the
-    opposite.
+    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on the body, or about the mass centre
+    for a joint without points, world axes, a scalar in the plane; `multipliers` of the joint's rows.
     """
 
     force: Float[Array, "*times d"]
@@ -142,14 +139,15 @@ class Reaction(NamedTuple):
 
 
 def with_shapes(values: Mapping[str, Any], units: Mapping[str, str]) -> str:
-    """The names of arrays with their shapes and units, in one line for `print`, without those that are None."""
+    """Names of arrays with shapes and units, in one line for `print`, without values that are None."""
     shapes = {name: getattr(value, "shape", value) for name, value in values.items() if value is not None}
     return ", ".join(f"{name} {shape} {units.get(name, '')}".rstrip() for name, shape in shapes.items())
 
 
 def rates_of(names: Mapping[str, list[int]]) -> dict[str, list[int]]:
-    """The names that `rates=` takes, from those of a system's rates: theirs, those of coordinates, and of planar bodies
-    the `angular_velocity`, as of bodies in space.
+    """The names that `rates=` takes, from `names` of a system's rates.
+
+    They are the names of rates, the names of coordinates, and for planar bodies `angular_velocity`, as in space.
     """
     turns = {
         f"{body}.angular_velocity": index
@@ -160,10 +158,10 @@ def rates_of(names: Mapping[str, list[int]]) -> dict[str, list[int]]:
 
 
 def directions(names: Mapping[str, list[int]]) -> dict[int, str]:
-    """The direction of every velocity, from the names of a system's rates: `"rod.x"`, `"rod.wx"`, `"theta"`."""
+    """The direction of every velocity, from `names` of a system's rates: `"rod.x"`, `"rod.wx"`, `"theta"`."""
     return {index[0]: name.removesuffix("_rate") for name, index in names.items() if len(index) == 1}
 
 
 def component_names(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Names of the components of an array, `"A.force[0]"`; of a number its own."""
+    """Names of the components of an array, `"A.force[0]"`; for a number, its name."""
     return [name + (f"[{', '.join(map(str, index))}]" if index else "") for index in np.ndindex(shape)]

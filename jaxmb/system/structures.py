@@ -1,4 +1,4 @@
-"""What follows from the structure of a system, found once for all systems of this structure."""
+"""A cache for methods whose result depends on the structure of a system alone."""
 
 import functools
 from collections.abc import Callable
@@ -9,16 +9,15 @@ import numpy as np
 
 from ..linalg.arrays import ARRAYS
 
-# For so many structures each function keeps what it found.
+# The number of structures in the cache of each method.
 _MOST = 64
 
 
 def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], dict[str, Any]]:
-    """A method that gives a dictionary, which depends on the structure of its object's `system`, and on no number in
-    it.
+    """Cache a method that returns a dictionary, which depends on the structure of its object's `system` only.
 
-    The method gets the system with zeros in its arrays, and without the axes of a batch. Structures are equal where
-    compiled programs are the same, so what is found can never be out of date.
+    The method gets the system with zeros in its arrays, and without the axes of a batch. Systems with one structure
+    have the same compiled programs, so a cached result is never out of date.
     """
 
     @functools.lru_cache(_MOST)

@@ -27,16 +27,15 @@ _NO_MOMENTUM = "Momentum is that of bodies; this system has none. Compute it fro
 class AbstractSystem(AbstractEquation):
     """A model: an equation of motion whose numbers have names.
 
-    Methods have the values of a model without bodies, whose motion is that of its coordinates: measurable quantities
-    are the coordinates, their rates q̇, and generalized constraint forces, `"theta"`, `"theta_rate"`, `"A.force"`.
+    This class describes models without bodies. Their quantities are coordinates, rates q̇ and generalized constraint
+    forces: `"theta"`, `"theta_rate"`, `"A.force"`.
 
     - `guess`: the default guess of `assemble`.
-    - `design`: the design variables, in the order in which they were added; those of later ones may determine earlier
-        ones.
+    - `design`: the design variables in order of addition; later variables may determine earlier variables.
     - `rows`: for every row of A, the name of its part and its number within the part.
-    - `state_ends`: for each kind of internal state, in the order of z, the index after the last one of this kind.
-    - `body_names`: names of the bodies; `Trajectory[name]` is the motion of a body if there are any, otherwise of a
-        coordinate.
+    - `state_ends`: for each kind of internal state, in the order of z, the index after its last entry.
+    - `body_names`: names of the bodies; `Trajectory[name]` is the motion of a body, or of a coordinate in a model
+        without bodies.
     """
 
     guess: AbstractVar[State]
@@ -61,29 +60,32 @@ class AbstractSystem(AbstractEquation):
         return Catalogue(self)
 
     def quantities(self) -> Mapping[str, Quantity]:
-        """The quantities that can be measured of a motion, by name."""
+        """The quantities of a motion, by name."""
         return Quantities(self, self.catalogue.measures())
 
     def prepared(self) -> Self:
-        """The system for the steps of a motion, whose states are close to the constraints, with what depends on its
-        parameters alone computed once; itself where there is no such thing.
+        """The system for the steps of a motion, with values that depend on parameters alone computed once.
+
+        Its rows are valid close to the constraints only. By default the system itself.
         """
         return self
 
     def closing(self) -> Self:
-        """The system whose rows, with `half_turned`, tell whether a state is consistent."""
+        """The system whose rows decide, together with `half_turned`, whether a state is consistent."""
         return self.prepared()
 
     def half_turned(self, q: Coordinates) -> Any:
-        """Which rows of Φ vanish at q because the system is `prepared`, with a joint turned away from where its
-        residual vanishes; False without such rows.
+        """Which rows of a `prepared` system's Φ vanish at q although their joint is turned away from closing.
+
+        False without such rows.
         """
         del q
         return False
 
     def on_host(self, t: Scalar) -> Any:
-        """The constraints at a time in NumPy, whose numbers are known, so that little or nothing is compiled to satisfy
-        them once; None where there is no such form.
+        """The constraints at a time in NumPy, to satisfy them once with little or no compilation.
+
+        None for traced systems, and for systems without this form.
         """
         return None
 
@@ -106,19 +108,19 @@ class AbstractSystem(AbstractEquation):
         return {}
 
     def normalize_fixed(self, q: Coordinates, fixed: Bool[np.ndarray, "nq"]) -> tuple[Float[Array, "nq"], int]:
-        """Coordinates that satisfy the invariants of fixed entries alone, and the number of these invariants.
+        """Coordinates that satisfy all invariants of fixed entries alone, and the number of these invariants.
 
-        Such invariants have no free coordinate that could satisfy them.
+        No free coordinate could satisfy such an invariant.
         """
         del fixed
         return q, 0
 
     def joint_coordinates(self) -> Mapping[str, Any]:
-        """The own coordinates of joints, by name; each has a `shape`."""
+        """The coordinates of joints, by name; each has a `shape`."""
         return self.catalogue.joint_coordinates()
 
     def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar) -> Self:
-        """The same system with coordinates of joints held at values, which change at some rates, from t on."""
+        """The same system with coordinates of joints held at `values` at time t; the values change at `rates`."""
         del values, rates, t
         return self
 
@@ -130,8 +132,9 @@ class AbstractSystem(AbstractEquation):
         return False
 
     def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "k"]:
-        """What these functions give while nothing moves, such as a prescribed motion or a force; of many parts of one
-        kind a combination. Empty where `of_time` is False.
+        """Values of these functions while nothing moves, such as a prescribed motion or a force.
+
+        For many parts of one kind a combination of the values; empty if `of_time` is False.
         """
         return jnp.zeros(0, q.dtype)
 
@@ -150,9 +153,7 @@ class AbstractSystem(AbstractEquation):
         raise ValueError(_NO_MOMENTUM)
 
     def angular_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "*d"]:
-        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, shape (3,) in world axes in
-        space.
-        """
+        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, in space world axes, (3,)."""
         raise ValueError(_NO_MOMENTUM)
 
     # Descriptions
