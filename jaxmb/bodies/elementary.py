@@ -344,10 +344,10 @@ def half_turned(groups: Sequence[AbstractConstraintGroup], poses: BodyPoses) -> 
     pairs = [item for item in listed if getattr(item.element, "along_a", None) is not None]
     if not pairs:
         return jnp.zeros(rows, bool)
-    turned = jax.vmap(space.direction)
+    direction = jax.vmap(space.direction)
     bodies = np.concatenate([item.bodies for item in pairs])
     of_a, of_b = (jnp.concatenate([getattr(item.element, name) for item in pairs]) for name in ("along_a", "along_b"))
-    a, b = turned(unchecked_take(poses, bodies[:, 0]), of_a), turned(unchecked_take(poses, bodies[:, 1]), of_b)
+    a, b = direction(unchecked_take(poses, bodies[:, 0]), of_a), direction(unchecked_take(poses, bodies[:, 1]), of_b)
     sizes = rot.norm(of_a) * rot.norm(of_b)
     # The two directions are parallel where the joint closes.
     opposite = _DOT[space.dimension](a, b)[:, 0] < 0.5 * sizes

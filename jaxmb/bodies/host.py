@@ -55,13 +55,13 @@ class HostScene(AbstractHost):
         self._elements, self._directions = _elements(system)
         self._listed = [_in_numpy(g) for g in self._groups]
         self._compiled = tuple(g for g, listed in zip(self._groups, self._listed, strict=True) if not listed)
-        self._last = None
+        self._cached = None
         places = [(g.group.body_index, g.rows) for g in self._groups]
         self._of_poses = self._layout.jacobian_source(places[: self._positions], of_poses=True)
         self._of_velocities = self._layout.jacobian_source(places, of_poses=False)
         self.analytic = not self._compiled
         self.linear, self.velocity_rows = system.linear, system.velocity_rows
-        self.coordinate_scale, self.velocity_scale = system.concrete_scales()
+        self.coordinate_scale, self.velocity_scale = system.known_scales()
 
     def _poses(self, q) -> Any:
         """Poses of the bodies, of scalar coordinates and the ground."""
@@ -74,8 +74,8 @@ class HostScene(AbstractHost):
         if not self._layout.spatial:
             angle = poses[:, 2:]
             return np.concatenate([poses, np.cos(angle), np.sin(angle)], axis=1)
-        turned: Any = poses[:, 3:]
-        return np.concatenate([poses, [rot.rotation_matrix(p).ravel() for p in turned]], axis=1)
+        euler: Any = poses[:, 3:]
+        return np.concatenate([poses, [rot.rotation_matrix(p).ravel() for p in euler]], axis=1)
 
     def _moves(self, q):
         """Rates of prepared poses along unit rates of poses."""
@@ -93,8 +93,8 @@ class HostScene(AbstractHost):
         if not self._layout.spatial:
             return of_bodies
         poses = self._poses(q)
-        turned: Any = zip(poses[:, 3:], of_bodies[:, 3:], strict=True)
-        return np.concatenate([of_bodies[:, :3], [rot.rates(p, w) for p, w in turned]], axis=1)
+        rotating: Any = zip(poses[:, 3:], of_bodies[:, 3:], strict=True)
+        return np.concatenate([of_bodies[:, :3], [rot.rates(p, w) for p, w in rotating]], axis=1)
 
     def _evaluated(self, q, u=None) -> list[_Rows]:
         """Rows of the compiled groups, by default at the guess's velocities."""
@@ -102,11 +102,11 @@ class HostScene(AbstractHost):
             return []
         u = self._u if u is None else u
         key = q.tobytes(), u.tobytes()
-        if self._last is None or self._last[0] != key:
+        if self._cached is None or self._cached[0] != key:
             of_bodies: Any = np.append(u, 0.0)[self._layout.velocity_index]
             now = Kinematics(self._t, self._prepared(q), of_bodies)
-            self._last = key, _rows(self._compiled, now, self._moves(q))
-        return self._last[1]
+            self._cached = key, _rows(self._compiled, now, self._moves(q))
+        return self._cached[1]
 
     def _joined(self, groups, of_elements: Any, of_compiled: Iterable[Any]) -> list[Any]:
         """Values of elements and of the compiled groups, in the order of `groups`."""
@@ -121,8 +121,8 @@ class HostScene(AbstractHost):
 
     def residual(self, q):
         """Φ."""
-        listed = None if self._elements is None else self._elements.residual(self._prepared(q))
-        return _flat(self._joined(self._groups[: self._positions], listed, (x.values for x in self._evaluated(q))))
+        values = None if self._elements is None else self._elements.residual(self._prepared(q))
+        return _flat(self._joined(self._groups[: self._positions], values, (x.values for x in self._evaluated(q))))
 
     def coordinate_residual(self, q):
         p = self._euler(q)
@@ -130,9 +130,9 @@ class HostScene(AbstractHost):
 
     def blocks(self, q, u=None) -> list[Float[np.ndarray, "parts rows k v"]]:
         """Blocks of A, group by group, for the bodies of each part; by default at the guess's velocities."""
-        listed = None if self._elements is None else self._elements.jacobian(self._prepared(q))
+        values = None if self._elements is None else self._elements.jacobian(self._prepared(q))
         compiled = zip(self._compiled, self._evaluated(q, u), strict=True)
-        joined = self._joined(self._groups, listed, (self._along_velocities(q, g, x.blocks) for g, x in compiled))
+        joined = self._joined(self._groups, values, (self._along_velocities(q, g, x.blocks) for g, x in compiled))
         pairs = zip(self._groups, joined, strict=True)
         return [x.reshape(len(g.group.names), g.rows, *x.shape[-2:]) for g, x in pairs]
 
@@ -145,16 +145,16 @@ class HostScene(AbstractHost):
         if not (self._layout.spatial and group.of_poses):
             return blocks
         units = np.eye(self._layout.space.velocity_size)
-        moved = [self._rates(q, np.tile(unit, (self._layout.ground + 1, 1))) for unit in units]
-        turned: Any = np.stack(moved, axis=-1)[group.group.body_index]
-        return np.einsum("prkn,pknv->prkv", blocks, turned)
+        rates = [self._rates(q, np.tile(unit, (self._layout.ground + 1, 1))) for unit in units]
+        moves: Any = np.stack(rates, axis=-1)[group.group.body_index]
+        return np.einsum("prkn,pknv->prkv", blocks, moves)
 
     def coordinate_jacobian(self, q):
-        listed = None
+        values = None
         if self._elements is not None:
             derivative = self._elements.jacobian_of_poses if self._layout.spatial else self._elements.jacobian
-            listed = derivative(self._prepared(q))
-        blocks = self._joined(self._groups[: self._positions], listed, (x.blocks for x in self._evaluated(q)))
+            values = derivative(self._prepared(q))
+        blocks = self._joined(self._groups[: self._positions], values, (x.blocks for x in self._evaluated(q)))
         rows = np.append(_flat(blocks), 0.0)[self._of_poses]
         of_lengths = np.zeros((len(self._layout.turning), q.size))
         places = self._layout.pose_index[self._layout.turning, 3:]
@@ -187,8 +187,8 @@ class HostScene(AbstractHost):
 
     def along(self, q, step):
         """The rates of coordinates with the velocities `step`."""
-        moved = self._rates(q, np.append(step, 0.0)[self._layout.velocity_index])
-        return moved[:-1].ravel()[self._layout.coordinate_place]
+        rates = self._rates(q, np.append(step, 0.0)[self._layout.velocity_index])
+        return rates[:-1].ravel()[self._layout.coordinate_place]
 
     def displaced(self, q, step):
         """The coordinates after a displacement along velocities."""
@@ -198,9 +198,9 @@ class HostScene(AbstractHost):
         """Whether the constraints hold, without a joint that is half a turn away from closing."""
         if not super().holds(q):
             return False
-        poses, turned = self._prepared(q), self._layout.space.direction
+        poses, direction = self._prepared(q), self._layout.space.direction
         return all(
-            turned(poses[a], u) @ turned(poses[b], v) > 0
+            direction(poses[a], u) @ direction(poses[b], v) > 0
             for bodies, of_a, of_b in self._directions
             for (a, b), u, v in zip(bodies, of_a, of_b, strict=True)
         )
@@ -233,8 +233,8 @@ def _elements(system) -> tuple[HostRows | None, list[tuple[np.ndarray, Any, Any]
         parts = [jax.tree.unflatten(structure, [x[k] for x in numbers]) for k in range(len(group.names))]
         elements = [on_bodies(part, space, part.elements) for part in parts]
         places = first + g.rows * np.arange(len(group.names))
-        for alike in zip(*elements, strict=True):
-            element = jax.tree.map(lambda *x: np.stack(x), *alike)
+        for of_parts in zip(*elements, strict=True):
+            element = jax.tree.map(lambda *x: np.stack(x), *of_parts)
             listed.append(Listed(element, group.body_index, places))
             if getattr(element, "along_a", None) is not None:
                 along.append((group.body_index, element.along_a, element.along_b))

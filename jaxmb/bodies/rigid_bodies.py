@@ -185,7 +185,7 @@ class RigidBodySystem(AbstractSystem):
     def velocity_scale(self):
         return jnp.where(self.layout.velocity_lengths, lax.stop_gradient(self.length), 1.0)
 
-    def concrete_scales(self) -> tuple[Float[np.ndarray, "nq"], Float[np.ndarray, "nu"]]:
+    def known_scales(self) -> tuple[Float[np.ndarray, "nq"], Float[np.ndarray, "nu"]]:
         """Scales of coordinates and velocities in NumPy, also within a trace, of a system that is not traced."""
         lengths = self.layout.coordinate_lengths, self.layout.velocity_lengths
         of_coordinates, of_velocities = (np.where(is_length, np.asarray(self.length), 1.0) for is_length in lengths)

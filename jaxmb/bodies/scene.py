@@ -227,7 +227,7 @@ class Scene(eqx.Module):
             frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
             free_joints=tuple(CoordinateGroup(group) for group in constraints if not group.rows),
             guess=dataclasses.replace(guess, z=forces.initial_states()),
-            length=_length([held for part, _ in parts for held in (part, *_held(part))], guess, layout),
+            length=_length([inner for part, _ in parts for inner in (part, *_inner(part))], guess, layout),
             ranks=Ranks(0, 0, 0, 0),
             implied=(),
             elimination=None,
@@ -463,7 +463,7 @@ def _strength(part, space, poses, velocities):
     return jnp.sum(jnp.abs(rows), axis=0)
 
 
-def _held(part):
+def _inner(part):
     """The inner parts of a part."""
     return (inner for _, inner in inner_parts(part))
 

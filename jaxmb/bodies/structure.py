@@ -64,7 +64,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
             f"remain in {listed}. The assembly starts at the position and the {turn} of each body: give poses that are "
             "nearer to an assembled mechanism. Else check lengths, points and axes: joints may contradict each other."
         )
-    joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, system.concrete_scales()[1])
+    joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, system.known_scales()[1])
     check_gradients(system, _row_norms(system, at.blocks))
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
@@ -148,7 +148,7 @@ def _of_host(on_host, q):
 
 def _row_norms(system, blocks):
     """The norm of each row of A, with columns multiplied by the scales of velocities."""
-    of_bodies = np.append(system.concrete_scales()[1], 0.0)[system.layout.velocity_index]
+    of_bodies = np.append(system.known_scales()[1], 0.0)[system.layout.velocity_index]
     scales = [of_bodies[np.array(g.group.bodies)][:, None] for g in system.constraints.groups]
     sizes = [np.sqrt(np.sum((b * s) ** 2, axis=(2, 3))) for b, s in zip(blocks, scales, strict=True)]
     return np.concatenate([size.reshape(-1) for size in sizes])

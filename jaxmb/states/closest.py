@@ -42,7 +42,7 @@ _ITERATIONS = 400
 _PROGRESS = 0.999
 # Pivots of implied rows, relative to the largest entry of the diagonal.
 _SHIFT = 1e-13
-# In blocks this share is a multiple of the largest residual, as in the method of Levenberg and Marquardt. It is at least
+# In blocks this share is a multiple of the largest residual, as in the method of Levenberg and Marquardt, but at least
 # this power of eps, 1e-11 in double precision.
 #
 # Off the constraints implied rows contradict each other by the square of the distance. Multipliers are this square over

@@ -125,17 +125,17 @@ class ContactSet:
         """The gaps [m, rad], negative where bodies are inside each other."""
         if not self.n:
             return jnp.zeros(0, q.dtype)
-        return _taken(system.position_residual(t, self.bound(q)), self.rows[: self.n])
+        return _of_rows(system.position_residual(t, self.bound(q)), self.rows[: self.n])
 
     def rates(self, system: Any, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "laws"]:
         """The rates of the gaps, and the velocities of slip."""
-        return _taken(system.velocity_residual(t, self.bound(q), u), self.rows)
+        return _of_rows(system.velocity_residual(t, self.bound(q), u), self.rows)
 
     def accelerations(
         self, system: Any, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
     ) -> Float[Array, "laws"]:
         """The second derivatives of the gaps, and the derivatives of the velocities of slip."""
-        return _taken(system.acceleration_residual(t, self.bound(q), u, udot), self.rows)
+        return _of_rows(system.acceleration_residual(t, self.bound(q), u, udot), self.rows)
 
     def gradients(self, system: Any, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "laws nu"]:
         """Derivatives of the rates by velocities: the rows of A with contacts closed and friction sticking."""
@@ -143,7 +143,7 @@ class ContactSet:
         return jax.vmap(lambda row: pull(row)[0])(jnp.eye(rates.size, dtype=rates.dtype))
 
 
-def _taken(values, numbers):
+def _of_rows(values, numbers):
     # Slices of consecutive rows, so that the compiler can leave out rows of other parts.
     rows = np.array(numbers, int)
     runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) != 1)) if rows.size else []
