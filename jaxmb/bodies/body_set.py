@@ -197,7 +197,7 @@ class BodySet(eqx.Module):
         return jnp.concatenate([self.mass, inertias])
 
     def wrenches(self, now: Kinematics, gravity: Float[Array, "d"] | None) -> list[Acting]:
-        """The sum of gravity and the gyroscopic moment `−ω × J ω`; empty without both."""
+        """The sum of gravity and the gyroscopic moment `−ω × J ω`; empty if the scene has neither."""
         size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
         parts = []
         if gravity is not None:

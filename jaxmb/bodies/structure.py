@@ -263,7 +263,7 @@ def _check_locked(system, joints, subsets):
 
 
 def _connected(system, parts):
-    """Sets of bodies that position constraints connect without the ground, with their parts; sets with a driver not."""
+    """Sets of bodies that position constraints connect without the ground, with their parts; no sets with a driver."""
     ground = system.layout.ground
     rheonomic = [moving for g in system.constraints.position for moving in [g.rheonomic] * len(g.group.bodies)]
     moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]

@@ -1,4 +1,4 @@
-"""Messages why a mechanism cannot be assembled or moved as prescribed, and where its constraints lose rank."""
+"""Why a mechanism cannot be assembled or moved as prescribed, in words, and where its constraints lose rank."""
 
 from typing import Any, NamedTuple
 
@@ -98,7 +98,7 @@ def _beside(system, t, q, free, rows=()):
 
 
 def cannot_assemble(system: AbstractSystem, t: Scalar, q: Coordinates, fixed: Int[np.ndarray, "nq"]) -> str:
-    """A message why no configuration has the prescribed coordinates.
+    """Why no configuration has the prescribed coordinates, as a message.
 
     **Arguments:** the `system` with coordinates of joints held; `q`: the closest configuration of the search; `fixed`:
     a mask of the prescribed coordinates of the system.
@@ -154,7 +154,7 @@ def _dependence(together, free):
 
 
 def cannot_move(at: Instant, fixed: Int[np.ndarray, "nu"]) -> str:
-    """A message why no velocities have the prescribed rates; arguments as in `cannot_assemble`."""
+    """Why no velocities have the prescribed rates, as a message; arguments as in `cannot_assemble`."""
     system: Any = at.system
     of_system = directions(system.rate_names())
     places = [k for k in of_system if fixed[k]]

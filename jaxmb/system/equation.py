@@ -236,7 +236,7 @@ class AbstractEquation(eqx.Module):
 
     @property
     def ideal_without_friction(self) -> bool:
-        """The same, if no dry friction slips."""
+        """`ideal_on_velocities`, if no dry friction slips."""
         return self.ideal_on_velocities
 
     @property
