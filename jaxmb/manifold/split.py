@@ -171,7 +171,7 @@ class Separate(AbstractSplit):
     ages: ClassVar[bool] = True
 
     @classmethod
-    def chosen(cls, at, of_coordinates, orders, solved, quality):
+    def chosen(cls, at, of_coordinates: Any, orders, solved, quality):
         system = at.system
         pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
         split, own = cls(*orders, pivots.order, jnp.zeros(())).refreshed(system, of_coordinates)
