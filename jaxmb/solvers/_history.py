@@ -50,16 +50,16 @@ def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
 
 
 def spans(mesh: Float[Array, " length"]) -> Float[Array, " length-1"]:
-    """The divisors of the factors of the basis. If the latest point is double, its own span is the next one."""
+    """The divisors of the factors of the basis. If the latest point is double, its span is the next one."""
     out = mesh[0] - mesh[1:]
     return jnp.where(out > 0, out, out[1])
 
 
 def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Array, "length points"]:
-    """The Newton basis of a mesh at some times."""
+    """The Newton basis of a mesh at given times."""
     length = mesh.shape[0]
     factors = (t[None, :] - mesh[:-1, None]) / spans(mesh)[:, None]
-    # A product over a mask is one kernel in XLA, a cumulative product a dozen.
+    # XLA compiles a product over a mask to one kernel, a cumulative product to a dozen.
     factors_of = np.tril(np.ones((length, length - 1), dtype=bool), -1)
     return jnp.prod(jnp.where(factors_of[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
 
@@ -76,7 +76,7 @@ def basis_means(
 
 
 def before_each(length: int) -> np.ndarray:
-    """Square matrix that sums, for each index, over those before it."""
+    """A square matrix that sums, for each index, over the preceding indices."""
     return np.tril(np.ones((length, length)), -1)
 
 
@@ -103,7 +103,7 @@ def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float
 def known_differences(
     known: Int[Array, ""], z: Float[Array, " n"], partial_sums: Float[Array, "length n"]
 ) -> Float[Array, "length n"]:
-    """The divided differences after a step with `z` at its end, from a number of points `known` before."""
-    # Rows that involve placeholders are kept at zero: they are never used but would grow without bound.
+    """The divided differences after a step with `z` at its end, from a number of points before the step (`known`)."""
+    # Rows with placeholders stay zero: they are never used but would grow without bound.
     rows = known >= np.arange(partial_sums.shape[0], dtype=np.int32)
     return jnp.where(rows[:, None], z[None] - partial_sums, jnp.zeros((), z.dtype))

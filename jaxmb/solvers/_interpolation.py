@@ -30,7 +30,7 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
 
     @abc.abstractmethod
     def _since_end(self, t: Any) -> Float[Array, " n"]:
-        """The solution at `t` minus that at the end of the step."""
+        """The solution at `t` minus the solution at the end of the step."""
 
 
 class RateInterpolation(MultistepInterpolation):

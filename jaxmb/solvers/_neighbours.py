@@ -11,11 +11,11 @@ from .order import GAIN
 
 
 def ladder(past_points: tuple[int, ...]) -> np.ndarray:
-    """For each number of points: the next lower, itself, and the next higher."""
+    """For each number of points: the next lower number, itself, and the next higher."""
     steps = [*range(1, past_points[0]), *past_points]
     out = np.zeros((past_points[-1] + 1, 3), np.int32)
-    for lower, own, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
-        out[own] = lower, own, upper
+    for lower, points, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
+        out[points] = lower, points, upper
     return out
 
 

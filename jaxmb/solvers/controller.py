@@ -24,15 +24,16 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
+# The factor after a step without a usable error estimate: the vector field is not finite, or a constraint was not
+# solved.
 _WITHOUT_ESTIMATE = 0.25
-# Repeated rejections mean that errors do not decrease according to the order, as at a kink or a jump: upper bounds of
-# the factor after the first, second, and every further rejection.
+# Upper bounds of the factor after the first, second, and every further rejection. Repeated rejections mean that errors
+# do not decrease according to the order, as at a kink or a jump.
 _REPEATED = (0.95, 0.5, 0.1)
 # The length of the trial before the first step, in units of the interval, and the factors from it to the first step.
 _TRIAL, _SHORTER, _LONGER = 1e-4, 1e-8, 100.0
 # The recovery from a step shortened by a wrapper is at most this factor, unless the step's own error allows a longer
-# one; beyond it differences are rounding errors.
+# one; beyond it, differences are rounding errors.
 _RECOVERY = 100.0
 # After a step without an estimate, this number of steps grow by at most this factor, so that steps that are too long to
 # be solved are not tried again and again.
@@ -42,26 +43,26 @@ _CAUTION, _CAUTIOUS = 4, 1.4
 class AbstractControllerState(eqx.Module):
     """The state of a step size controller that knows its next step.
 
-    **Fields:** `intended`: the last step size that was requested.
+    **Fields:** `intended`: the last requested step size.
     """
 
     intended: AbstractVar[Float[Array, ""]]
 
 
 def intended_step(controller_state: Any) -> Float[Array, ""] | None:
-    """The length of the next step, from the state of a controller that knows it, which others may be wrapped around."""
-    found = states_inside(controller_state, AbstractControllerState)
-    return found[0].intended if found else None
+    """The length of the next step, from the state of a controller that knows it or wraps one that does; else None."""
+    states = states_inside(controller_state, AbstractControllerState)
+    return states[0].intended if states else None
 
 
 def states_inside(controller_state: Any, kind: type) -> list[Any]:
-    """The states of a kind in that of a controller, which others may be wrapped around."""
+    """The states of a kind in a controller's state, which may be nested."""
     is_one = lambda x: isinstance(x, kind)
     return [x for x in jax.tree.leaves(controller_state, is_leaf=is_one) if is_one(x)]
 
 
 class AbstractControllerAround(diffrax.AbstractAdaptiveStepSizeController):
-    """A controller around another one, `controller`, with the tolerances of that."""
+    """A controller around another one, `controller`, with the latter's tolerances."""
 
     controller: AbstractVar[Any]
 

@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 # The constants were chosen by measuring evaluations against true error on Kepler's problem, the Pleiades and
 # Arenstorf's orbit. Results are insensitive to them; a strong preference for low orders or for an unchanged step costs
-# 10-20%.
-# Weights of the steps of the lower and of the higher order relative to that of the present order.
+# 10-20%. Weights of the steps of the lower and of the higher order, relative to the present order.
 LOWER, _UPPER = 0.98, 0.95
 # After a step that is refused, the step changes by this factor, times the controller's safety.
 _REFUSED = 0.75
@@ -27,8 +26,8 @@ class StepEstimate(eqx.Module):
 
     - `error`: the weighted norm of the local error; below one the step is good.
     - `growth`: the factor by which all steps may grow, with the order chosen for the next step.
-    - `retry`: the same for the order just used; zero if there is no usable estimate, negative if no step from here can
-        have one.
+    - `retry`: the same for the order just used; zero without a usable estimate, negative if no step from this state can
+        have an estimate.
     - `response`: the power of these factors by which to change the next step alone, with the earlier steps given.
     - `limit`: the largest factor by which the next step may grow.
     - `work`: evaluations of the vector field, and matrices computed. Not integers, which diffrax does not expect in an
@@ -44,7 +43,7 @@ class StepEstimate(eqx.Module):
 
 
 def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
-    """The estimate of a step that must not be accepted, where `off`."""
+    """The estimate of a step, changed where it must not be accepted (`off`)."""
     parts = lambda e: (e.error, e.growth, e.retry, e.response)
     values = zip(parts(estimate), (jnp.inf, 0.0, _REFUSED, 1.0), strict=True)
     changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]
@@ -75,7 +74,7 @@ def choose_order(
     **Arguments:**
 
     - `errors`: weighted norms of the local errors of the lower, the present and the higher formula in the step,
-        infinite or NaN if the step failed. Those of formulas that are not allowed are ignored.
+        infinite or NaN if the step failed. The errors of formulas that are not allowed are ignored.
     - `powers`: the powers of the step that these errors are proportional to.
     - `response`: as in `StepEstimate`.
     - `may_fall`, `may_rise`: whether the lower and the higher formula are allowed.

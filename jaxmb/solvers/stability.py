@@ -260,8 +260,8 @@ def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figu
     axes = figure.add_subplot() if ax is None else ax
     re, im = _window(formulas)
     upper = re + 1j * im[:, None]
-    for n, each in enumerate(formulas):
-        radius = spectral_radius(each, upper)
+    for n, rule in enumerate(formulas):
+        radius = spectral_radius(rule, upper)
         mirrored = np.concatenate([radius[:0:-1], radius])
         plane = re, np.concatenate([-im[:0:-1], im]), mirrored
         axes.contourf(*plane, levels=[0.0, 1.0], colors=[f"C{n % 10}"], alpha=0.1)
@@ -271,7 +271,7 @@ def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figu
     axes.set_aspect("equal")
     axes.set_xlabel("Re μ")
     axes.set_ylabel("Im μ")
-    handles = [Line2D([], [], color=f"C{n % 10}", label=each.name) for n, each in enumerate(formulas)]
+    handles = [Line2D([], [], color=f"C{n % 10}", label=rule.name) for n, rule in enumerate(formulas)]
     axes.legend(handles=handles, fontsize="small")
     return figure
 
@@ -279,10 +279,10 @@ def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figu
 def _window(formulas: Sequence[Formula], points: int = 161) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Real and nonnegative imaginary parts of a grid around the boundaries of the regions."""
     extents = []
-    for each in formulas:
-        locus = boundary_locus(each, np.linspace(1e-3, np.pi, 500)).ravel()
+    for rule in formulas:
+        locus = boundary_locus(rule, np.linspace(1e-3, np.pi, 500)).ravel()
         locus = locus[np.isfinite(locus)]
-        boundary = locus[spectral_radius(each, locus) <= 1 + _OUTSIDE]
+        boundary = locus[spectral_radius(rule, locus) <= 1 + _OUTSIDE]
         locus = boundary if len(boundary) else locus
         # Some boundaries extend to infinity.
         extents.append(locus[np.abs(locus) <= 3 * np.median(np.abs(locus))])
@@ -303,15 +303,15 @@ def _coefficients(family: str, nodes: Sequence[Fraction]) -> tuple[Rationals, Ra
     """`a`, `b`, `c` for the times `(t_{n+1-j} - t_{n+1}) / h` of the points, newest first."""
     integrated, multiplicity = FAMILIES[family].integrated, FAMILIES[family].multiplicity
     points = range(len(nodes))
-    given = {(0, 0): Fraction(1), (0, 1): Fraction(-1)} if integrated else {(0, 0): Fraction(1)}
+    fixed = {(0, 0): Fraction(1), (0, 1): Fraction(-1)} if integrated else {(0, 0): Fraction(1)}
     # Coefficients are named by the derivative that they multiply, and by the point.
     lowest = 1 if integrated else 0
     unknown = [(1, 0), (2, 0), *((d, j) for d in range(lowest, lowest + multiplicity) for j in points[1:])]
-    # A given a sums to zero, so constants are solutions already.
+    # The fixed a sum to zero, so constants are solutions already.
     degrees = range(lowest, lowest + len(unknown))
     matrix = [[_residual(nodes[j], d, q) for d, j in unknown] for q in degrees]
-    right = [sum((-x * _residual(nodes[j], d, q) for (d, j), x in given.items()), Fraction(0)) for q in degrees]
-    solved = given | dict(zip(unknown, _solve(matrix, right), strict=True))
+    right = [sum((-x * _residual(nodes[j], d, q) for (d, j), x in fixed.items()), Fraction(0)) for q in degrees]
+    solved = fixed | dict(zip(unknown, _solve(matrix, right), strict=True))
     a, b, c = (tuple(solved.get((d, j), Fraction(0)) for j in points) for d in range(3))
     return a, b, c
 
