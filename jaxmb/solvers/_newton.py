@@ -119,7 +119,7 @@ class AbstractLinearization(eqx.Module):
     def errors(
         self, inverses: Any, free: Int[Array, " free"], changes: Float[Array, "formulas n"]
     ) -> Float[Array, "formulas n"]:
-        """The changes of the solution by changes of the past, also in components that do not follow from the unknowns."""
+        """The changes of the solution by changes of the past, also in components that do not depend on the unknowns."""
 
     @abc.abstractmethod
     def tangents(

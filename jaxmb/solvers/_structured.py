@@ -186,7 +186,7 @@ def structured(jacobian: Callable[[Float[Array, " n"]], Any], y: Float[Array, " 
 def unknown_structure(
     jacobian: Callable[[Float[Array, " n"]], Any], y: Float[Array, " n"]
 ) -> StructuredLinearization | None:
-    """Zeros for a term that knows the structure of its Jacobian, so that the first step computes its matrix; else None."""
+    """Zeros for a term that knows the structure of its Jacobian, so that the first step computes it; else None."""
     shapes = eqx.filter_eval_shape(structured, jacobian, y)
     if shapes is None:
         return None

@@ -165,7 +165,7 @@ def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: 
 
 
 def kept_of_chart(term: Any, chart: Chart | None, at_start: bool = False) -> PyTree[Array]:
-    """The part of the chart at the end of a step that `at_solution` needs; `at_start`: for the start of a first step."""
+    """The part of the chart at the end of a step that `at_solution` needs; `at_start`: for the start of a run."""
     manifold = _manifold(term)
     return manifold.kept_at_start(chart) if at_start else manifold.kept(chart)
 

@@ -173,7 +173,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
     @abc.abstractmethod
     def evaluate(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
-        """Evaluate the vector field at a state on the manifold or near it, a prediction, with or without projecting it."""
+        """Evaluate the vector field at a state on the manifold or near it, a prediction; projection is optional."""
 
     @abc.abstractmethod
     def project_near(self, t: Any, y: Y, linearized_at: ManifoldEvaluation, args: Args) -> ManifoldEvaluation:

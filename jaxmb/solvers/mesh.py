@@ -23,7 +23,7 @@ from .events import events_found
 from .linear_map import filled, linear_map
 from .packing import Layout
 from .segments import Row, Segments, choice_of, first_of, remainder, row_of, start_of
-from .stepping import ended, known_in_steps, stepped
+from .stepping import constant_fields, ended, stepped
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 

@@ -84,7 +84,7 @@ def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
 
 
 def start_of(steps: AbstractSteps, since: Any, state: Any) -> tuple[Any, Any, PyTree[Array], PyTree[Array]]:
-    """The start of a segment: `since` of its first row, its time, the state, and the solver's state without tangents."""
+    """The start of a segment: `since` of its first row, its time, the state, and the solver's plain state."""
     return since, state.tprev, state.y, steps.alone(state.solver_state)
 
 

@@ -59,7 +59,7 @@ class AbstractSteps(eqx.Module):
 
     @abc.abstractmethod
     def chosen(self, solver_state: Any) -> PyTree[Array]:
-        """The parts of the solver's state that the error estimate of a step chose for the next step; None without any."""
+        """The parts of the solver's state that the error estimate chose for the next step; None without any."""
 
     def of_solver_alone(self) -> Self:
         """The same for runs of the solver without tangents."""
