@@ -83,9 +83,9 @@ class ContactGuards(AbstractGuards):
         """The numbers of the event at a state, without derivatives."""
         return find_event(self.system.at(y), self.formulation, self.tolerance, t, y)
 
-    def impact(self, t: Scalar, y: State, dated: bool = False, found: Event | None = None) -> Impact:
+    def impact(self, t: Scalar, y: State, dated: bool = False, event: Event | None = None) -> Impact:
         """The event at a state; see `impact`."""
-        return impact(self.system.at(y), self.formulation, self.tolerance, t, y, dated, found)
+        return impact(self.system.at(y), self.formulation, self.tolerance, t, y, dated, event)
 
     def changed(self, before, after):
         system, before, after = lax.stop_gradient((self.system, before, after))

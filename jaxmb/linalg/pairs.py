@@ -1,6 +1,4 @@
-"""Numbers of which some belong together in pairs, the components of vectors in planes; a pair is named by the place of
-its first number, and follows it.
-"""
+"""Lists of numbers that contain pairs, the components of plane vectors. The place of its first number names a pair."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,10 +13,8 @@ def of_pairs(pairs: tuple[int, ...]) -> np.ndarray:
 
 
 def placed_pairs(pairs: tuple[int, ...], values: Array, others: Array, first: int = 0) -> Array:
-    """Values of each number of `pairs`, shape (pairs, 2, …), among those of `others`, whose places they take; before
-    them `first` zeros.
-    """
-    # A gather, which is compiled in less time than a scatter.
+    """`others` with the places of `pairs` replaced by values of shape (pairs, 2, …), after `first` zeros."""
+    # A gather, which compiles faster than a scatter.
     m, paired = len(others), of_pairs(pairs).reshape(-1)
     place = np.zeros(m, int)
     place[paired] = np.arange(paired.size)
@@ -29,15 +25,15 @@ def placed_pairs(pairs: tuple[int, ...], values: Array, others: Array, first: in
 
 
 def for_both(pairs: tuple[int, ...], values: Array, others: Array) -> Array:
-    """The same of one value for both numbers of each pair."""
+    """The same with one value for both numbers of each pair."""
     return placed_pairs(pairs, jnp.stack([values, values], axis=1), others)
 
 
 def for_first(pairs: tuple[int, ...], values: Array, others: Array) -> Array:
-    """The same of a value for the first number of each pair, and zero for the second one."""
+    """The same with a value for the first number of each pair, and zero for the second."""
     return placed_pairs(pairs, jnp.stack([values, jnp.zeros_like(values)], axis=1), others)
 
 
 def sizes_of(pairs: tuple[int, ...], values: Float[Array, "m"]) -> Float[Array, "m"]:
-    """The size of each number, and for both numbers of a pair that of their vector."""
+    """The size of each number; both numbers of a pair have the norm of their vector."""
     return for_both(pairs, norm(values[of_pairs(pairs)]), jnp.abs(values)) if pairs else jnp.abs(values)

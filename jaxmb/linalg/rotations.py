@@ -85,7 +85,9 @@ def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 @jax.custom_jvp
 def _square(p):
-    """The nine entries of the matrix, a quadratic form: its derivative is one product, where a bilinear map has two."""
+    """The nine entries of the matrix, a quadratic form: its derivative is one product, whereas a bilinear map has
+    two.
+    """
     return _ROTATION(p, p)
 
 
