@@ -6,7 +6,7 @@ from ._compat import set_message
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """Outcomes; diffrax's, and those of mechanics. Each text says what to try next.
+    """Outcomes of diffrax, and of mechanics. Each text names the next thing to try.
 
     ```python
     motion = jaxmb.simulate(system, state, t1=1.0, throw=False)

@@ -1,4 +1,4 @@
-"""JAX at the head of a script: its precision, how programs are compiled, and that they are kept on disk."""
+"""JAX at the head of a script: its precision, the compilation of programs, and their cache on disk."""
 
 import gc
 import os

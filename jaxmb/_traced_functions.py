@@ -85,8 +85,8 @@ def _users_frames(error):
 
 
 def is_of_user(error: BaseException) -> bool:
-    """Whether a line of the user raised an error, by itself or through the standard library or another package, and not
-    JAX, NumPy or jaxmb, unless the error is about a file.
+    """Whether a line of the user raised an error, by itself or through the standard library or another package. Errors
+    of JAX, NumPy and jaxmb do not count, unless they are about a file.
     """
     if isinstance(error, OSError):
         return bool(_users_frames(error))

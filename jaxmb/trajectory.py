@@ -118,7 +118,7 @@ class Trajectory(eqx.Module):
     points of the past, and `wrong_derivative`: whether differences of f contradict its derivative; `num_events`: times
     of `events`; and `linearised_steps`: whether derivatives use one linearisation of the equations at each step, or the
     derivative of each step as it is, which costs more); `result`, how it ended. `trajectory["crank"]` is the motion of
-    a body, a `BodyMotion`, and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a
+    a body, a `BodyMotion`, and `trajectory["hip"]` the motion of a joint, a frame or a part with internal states, a
     `PartMotion`; of a system in generalized coordinates `trajectory["theta"]` is a coordinate and
     `trajectory["theta_rate"]` its rate, shape (times,).
 
@@ -245,8 +245,8 @@ class Trajectory(eqx.Module):
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints; in a batch, at the
         same times of every member.
 
-        At an announced jump, velocities are those after it, as in saved states; at `numpy.nextafter(t, -numpy.inf)`
-        they are those before it. The state is NaN outside of the run, and if Newton's method finds no state on the
+        At the time t of an announced jump, velocities are taken after it, as in saved states; at `numpy.nextafter(t,
+        -numpy.inf)` before it. The state is NaN outside of the run, and if Newton's method finds no state on the
         constraints, as between steps that are too long.
         """
         if self.interpolation is None:
@@ -481,8 +481,8 @@ class PartMotion:
 class GlobalError(NamedTuple):
     """The estimated global error of a motion: its distance from the same motion at tighter tolerances.
 
-    Steps of the closer motion may err a hundredth as much (near rounding, or with a method of a fixed order, a tenth),
-    so the distance is nearly the error itself. It does not contain errors of the model, nor rounding errors that both
+    Steps of the closer motion may err a hundredth as much; near rounding, or with a method of a fixed order, a tenth.
+    So the distance is nearly the error itself. It does not contain errors of the model, nor rounding errors that both
     motions share. In derivatives it is a constant.
     """
 

@@ -26,8 +26,8 @@ from .forces import directions, free_accelerations, friction_coefficients
 from .problem import Laws, Problem, is_implied
 from .tolerance import REST, ContactTolerance
 
-# The normal forces of joints, which depend on the friction in them, decide in this many rounds of impulses and forces
-# which contacts stay closed and which friction sticks. Without such friction, low bounces decide in a second round.
+# The number of rounds of impulses and forces that decide which contacts stay closed and which friction sticks, if
+# normal forces of joints depend on the friction in them. Without such friction, low bounces decide in a second round.
 _ROUNDS = 4
 # Rebounds without gain of energy are found in this many trials, to this fraction of the summands of the energy.
 _TRIALS, _GAIN = 40, 1e-12
@@ -36,7 +36,7 @@ _TRIALS, _GAIN = 40, 1e-12
 class Event(NamedTuple):
     """The numbers of an event, for its derivative as well.
 
-    **Fields:** see `Impact` for those not listed.
+    **Fields:** see `Impact` for the fields that are not listed.
 
     - `late`: the time until then.
     - `first`: the gap or slip that is zero first; none if `hits` is false.
@@ -104,7 +104,7 @@ class Trial(NamedTuple):
 
 
 def next_trial(trial: Trial, gained, size, k) -> Trial:
-    """The next trial after `k` trials; before the first one, the whole rebound was tried and gained energy."""
+    """The next trial after `k` trials; before the first trial, the whole rebound was tried and gained energy."""
     first = k == 0
     again = jnp.where(first, gained > REST * size, trial.again & (jnp.abs(gained) > _GAIN * size))
     bracket, share = narrowed(trial.bracket, trial.share, gained, k % 3 == 2)
@@ -338,8 +338,8 @@ class Impacting:
         return when.u + jnp.where(k < self.turns, 0.0, self.moves.jump) + impulses @ self.moves.by_unit
 
     def expand(self, k, before: Round, answers, impulses) -> Round:
-        """The end of the compression, and the problem of the further impulses, beside those with which contacts push
-        again in the expansion.
+        """The end of the compression, and the problem of the expansion: its impulses beside the least ones with which
+        contacts push again.
         """
         when = before.when
         again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]
@@ -390,8 +390,8 @@ class Impacting:
         return before._replace(problem=problem, when=when)
 
     def settle(self, k, before: Round, answers, forces) -> Round:
-        """The laws that hold after an impact with their forces, and the problem of the impulses in a further round, in
-        which other contacts may bounce too low to be resolved.
+        """The laws that hold after an impact with their forces, and the problem of the impulses in a further round.
+        Other contacts may bounce too low there to be resolved.
         """
         struck, curve = before.struck, before.problem.free + self.influence @ forces
         low, rest = self.low_bounces(before, curve[: self.contacts.n], k == 2 * self.turns - 1)
@@ -533,7 +533,7 @@ class Impacting:
         cancelled = is_held & cancelled
         if m:
             # Otherwise bodies that move side by side would approach at a rate too small, beside slips, to close their
-            # contact, and each step would end with an event.
+            # contact. Each step would end with an event.
             drifts = jnp.pad(staying & ~is_held[:n] & ~implied & (rate[:n] < 0), (0, m))
             cancelled = self.independent(cancelled | drifts)
         return is_held, jnp.where(cancelled, solved_components(self.influence, rates_left, cancelled), 0.0)

@@ -77,7 +77,7 @@ class GivenLaws(AbstractLaws):
 
 class ReactiveLaws(AbstractLaws):
     """C depends on multipliers and changes them, so both are solved for together. If the multipliers are undetermined,
-    C uses those of ideal constraints.
+    C uses the multipliers of ideal constraints.
     """
 
     def applied(self, at, memory: Any):
@@ -119,8 +119,8 @@ def accelerations(
     u: Velocities,
     gamma_shift: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, those of `A
-    u̇ = γ − gamma_shift`. NaN where friction does not determine them.
+    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, for `A u̇ = γ
+    − gamma_shift`. NaN where friction does not determine them.
 
     ```python
     method = jaxmb.formulations.Multipliers()

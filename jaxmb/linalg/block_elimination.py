@@ -72,10 +72,10 @@ class BlockFactor(eqx.Module):
 def eliminate_blocks(
     lower: Inexact[Array, "blocks b b"], order: NodeOrder, upper: Inexact[Array, "blocks b b"] | None = None
 ) -> BlockFactor:
-    """The factor of a matrix from its stored blocks, those of fill zero; see `NodeOrder`.
+    """The factor of a matrix from its stored blocks, with zeros for fill; see `NodeOrder`.
 
-    **Arguments:** `lower`: the blocks whose row is the later node, and those on the diagonal; `upper`: the others of a
-    matrix that is not symmetric, each at the place of the block that mirrors it; on the diagonal anything.
+    **Arguments:** `lower`: the blocks on the diagonal, and the blocks whose row is the later node; `upper`: the other
+    blocks of a matrix that is not symmetric, each at the place of its mirror image; on the diagonal anything.
     """
     sides = [lower] if upper is None else [lower, upper.swapaxes(1, 2)]
     size, dtype = lower.shape[1], lower.dtype

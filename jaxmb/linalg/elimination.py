@@ -1,8 +1,8 @@
 """Gaussian elimination with full pivoting inside `lax`: which columns depend on which, and the influence matrix.
 
-A constraint Jacobian `A` (m × n) of rank r splits its columns into r dependent and n − r independent ones, `A_d δx_d +
-A_i δx_i = 0`, so `δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ A_i`. Full pivoting chooses the split for which
-H stays of order one. The other m − r rows are implied.
+A constraint Jacobian `A` (m × n) of rank r has r dependent and n − r independent columns, `A_d δx_d + A_i δx_i = 0`. So
+`δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ A_i`. Full pivoting chooses the split for which H stays of order
+one. The other m − r rows are implied.
 
 Searching for pivots is the expensive part, so it is done only when a chart is made (`full_pivot`); at every other state
 the same split is used without search (`eliminate`). Pivots are integers without a derivative; values have one.

@@ -1,10 +1,10 @@
 """The order of elimination of the nodes of a symmetric block-sparse matrix: graph arithmetic on integers.
 
-Nodes that are not neighbours are eliminated together. Each level takes nodes of low degree: a chain of n nodes needs
-about log₂ n levels (it is cyclic reduction there), and a tree loses its leaves and its paths at once. A level is cut
-into steps of a fixed number of lanes. So one loop executes all steps of a stage, and the size of a program does not
-depend on the number of nodes. The last nodes, when few are left or most are neighbours of each other, are eliminated
-together as one dense matrix.
+Nodes that are not neighbours are eliminated together. Each level takes nodes of low degree. So a chain of n nodes needs
+about log₂ n levels (cyclic reduction), and a tree loses its leaves and its paths at once. A level is cut into steps of
+a fixed number of lanes. So one loop executes all steps of a stage, and the size of a program does not depend on the
+number of nodes. The last nodes, when few are left or most are neighbours of each other, are eliminated together as one
+dense matrix.
 
 Sources: J. W. H. Liu, "The role of elimination trees in sparse factorization", SIAM J. Matrix Anal. Appl. 11(1), 1990
 (fill); M. Luby, SIAM J. Comput. 15(4), 1986 (independent sets).

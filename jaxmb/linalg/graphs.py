@@ -1,4 +1,4 @@
-"""Graphs of bodies and joints: what is connected, the biconnected components with the vertices where they meet, and
+"""Graphs of bodies and joints: connected and biconnected components, the vertices at which the latter meet, and
 shortest loops.
 
 Source: J. Hopcroft and R. Tarjan, "Efficient algorithms for graph manipulation", Comm. ACM 16(6), 1973.
@@ -101,8 +101,8 @@ def _search(root, adjacent, edges, depth, out):
 
 
 def vertices_before(edges: Sequence[tuple[int, ...]], ground: int) -> list[tuple[int, ...]]:
-    """The vertices that each edge waits for in an elimination: an edge of a spanning tree for the vertex below it,
-    another edge for the vertices of a shortest loop through it.
+    """The vertices that each edge waits for in an elimination. An edge of a spanning tree waits for the vertex below
+    it, another edge for the vertices of a shortest loop through it.
 
     **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its number, one more than the last
     vertex's.

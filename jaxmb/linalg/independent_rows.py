@@ -1,7 +1,7 @@
 """Independent rows of matrices of concrete numbers.
 
 Pivots of a dense matrix are its largest entries. Pivots of a sparse matrix are chosen for little fill, among entries
-not much smaller than the largest of their column, so that the multiples of subtracted rows are not large.
+not much smaller than the largest of their column. So the multiples of subtracted rows are not large.
 
 Source: H. M. Markowitz, "The elimination form of the inverse and its application to linear programming", Management
 Science 3(3), 1957; I. S. Duff, A. M. Erisman and J. K. Reid, "Direct Methods for Sparse Matrices", 2017, ch. 7

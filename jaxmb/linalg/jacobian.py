@@ -55,7 +55,7 @@ class AbstractJacobian(eqx.Module):
 
     @abc.abstractmethod
     def scatter_rows(self, values: Float[Array, "*r"]) -> Float[Array, "m"]:
-        """The values of all rows from those of the independent ones: zero for implied rows."""
+        """The values of all rows from the values of the independent ones: zero for implied rows."""
 
     @abc.abstractmethod
     def gram(self, inertia: AbstractInertia) -> AbstractPositiveDefinite:

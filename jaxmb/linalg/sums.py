@@ -1,7 +1,7 @@
 """Entries at static places, and sums of entries by static places, each the transpose of the other.
 
-Both consist of gathers. The transpose of JAX's gather is a scatter, which XLA compiles to a loop on CPUs and which is
-slow on other devices: scatters were a quarter of the kernels of a gradient in space.
+Both consist of gathers. The transpose of JAX's gather is a scatter, which XLA compiles to a loop on CPUs, and which is
+slow on other devices. Scatters were a quarter of the kernels of a gradient in space.
 """
 
 import dataclasses

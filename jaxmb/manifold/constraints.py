@@ -1,12 +1,12 @@
 """The constraints at a state, and return to them from a nearby state.
 
 A step of a multistep method evaluates at a prediction, and then at a corrected state beside it. Only the prediction
-needs an elimination: with its factor, Newton's method (with one matrix, the chord method) restores positions and
+needs an elimination. With its factor, Newton's method with one matrix (the chord method) restores positions and
 velocities, and corrects the accelerations of the prediction. Each correction leaves an error of the size of the
 distance between the two states. So at tolerances of 1e-6 and below one correction of each suffices.
 
 Derivatives follow by the implicit function theorem from the equations at the restored state, with a factor of that
-state, not from the algorithm: they do not depend on the formulation, and cannot contain a frozen iterate.
+state. They do not depend on the algorithm or the formulation, and cannot contain a frozen iterate.
 """
 
 import abc

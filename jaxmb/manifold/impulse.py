@@ -19,15 +19,15 @@ from .orthogonal_projection import project_velocities
 
 # Jumps are searched in this number of intervals in all, and in at least the second number between two restarts.
 _INTERVALS, _FEWEST = 256, 16
-# Each row's least smooth place between two restarts is followed, up to this number of places, those most like jumps
+# Each row's least smooth place between two restarts is followed, up to this number of places, the likeliest jumps
 # first. The program follows some at once.
 _PLACES, _AT_ONCE = 64, 8
 # A place is divided into this number of parts, and three of them are kept, this number of times: down to rounding.
 _PARTS, _ROUNDS = 8, 38
 # Variations smaller than these fractions of the largest value, of their row and of all rows, are ignored.
 _VISIBLE, _ROUNDED = 1e-6, 1e-11
-# At a jump the second difference of the changes is at least this fraction of the largest change, and at least the
-# second fraction of the latter remains in the end; of a smooth function next to nothing remains.
+# At a jump the second difference of the changes is at least the first fraction of the largest change. At least the
+# second fraction of that change remains in the end; of a smooth function next to nothing remains.
 _UNEVEN, _LEFT = 0.02, 0.01
 # Rows are examined at this number of configurations beside the state's.
 _OTHERS = 2
@@ -88,8 +88,10 @@ def after_jump(
 
 
 class Jump(NamedTuple):
-    """A jump of a prescribed rate or of its derivative: the first time after it [s], in the precision of the state, and
-    the number of the `row`, among the rows of ψ followed by the rows of A.
+    """A jump of a prescribed rate or of its derivative.
+
+    **Fields:** `t`: the first time after it [s], in the precision of the state; `row`: its number among the rows of ψ
+    followed by the rows of A.
     """
 
     t: np.floating
@@ -101,8 +103,8 @@ def find_jumps(
 ) -> list[Jump]:
     """Search for times between two others at which prescribed rates, or their derivatives, jump.
 
-    Each row is examined between each two neighbouring `restarts`. The place where its changes in equal intervals are
-    least even is divided, and the least even part is followed, again and again: a smooth function becomes even, a jump
+    Each row is examined between each two neighbouring `restarts`. The place with the least even changes in equal
+    intervals is divided, and the least even part is followed, again and again. A smooth function becomes even, a jump
     does not. At most one jump of a row is found between two restarts.
 
     Coordinates are the same at all times. An angle's row wraps where the prescribed angle is half a turn away from the

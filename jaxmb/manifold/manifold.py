@@ -68,8 +68,8 @@ class AbstractManifold(eqx.Module):
         """
 
     def contact_tolerance(self, system: AbstractEquation, rtol: Scalar) -> ContactTolerance | None:
-        """The sizes that count as zero when contacts close: gaps up to a thousandth of the tolerance of integration,
-        and up to a given tolerance of positions, relative to the system's size; None without contacts.
+        """The sizes that count as zero when contacts close, relative to the system's size; None without contacts. Gaps
+        count as zero up to a thousandth of the tolerance of integration, and up to a given tolerance of positions.
         """
         if not system.contacts:
             return None

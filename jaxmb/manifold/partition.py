@@ -60,8 +60,8 @@ else:
 _AGE = 4
 _SLOW = 3
 # The stored factor is useless if the nearness to a loss of rank has changed by this factor since it was made, and on
-# the other side of that position: a factor of this state then replaces it. (A parallelogram in space that lies flat
-# several times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40 cases end soon after that position, as
+# the other side of that position. A factor of the present state then replaces it. (A parallelogram in space that lies
+# flat several times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40 cases end soon after that position, as
 # Newton's method fails at steps of any length; with this replacement none of 200.)
 _MOVED = 1.5
 # A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten
@@ -245,7 +245,7 @@ class Partition(AbstractManifold):
     constraints to Newton's tolerance at the end of every step. The error of a step is measured on all components. A
     chart is replaced when its influence matrix H has grown by the factor `max_influence`, or when redundant rows would
     serve better than the kept ones. The solver's history contains all components, so a new chart needs no restart. No
-    step ends much nearer than it began to a position where rows lose rank, such as a linkage that lies flat: it is made
+    step ends much nearer than it began to a position where rows lose rank, such as a linkage that lies flat. It is made
     shorter, so that the next step passes over that position.
 
     The formulation finds the accelerations of predicted states; the accelerations of corrected states follow by one
@@ -494,7 +494,7 @@ class FreeTerm(AbstractChartTerm):
 
 
 def _both(first, second):
-    """Two memories of laws, one after the other."""
+    """Two memories of laws, stacked."""
     return jax.tree.map(lambda *memories: jnp.stack(memories), first, second)
 
 

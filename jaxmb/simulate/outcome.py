@@ -133,7 +133,7 @@ def warn_of_jumps(system, outcome: Outcome, span: Span, restarts, announced) -> 
     jumps = _jumps.found((system, t0, t1, restarts), lambda: find_jumps(system, q, t0, t1, restarts))
     if not jumps:
         return
-    # The rows of ψ, then those of A.
+    # The rows of ψ, then the rows of A.
     rows = (*system.rows[: system.velocity_rows], *system.rows)
     names = " and ".join(dict.fromkeys(repr(rows[jump.row][0]) for jump in jumps))
     times = list(dict.fromkeys(jump.t for jump in jumps))
@@ -214,8 +214,8 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
 
 
 def reason_of_failure(system, result, span: Span, outcome: Outcome) -> str:
-    """Why a simulation ended at a finite state: numbers that are not finite there or just beyond, joints whose
-    constraints lose rank or cannot be met, or times that are too coarse.
+    """Why a simulation ended at a finite state. The reasons are numbers that are not finite there or just beyond,
+    joints whose constraints lose rank or cannot be met, and times that are too coarse.
     """
     t, y = outcome.t, outcome.y
     system = system.at(y)

@@ -207,7 +207,7 @@ def corrected(correction: Any, system: AbstractSystem, ts: Any, ys: Any, start: 
 
 
 def _replaced(values, old, new):
-    """Values with those among the `old` ones, which run up or down, replaced by the `new` ones."""
+    """Values in which the `old` ones, which run up or down, are replaced by the `new` ones."""
     order = jnp.argsort(old)
     k = order[jnp.clip(jnp.searchsorted(old[order], values), 0, old.size - 1)]
     return jnp.where(values == old[k], new[k], values)

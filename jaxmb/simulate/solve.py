@@ -170,7 +170,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     result, stuck, ran_out, coupling = _verdict(problem, span, start, end, solution, lost, saves.outside)
     motion, failed = (ys, solution.interpolation), has_failed(result)
     if problem.traced:
-        # Otherwise a derivative would be that of the part before the failure. The error belongs to the value, not to a
+        # Otherwise a derivative would belong to the part before the failure. The error belongs to the value, not to a
         # derivative taken alone.
         inputs = system, problem.state, problem.span, method.formulation, method.policy, stops.event, first.fn
         motion = nan_where(failed, motion, inputs)
@@ -252,7 +252,7 @@ def made_precise(problem: Problem, result: Any, outcome: Outcome) -> tuple[Any, 
 
 
 def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any]:
-    """The result of a run that ended at a state, made precise if it is stuck, and the coupling of friction with its own
+    """The result of a run that ended at a state, made precise if it is stuck; and the coupling of friction with its own
     reactions there, None without friction.
     """
     system = problem.system.prepared()

@@ -1,8 +1,8 @@
 """The choice of formulas that treat stiff components correctly, by the eigenvalues of the Jacobian.
 
-Formulas that are not A-stable amplify oscillations with an eigenvalue λ near the imaginary axis and `|h λ|` of order
-one to ten: lightly damped vibrations of stiff springs. An error estimate detects such oscillations only when they are
-as large as the tolerance, and then keeps steps as short as those of an explicit method. The eigenvalues predict them.
+Formulas that are not A-stable amplify lightly damped vibrations of stiff springs: an eigenvalue λ near the imaginary
+axis with `|h λ|` of order one to ten. An error estimate detects such oscillations only when they are as large as the
+tolerance, and then steps become as short as with an explicit method. The eigenvalues predict them.
 
 A-stable formulas damp components that should grow if `h λ` is large, and their error estimates as well. The equation of
 such a step has several solutions, and Newton's method may find the wrong one.
@@ -58,7 +58,7 @@ def sectors(family: str) -> NDArray[np.float64]:
     return out
 
 
-# Members of a batch are treated one after the other; see `jaxmb.linalg`.
+# Members of a batch are computed one after the other; see `jaxmb.linalg`.
 @sequential_vmap
 def _lapack_eigenvalues(matrix):
     return jnp.linalg.eigvals(matrix)

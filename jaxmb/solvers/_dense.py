@@ -94,7 +94,7 @@ class DenseLinearization(AbstractLinearization):
         units = jnp.zeros((free.size, self.state.shape[0]), self.state.dtype).at[jnp.arange(free.size), free].set(1)
         state, rate, _ = jax.vmap(lambda x: push(x, None), out_axes=-1)(units)
         jacobian = rate[free]
-        # A rate whose free components are held still satisfies the constraints where the state has moved to.
+        # A rate with held free components still satisfies the constraints at the moved state.
         turned = (rate - state @ jacobian).T
         _, _, acceleration = jax.vmap(push, out_axes=-1)(units, turned)
         held_acceleration, exact_inverses = acceleration[free], inverses_of(jacobian, acceleration[free], a, b)
@@ -189,7 +189,7 @@ def inverses_of(
     return Inverses(p, p_rate, missing, c)
 
 
-# Members of a batch are treated one after the other; see `jaxmb.linalg`.
+# Members of a batch are computed one after the other; see `jaxmb.linalg`.
 @sequential_vmap
 def _lapack_inverse(matrix):
     return jnp.linalg.inv(matrix)

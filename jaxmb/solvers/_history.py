@@ -6,8 +6,8 @@ derivatives is
     P(t) = sum_i differences[i] * basis_i(t),    basis_i(t) = prod_{j<i} (t - t_{n-j}) / (t_n - t_{n-j-1}),
 
 where `differences[i]` is the divided difference `f[t_n, ..., t_{n-i}]` times the spans that `basis_i` is divided by.
-All entries have the units of `f`, so no step size causes overflow or underflow, and advancing by one step needs only
-`basis_i` at the new mesh point: there are no loops over the order.
+All entries have the units of `f`, so no step size causes overflow or underflow. Advancing by one step needs only
+`basis_i` at the new mesh point, without loops over the order.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 HIGHEST_ORDER = 13
 LENGTH = HIGHEST_ORDER + 1
 
-# Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, that of the highest basis polynomial.
+# Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, the highest of a basis polynomial.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(7)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
 INDEX = np.arange(LENGTH, dtype=np.int32)

@@ -37,7 +37,7 @@ class RateInterpolation(MultistepInterpolation):
     """The integral of a polynomial through the derivatives at the end of a step and before.
 
     The evaluation at the end of a step changes this polynomial slightly, so its integral misses the initial value of
-    the step by `mismatch`. A cubic that is flat at both ends compensates for it: the solution is continuously
+    the step by `mismatch`. A cubic that is flat at both ends compensates for it. So the solution is continuously
     differentiable from step to step, and its derivative at mesh points is the vector field.
     """
 

@@ -1,4 +1,4 @@
-"""The formulas of a family beside the one in use, and the steps at which they damp."""
+"""The neighbours of the present formula in its family, and the steps at which formulas damp."""
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,7 @@ def damped_growth(
     factors: Float[Array, " formulas"],
 ) -> Float[Array, " formulas"]:
     """The factors by which steps may grow such that the longer steps damp all decaying components."""
-    # One change of a step is not larger than this.
+    # A single change of the step lies within these bounds.
     steps = h * jnp.stack([jnp.clip(factors, 0.5, 4.0), jnp.ones_like(factors)])
     then, now = jax.vmap(lambda steps: are_damped(family, points, steps, spectrum))(steps)
     zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)

@@ -1,8 +1,8 @@
 """Newton's method for the implicit equation of a step that uses the second derivative.
 
-A step solves `y = past + a f(t, y) + b g(t, y)`, where `g` is the time derivative of `f` along the solution: one exact
-directional derivative of `f`. The iteration is the same for all linearisations: full matrices (`_dense`), and matrices
-that know their structure (`_structured`).
+A step solves `y = past + a f(t, y) + b g(t, y)`. The time derivative `g` of `f` along the solution is exact: one
+directional derivative. The iteration is the same for all linearisations: full matrices (`_dense`), and matrices that
+know their structure (`_structured`).
 """
 
 import abc
@@ -130,8 +130,9 @@ class AbstractLinearization(eqx.Module):
         free: Int[Array, " free"],
         push: Callable[..., tuple[Array, Array, Array]],
     ) -> Callable[..., tuple[Array, Array, Array]]:
-        """The tangents of `(y, f, g)` at the end of a step, as a linear function `(by_numbers, load)`: of the tangents
-        of `(y, f, g)` for a held y and rate, and of the tangent of `past + a f + b g` for held f and g.
+        """The tangents of `(y, f, g)` at the end of a step, as a linear function of `(by_numbers, load)`. The first are
+        the tangents of `(y, f, g)` for a held y and rate, the second is the tangent of `past + a f + b g` for held f
+        and g.
 
         **Arguments:** `push`: the tangents of `(y, f, g)` by the tangents of y and of the rate that g is along.
         """
@@ -216,11 +217,11 @@ class Newton(eqx.Module):
     than round-off.
 
     If the error of the prediction is as large as the state, as at the end of a fast transient, there is no second
-    correction: the matrix may be so large that this correction appears negligible far from any solution.
+    correction. Otherwise, with a large matrix, it might appear negligible far from any solution.
 
     **Fields:** the `equation`; `size`: the norm of a correction in units of the tolerance; `tol`: the norm of the last
-    correction, which is not applied to y, and to f and g only through the current matrix: stiffness would multiply its
-    error there and spoil predictions.
+    correction. It is not applied to y, and to f and g only through the current matrix, since stiffness would multiply
+    its error there and spoil predictions.
     """
 
     equation: StepEquation

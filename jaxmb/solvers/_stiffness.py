@@ -2,7 +2,7 @@
 
 A step is counted as stiff under two conditions. First, the Jacobian, estimated from the corrector, is so large that the
 step is near the stability bound. Second, along the solution the vector field changes much less than that, relative to
-the state, or the state changes less than in the corrector: stability errors, not the motion, keep the step short. By
+the state, or the state changes less than in the corrector. So stability errors, not the motion, keep the step short. By
 measurement, this holds for fewer than one in ten steps of non-stiff motions, and for four in ten to all steps if
 stability limits them (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances 1e-4 to 1e-9).
 
@@ -52,7 +52,7 @@ def observed(
 ) -> Stiffness:
     """The evidence after one more step, from the changes of y and f by the corrector and by the step.
 
-    Sizes that are zero or not finite are no evidence.
+    Sizes that are zero or not finite do not count as evidence.
     """
     # |df| / |dy| of the corrector, compared with the ratio along the solution, without division.
     near = h * correction[1] > _NEAR * jnp.asarray(_bounds(), h.dtype)[order] * correction[0]

@@ -1,6 +1,6 @@
 """Newton's method with a Jacobian that knows its structure, as some terms on a manifold do.
 
-All components of the state are unknowns, and each iterate is projected on the manifold: the solution is the projection
+All components of the state are unknowns, and each iterate is projected on the manifold. The solution is the projection
 of `past + a f + b g`. With `1 - a x - b x² = (1 - r x)(1 - r* x)` one factor of `1 - r J` for a complex number r solves
 for corrections. The eigenvalues of J near 1 / r decide which formulas and steps are stable; they follow from Arnoldi's
 method with the same factor. The factor leaves out some terms of the exact derivative, so Newton's method converges
@@ -33,11 +33,11 @@ _ARNOLDI = 16
 _SMALL = 0.02
 # The part of a vector outside the space of the preceding vectors, at most, that is rounding errors.
 _ROUNDING = 1e-10
-# A matrix is renewed after a step whose corrections shrank more slowly than by this factor, and in a step where more
-# than about this number of iterations would follow.
+# A matrix is renewed after a step whose corrections shrank more slowly than by the first factor, and in a step that
+# would need more than about the second number of further iterations.
 _SLOW, _PATIENCE = 0.35, 8
-# The largest number of iterations for derivatives; the relative residual at which they end, and the largest one of a
-# derivative that may be used, in rounding units.
+# The largest number of iterations for derivatives; in rounding units, the relative residual at which they end, and the
+# largest residual of a usable derivative.
 _ITERATIONS, _RESIDUAL, _LARGEST_RESIDUAL = 40, 50, 1e5
 
 
@@ -234,7 +234,7 @@ def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -
 def _iterate(
     apply: Callable[[Array], Array], precondition: Callable[[Array], Array], load: Float[Array, " n"]
 ) -> Array:
-    """The solution of a linear equation by generalized conjugate residuals; NaN where it is not found."""
+    """The solution of a linear equation by generalized conjugate residuals; NaN without convergence."""
     n, dtype = load.size, load.dtype
     size = lambda x: jnp.sqrt(jnp.sum(x**2))
     unit = jnp.finfo(dtype).eps * size(load)

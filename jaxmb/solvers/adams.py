@@ -37,8 +37,8 @@ from .tolerances import Tolerances, norm_of
 _TARGET = 0.2
 # Numbers of evaluations and matrices in a step.
 _WORK = np.array([2, 0], np.int32)
-# The local error of order k is proportional to the power k + 1 of the steps if all of them change, but to the power 1 +
-# sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
+# The local error of order k is a product of the spans h_n + ... + h_{n-m+1}. So it is proportional to the power k + 1
+# of the steps if all of them change, but to the power 1 + sum_{m<=k} 1/m if only the last step does.
 _ORDERS = np.arange(1, LENGTH)
 _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
@@ -167,8 +167,7 @@ class Adams(AbstractMultistep):
 
         - `min_order`, `max_order`: bounds of the order; equal values fix it, after a start from order one.
         - `stiffness`: whether to count the steps that are limited by stability instead of accuracy, in
-            `AdamsState.stiffness`, and whether to stop, with `diffrax.RESULTS.nonlinear_divergence`, when a motion is
-            found stiff.
+            `AdamsState.stiffness`, and whether to stop at a stiff motion, with `diffrax.RESULTS.nonlinear_divergence`.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen. Otherwise leave them out.
 

@@ -2,8 +2,8 @@
 
 A step evaluates its field twice, at a prediction and at the corrected state, which differ by the local error. The
 tangent of a step uses one linearisation for both, at the corrected state, which is on its manifold and has a known
-field: nothing is solved, and little of a step is stored. It is the same method, applied to the tangent equation on the
-mesh of the motion, and differs from the derivative of the step by less than the local error of the tangent.
+field. So nothing is solved, and little of a step is stored. It is the same method, applied to the tangent equation on
+the mesh of the motion. It differs from the derivative of the step by less than the local error of the tangent.
 """
 
 import dataclasses
@@ -37,8 +37,9 @@ class Coefficients(eqx.Module):
     differences: Float[Array, "3"]
 
     def sums(self, differences: Float[Array, "length n"]) -> tuple[Array, Array, Array]:
-        """Values at the end of the step of the polynomials through the last 0, 1, 2, ... derivatives, and through the
-        last k - 1, k and k + 1; and the mean over the step of the polynomial through the last k.
+        """Values at the end of the step of two sets of polynomials, and a mean over the step. The first set goes
+        through the last 0, 1, 2, ... derivatives, the second through the last k - 1, k and k + 1; the mean is of the
+        polynomial through the last k.
         """
         sums = self.products @ differences
         return sums[:LENGTH], sums[LENGTH:-1], sums[-1]
@@ -55,7 +56,7 @@ def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, 
     end = step_end(mesh, t1)
     means, values = basis_means(mesh, mesh[0], end)
     means, values = means.astype(dtype), values.astype(dtype)
-    # Row by row, how many differences count: all polynomials, those of three orders, and the mean.
+    # For each row, how many differences count: all polynomials, the polynomials of three orders, and the mean.
     lengths = jnp.concatenate([jnp.asarray(INDEX), order + np.array([-1, 0, 1, 0], np.int32)])
     is_mean = np.arange(LENGTH + 4) == LENGTH + 3
     products = jnp.where(is_mean[:, None], means[None], values[None])
@@ -72,8 +73,8 @@ class AdamsRow(eqx.Module):
 
     **Fields:** its `end`; the `mesh`, the `order` and the number of `known` points at its start; state `y` and field
     `f` at its end; `kept`: the numbers kept of the chart there; `jump` at its start, None if steps have none. In the
-    row of a start the order is zero, `known` is zero unless the memory is given, and y, f and the chart belong to the
-    start.
+    row of a start the order is zero, and `known` is zero unless the memory is given. Then y, f and the chart belong to
+    the start.
     """
 
     end: Any

@@ -1,6 +1,6 @@
 """Functions of the user that close over traced values.
 
-JAX differentiates by such a value only if it is an argument: a custom derivative rule would treat it as a constant, and
+JAX differentiates by such a value only if it is an argument. A custom derivative rule would treat it as a constant, and
 the derivative by it would silently be zero. `opened` makes it an argument.
 """
 

@@ -35,8 +35,8 @@ _TRIAL, _SHORTER, _LONGER = 1e-4, 1e-8, 100.0
 # The recovery from a step shortened by a wrapper is at most this factor, unless the step's own error allows a longer
 # one; beyond it, differences are rounding errors.
 _RECOVERY = 100.0
-# After a step without an estimate, this number of steps grow by at most this factor, so that steps that are too long to
-# be solved are not tried again and again.
+# After a step without an estimate, this number of steps grow by at most this factor, so that unsolvable long steps are
+# not tried again and again.
 _CAUTION, _CAUTIOUS = 4, 1.4
 
 
@@ -123,10 +123,9 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
     motion = jaxmb.simulate(system, state, t1=1.0, solver=jaxmb.solvers.Adams(), stepsize_controller=control)
     ```
 
-    The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm, so that
-    the error of the result is of the size of the tolerance; below more, up to one, where that would be rounding. For
-    `Adams` and `Hermite`; to step exactly to some times, or over jumps, wrap it in
-    `diffrax.ClipStepSizeController`.
+    The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm. The error
+    of the result is then of the size of the tolerance. Near rounding errors the bound is larger, up to one. For `Adams`
+    and `Hermite`; to step exactly to some times, or over jumps, wrap it in `diffrax.ClipStepSizeController`.
 
     Without a given `dt0` the first step is a trial of one ten-thousandth of the interval, whose error tells how long
     the first step may be. It is rejected and counted as that, unless it happens to be of about the right length.
@@ -258,7 +257,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         keep = (y_error.error < 1) & ~(trial & (safety * y_error.retry > scalar(self.factormax)))
         if self.force_dtmin:
             keep = keep | (intended <= jnp.asarray(self.dtmin, dtype))
-        # The first step has no others before it.
+        # No steps precede the first one.
         response = jnp.where(opening > 0, scalar(1.0), y_error.response)
         allowed = (safety * jnp.where(keep, y_error.growth, y_error.retry)) ** response
         growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))

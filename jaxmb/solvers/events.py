@@ -33,9 +33,9 @@ _FRACTION, _EVALUATIONS, _SECANTS = 1e-13, 60, 12
 _END = 1e-9
 # After an event that follows another one at once, the next step is this fraction of the last attempted step.
 _SHORTER = 1e-2
-# A step is halved, so many times at most since guards may jump, unless at its middle gaps follow a cubic polynomial and
-# forces the mean of both ends, up to these fractions. If they do not to a hundredth of that, or if a force varies, the
-# next step is at most twice as long: otherwise they could repeat themselves in it.
+# At the middle of a step, gaps must follow a cubic polynomial and forces the mean of both ends, up to these fractions.
+# Otherwise it is halved, so many times at most, since guards may jump. If the differences exceed a hundredth of that,
+# or if a force varies, the next step is at most twice as long: they could repeat themselves in a longer one.
 _COARSE, _BENT, _HALVED, _NOT_SMOOTH, _VARIES, _GROWTH = 0.25, 0.05, 4, 0.01, 0.4, 2.0
 # The next start has this share of the length that the error of the last start allows.
 _START_SAFETY = 0.92
@@ -244,8 +244,8 @@ def _looked(search: _Search, values, rates, step_data):
     """The guards at the end, the middle and the start of a step.
 
     Looks for guards that are negative in the middle and for guards that are least within one of the halves. The step is
-    coarse where a guard's rate in the middle differs from that of the cubic polynomial through its values and rates at
-    the ends and its value in the middle, and where forces vary.
+    coarse if forces vary, or if a guard's rate in the middle differs from a cubic polynomial. The polynomial follows
+    from the rates at both ends, the value at the end and the value in the middle.
     """
     (last, values, first), (ends, rates, start) = values, rates
     search = search._replace(s=0.5 * search.s, end=last, rates=ends, middle=values, slopes=rates, start=start)
@@ -352,7 +352,7 @@ def _dipped(search: _Search, values, rates, step_data):
 
 
 def _risen(search: _Search, values, rates, step_data):
-    """Back from a point where guards are negative to one where they are positive; near the start there may be none."""
+    """Back from a point with negative guards to a point with positive ones, which may not exist near the start."""
     del rates
     values = values[0]
     least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
@@ -397,7 +397,7 @@ def narrowed(bracket: Bracket, s: Any, value: Any, bisects: Any, least: float = 
     """An interval shortened by a further value of the function in it, and the next point of evaluation.
 
     Source: M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11,
-    1971 (the Illinois method): if the same end moves twice, the value at the other end counts half.
+    1971 (the Illinois method). If the same end moves twice, the value at the other end counts half.
 
     **Arguments:** `value` at `s`; `bisects`: whether the middle is next; `least`: the distance of the next point from
     both ends, so that the interval becomes that short once one end is at the zero.

@@ -20,11 +20,11 @@ from .manifold_term import AbstractGaps
 
 # A stretch of a step is examined in this many pieces; stretches that hide nothing grow by this factor.
 _PIECES, _GROWTH = 8, 4.0
-# A contact is hidden if it is this many times deeper than at both ends of the step, or if its depth differs by this
-# fraction from the cubic polynomial through gaps and rates at both ends.
+# A contact is hidden if it is this many times deeper than at both ends of the step. It is also hidden if its depth
+# differs by this fraction from the cubic polynomial through gaps and rates at both ends.
 _DEEPER, _OFF = 2.0, 0.2
-# Depths below this fraction of the width in which a force sets in do not count (the depth of a ramp at a distance of 25
-# 000 widths). Depths below the next fraction may differ from the polynomial: there is no contact yet.
+# Depths below this fraction of the width in which a force sets in do not count (a ramp has it at a distance of 25 000
+# widths). Depths below the next fraction may differ from the polynomial, since the contact is not closed yet.
 _FAINT, _NEAR = 1e-5, 0.25
 # Pieces this short, relative to the step, are not divided; after this many looks the step is shortened.
 _SHORTEST, _LOOKS = 1e-9, 256
@@ -181,7 +181,7 @@ def _unlike(gaps, rates, piece):
 
 def _least(gaps, rates, piece):
     """Lower bounds of gaps in pieces between times. Gaps that close and open again are convex, as the distance from a
-    convex body along a straight path: the tangents at both ends meet at a lower bound.
+    convex body along a straight path. So the tangents at both ends meet at a lower bound.
     """
     (before, after), (closing, opening) = (gaps[:-1], gaps[1:]), (rates[:-1], rates[1:])
     turns = (closing < 0) & (opening > 0)

@@ -195,9 +195,9 @@ class Hermite(AbstractMultistep):
     Jacobian. Non-stiff problems are solved as accurately as by `Adams`, but more slowly.
 
     If a solution jumps from one slow motion to another, as in relaxation oscillations, give reverse mode a checkpoint
-    for every step, `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`. With fewer it repeats steps, rounding
-    changes their lengths slightly, and jumps occur too early or too late (van der Pol's equation with μ = 100 over a
-    jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
+    for every step, `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`. With fewer checkpoints it repeats
+    steps. Rounding then changes their lengths slightly, and jumps occur too early or too late (van der Pol's equation
+    with μ = 100 over a jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
 
     **Reference:**
 
@@ -232,11 +232,11 @@ class Hermite(AbstractMultistep):
         """**Arguments:**
 
         - `family`: the family of formulas.
-        - `past_points`: the numbers k of points of the past to choose from, increasing; default all useful ones. A
-            pair such as `(2, 4)` is a method that switches between two formulas by their errors; a single number fixes
-            the order. The method starts with k = 1.
+        - `past_points`: the numbers k of points of the past to choose from, increasing; default all useful ones. A pair
+            such as `(2, 4)` is a method that switches between two formulas by their errors; a single number fixes the
+            order. The method starts with k = 1.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
-            `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
+            `diffrax.StepTo`). They are the tolerances for the choice of the order and for Newton's method. Otherwise
             leave them out.
 
         **Raises:** `ValueError` for an unknown family, for numbers of points that it does not have or that are not
@@ -397,8 +397,8 @@ class Hermite(AbstractMultistep):
         return recent @ states, (recent * rates) @ states
 
     def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, begins: Any):
-        """The end of a step as a linear map of tangents: of the numbers, of the state at its start, and of the history
-        there, on the mesh of the step.
+        """The end of a step as a linear map of the tangents of the numbers, and of the state and the history at its
+        start, on the mesh of the step.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and the numbers; `end`:
         its time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there; `begins`:

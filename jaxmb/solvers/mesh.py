@@ -300,7 +300,7 @@ def _saved(series: Saved, table, place, k, row, w, dense, at):
 
 
 def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
-    """The transpose of `_saved`: the cotangents of a step's end and dense output, with those of the states saved in the
+    """The transpose of `_saved`: the cotangents of a step's end and dense output, including the states saved in the
     step, and the place of the series before it.
     """
     here = series.takes(k, row)
@@ -380,9 +380,10 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 
 def _recorded(equations, init_state, fixed, constants, limit, most):
-    """The last state of diffrax's loop, and packed: the rows of the last segment of at most `most` steps, then the row
-    of the start if there is one; and the starts of all segments with the choices of all steps, None for a single
-    segment.
+    """The last state of diffrax's loop, the rows of the last segment, and the starts of all segments with the choices
+    of all steps, None for a single segment. All but the first are packed.
+
+    The segment has at most `most` steps; behind its rows follows the row of the start if there is one.
     """
     (given, steps), terms = fixed, equations["terms"]
     size = min(most, given["max_steps"])
@@ -453,7 +454,7 @@ def _with_derivatives(recorded, equations, jumps, init_state, fixed):
     which the step size controller knows as well. The solver and these times are here for their tangents.
     """
     del jumps, fixed
-    # In a batch all outputs must be batched if their tangents are, and tangents are batched if any input is: under
+    # In a batch all outputs must be batched if their tangents are, and tangents are batched if any input is. Under
     # `jit`, JAX gives the outputs of a rule the batch axes of the outputs of its function.
     numbers = [x for x in jax.tree.leaves((recorded, equations, init_state)) if eqx.is_array(x) and x.size]
     same = jnp.any(jnp.stack([jnp.ravel(x)[0] != jnp.ravel(x)[0] for x in numbers]))

@@ -116,7 +116,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     solves_implicitly: AbstractVar[bool]
     finest: ClassVar[float] = 0.0
 
-    # diffrax fills in the tolerances of a step size controller here; there is no root finder.
+    # diffrax fills in the tolerances of a step size controller here; it is not a root finder.
     @property
     def root_finder(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.tolerances
@@ -310,7 +310,7 @@ def _step_from(solver, t1, like, args, state, terms, before, memory):
 def tolerances_of(
     solver: str, rtol: Any = None, atol: Any = None, norm: Callable[[PyTree], Any] = optx.rms_norm
 ) -> Tolerances:
-    """The tolerances of a solver, by default those of the step size controller.
+    """The tolerances of a solver, by default from the step size controller.
 
     **Raises:** `ValueError` for one tolerance without the other.
     """

@@ -70,8 +70,8 @@ def _step_from(solver, t0, t1, args, made_jump, terms, y0, state):
 
 
 def with_counted(controller: Any, counted: tuple[int, ...] | None) -> Any:
-    """A controller that measures the errors of some components only: those with the indices `counted` in the raveled
-    state (None: all). A controller that measures no errors is unchanged.
+    """A controller that measures the errors of some components only, with the indices `counted` in the raveled state
+    (None: all). A controller that measures no errors is unchanged.
     """
     if counted is None:
         return controller
@@ -140,8 +140,8 @@ class OneStepState(AbstractControllerState):
 
 
 class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
-    """A PID controller of the error of a state, in units of tolerances that may be relative to running `scales`, and of
-    the errors of `tangents` if the solver carries them along. `rtol`, `atol` and `norm` are those of `controller`.
+    """A PID controller of the error of a state, and of `tangents` if the solver carries them along. Errors are in units
+    of tolerances, which may be relative to running `scales`. `rtol`, `atol` and `norm` are taken from `controller`.
     """
 
     rtol: Any

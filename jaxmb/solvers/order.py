@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 # Arenstorf's orbit. Results are insensitive to them; a strong preference for low orders or for an unchanged step costs
 # 10-20%. Weights of the steps of the lower and of the higher order, relative to the present order.
 LOWER, _UPPER = 0.98, 0.95
-# After a step that is refused, the step changes by this factor, times the controller's safety.
+# After a refused step, the step changes by this factor, times the controller's safety.
 _REFUSED = 0.75
 # The fraction of the deviation from the target that the next step corrects.
 GAIN = 0.85
@@ -69,7 +69,7 @@ def choose_order(
     limit: Any = np.inf,
     bounded: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None,
 ) -> tuple[Int[Array, ""], StepEstimate]:
-    """Choose, among the present formula and its neighbours in order, the one that allows the longest next step.
+    """Choose the formula that allows the longest next step, among the present formula and its neighbours in order.
 
     **Arguments:**
 
@@ -81,7 +81,7 @@ def choose_order(
     - `known`: whether there are enough points for the error of the higher formula.
     - `target`: the error to aim at, in units of the tolerance.
     - `work`, `limit`: as in `StepEstimate`.
-    - `bounded`: limits the growth factors of the three formulas to those that stability allows.
+    - `bounded`: limits the growth factors of the three formulas for stability.
 
     **Returns:** `(-1, 0 or 1, StepEstimate)`.
     """
@@ -94,7 +94,7 @@ def choose_order(
     lower = jnp.where(may_fall, LOWER * factors[0], zero)
     same = factors[1]
     higher = jnp.where(may_rise & known, _UPPER * factors[2], zero)
-    # While every point since the start is in use there is no estimate for the next order, but it is usually better.
+    # While every point since the start is in use, the next order has no estimate, but is usually better.
     opening = may_rise & ~known & (lower <= same)
     rise = opening | ((higher > same) & (higher > lower))
     fall = ~rise & (lower > same)

@@ -60,8 +60,8 @@ class Jump(eqx.Module):
 def restarts(
     of, moved, like, jump: Jump, numbers: Callable[..., tuple[Array, ...]]
 ) -> Callable[..., tuple[Array, ...]]:
-    """The tangents of the numbers after a jump, if there was one, as a linear function of the tangents of the run's
-    numbers, of the state before it and of the field before it.
+    """The tangents of the numbers after a jump, if there was a jump, as a linear function. Its arguments are the
+    tangents of the run's numbers, and of the state and the field before the jump.
 
     **Arguments:** `numbers(field, t, y)`: the raveled state that a method starts from, and its derivatives there.
     """

@@ -26,7 +26,7 @@ class Block(eqx.Module):
     """A block of components of a state, measured by its largest component.
 
     **Fields:** its `name`; `size`: the number of its components; `initial`: the expected size at the start of a motion,
-    in natural units, used if the block is zero but for rounding errors, and None for a block with a least size of 1e-4;
+    in natural units, for a block that is zero but for rounding errors; None for a block with a least size of 1e-4;
     `rate_of`: the name of the preceding block whose rate of change it is, or None.
     """
 

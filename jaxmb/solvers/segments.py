@@ -44,7 +44,7 @@ class Choice(NamedTuple):
     """The choices made for a step.
 
     **Fields:** its end `tnext`, its start `tprev`, and whether it `made_jump`, as in the states of diffrax's loop.
-    Without jumps the last two are None: a step starts where the last one ended. `at_event` of its row; `chosen`: the
+    Without jumps the last two are None: a step starts at the end of the last. `at_event` of its row; `chosen`: the
     choices of its error estimate for the next step.
     """
 
@@ -96,8 +96,8 @@ def _at_event(old, new):
 
 
 def remainder(k: Any, size: int) -> Any:
-    """The remainder of a nonnegative number of steps: one operation for a power of two, else ten, and every kernel that
-    uses it as an index repeats them.
+    """The remainder of a nonnegative number of steps. It is one operation for a power of two, else ten, and every
+    kernel that uses it as an index repeats them.
     """
     k = jnp.asarray(k)
     return k & (size - 1) if size & (size - 1) == 0 else lax.rem(k, jnp.asarray(size, k.dtype))

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 Rationals: TypeAlias = tuple[Fraction, ...]
 
-# Tolerances: roots this far outside the unit circle count as on it, and points of the locus this near the imaginary
-# axis, relative to their size, as on the axis.
+# Tolerances: roots this far outside the unit circle count as on it. Points of the locus this near the imaginary axis,
+# relative to their size, count as on the axis.
 _OUTSIDE = 1e-7
 _LEFT = 1e-9
 
@@ -98,8 +98,8 @@ def formula(family: str, k: int) -> Formula:
 def adams(k: int) -> Formula:
     """Adams' predictor and corrector of order k with local extrapolation (PECE), on the test equation.
 
-    The formula of Adams and Bashforth of order k predicts, that of Adams and Moulton of order k + 1 corrects, and the
-    derivative is evaluated after both. With the coefficients `p_j` and `q_j` of the two,
+    The formula of Adams and Bashforth of order k predicts, the formula of Adams and Moulton of order k + 1 corrects,
+    and the derivative is evaluated after both. With the coefficients `p_j` and `q_j` of the two,
 
         y_{n+1} = y_n + h q_0 λ (y_n + h sum_j p_j f_{n+1-j}) + h sum_j q_j f_{n+1-j},  j = 1 ... k,
 
@@ -159,7 +159,7 @@ def boundary_locus(formula: Formula, theta: ArrayLike) -> NDArray[np.complex128]
 
     **Arguments:** `theta`: angles [rad], of any shape.
 
-    **Returns:** complex, of shape `(2, *theta.shape)`: the root of smaller and that of larger modulus of the quadratic
+    **Returns:** complex, of shape `(2, *theta.shape)`: the roots of smaller and of larger modulus of the quadratic
     equation `Π(ζ, μ) = 0`. The latter is infinite where the equation is linear.
     """
     powers = np.exp(-1j * np.asarray(theta, float)[..., None] * np.arange(len(formula.a)))
@@ -176,7 +176,7 @@ def stability_angle(formula: Formula) -> float:
 
     Computed from the sector without points of the boundary locus; roots are then tested on rays in it.
 
-    **Returns:** α [degrees] to 1e-3, 90 for an A-stable formula and 0 for one that is stable in no sector.
+    **Returns:** α [degrees] to 1e-3, 90 for an A-stable formula and 0 for a formula that is stable in no sector.
     """
 
     mu = boundary_locus(formula, _THETA)
@@ -206,7 +206,7 @@ def damping_at_infinity(formula: Formula) -> float:
 
 
 def is_zero_stable(formula: Formula) -> bool:
-    """Whether the formula is stable for `μ = 0`: all roots in the unit circle, and those on it simple."""
+    """Whether the formula is stable for `μ = 0`: all roots in the unit circle, and roots on it simple."""
     roots = characteristic_roots(formula, 0.0)
     on_circle = roots[np.abs(roots) > 1 - _OUTSIDE]
     distances = np.abs(on_circle[:, None] - on_circle) + np.eye(len(on_circle))
@@ -216,13 +216,13 @@ def is_zero_stable(formula: Formula) -> bool:
 def largest_growth(family: str, k: int) -> float:
     """The largest constant ratio of neighbouring steps for which a formula of variable step remains zero-stable.
 
-    With steps in a constant ratio the coefficients are constant too. Those of y are the same for all steps in the
-    families E and H, and in the one-step formulas.
+    With steps in a constant ratio the coefficients are constant too. The coefficients of y are the same for all steps
+    in the families E and H, and in the one-step formulas.
 
     **Arguments:** `family`, `k`: as for `formula`.
 
-    **Returns:** the ratio of a step and the one before, to 1e-5; infinite if every ratio is stable. It is below one for
-    a formula that is not zero-stable when the steps are equal.
+    **Returns:** the ratio of a step and its predecessor, to 1e-5; infinite if every ratio is stable. It is below one
+    for a formula that is not zero-stable when the steps are equal.
 
     **Raises:** `ValueError` for another family or `k < 1`.
     """
@@ -233,7 +233,7 @@ def largest_growth(family: str, k: int) -> float:
     def unstable(n):
         ratio = Fraction(n, _PARTS)
         nodes = [Fraction(0), *itertools.accumulate(-(ratio**-j) for j in range(k))]
-        # Sums of the coefficients are those of the polynomial divided by ζ - 1.
+        # Sums of the coefficients are the coefficients of the polynomial divided by ζ - 1.
         return _largest(np.roots(np.cumsum(np.array(_coefficients(family, nodes)[0], float))[:-1])) > 1
 
     tenth = _PARTS // 10
@@ -244,7 +244,7 @@ def largest_growth(family: str, k: int) -> float:
 def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figure":
     """Draw the regions of stability of some formulas in the plane of μ, shaded.
 
-    **Arguments:** `formulas`: the formulas; `ax`: the matplotlib axes, default those of a new figure.
+    **Arguments:** `formulas`: the formulas; `ax`: the matplotlib axes, default in a new figure.
 
     **Returns:** the matplotlib `Figure`.
 

@@ -307,8 +307,8 @@ def _is_finite(y: PyTree) -> Any:
 
 
 def _changes(event: diffrax.Event, before: PyTree, values: PyTree, finite: Any) -> PyTree:
-    """Which functions of an event say that it happened in a step to a state that is `finite`: a truth value, or a
-    number that changes its sign or is none any more.
+    """Which functions of an event happened in a step to a state that is `finite`: a true value, or a number that
+    changes its sign or becomes NaN.
     """
 
     def changes(_, old, new, upwards):
@@ -325,7 +325,7 @@ def _changes(event: diffrax.Event, before: PyTree, values: PyTree, finite: Any) 
 
 
 def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
-    """The first of several that happened, and whether one did."""
+    """The first of several events that happened, and whether any did."""
     leaves, structure = jax.tree.flatten(mask)
     happened, first = False, []
     for leaf in leaves:
@@ -335,7 +335,7 @@ def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
 
 
 def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree, Any]:
-    """The time of the event in the last step, the state there, and the result; of a run without an event, those of its
+    """The time of the event in the last step, the state there, and the result; in a run without an event, of its
     end.
     """
     event: Any = solve.event

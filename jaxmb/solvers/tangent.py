@@ -2,7 +2,7 @@
 
 Steps that follow a motion may lie far outside the stability region of a mode that is not excited. The motion does not
 show it, but its derivatives grow from step to step without bound. A differentiated solve therefore carries a tangent w
-of the state along, `w' = J(t, y) w`, from a start that excites every mode, and keeps its local error small as well.
+of the state along, `w' = J(t, y) w`, and keeps its local error small as well. Its start excites every mode.
 
 Nor does a motion show a force of strength zero, but its derivative by the strength is a function of time that steps
 must resolve. With derivatives by parameters, the solve also carries a tangent that parameters cause, `d' = J d + f_p`.
@@ -195,7 +195,7 @@ def _pushed_jvp(primals, tangents):
     out, push, rest = jax.linearize(run, moving, has_aux=True)
     zeros = jax.tree.map(jnp.zeros_like, moving)
     dout = push(eqx.combine((dfunction, dat), zeros))
-    # As a derivative of the linear function, each leaves out what its direction does not change.
+    # Each is a derivative of the linear function, and so omits parts that its direction does not change.
     pushes = [eqx.filter_jvp(push, (zeros,), (tangent,))[1] for tangent in directions]
     return (eqx.combine(out, rest), pushes), (dout, jax.tree.map(lambda _: None, pushes))
 

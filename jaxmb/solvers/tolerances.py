@@ -13,7 +13,7 @@ from .evaluation import unravel_like
 from .scales import RunningScales, ends_of
 
 # The part of the tolerance for the error of one step. A method of variable order settles where the estimates of
-# neighbouring orders are equal: the extrapolated step is hardly better than its estimate, and the errors of a hundred
+# neighbouring orders are equal. The extrapolated step is hardly better than its estimate, and the errors of a hundred
 # steps add up. A Runge–Kutta method of high order takes fewer steps, much better than their estimates. With one
 # twentieth a tolerance means the same error of the result for both.
 _SHARE = 1 / 20

@@ -104,7 +104,7 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
 
 def jump_times(controller: Any) -> Any:
     """The times of jumps that a step size controller knows, or None."""
-    # A concrete class, which alone has such times.
+    # A concrete class: no other has such times.
     return controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
 
 
