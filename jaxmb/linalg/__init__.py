@@ -8,8 +8,10 @@ microseconds for one matrix inside a compiled loop.
 fast as LAPACK up to about 30 rows. A search for pivots in every elimination costs ten times as much, so pivots are
 searched only when a chart is made (`elimination`).
 
-| n | 4 | 8 | 12 | 20 | 30 | |---|---|---|---|---|---| | LAPACK inverse | 0.7 | 1.1 | 2.2 | 4.3 | 8.6 | | Gauss–Jordan
-in a known order | 0.1 | 0.55 | 1.25 | 4.3 | 8.0 |
+| n | 4 | 8 | 12 | 20 | 30 |
+|---|---|---|---|---|---|
+| LAPACK inverse | 0.7 | 1.1 | 2.2 | 4.3 | 8.6 |
+| Gauss–Jordan in a known order | 0.1 | 0.55 | 1.25 | 4.3 | 8.0 |
 
 Full pivoting with the search takes 1.5, 9 and 88 for matrices of 4 × 9, 8 × 12 and 20 × 21. Without the search, the
 loop that rotates the pivot into the corner is nearly twice as fast as elimination in place up to 18 rows. Elimination

@@ -3,10 +3,11 @@
 A formula advances `y' = f`, whose second derivative is `g`. It interpolates a quantity z at the end of the step, with
 its slope, and at points of the past, and imposes one condition on the polynomial:
 
-    family   z   points of the past     the polynomial                                order E        f   k
-    integrated over the step gives the change     k + 2 H        f   k, with their slopes   the same
-    2k + 2 B        y   k                      has the second derivative g at the end        k + 1 Y        y   k, with
-    their slopes   the same                                      2k + 1
+    family   z   points of the past     the polynomial                                order
+    E        f   k                      integrated over the step gives the change     k + 2
+    H        f   k, with their slopes   the same                                      2k + 2
+    B        y   k                      has the second derivative g at the end        k + 1
+    Y        y   k, with their slopes   the same                                      2k + 1
 
 A point with its slope is a double node. So all families are one formula on `m` nodes of the past, `m = k` or `2k`, and
 follow from one table of divided differences. With the Newton basis of these nodes and `s = (t - t_{n+1}) / h`,
