@@ -173,18 +173,16 @@ def define_bilinear(
             jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             for x, axis in zip(operands, axes, strict=True)
         ]
-        return primitive.bind(*front, **static), 0
+        return op.bind(*front, **static), 0
 
     of_a, of_b = gradients
-    primitive = Primitive(name)
-    primitive.def_impl(jax.jit(evaluate, static_argnames=parameters))
-    primitive.def_abstract_eval(lambda a, b, **static: ShapedArray(shape(a, b, **static), a.dtype))
-    mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=False))
-    ad.defbilinear(
-        primitive, lambda c, a, b, **static: of_a(c, b, **static), lambda c, a, b, **static: of_b(c, a, **static)
-    )
-    batching.primitive_batchers[primitive] = batched
-    return primitive.bind
+    op = Primitive(name)
+    op.def_impl(jax.jit(evaluate, static_argnames=parameters))
+    op.def_abstract_eval(lambda a, b, **static: ShapedArray(shape(a, b, **static), a.dtype))
+    mlir.register_lowering(op, mlir.lower_fun(evaluate, multiple_results=False))
+    ad.defbilinear(op, lambda c, a, b, **static: of_a(c, b, **static), lambda c, a, b, **static: of_b(c, a, **static))
+    batching.primitive_batchers[op] = batched
+    return op.bind
 
 
 def define_linear(
@@ -201,15 +199,15 @@ def define_linear(
     """
 
     def batched(operands, axes, *, lead, **static):
-        return primitive.bind(jnp.moveaxis(operands[0], axes[0], 0), lead=lead + 1, **static), 0
+        return op.bind(jnp.moveaxis(operands[0], axes[0], 0), lead=lead + 1, **static), 0
 
-    primitive = Primitive(name)
-    primitive.def_impl(jax.jit(evaluate, static_argnames=("lead", *parameters)))
-    primitive.def_abstract_eval(lambda a, **static: ShapedArray(shape(a.shape, **static), a.dtype))
-    mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=False))
-    ad.deflinear2(primitive, lambda c, a, **static: [transpose(c, a.aval.shape, **static)])
-    batching.primitive_batchers[primitive] = batched
-    return functools.partial(primitive.bind, lead=0)
+    op = Primitive(name)
+    op.def_impl(jax.jit(evaluate, static_argnames=("lead", *parameters)))
+    op.def_abstract_eval(lambda a, **static: ShapedArray(shape(a.shape, **static), a.dtype))
+    mlir.register_lowering(op, mlir.lower_fun(evaluate, multiple_results=False))
+    ad.deflinear2(op, lambda c, a, **static: [transpose(c, a.aval.shape, **static)])
+    batching.primitive_batchers[op] = batched
+    return functools.partial(op.bind, lead=0)
 
 
 def let_go(primitive: Primitive, rule: Callable[[list[bool], Any], tuple[list[bool], Any]]) -> None:

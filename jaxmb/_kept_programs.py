@@ -70,14 +70,12 @@ class KeptPrograms(CacheInterface):
         """Drop programs until there is room for one of this size."""
         files = {}
         with os.scandir(self._path) as entries:
-            for entry in entries:
+            for file in entries:
                 with contextlib.suppress(FileNotFoundError):
-                    files[entry.name] = entry.stat()
-        sizes = {name.removesuffix(_PROGRAM): entry.st_size for name, entry in files.items() if name.endswith(_PROGRAM)}
+                    files[file.name] = file.stat()
+        sizes = {name.removesuffix(_PROGRAM): file.st_size for name, file in files.items() if name.endswith(_PROGRAM)}
         used = {key: files.get(f"{key}{_USED}", files[f"{key}{_PROGRAM}"]).st_mtime for key in sizes}
-        dropped = [
-            name for name, entry in files.items() if name.endswith(_NEW) and entry.st_mtime < time.time() - _DEAD
-        ]
+        dropped = [name for name, file in files.items() if name.endswith(_NEW) and file.st_mtime < time.time() - _DEAD]
         total = sum(sizes.values()) + size
         for key in sorted(sizes, key=used.__getitem__):
             if total <= self._max_size:

@@ -45,9 +45,9 @@ class State(eqx.Module):
 
 def _shown(x: Any) -> str:
     """The numbers of an array if they are concrete and few, else its shape and type."""
-    is_concrete = isinstance(x, Array | np.ndarray) and not isinstance(x, Tracer)
+    concrete = isinstance(x, Array | np.ndarray) and not isinstance(x, Tracer)
     return (
         np.array2string(np.asarray(x), precision=6, separator=", ")
-        if is_concrete and x.size <= _FEW
+        if concrete and x.size <= _FEW
         else eqx.tree_pformat(x)
     )

@@ -36,17 +36,12 @@ _TRIALS, _GAIN = 40, 1e-12
 class Event(NamedTuple):
     """The numbers of an event, for its derivative as well.
 
-    **Fields:** see `Impact` for the fields that are not listed.
-
-    - `late`: the time until then.
-    - `first`: the gap or slip that is zero first; none if `hits` is false.
-    - `before`, `after`: accelerations before and after.
-    - `at`, `u`: velocities before and after.
-    - `held`: contacts whose gaps have the rates of the impact, and friction whose slip is zero.
-    - `low`: contacts that would bounce lower than the resolution.
-    - `slips`: the direction of slip in the impact, zero without slip.
-    - `share`: the share of the rebounds at which no energy is gained.
-    - `compression`: of an impact by Poisson's law; `held` and `slips` then belong to the expansion.
+    **Fields:** `late`: the time until then; `first`: the gap or slip that is zero first, none if `hits` is false;
+    accelerations `before` and `after`; velocities before (`at`) and after (`u`); `held`: contacts whose gaps have the
+    rates of the impact, and friction whose slip is zero; `low`: contacts that would bounce lower than the resolution;
+    `slips`: the direction of slip in the impact, or zero; `share` of the rebounds at which no energy is gained;
+    `compression` of an impact by Poisson's law, after which `held` and `slips` belong to the expansion; see `Impact`
+    for the others.
     """
 
     late: Float[Array, ""]

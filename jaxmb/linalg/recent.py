@@ -49,8 +49,6 @@ def _are_same(argument, kept):
     if argument is kept:
         return True
     if isinstance(argument, eqx.Module) and type(argument) is type(kept):
-        (leaves, structure), (kept_leaves, kept_structure) = jax.tree.flatten(argument), jax.tree.flatten(kept)
-        return (
-            len(leaves) == len(kept_leaves) and all(map(_are_same, leaves, kept_leaves)) and structure == kept_structure
-        )
+        (leaves, structure), (old_leaves, old_structure) = jax.tree.flatten(argument), jax.tree.flatten(kept)
+        return len(leaves) == len(old_leaves) and all(map(_are_same, leaves, old_leaves)) and structure == old_structure
     return isinstance(argument, _NUMBERS) and type(argument) is type(kept) and argument == kept

@@ -71,16 +71,14 @@ def parameter_changes(
     """Values of parameters and their changes, by name; None for all."""
     if direction is None:
         return None
-    values_by_name = parameters(system)
+    values = parameters(system)
     if not isinstance(direction, Mapping):
         raise ValueError(f"direction must be a dictionary of parameters by name, got {direction!r}.")
     for name in direction:
-        if name not in values_by_name:
-            raise unknown("parameter", name, values_by_name)
-    array = lambda name, x: real_array(
-        f"direction[{name!r}]", x, values_by_name[name].dtype, (values_by_name[name].shape,)
-    )
-    return {name: (values_by_name[name], array(name, x)) for name, x in direction.items()}
+        if name not in values:
+            raise unknown("parameter", name, values)
+    array = lambda name, x: real_array(f"direction[{name!r}]", x, values[name].dtype, (values[name].shape,))
+    return {name: (values[name], array(name, x)) for name, x in direction.items()}
 
 
 def pushed(function: Callable[..., Any], at: Any, used: Any) -> Any:

@@ -97,7 +97,7 @@ class DenseLinearization(AbstractLinearization):
         # A rate with held free components still satisfies the constraints at the moved state.
         turned = (rate - state @ jacobian).T
         _, _, acceleration = jax.vmap(push, out_axes=-1)(units, turned)
-        held_acceleration, exact_inverses = acceleration[free], inverses_of(jacobian, acceleration[free], a, b)
+        of_g, exact = acceleration[free], inverses_of(jacobian, acceleration[free], a, b)
 
         def solve(by_numbers, load):
             y, f, g = by_numbers
@@ -108,9 +108,9 @@ class DenseLinearization(AbstractLinearization):
                 # Large terms are combined as in `correction` above, so the result does not depend on the last digits of
                 # an inverse.
                 slope = moved + jacobian @ change
-                mismatch = change - (load + b * g)[free] - b * held_acceleration @ change
-                mismatch = mismatch - exact_inverses.missing * jacobian @ slope
-                return exact_inverses.c @ (exact_inverses.p @ mismatch - exact_inverses.p_rate @ slope), slope
+                mismatch = change - (load + b * g)[free] - b * of_g @ change
+                mismatch = mismatch - exact.missing * jacobian @ slope
+                return exact.c @ (exact.p @ mismatch - exact.p_rate @ slope), slope
 
             change = -correction(jnp.zeros_like(moved))[0]
             remainder, slope = correction(change)

@@ -219,9 +219,9 @@ def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -
         # Small machines have fewer eigenvalues than steps. The rest of x is then rounding errors, whose direction must
         # not enter the basis.
         length = size(x)
-        is_new = length > _ROUNDING * whole
-        x = jnp.where(is_new, x / length.astype(x.dtype), jnp.zeros_like(x))
-        return basis.at[k + 1].set(x), column.at[k + 1].set(jnp.where(is_new, length, 0.0).astype(x.dtype))
+        new = length > _ROUNDING * whole
+        x = jnp.where(new, x / length.astype(x.dtype), jnp.zeros_like(x))
+        return basis.at[k + 1].set(x), column.at[k + 1].set(jnp.where(new, length, 0.0).astype(x.dtype))
 
     _, columns = lax.scan(extend, basis, jnp.arange(m))
     ritz_values = eigenvalues(columns[:, :m].T)

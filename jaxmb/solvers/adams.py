@@ -215,20 +215,18 @@ class Adams(AbstractMultistep):
         if before is None:
             step_counts, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
             sizes = None if self.tolerances.scales is None else self.tolerances.scales.none(flat.dtype)
-            jump_numbers = eqx.filter_eval_shape(found_at_jump, terms, t0, y0, args)
-            jump_numbers = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jump_numbers)
+            at_jump = eqx.filter_eval_shape(found_at_jump, terms, t0, y0, args)
+            at_jump = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), at_jump)
         else:
             step_counts, stiffness, sizes = before.step_counts, before.stiffness, before.sizes
-            jump_numbers = before.found
+            at_jump = before.found
         tangents = None
         if self.tangent_control is not None:
             control = self.tangent_control
             ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
             tangents = tuple(Tangent(w, jnp.zeros_like(history.differences), control.largest(w)) for w in ws)
         order = jnp.asarray(1, np.int32)
-        return AdamsState(
-            history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents, jump_numbers
-        )
+        return AdamsState(history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents, at_jump)
 
     def attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
         history, order, chart = state.history, state.order, state.chart

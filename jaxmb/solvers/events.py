@@ -57,22 +57,15 @@ class AbstractErrorWithMore(eqx.Module):
 
 
 class Crossing(AbstractErrorWithMore):
-    """The `y_error` that a solver passes to an `EventController`.
+    """The `y_error` that a solver passes to an `EventController`; flags are 1 or 0, since diffrax expects no truth
+    values.
 
-    **Fields:** Flags are 1 or 0, since diffrax expects no truth values in an error.
-
-    - `error`: the error for the controller inside.
-    - `target`: the time of the first zero in the step.
-    - `within`: 1 if a guard is negative within the step.
-    - `lowest`: the lowest guard at its end.
-    - `falling`: 1 if a guard falls through zero there.
-    - `lost`: 1 if the term lost the motion at the start of the step: an event led to no state, and the state is
-        infinite.
-    - `coarse`: how coarse the step is for guards that vary in it; above 1 it is too long.
-    - `touch`, `near`: as of the guards.
-    - `retry`: the factor by which a multistep method could retry the step; infinite for other methods, which do not
-        restart.
-    - `idle`: 1 if the step restarts though the event changed nothing.
+    **Fields:** the `error` for the controller inside; `target`: the time of the first zero in the step; `within`: 1 if
+    a guard is negative within the step; the `lowest` guard at its end; `falling`: 1 if a guard falls through zero
+    there; `lost`: 1 if an event at its start led to no state, and the state is infinite; `coarse`: above 1 if the step
+    is too long for guards that vary in it; `touch` and `near` of the guards; `retry`: the factor by which a multistep
+    method could retry the step, infinite for methods without restarts; `idle`: 1 if the step restarts though the event
+    changed nothing.
     """
 
     error: PyTree

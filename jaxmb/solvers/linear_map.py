@@ -36,7 +36,7 @@ class _Programs:
     def program_of(self, operands: Sequence[jax.ShapeDtypeStruct]) -> Any:
         """The traced map for operands of these shapes, residuals and x, which distinguishes it from others."""
         count = len(operands) - len(self.inputs)
-        return jax.make_jaxpr(lambda *arrays: _evaluate(*arrays, programs=self, residual_count=count))(*operands)
+        return jax.make_jaxpr(lambda *arrays: _evaluate(*arrays, programs=self, split=count))(*operands)
 
     def transposed(self, nonzero: tuple[bool, ...]) -> "_Programs":
         """The transpose, for cotangents of which only the `nonzero` ones are given."""
@@ -125,7 +125,7 @@ def linear_map(
     shapes = lambda leaves: [ShapedArray(a.shape, a.dtype) for a in leaves]
     both = map_of(again[0]), transpose_of(again[1])
     programs = _Programs(map_of(forward), transpose_of(backward), both, shapes(inputs), shapes(outputs))
-    values = _linear_map.bind(*residual_leaves, *inputs, programs=programs, residual_count=len(residual_leaves))
+    values = _linear_map.bind(*residual_leaves, *inputs, programs=programs, split=len(residual_leaves))
     return jax.tree.unflatten(of_outputs, values)
 
 
@@ -135,26 +135,24 @@ def filled(x: PyTree, tangent: PyTree) -> PyTree:
     return jax.tree.map(fill, x, tangent, is_leaf=lambda x: x is None)
 
 
-def _evaluate(*operands: Array, programs: _Programs, residual_count: int) -> list[Array]:
-    return programs.forward(
-        list(operands[:residual_count]), list(operands[residual_count:]), [True] * len(programs.outputs)
-    )
+def _evaluate(*operands: Array, programs: _Programs, split: int) -> list[Array]:
+    return programs.forward(list(operands[:split]), list(operands[split:]), [True] * len(programs.outputs))
 
 
-def _push(primals, tangents, *, programs: _Programs, residual_count: int):
-    out = _linear_map.bind(*primals, programs=programs, residual_count=residual_count)
+def _push(primals, tangents, *, programs: _Programs, split: int):
+    out = _linear_map.bind(*primals, programs=programs, split=split)
     pushed = [jnp.zeros(a.shape, a.dtype) for a in programs.outputs]
-    if any(type(t) is not Zero for t in tangents[residual_count:]):
-        x = [ad.instantiate_zeros(t) for t in tangents[residual_count:]]
-        pushed = _linear_map.bind(*primals[:residual_count], *x, programs=programs, residual_count=residual_count)
-    moving = [k for k in range(residual_count) if type(tangents[k]) is not Zero]
+    if any(type(t) is not Zero for t in tangents[split:]):
+        x = [ad.instantiate_zeros(t) for t in tangents[split:]]
+        pushed = _linear_map.bind(*primals[:split], *x, programs=programs, split=split)
+    moving = [k for k in range(split) if type(tangents[k]) is not Zero]
     if moving:
 
         def moved(*values):
-            residuals = list(primals[:residual_count])
+            residuals = list(primals[:split])
             for k, value in zip(moving, values, strict=True):
                 residuals[k] = value
-            return programs.again[0](residuals, list(primals[residual_count:]), [True] * len(programs.outputs))
+            return programs.again[0](residuals, list(primals[split:]), [True] * len(programs.outputs))
 
         along = tuple(tangents[k] for k in moving)
         _, by_residuals = jax.jvp(moved, tuple(primals[k] for k in moving), along)
@@ -162,23 +160,21 @@ def _push(primals, tangents, *, programs: _Programs, residual_count: int):
     return out, pushed
 
 
-def _transpose(cotangents, *operands, programs: _Programs, residual_count: int):
+def _transpose(cotangents, *operands, programs: _Programs, split: int):
     nonzero = tuple(type(c) is not Zero for c in cotangents)
     given = [c for c, here in zip(cotangents, nonzero, strict=True) if here]
-    pulled = _linear_map.bind(
-        *operands[:residual_count], *given, programs=programs.transposed(nonzero), residual_count=residual_count
-    )
-    return [None] * residual_count + list(pulled)
+    pulled = _linear_map.bind(*operands[:split], *given, programs=programs.transposed(nonzero), split=split)
+    return [None] * split + list(pulled)
 
 
-def _batch(operands, axes, *, programs: _Programs, residual_count: int):
+def _batch(operands, axes, *, programs: _Programs, split: int):
     size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
     front = [
         jnp.broadcast_to(x[None], (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(operands[residual_count:], axes[residual_count:], strict=True)
+        for x, axis in zip(operands[split:], axes[split:], strict=True)
     ]
-    batched = programs.batched(size, axes[:residual_count])
-    out = _linear_map.bind(*operands[:residual_count], *front, programs=batched, residual_count=residual_count)
+    batched = programs.batched(size, axes[:split])
+    out = _linear_map.bind(*operands[:split], *front, programs=batched, split=split)
     return out, [0] * len(out)
 
 
@@ -207,7 +203,7 @@ batching.defvectorized(_forward_only)
 _linear_map = Primitive("linear_map")
 _linear_map.multiple_results = True
 _linear_map.def_impl(lambda *operands, **static: jax.jit(lambda *x: _evaluate(*x, **static))(*operands))
-_linear_map.def_abstract_eval(lambda *operands, programs, residual_count: list(programs.outputs))
+_linear_map.def_abstract_eval(lambda *operands, programs, split: list(programs.outputs))
 mlir.register_lowering(_linear_map, mlir.lower_fun(_evaluate, multiple_results=True))
 ad.primitive_jvps[_linear_map] = _push
 ad.primitive_transposes[_linear_map] = _transpose

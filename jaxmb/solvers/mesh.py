@@ -205,10 +205,8 @@ class Mesh(eqx.Module):
                 rows = [buffer_set(buffer, self._place(k), x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x, self._is_step(k)), ddense, dense)
-            all_series = zip(self.saved, saved, places, strict=True)
-            new = [
-                _saved(series, table, place, k, row, after[0], ddense, step.at) for series, table, place in all_series
-            ]
+            parts = zip(self.saved, saved, places, strict=True)
+            new = [_saved(series, table, place, k, row, after[0], ddense, step.at) for series, table, place in parts]
             saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
             return k + 1, after, saved, places, rows, dense, ddense if self.event else None
 

@@ -43,7 +43,7 @@ class StepEstimate(eqx.Module):
 
 
 def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
-    """The estimate of a step, changed where it must not be accepted (`off`)."""
+    """The estimate of a step, which must not be accepted where `off`."""
     parts = lambda e: (e.error, e.growth, e.retry, e.response)
     values = zip(parts(estimate), (jnp.inf, 0.0, _REFUSED, 1.0), strict=True)
     changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]

@@ -66,7 +66,7 @@ class RunningScales(eqx.Module):
             if block.rate_of is None:
                 sizes[block.name] = _expected(block, size)
             else:
-                # From rest, a rate of this size moves the other block by its size.
+                # From rest, the acceleration reaches this velocity when the other block has moved by its size.
                 ahead = jnp.sqrt(sizes[block.rate_of] * rate)
                 size = jnp.maximum(size, jnp.where(jnp.isfinite(ahead), ahead, 0.0))
                 # Less where the motion itself is small.

@@ -41,7 +41,7 @@ class _Solve(NamedTuple):
     max_steps: int | None
     progress_meter: Any
 
-    def map_series(self, function: Callable[[diffrax.SubSaveAt, Any], Any], saved: PyTree) -> PyTree:
+    def on_series(self, function: Callable[[diffrax.SubSaveAt, Any], Any], saved: PyTree) -> PyTree:
         """Map a function of `(series, saved)` over the series of saved states."""
         return jax.tree.map(function, self.saveat.subs, saved, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
 
@@ -86,7 +86,7 @@ def stepped(state: Any, outer_while_loop: Callable[..., Any], constants: dict[st
     if solve.saveat.dense:
         state = dataclasses.replace(state, dense_ts=state.dense_ts.at[0].set(solve.t0))
     at_start = lambda sub, saved: _saved(solve, sub, saved, solve.t0, state.y) if sub.t0 else saved
-    state = dataclasses.replace(state, save_state=solve.map_series(at_start, state.save_state))
+    state = dataclasses.replace(state, save_state=solve.on_series(at_start, state.save_state))
     proceed = lambda state: _proceeds(solve, dataclasses.replace(state, **constants))
     advance = lambda state: _advanced(solve, dataclasses.replace(state, **constants))
     return outer_while_loop(proceed, advance, state, max_steps=solve.max_steps, buffers=_buffers)
@@ -101,9 +101,9 @@ def ended(last: Any, constants: dict[str, Any], **given: Any) -> Any:
         happened = jnp.any(jnp.stack(jax.tree.leaves(last.event_mask)))
         find = lambda: _time_of_event(solve, last, happened)
         t, y, result = lax.cond(any_of_batch(happened), find, lambda: (t, y, result))
-        saved = solve.map_series(lambda _, saved: _until(saved, t), saved)
-    saved = solve.map_series(lambda sub, saved: _without_steps(solve, sub, saved, y), saved)
-    saved = solve.map_series(
+        saved = solve.on_series(lambda _, saved: _until(saved, t), saved)
+    saved = solve.on_series(lambda sub, saved: _without_steps(solve, sub, saved, y), saved)
+    saved = solve.on_series(
         lambda sub, saved: _with_end(solve, sub, saved, last.num_accepted_steps, (t, y), finds), saved
     )
     last = dataclasses.replace(last, **constants | {"save_state": saved})
@@ -171,8 +171,8 @@ def _advanced(solve: _Solve, state: Any) -> Any:
         num_rejected_steps=state.num_rejected_steps + jnp.where(keep, 0, 1),
     )
     within = solve.solver.interpolation_cls(t0=start, t1=end, **dense)
-    saved = solve.map_series(lambda sub, saved: _with_times(solve, sub, saved, within, end, keep), state.save_state)
-    saved = solve.map_series(lambda sub, saved: _with_step(solve, sub, saved, accepted, (tprev, y), keep), saved)
+    saved = solve.on_series(lambda sub, saved: _with_times(solve, sub, saved, within, end, keep), state.save_state)
+    saved = solve.on_series(lambda sub, saved: _with_step(solve, sub, saved, accepted, (tprev, y), keep), saved)
     new = dataclasses.replace(new, save_state=saved)
     if solve.saveat.dense:
         place = state.dense_save_index
