@@ -69,7 +69,7 @@ def impact(
     t: Scalar,
     y: State,
     dated: bool = False,
-    event: Event | None = None,
+    given: Event | None = None,
 ) -> Impact:
     """The event of contacts that are about to close, or to open, at a state.
 
@@ -79,11 +79,11 @@ def impact(
     has none. There is no second derivative.
 
     **Arguments:** `system`: with the internal states of `y`; `dated`: whether `late` has its derivative even if the
-    state after the event does not depend on it, as when a contact opens; `event`: the event, if it is known.
+    state after the event does not depend on it, as when a contact opens; `given`: the event, if it is known.
     """
     t, touch = jnp.asarray(t, y.q.dtype), jnp.asarray(tolerance.touch, y.q.dtype)
-    event = find_event(system, formulation, tolerance, t, y) if event is None else event
-    after, event = _impact(system, t, y, event, ContactTolerance(touch), dated)
+    given = find_event(system, formulation, tolerance, t, y) if given is None else given
+    after, event = _impact(system, t, y, given, ContactTolerance(touch), dated)
     old, new = (system.contacts.as_modes(numbers).kinds for numbers in event.modes)
     return Impact(after, event.late, event.impulses, (old, new), event.rest, event.energy, event.solvable)
 
