@@ -242,9 +242,7 @@ def any_of_batch(pred: Any) -> Any:
 
 
 def cond_of_any_lane(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
-    """`lax.cond` that stays a branch under `vmap`: computed if any lane takes it, and used only by the lanes that
-    do.
-    """
+    """`lax.cond` that stays a branch under `vmap`: computed if any lane takes it, used only by these lanes."""
     new = lax.cond(any_of_batch(pred), true_fn, false_fn, operand)
     return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, false_fn(operand))
 

@@ -170,23 +170,23 @@ class ContactEvents(eqx.Module):
                 yield Event(time, name, kind if changed else "impact", impulse, lost)
 
 
-def contact_events(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> ContactEvents:
+def contact_events(system: AbstractSystem, formulation: AbstractFormulation, record: FoundEvents) -> ContactEvents:
     """The events of a run, or of a batch of runs, from their records."""
-    evaluated = _evaluated if is_traced((system, formulation, found)) else _happened
+    evaluated = _evaluated if is_traced((system, formulation, record)) else _happened
     contacts = system.contacts
-    return ContactEvents(contacts.names, contacts.n, *evaluated(system, formulation, found))
+    return ContactEvents(contacts.names, contacts.n, *evaluated(system, formulation, record))
 
 
-def _happened(system, formulation, found):
+def _happened(system, formulation, record):
     """The same for concrete numbers: as many events as there are, in blocks that all use one program."""
-    most, axis = found.times.shape[-1], found.times.ndim - 1
-    number, times, states = (np.asarray(x) for x in (found.number, found.times, found.states))
+    most, axis = record.times.shape[-1], record.times.ndim - 1
+    number, times, states = (np.asarray(x) for x in (record.number, record.times, record.states))
     number, blocks = np.minimum(number, most), []
     # Concrete also while a function is traced, if the run is not its argument.
     with jax.ensure_compile_time_eval():
         for first in range(0, max(int(np.max(number, initial=0)), 1), _TOGETHER):
             places = np.minimum(np.arange(first, first + _TOGETHER), most - 1)
-            block = found._replace(number=number - first, times=times[..., places], states=states[..., places, :])
+            block = record._replace(number=number - first, times=times[..., places], states=states[..., places, :])
             blocks.append(_evaluated(system, formulation, block))
     rows = [np.concatenate(column, axis) for column in zip(*blocks, strict=True)]
     count = int(np.sum(np.isfinite(rows[0]))) if axis == 0 else most
@@ -202,19 +202,19 @@ def _happened(system, formulation, found):
 
 
 @jitted
-def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> Any:
-    if found.times.ndim > 1:
-        return eqx.filter_vmap(_evaluated)(system, formulation, found)
-    guards = ContactGuards(system, formulation, ContactTolerance(found.touch))
+def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, record: FoundEvents) -> Any:
+    if record.times.ndim > 1:
+        return eqx.filter_vmap(_evaluated)(system, formulation, record)
+    guards = ContactGuards(system, formulation, ContactTolerance(record.touch))
     nq, nu = system.nq, system.nu
     # Entries behind the last event need a state without failure, also of derivatives.
     guess = system.guess
     still = jnp.concatenate([guess.q, guess.u, jnp.zeros(system.nz, guess.q.dtype)])
-    some = found.number > 0
-    first = jnp.where(some, found.states[0], still), jnp.where(some, found.times[0], 0.0)
+    some = record.number > 0
+    first = jnp.where(some, record.states[0], still), jnp.where(some, record.times[0], 0.0)
 
     def single(k, t, flat):
-        is_event = k < found.number
+        is_event = k < record.number
         flat = jnp.where(is_event, flat, first[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
         out = guards.impact(jnp.where(is_event, t, first[1]), y, dated=True)
@@ -225,6 +225,6 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: 
         values = out.impulses, out.energy, before, after, out.rest
         return time, *jax.tree.map(lambda x: jnp.where(is_event, x, 0.0), values)
 
-    rows = jax.vmap(single)(jnp.arange(found.times.size), found.times, found.states)
+    rows = jax.vmap(single)(jnp.arange(record.times.size), record.times, record.states)
     order = jnp.argsort(jnp.isinf(rows[0]), stable=True)
     return jax.tree.map(lambda x: x[order], rows)

@@ -60,9 +60,7 @@ def contact_forces(system, t, q, u):
 
 
 def directions(system, t, q, u):
-    """The rows of A of closed contacts and sticking friction; and A with the other rows that bind velocities, which are
-    selected.
-    """
+    """The rows of A of contacts and friction; A with the other rows that bind velocities, selected."""
     numbers = system.contacts.rows
     jacobian = system.structured_jacobian(t, system.contacts.bound(q), u)
     unit = np.eye(system.acceleration_rows)[list(numbers)]

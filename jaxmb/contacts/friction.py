@@ -125,9 +125,7 @@ class SlipSearch:
         return jnp.where(size > 0, e / jnp.where(size > 0, size, 1.0), jnp.array([1.0, 0.0], self.b.dtype))
 
     def advance(self, carry):
-        """One round: the laws that hold along and across the directions, then Newton's method for directions and
-        forces.
-        """
+        """One round: the laws that hold along and across the directions, then Newton's method."""
         e, _, _, _, count = carry
         # The limit across decreases with each round, so that the rectangle of both approaches the circle.
         answers, *straight = self.in_lines(e, jnp.maximum(0.5**count, _ACROSS))

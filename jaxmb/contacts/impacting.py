@@ -333,9 +333,7 @@ class Impacting:
         return when.u + jnp.where(k < self.turns, 0.0, self.moves.jump) + impulses @ self.moves.by_unit
 
     def expand(self, k, before: Round, answers, impulses) -> Round:
-        """The end of the compression, and the problem of the expansion: its impulses beside the least ones with which
-        contacts push again.
-        """
+        """The end of the compression, and the problem of the expansion: impulses beyond the least ones."""
         when = before.when
         again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]
         pushes = np.array(self.contacts.by_poisson, bool) & ~before.low

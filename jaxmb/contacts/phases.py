@@ -150,9 +150,7 @@ class Phases:
         return plain, matrix, jnp.where(phase.held, asked, right)
 
     def friction_laws(self, plain, phase: Phase, law, right):
-        """The equations with the laws of friction that slips, whose impulses are in proportion to the contacts'
-        impulses.
-        """
+        """The equations with the laws of slipping friction, with impulses proportional to the contacts'."""
         contacts, (coefficient, change) = self.contacts, self.coefficients
         n, contact_of = contacts.n, np.array(contacts.contact_of)
         pushed = jnp.where(contacts.in_joints, 0.0, phase.impulses[contact_of])

@@ -77,9 +77,7 @@ def contracts(coupling: Float[Array, "k k"]) -> Bool[Array, ""]:
 
 
 def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Array, "k"]:
-    """Solve with `1 − P ∂C/∂x`. If the coupling contracts, the diagonal dominates in some units, and pivots need no
-    search.
-    """
+    """Solve with `1 − P ∂C/∂x`: if the coupling contracts, pivots need no search."""
     if b.size > _FEW:
         return gauss_jordan(matrix, b.size) @ b
     # The inverse, so that the solution stays a linear function of b.

@@ -145,9 +145,7 @@ def accelerations_at(
 
 
 def _friction(at, formulation, jacobian, gamma):
-    """Multipliers of the rows that forces depend on, their coupling, and whether they are undetermined; without
-    derivative.
-    """
+    """Multipliers that forces depend on, their coupling, and whether they are undetermined; without derivative."""
     inertia, force, at = lax.stop_gradient((at.inertia, at.force, at))
     formulation, jacobian, gamma = lax.stop_gradient((formulation, jacobian, gamma))
     rows = at.system.friction_rows
@@ -165,9 +163,7 @@ def _friction(at, formulation, jacobian, gamma):
 
 
 def friction_coupling(at: Instant, formulation: AbstractFormulation) -> Float[Array, "k k"]:
-    """How much the multipliers that friction depends on change with themselves, through its force; see `friction`.
-    Without derivative.
-    """
+    """The influence of friction on its own reactions, see `friction`; without derivative."""
     at = lax.stop_gradient(at)
     jacobian = suitable_jacobian(at, formulation)
     return _friction(at, formulation.prepared(at.inertia, jacobian), jacobian, at.gamma)[1]

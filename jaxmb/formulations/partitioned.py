@@ -80,7 +80,5 @@ def _solve(inertia, force, factor, gamma, solve, product=jnp.matmul):
 
 
 def _summed(matrix, x):
-    """A product as sums, for several right-hand sides: for small matrices, XLA's library call takes longer than all the
-    rest.
-    """
+    """A product as sums: for small matrices, a library call takes longer than all the rest."""
     return jnp.sum(matrix * x[None], axis=1)

@@ -73,9 +73,7 @@ def lemke(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"
 
 
 def independent_components(W: Float[Array, "k k"], among: Bool[Array, "k"]) -> Bool[Array, "k"]:
-    """A largest set of components, `among` the given ones, whose columns are independent; for a positive semidefinite
-    W, without derivative.
-    """
+    """A largest set `among` components with independent columns; for a semidefinite W, without derivative."""
     W, among = lax.stop_gradient((W, among))
     scale = scale_of(W)
 

@@ -84,9 +84,7 @@ class _Elimination:
                 self.columns.setdefault(c, set()).add(r)
 
     def run(self, candidates, zero):
-        """Eliminate with pivots in the `candidates` while any of their entries exceeds `zero`; the rows of the
-        pivots.
-        """
+        """Eliminate with pivots in the `candidates` while any entry of theirs exceeds `zero`; the pivots' rows."""
         heap = [(len(self.rows[r]), r) for r in candidates if self._largest(r) > zero]
         heapq.heapify(heap)
         allowed, kept = set(candidates), []

@@ -29,9 +29,7 @@ _GRADIENTS = 300
 
 
 class AbstractJacobian(eqx.Module):
-    """The Jacobian A (m × n) of all constraint rows. Some rows may be implied by others; `gather_rows` keeps the
-    independent ones.
-    """
+    """The Jacobian A (m × n) of all constraint rows, of which some may be implied by others."""
 
     @abc.abstractmethod
     def product(self, v: Float[Array, "n"]) -> Float[Array, "m"]:

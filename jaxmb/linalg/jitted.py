@@ -53,9 +53,7 @@ def jitted(
 
 
 def on_host(function: Callable[_Arguments, Any]) -> Callable[_Arguments, Any]:
-    """`jitted` for a function of concrete numbers that is called a few times, with a result in NumPy, even while JAX
-    traces something else.
-    """
+    """`jitted` for concrete numbers and a few calls, with a result in NumPy, even while JAX traces something else."""
     program = jitted(function, _FOR_FEW_CALLS)
 
     @functools.wraps(function)

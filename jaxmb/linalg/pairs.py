@@ -12,26 +12,26 @@ def of_pairs(pairs: tuple[int, ...]) -> np.ndarray:
     return np.array(pairs, int)[:, None] + np.arange(2)
 
 
-def placed_pairs(pairs: tuple[int, ...], values: Array, others: Array, first: int = 0) -> Array:
-    """`others` with the places of `pairs` replaced by values of shape (pairs, 2, …), after `first` zeros."""
+def placed_pairs(pairs: tuple[int, ...], values: Array, singles: Array, first: int = 0) -> Array:
+    """`singles` with the places of `pairs` replaced by values of shape (pairs, 2, …), after `first` zeros."""
     # A gather, which compiles faster than a scatter.
-    m, paired = len(others), of_pairs(pairs).reshape(-1)
+    m, paired = len(singles), of_pairs(pairs).reshape(-1)
     place = np.zeros(m, int)
     place[paired] = np.arange(paired.size)
     taken = values.reshape(-1, *values.shape[2:])[place]
     mask = np.isin(np.arange(m), paired).reshape(-1, *(1,) * (values.ndim - 2))
-    placed = jnp.where(mask, taken, others)
+    placed = jnp.where(mask, taken, singles)
     return jnp.concatenate([jnp.zeros((first, *placed.shape[1:]), placed.dtype), placed]) if first else placed
 
 
-def for_both(pairs: tuple[int, ...], values: Array, others: Array) -> Array:
+def for_both(pairs: tuple[int, ...], values: Array, singles: Array) -> Array:
     """The same with one value for both numbers of each pair."""
-    return placed_pairs(pairs, jnp.stack([values, values], axis=1), others)
+    return placed_pairs(pairs, jnp.stack([values, values], axis=1), singles)
 
 
-def for_first(pairs: tuple[int, ...], values: Array, others: Array) -> Array:
+def for_first(pairs: tuple[int, ...], values: Array, singles: Array) -> Array:
     """The same with a value for the first number of each pair, and zero for the second."""
-    return placed_pairs(pairs, jnp.stack([values, jnp.zeros_like(values)], axis=1), others)
+    return placed_pairs(pairs, jnp.stack([values, jnp.zeros_like(values)], axis=1), singles)
 
 
 def sizes_of(pairs: tuple[int, ...], values: Float[Array, "m"]) -> Float[Array, "m"]:

@@ -46,9 +46,7 @@ class AbstractConstraints(eqx.Module):
 
     @abc.abstractmethod
     def push_positions(self, at: Instant, along: Instant) -> Float[Array, "nq"]:
-        """The tangent of restored coordinates, from the instant of this linearisation and its tangent before the
-        restoration.
-        """
+        """The tangent of restored coordinates, from the tangent of the instant before the restoration."""
 
     @abc.abstractmethod
     def cancel_velocities(self, residual: Float[Array, "m"]) -> Float[Array, "nu"]:

@@ -55,9 +55,7 @@ class AbstractManifold(eqx.Module):
         """
 
     def default_formulation(self, system: AbstractEquation) -> AbstractFormulation:
-        """The default formulation of a simulation: the cheapest one without a partition of the velocities that the mass
-        matrix allows.
-        """
+        """The default formulation: the cheapest one without a partition that the mass matrix allows."""
         return _MULTIPLIERS if system.positive_definite_mass else _NULL_SPACE
 
     @abc.abstractmethod
@@ -127,9 +125,7 @@ def normalize_state(system: AbstractEquation, t: Scalar, y: State) -> State:
 
 
 def newton_tolerance(given: float | None, rtol: Scalar) -> Any:
-    """The size of the last Newton correction of positions relative to the system's size: as given, or tied to the
-    tolerance of integration.
-    """
+    """The size of the last Newton correction relative to the system's size: as given, or by the tolerance `rtol`."""
     dtype = jnp.result_type(float)
     if given is not None:
         return as_array(given, dtype)

@@ -48,9 +48,7 @@ def projector_constraints(at: Instant) -> "ProjectorConstraints":
 
 
 class ProjectorConstraints(AbstractConstraints):
-    """Constraints that are linear in velocities, by the `projector` at coordinates `q` in the metric of the mass
-    matrix.
-    """
+    """Constraints linear in velocities, by the `projector` at coordinates `q` in the metric of the mass matrix."""
 
     q: Coordinates
     projector: MassProjector
@@ -153,9 +151,7 @@ def project(system: AbstractEquation, t: Scalar, y: State) -> State:
 
 
 def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Bool[Array, ""]]:
-    """The state of `project`, and whether Newton's method failed. After a failure the state has no meaning, and finite
-    derivatives.
-    """
+    """The state of `project`, meaningless but finite after a failure, and whether Newton's method failed."""
     eps, at = jnp.finfo(y.q.dtype).eps, Instant.of(system, jnp.asarray(t, y.q.dtype), y)
     failed = jnp.array(False)
     if system.elimination is not None:

@@ -300,9 +300,7 @@ class Partition(AbstractManifold):
 
 
 class RedundantRows(eqx.Module):
-    """The `sizes` of the rows of ψ, and the `violation` of redundant rows at the end of the last step relative to the
-    allowed one.
-    """
+    """The `sizes` of the rows of ψ, and the `violation` of redundant rows in units of the allowed one."""
 
     sizes: Float[Array, "velocity_rows"]
     violation: Float[Array, ""]

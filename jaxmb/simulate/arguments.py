@@ -45,9 +45,7 @@ def check_kinds(*given: Any) -> None:
 
 
 def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
-    """Refuse steps without error estimates for a method that chooses its order by tolerances, unless it has its
-    tolerances.
-    """
+    """Refuse steps without error estimates for a method that chooses its order by tolerances and has none."""
     estimates = stepsize_controller is None or isinstance(
         stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
     )

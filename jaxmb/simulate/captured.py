@@ -24,9 +24,7 @@ def captured_event(event: diffrax.Event | None, t: Any, state: State) -> diffrax
 
 
 def captured_call(function: Any, *args: Any, **named: Any) -> Any:
-    """A function of the user, identified by its present computation with such arguments; functions of packages and
-    anything else unchanged.
-    """
+    """A user's function, identified by its present computation; functions of packages and anything else unchanged."""
     if not callable(function) or is_installed(getattr(getattr(function, "__code__", None), "co_filename", None)):
         return function
     module = CapturedModule(function)

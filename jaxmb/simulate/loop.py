@@ -1,6 +1,4 @@
-"""The loop of a run, without diffrax's checks in the compiled program, and without a program for each number of
-steps.
-"""
+"""The loop of a run, without diffrax's checks in the program, and without a program for each number of steps."""
 
 from typing import Any
 

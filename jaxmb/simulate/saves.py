@@ -77,9 +77,7 @@ def with_end(saveat: diffrax.SaveAt, t: Any, state: State) -> diffrax.SaveAt:
 
 
 def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
-    """The same with further times behind the end of the run, which are not saved: one program serves several numbers of
-    times.
-    """
+    """The same with times behind the end of the run, which are not saved: one program serves several numbers."""
     first, last = saveat.subs
     if first.ts is None or first.ts.shape[0] == 0 or start == end:
         # In an empty interval every time would be saved.
@@ -190,9 +188,7 @@ def seen(function: Any, ts: Any, ys: Any, start: tuple[Any, State]) -> Any:
 
 
 def corrected(correction: Any, system: AbstractSystem, ts: Any, ys: Any, start: tuple[Any, State]) -> tuple[Any, Any]:
-    """Saved states, returned to the constraints, and whether that failed for one of them; entries after the end of a
-    run are unchanged.
-    """
+    """Saved states, returned to the constraints, and whether one failed; unchanged after the end of a run."""
     finite = jnp.isfinite(ts)
     # Elsewhere the start is corrected instead, which has no failure and no derivative.
     at_start, y0 = lax.stop_gradient(start)

@@ -104,9 +104,7 @@ class Start(NamedTuple):
 
 
 class End(NamedTuple):
-    """The end of a run: time, state, the solver's result, the next step, and events of contacts (None without
-    contacts).
-    """
+    """The end of a run: time, state, the solver's result, the next step, and events of contacts or None."""
 
     t: Any
     y: State
@@ -136,9 +134,7 @@ def solved(problem: Problem) -> tuple[Trajectory, Outcome]:
 
 @jitted
 def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
-    """The values that the program returns: fields of the `Trajectory` without the system, which is an argument
-    already.
-    """
+    """The results of the program: fields of the `Trajectory` without the system, which is an argument."""
     tracing_begins()
     system, method, stops, watched = problem.system, problem.method, problem.stops, problem.watched
     method.check_impulses(system, stops.restarts is not None)

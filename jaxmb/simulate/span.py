@@ -37,9 +37,7 @@ class Span(NamedTuple):
 
     @classmethod
     def checked(cls, t0: Any, t1: Any, dt0: Any, saved: Any, dtype: Any) -> "Span":
-        """**Arguments:** `saved`: as given by the user, since under a trace the times of a `SaveAt` that is made here
-        are traced as well.
-        """
+        """**Arguments:** `saved`: as the user gave it, since a trace also traces the times of a new `SaveAt`."""
         start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
         for name, time in (("t0", start), ("t1", end)):
             if not is_traced(time) and not np.isfinite(time):

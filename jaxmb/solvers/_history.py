@@ -101,9 +101,9 @@ def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float
 
 
 def known_differences(
-    known: Int[Array, ""], z: Float[Array, " n"], partial_sums: Float[Array, "length n"]
+    count: Int[Array, ""], z: Float[Array, " n"], partial_sums: Float[Array, "length n"]
 ) -> Float[Array, "length n"]:
-    """The divided differences after a step with `z` at its end, from a number of points before the step (`known`)."""
+    """The divided differences after a step with `z` at its end, from the `count` of points before it."""
     # Rows with placeholders stay zero: they are never used but would grow without bound.
-    rows = known >= np.arange(partial_sums.shape[0], dtype=np.int32)
+    rows = count >= np.arange(partial_sums.shape[0], dtype=np.int32)
     return jnp.where(rows[:, None], z[None] - partial_sums, jnp.zeros((), z.dtype))

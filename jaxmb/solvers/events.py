@@ -95,9 +95,7 @@ def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
 
 
 def cond_of_jumps(guards: AbstractGuards | None) -> Callable:
-    """The `lax.cond` for the restart after a jump: members of a batch jump together, but have events at different
-    times.
-    """
+    """The `lax.cond` for a restart: members of a batch jump together, but have events at different times."""
     return cond_of_any_lane if guards is None else cond_of_lanes
 
 

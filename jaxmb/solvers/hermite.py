@@ -128,9 +128,7 @@ class _Step(AbstractAttempt):
 
 
 class PushedTangent(NamedTuple):
-    """A tangent that is carried along: `before` a step, with its memory there; at its `end`; and there by every formula
-    (`ends`).
-    """
+    """A tangent that is carried along: `before` a step, at its `end`, and there by every formula (`ends`)."""
 
     before: Tangent
     end: StepEnd
@@ -337,7 +335,7 @@ class Hermite(AbstractMultistep):
         # Tangents that are carried along have no derivatives.
         terms, frozen_step, state, before = freeze((terms, step, state, before))
         along, newton, history = control.of_terms(terms), frozen_step.newton, state.history
-        is_moved = jax.tree.map(lambda *own: any(x is not None for x in own), *along, is_leaf=lambda x: x is None)
+        is_moved = jax.tree.map(lambda *parts: any(x is not None for x in parts), *along, is_leaf=lambda x: x is None)
         numbers, rest = eqx.partition(terms, is_moved)
         formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
         free = free_components(terms, before, state.chart)
@@ -438,9 +436,7 @@ class Hermite(AbstractMultistep):
     def equation(
         self, formula: Formula, before: Float[Array, " n"], differences: Float[Array, "length m"]
     ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, ""]]:
-        """`(past, a, b)` of the equation `y = past + a f + b g` of a step; `past` is linear in the state `before` and
-        in the differences.
-        """
+        """`(past, a, b)` of the equation `y = past + a f + b g` of a step; `past` is linear in the arguments."""
         base = before if FAMILIES[self.family].integrated else jnp.zeros_like(before)
         of, nodes = formula.coefficients, formula.nodes
         past = base + formula.unit * (of.past[nodes] @ differences[:, : before.size])

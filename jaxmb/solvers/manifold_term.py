@@ -196,9 +196,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return out._replace(failed=out.failed | linearized_at.failed)
 
     def kept(self, chart: Chart) -> PyTree[Array]:
-        """The part of the chart at the end of a step that `at_solution` needs, stored for each step; by default all of
-        it.
-        """
+        """The part of the chart at the end of a step for `at_solution`, stored for each step; by default all of it."""
         return chart
 
     def kept_at_start(self, chart: Chart) -> PyTree[Array]:
@@ -261,9 +259,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return None
 
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:
-        """A mask with the structure of `y`: true for the components whose local error is measured; by default None,
-        all.
-        """
+        """A mask like `y`: true for the components whose local error is measured; by default None, all."""
         del chart
         return None
 
@@ -293,9 +289,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return self
 
     def after_step(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
-        """The chart at the end of a step, with the data of the state there that `refuses` needs; by default the same
-        chart.
-        """
+        """The chart at the end of a step, with the data there that `refuses` needs; by default the same chart."""
         del t, y, args
         return chart
 

@@ -65,9 +65,7 @@ class AbstractMultistepState(eqx.Module):
     @property
     @abc.abstractmethod
     def chosen(self) -> PyTree[Array]:
-        """The choices of the last step's error estimate for the next step, such as its order: fields, or parts of them;
-        None without any.
-        """
+        """The choices of the last step for the next, such as its order: fields, or parts of them; None without any."""
 
     def with_found(self, found: PyTree[Array]) -> Self:
         """The same after a jump, with the numbers of `AbstractManifoldTerm.found_at_jump` if the method keeps them."""
@@ -179,10 +177,10 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
         def restarted(before):
             y0, solver_state = layout.unpacked(before)
-            found = found_at_jump(terms, t0, y0, args)
-            after = after_jump(terms, t0, y0, found, args)
+            numbers = found_at_jump(terms, t0, y0, args)
+            after = after_jump(terms, t0, y0, numbers, args)
             chart = chart_after_jump(terms, solver_state.chart)
-            state = self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(found)
+            state = self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(numbers)
             return layout.packed((after, state))
 
         cond = cond_of_jumps(guards_of(terms))

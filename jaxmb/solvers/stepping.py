@@ -271,9 +271,7 @@ def _without_steps(solve, sub, saved, y):
 
 
 def _with_end(solve, sub, saved, accepted, at, finds):
-    """A series with the end of the run, unless the last step saved it. If an event is searched, states saved after it
-    are dropped.
-    """
+    """A series with the end of the run, unless the last step saved it, and without states after an event."""
     by_step = sub.steps == 1 if sub.steps < 2 else accepted % sub.steps == 0
     if finds:
         here = sub.t1 | by_step
@@ -307,9 +305,7 @@ def _is_finite(y: PyTree) -> Any:
 
 
 def _changes(event: diffrax.Event, before: PyTree, values: PyTree, finite: Any) -> PyTree:
-    """Which functions of an event happened in a step to a state that is `finite`: a true value, or a number that
-    changes its sign or becomes NaN.
-    """
+    """Which events happened in a step to a `finite` state: a true value, a change of sign, or a new NaN."""
 
     def changes(_, old, new, upwards):
         if jnp.issubdtype(jnp.result_type(new), jnp.bool_):
@@ -335,9 +331,7 @@ def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
 
 
 def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree, Any]:
-    """The time of the event in the last step, the state there, and the result; in a run without an event, of its
-    end.
-    """
+    """The time of the event in the last step, the state there, and the result; without an event, at the end."""
     event: Any = solve.event
     finite = jnp.isfinite(last.event_tnext)
     end = jnp.where(finite, last.event_tnext, solve.t1)

@@ -78,9 +78,7 @@ class AbstractSteps(eqx.Module):
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
     def start(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
-        """The row of the start of a run, if there is one (`starts`), from the states of diffrax's loop before and after
-        the first accepted step.
-        """
+        """The row of the start of a run (`starts`), from the states around the first accepted step."""
         raise NotImplementedError
 
     @abc.abstractmethod
@@ -94,9 +92,7 @@ class AbstractSteps(eqx.Module):
     def row_tangent(
         self, row: PyTree[Array], like: PyTree[Array], before: tuple[Array, PyTree], after: tuple[Array, PyTree]
     ) -> PyTree[Array]:
-        """The tangent of a row, from the tangents of state and memory before and after its step; None for numbers
-        without one.
-        """
+        """The tangent of a row, from the tangents around its step; None for numbers without one."""
 
 
 def refuse_moving_jumps(moved: Moving, solver: Any) -> None:

@@ -61,9 +61,7 @@ class TangentControl(eqx.Module):
     restored: tuple[Float[Array, " n"], ...] | None = None
 
     def starts(self) -> tuple[Float[Array, " n"], ...]:
-        """A start with entries of random signs and sizes between one half and one unit, always the same; and a faint
-        one.
-        """
+        """A start with entries of random signs between one half and one unit, always the same; and a faint one."""
         if self.restored is not None:
             return self.restored
         random = np.random.default_rng(0)
