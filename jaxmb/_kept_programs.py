@@ -9,8 +9,7 @@ from pathlib import Path
 
 from ._compat import CacheInterface
 
-# The endings that JAX appends to the hash of a program: for the program, and for a file that is written when it is
-# used.
+# The endings that JAX appends to the hash of a program: for the program, and for a file written at each use.
 _PROGRAM, _USED = "-cache", "-atime"
 # The ending of a file that is being written; at this age [s] its process has died.
 _NEW, _DEAD = ".new", 3600.0

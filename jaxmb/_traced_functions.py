@@ -114,8 +114,7 @@ def with_note(function: Callable[..., Any], what: str) -> Callable[..., Any]:
 
 
 def asked_argument(error: KeyError) -> tuple[str, Mapping[Any, Any]] | None:
-    """The dictionary among the arguments of the user's function that a line asked for a missing name, with its name
-    there.
+    """The dictionary argument of the user's function that lacks the name that a line asked for, and its name.
 
     None for another dictionary, which is the user's, and for an `UnknownNameError`.
     """

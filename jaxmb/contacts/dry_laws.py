@@ -34,8 +34,7 @@ class Answers(NamedTuple):
 
     **Fields:** contacts that are `closed`; friction that `sticks`; `slips`: the direction of other friction, 1 or -1,
     for pairs the components of a unit vector, and 0 without force; `solvable`: there is a solution, and no slipping
-    contact has two; `implied`: friction of pairs that sticks as well, but follows from other laws, which carry its
-    force.
+    contact has two; `implied`: friction of pairs that sticks by other laws, which carry its force.
     """
 
     closed: Bool[Array, "n"]

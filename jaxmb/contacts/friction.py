@@ -1,5 +1,4 @@
-"""Which contacts are closed, and which dry friction sticks or slips, also in two directions with a force in a circular
-cone.
+"""Which contacts are closed, and which dry friction sticks or slips, also in planes with circular cones.
 
 Source, for the direction of slip: P. Alart and A. Curnier, "A mixed formulation for frictional contact problems prone
 to Newton like solution methods", Computer Methods in Applied Mechanics and Engineering 92, 1991.
@@ -23,8 +22,7 @@ from .dry_laws import Answers, Dry, in_lines, laws_of
 _TURN, _TURNS, _CORRECTIONS = 1e-7, 60, 2
 # The least limit of a force across its direction, as a fraction of its limit along it.
 _ACROSS = 0.01
-# There is no solution if a force of friction in two directions differs from the direction of slip by more than this
-# fraction.
+# There is no solution if a force of friction in two directions is off the direction of slip by this fraction.
 _ASIDE = 1e-8
 # Several contacts that stick share undetermined forces as if they yielded by this fraction of `W`.
 _YIELD = 1e-8

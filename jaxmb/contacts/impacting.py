@@ -123,8 +123,8 @@ class Struck(NamedTuple):
 
     **Fields:** `answers`: the laws that hold in it; its `impulses`; the velocities `u` after it, and the `rate` of gaps
     and slips; the accelerations `udot` there without contacts and friction; contacts that are `resting`, and friction
-    whose slip has `ended`; `gained`: twice the energy gained by the impulses, and the size of its summands; the `share`
-    of the rebounds.
+    whose slip has `ended`; `gained`: twice the energy gained by the impulses, and the size of its summands; the
+    `share`.
     """
 
     answers: Answers
@@ -403,8 +403,7 @@ class Impacting:
         )
 
     def low_bounces(self, before: Round, curve, is_first):
-        """Contacts that open in the first round by less than the resolution before they close again, and the times
-        until they rest.
+        """Contacts whose next bounce in the first round is below the resolution, and the times until they rest.
 
         **Arguments:** `curve`: the second derivatives of the gaps.
         """

@@ -117,8 +117,7 @@ class Phases:
         return impulses, plain + impulses @ self.moves, matrix
 
     def equations(self, before, dbefore, phase: Phase, normal):
-        """The velocities at the end of a phase without a change of its impulses, and the linear equations for that
-        change.
+        """The velocities after a phase without a change of its impulses, and the linear equations for the change.
 
         **Arguments:** the velocities `before` the phase, and their derivative; `normal`: the changes of the normal
         impulses of contacts that are not held.

@@ -94,8 +94,7 @@ class Laws(NamedTuple):
         **Arguments:** `opening`: the accelerations without them; `slips`: the direction of slip, zero where friction
         may stick; `forces`: approximate ones, on which the normal forces of joints depend.
         """
-        # Friction that has just reached its limit is beyond it, up to the resolution of the search for the laws that
-        # hold.
+        # Friction that has just reached its limit is beyond it, up to the resolution of the search for laws.
         limit = self.limit * jnp.where(modes.sticks, 1 - _REACHED, 1 + _HELD)
         coefficient = jnp.where(self.sizes(slips) == 0, limit, self.coefficient)
         bounds = jnp.zeros(self.contacts.m, opening.dtype)

@@ -115,8 +115,7 @@ def full_pivot(
         (n,); the matrix is equilibrated with it, and its rows brought to unit norm, before pivots are compared.
     - `level`: rows of level 0 are eliminated before rows of higher levels, shape (m,). This nests the dependent columns
         of nonholonomic rows in the independent columns of the holonomic ones.
-    - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, independent rows at least
-        1e-4.
+    - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, others at least 1e-4.
     """
     m, n = A.shape
     A = lax.stop_gradient(A)

@@ -3,8 +3,7 @@
 Nodes that are not neighbours are eliminated together. Each level takes nodes of low degree. So a chain of n nodes needs
 about log₂ n levels (cyclic reduction), and a tree loses its leaves and its paths at once. A level is cut into steps of
 a fixed number of lanes. So one loop executes all steps of a stage, and the size of a program does not depend on the
-number of nodes. The last nodes, when few are left or most are neighbours of each other, are eliminated together as one
-dense matrix.
+number of nodes. The last nodes, when few are left or most are neighbours, are eliminated together as one dense matrix.
 
 Sources: J. W. H. Liu, "The role of elimination trees in sparse factorization", SIAM J. Matrix Anal. Appl. 11(1), 1990
 (fill); M. Luby, SIAM J. Comput. 15(4), 1986 (independent sets).
@@ -97,8 +96,7 @@ def order_nodes(
 
     **Arguments:** `neighbours` of each node, without itself; `size` of a block; `after`: the nodes that must be
     eliminated before each node; `every_bound`: whether to try orders that eliminate nodes of higher degrees at once
-    even if a node of low degree exists. Low degrees first may follow a chain from its end and take a level for each
-    node.
+    even if a node of low degree exists. Low degrees first may follow a chain and take a level for each node.
     """
     tries = []
     for cap in _CAPS:
@@ -213,8 +211,7 @@ def _laid_out(neighbours, levels, rest, size, cost):
 def _cut(levels, size, most=2):
     """Levels grouped in at most `most` stages, each with one number of lanes and one of later neighbours.
 
-    (A third stage saves no time in chains, trees and nets of up to 10 000 bodies, and takes 10 to 25 % longer to
-    compile.)
+    (A third stage saves no time in chains, trees and nets of up to 10 000 bodies, and compiles 10 to 25 % longer.)
     """
     count = len(levels)
     if not count:

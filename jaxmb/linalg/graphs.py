@@ -1,5 +1,4 @@
-"""Graphs of bodies and joints: connected and biconnected components, the vertices at which the latter meet, and
-shortest loops.
+"""Graphs of bodies and joints: connected and biconnected components, the vertices between these, shortest loops.
 
 Source: J. Hopcroft and R. Tarjan, "Efficient algorithms for graph manipulation", Comm. ACM 16(6), 1973.
 """
@@ -104,8 +103,7 @@ def vertices_before(edges: Sequence[tuple[int, ...]], ground: int) -> list[tuple
     """The vertices that each edge waits for in an elimination. An edge of a spanning tree waits for the vertex below
     it, another edge for the vertices of a shortest loop through it.
 
-    **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its number, one more than the last
-    vertex's.
+    **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its number, after the last vertex.
     """
     at: list[list[int]] = [[] for _ in range(ground + 1)]
     vertices = [ends if len(ends) > 1 else (*ends, ground) for ends in edges]

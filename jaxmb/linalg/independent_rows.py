@@ -58,7 +58,7 @@ def sparse_pivots(
     """Independent rows, and how the others depend on them.
 
     **Arguments:** `rows`: the entries of each by column, of unit norm or zero; `level` of each: rows of low levels
-    become pivots first; `zero`: the largest remaining entry of a dependent row; `rounding`: entries below this are
+    become pivots first; `zero`: the largest remaining entry of a dependent row; `rounding`: smaller entries are
     dropped.
     """
     elimination = _Elimination(rows, rounding)

@@ -174,8 +174,7 @@ class MassProjector(eqx.Module):
         self, curved: Callable[[Float[Array, "n"]], Float[Array, "n"]], force: Float[Array, "n"]
     ) -> Float[Array, "n"]:
         """`v` in the null space of A with `H v + Aᵀ δμ = force`, by projected conjugate gradients; `curved` is `v -> H
-        v`. At a direction of negative curvature the iteration ends with its last iterate; at the start with that
-        direction.
+        v`. At a direction of negative curvature the iteration ends; at the start, with that direction.
 
         Source: N. I. M. Gould, M. E. Hribar and J. Nocedal, "On the solution of equality constrained quadratic
         programming problems arising in optimization", SIAM J. Sci. Comput. 23(4), 2001.

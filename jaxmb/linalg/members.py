@@ -31,8 +31,8 @@ def in_blocks(function: Callable[[PyTree], PyTree], members: PyTree, most: int) 
 
 
 def vmap_states(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
-    """`jax.vmap` of a function of the states of a motion, along axis 0 of all arrays; on a CPU in blocks that fit the
-    cache.
+    """`jax.vmap` of a function of the states of a motion, along axis 0 of all arrays; on a CPU in blocks of the cache's
+    size.
 
     A loop over blocks takes a tenth longer to compile in a derivative, so few states are not divided.
 

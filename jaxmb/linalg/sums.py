@@ -16,8 +16,7 @@ from jaxtyping import Array, Float, Int
 from .._compat import define_linear
 from .digest import digest
 
-# The number of entries of a place that one pass adds up; more take another pass, so the work is proportional to the
-# number of entries.
+# The number of entries of a place that one pass adds up; more take another pass: the work is proportional to them.
 _WIDTH = 4
 
 

@@ -110,7 +110,7 @@ def restore(at: Instant, near: SolvedState, tol: Scalar) -> RestoredState:
     by the size of the displacement.
 
     **Arguments:** `at`: near the constraints; a chart keeps the independent entries of the state; `near`: a nearby
-    state at the same time; `tol`: the size of omitted corrections, relative to the system's size, its speed and its
+    state at the same time; `tol`: the size of omitted corrections, relative to the system's size, speed and
     accelerations.
     """
     # The factor of the nearby state solves the equations, but only the factor of this state differentiates them.

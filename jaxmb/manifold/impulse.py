@@ -51,8 +51,8 @@ def after_jumps(
     """
     fixed = lax.stop_gradient(t)
     at_jump = jnp.isin(fixed, jumps, method="binary_search")
-    # A run backward from a jump begins at the number before it, which is then its last time. A run without a step has
-    # one time only.
+    # A run backward from a jump begins at the number before it, which is then its last time. Without a step it has one
+    # time.
     last, earlier = jnp.maximum(t0, t1), next_number(fixed, -1)
     at_end = ((fixed == last) | (earlier == last)) & (t0 != t1)
     moved = jnp.where(at_end, earlier, jnp.where(at_jump, next_number(fixed, 1), fixed))

@@ -37,8 +37,7 @@ _MEASURED = 0.6
 # The last measured correction of velocities for nonlinear constraints, relative to the speed, as a power of eps: the
 # remaining error is of the size of its square.
 _MEASURED_SPEED = 0.4
-# The number of corrections of velocities near constraints that are not linear in them, and of further ones from farther
-# away.
+# The number of corrections of velocities near constraints not linear in them, and of further ones from far away.
 _FEW, _MORE = 3, 5
 
 

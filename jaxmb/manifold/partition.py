@@ -159,8 +159,8 @@ class ChartConstraints(AbstractConstraints):
 
     def restore(self, at, near, tol):
         q, iterations, failed = restore_positions(at, self.split, self.outdated, tol)
-        # The factor is wrong by the distance between the two states, so the first correction leaves its square, and the
-        # second its cube.
+        # The factor is wrong by the distance of the two states: the first correction leaves its square, the second its
+        # cube.
         right_inverse, at = self.factor.right_inverse, at.with_(q=q)
         at = at.with_(u=at.u - right_inverse @ at.velocity_residual)
         if not at.system.linear:
@@ -168,8 +168,7 @@ class ChartConstraints(AbstractConstraints):
             at = at.with_(u=at.u - step)
             failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(at.u))))
         # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`. The accelerations are then
-        # wrong by the square of the distance, or by the distance if a multiplier that friction depends on changes its
-        # sign.
+        # wrong by the square of the distance, or by the distance where a reaction with friction changes its sign.
         rows = at.acceleration_residual(near.udot)
         unbalanced = self._unbalanced(at, near)
         multipliers = self._of_accelerations.right_inverse.T @ unbalanced
@@ -547,8 +546,7 @@ def _violation(at, sizes, newton_tol):
 def _choose(at, of_coordinates):
     """A chart by full pivoting, its quality, and whether the rank is less than when the scene was compiled.
 
-    The rank may be higher: if the state is on the constraints to Newton's tolerance only, so are redundant rows
-    redundant.
+    The rank may be higher: at a state within Newton's tolerance, redundant rows are only nearly redundant.
     """
     system, jacobian, rows = at.system, at.jacobian, at.system.velocity_rows
     scale, levels = system.velocity_scale(), row_levels(system)

@@ -22,7 +22,7 @@ class _Wait:
     """A wait for a program.
 
     **Fields:** `began`: when its tracing began; `ended`: when its compilation ended, None before; `told`: whether the
-    user was told.
+    user was.
     """
 
     def __init__(self, system: AbstractSystem):

@@ -26,8 +26,7 @@ def integrated(
     """The solution of `diffrax.diffeqsolve`, with derivatives.
 
     **Arguments:** `integration`: term, solver and options of `diffeqsolve`; `control` of tangents, None for none;
-    `projects_steps`: whether states return to constraints after steps; `differentiated`: whether derivatives are known
-    to be taken.
+    `projects_steps`: whether states return to constraints after steps; `differentiated`: whether it is known to be.
     """
     if differentiated:
         # Then the run without derivatives is not traced.

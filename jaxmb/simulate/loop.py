@@ -19,8 +19,7 @@ class Loop(diffrax.AbstractAdjoint):
     compiles a program for each number of steps.
 
     **Fields:** the `times` of the first series of saved states, None if it has none; `end`: whether that series ends
-    with the end of the run; `limit`: the largest number of steps; `derivatives` on the mesh, None for a run without
-    any.
+    with the end of the run; `limit`: the largest number of steps; `derivatives` on the mesh, or None.
     """
 
     times: Any

@@ -75,8 +75,7 @@ class Start(NamedTuple):
     """The start of a run.
 
     **Fields:** the `given` state, NaN if it violates the constraints, and `y`, which follows a moving start; whether it
-    is `consistent`; whether parameters are in their range (`valid`); `finite`: whether all that holds and its numbers
-    are finite.
+    is `consistent`; whether parameters are in their range (`valid`); `finite`: all this, and finite numbers.
     """
 
     given: State

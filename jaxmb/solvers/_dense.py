@@ -18,8 +18,7 @@ from ._newton import AbstractLinearization, StepEquation
 # The matrix is renewed after a step whose corrections shrank more slowly than by this factor.
 _SLOW = 0.2
 # The derivative of the Jacobian along the motion is a difference over this power of the rounding unit, in steps. With
-# longer differences the truncation error, which is stiff, slows Newton's method; with shorter ones the rounding error
-# does.
+# longer ones the stiff truncation error slows Newton's method, with shorter ones the rounding error.
 _AHEAD = 0.4
 
 
@@ -105,8 +104,7 @@ class DenseLinearization(AbstractLinearization):
             g = g + push(None, f - state @ moved)[2]
 
             def correction(change):
-                # Large terms are combined as in `correction` above, so the result does not depend on the last digits of
-                # an inverse.
+                # Large terms are combined as in `correction` above, so the last digits of an inverse do not matter.
                 slope = moved + jacobian @ change
                 mismatch = change - (load + b * g)[free] - b * of_g @ change
                 mismatch = mismatch - exact.missing * jacobian @ slope

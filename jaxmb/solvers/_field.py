@@ -50,8 +50,7 @@ def probed_derivatives(
         (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
         times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
         (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, way]))
-        # The same direction at both states: the mean of both slopes then equals the slope of the difference to second
-        # order.
+        # The same direction at both states: the mean of both slopes is that of the difference to second order.
         way = lax.stop_gradient(move) if along else way
         return (y + way, way), (Derivatives(state, f, g, rest), slope)
 

@@ -27,8 +27,7 @@ else:
 _MAX_ITERATIONS = 10
 # If a matrix of an earlier step has failed, this number of steps compute new ones.
 _DISTRUST = 10
-# If a correction is larger than this fraction of the state and its change, the matrix is not reliable at the corrected
-# state.
+# If a correction is larger than this fraction of the state and its change, the matrix is unreliable after it.
 _FAR = 0.1
 # The largest number of matrices for a step; and the code for success.
 _ATTEMPTS, _DONE = 4, 9
@@ -38,8 +37,7 @@ class StepEquation(eqx.Module):
     """The equation `y = past + a f(t, y) + b g(t, y)` of a step.
 
     **Fields:** `field`; `jacobian(y)`: its derivative with known structure and the direction of time, or None; `t`, the
-    end of the step, and `h`, its length; `past`, `a`, `b`; `free`: indices of the unknowns among the components of the
-    state.
+    end of the step, and `h`, its length; `past`, `a`, `b`; `free`: indices of the unknowns in the state.
     """
 
     field: Field
@@ -213,8 +211,7 @@ class Newton(eqx.Module):
 
     g is evaluated along the predicted rate, then along the f after each correction. In f itself, stiffness multiplies
     the error of y. In g this error would spoil other components by the change of the Jacobian, times the square of the
-    step. Newton's method would then converge only from nearby, and on Robertson's reaction only inside a basin smaller
-    than round-off.
+    step. Newton's method would then converge only from nearby, on Robertson's reaction from a basin below round-off.
 
     If the error of the prediction is as large as the state, as at the end of a fast transient, there is no second
     correction. Otherwise, with a large matrix, it might appear negligible far from any solution.

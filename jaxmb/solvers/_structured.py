@@ -4,8 +4,7 @@ All components of the state are unknowns, and each iterate is projected on the m
 of `past + a f + b g`. With `1 - a x - b x² = (1 - r x)(1 - r* x)` one factor of `1 - r J` for a complex number r solves
 for corrections. The eigenvalues of J near 1 / r decide which formulas and steps are stable; they follow from Arnoldi's
 method with the same factor. The factor leaves out some terms of the exact derivative, so Newton's method converges
-linearly. The derivative of its solution is found by iteration with the exact linear function, preconditioned by the
-factor.
+linearly. The derivative of its solution is found by iteration with the exact function, preconditioned by the factor.
 
 Sources: Y. Saad, "Numerical Methods for Large Eigenvalue Problems", SIAM, 2011 (shift-and-invert Arnoldi); S. C.
 Eisenstat, H. C. Elman and M. H. Schultz, SIAM J. Numer. Anal. 20(2), 1983 (generalized conjugate residuals).

@@ -57,8 +57,7 @@ class AdamsState(AbstractMultistepState):
     - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
     - `tangents`: the tangents whose errors are controlled beside the state's error, otherwise `None`.
-    - `found`: the numbers of `AbstractManifoldTerm.found_at_jump` at the last jump, for its derivatives, otherwise
-        `None`.
+    - `found`: the numbers of `AbstractManifoldTerm.found_at_jump` for derivatives of the last jump, or `None`.
     """
 
     history: History

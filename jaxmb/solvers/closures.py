@@ -61,7 +61,7 @@ def _calling(func: Any, args: Any, keywords: Any, *positional: Any, **named: Any
 class _Code:
     """The code of a function, and the contents of its closure without the traced values.
 
-    Two are equal if they compute the same from equal traced values, so that a function written anew for each call is
+    Two are equal if they compute the same from equal traced values, so a function written anew for each call is
     compiled once.
     """
 

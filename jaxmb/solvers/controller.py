@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# The factor after a step without a usable error estimate: the vector field is not finite, or a constraint was not
-# solved.
+# The factor after a step without a usable error estimate: the field is not finite, or constraints are unsolved.
 _WITHOUT_ESTIMATE = 0.25
 # Upper bounds of the factor after the first, second, and every further rejection. Repeated rejections mean that errors
 # do not decrease according to the order, as at a kink or a jump.

@@ -43,8 +43,7 @@ _START_SAFETY = 0.92
 _FAINT = 1e-3
 # The result of a solve that ends because an event leads to no state.
 NO_STATE: Any = diffrax.RESULTS.internal_error
-# At the start of a run a guard may be this negative, by rounding of the given state, if it rises by the end of the
-# step.
+# At the start of a run a guard may be this negative, by rounding of the given state, if it rises in the step.
 _OVERLAP = 1e-5
 # If a guard is zero at the start of a step as well, its rise is searched down to this power of two.
 _HALVINGS = 30
@@ -57,15 +56,13 @@ class AbstractErrorWithMore(eqx.Module):
 
 
 class Crossing(AbstractErrorWithMore):
-    """The `y_error` that a solver passes to an `EventController`; flags are 1 or 0, since diffrax expects no truth
-    values.
+    """The `y_error` that a solver passes to an `EventController`; flags are 1 or 0, as diffrax expects.
 
     **Fields:** the `error` for the controller inside; `target`: the time of the first zero in the step; `within`: 1 if
     a guard is negative within the step; the `lowest` guard at its end; `falling`: 1 if a guard falls through zero
     there; `lost`: 1 if an event at its start led to no state, and the state is infinite; `coarse`: above 1 if the step
     is too long for guards that vary in it; `touch` and `near` of the guards; `retry`: the factor by which a multistep
-    method could retry the step, infinite for methods without restarts; `idle`: 1 if the step restarts though the event
-    changed nothing.
+    method could retry the step, infinite for methods without restarts; `idle`: 1 if the step restarts after no change.
     """
 
     error: PyTree
@@ -469,8 +466,7 @@ class EventController(AbstractControllerAround):
             jnp.array(False),
             next_t0,
             next_t1,
-            # The controller inside does not learn of a step without length, which occurs when one event follows another
-            # at once.
+            # The controller inside does not learn of a step without length, between events at the same time.
             jax.tree.map(lambda new, old: jnp.where(t1 <= t0, old, new), inner, before.inner),
             jnp.full_like(before.target, jnp.inf),
             jnp.where(jnp.isinf(before.target), t1 - t0, before.length),

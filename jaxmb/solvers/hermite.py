@@ -234,8 +234,7 @@ class Hermite(AbstractMultistep):
             such as `(2, 4)` is a method that switches between two formulas by their errors; a single number fixes the
             order. The method starts with k = 1.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
-            `diffrax.StepTo`). They are the tolerances for the choice of the order and for Newton's method. Otherwise
-            leave them out.
+            `diffrax.StepTo`). They then control the order and Newton's method. Otherwise leave them out.
 
         **Raises:** `ValueError` for an unknown family, for numbers of points that it does not have or that are not
         increasing, and if only one tolerance is given.

@@ -35,8 +35,7 @@ class ManifoldEvaluation(NamedTuple):
     - `chart`: the chart with the same index sets, which may carry counters, and data that make the next evaluation
         cheaper.
     - `failed`: true if the state could not be evaluated or projected; a smaller step is then tried.
-    - `factors`: data that make the projection of a nearby state at the same time cheaper; any pytree of arrays, or
-        None.
+    - `factors`: data for a cheaper projection of a nearby state at the same time; any pytree of arrays, or None.
     """
 
     y: Y

@@ -38,8 +38,7 @@ class Saved(eqx.Module):
 
     **Fields:** `start`: whether it begins with the start; its `times`, or None; `steps`: it saves every so many steps,
     0 for none; `events`: whether it saves the state before each event; its `length`; `passed`: how many states and how
-    many of the times were passed. In a series of events the second number is 1 if the next step found the last event
-    void.
+    many of the times were passed. Of events the second number is 1 if the next step found the last one void.
     """
 
     start: bool = eqx.field(static=True)

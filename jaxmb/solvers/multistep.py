@@ -106,7 +106,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     - `solves_implicitly`: whether a step solves an equation for the independent components of the state; an
         `AbstractManifoldTerm` must then name them (`free`).
     - `finest`: the smallest relative tolerance of a step that the method resolves, in units of the machine precision;
-        default zero.
+        default 0.
     """
 
     tolerances: AbstractVar[Tolerances]
@@ -241,8 +241,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
         `attempted` makes the attempt, `tolerances.of_step` and `weighted_norm` measure its error, and `choose_order`
         makes the estimate. `tangents_after`, `grown_sizes` and `next_chart` give fields of the new state. `dense_info`
-        contains the arguments of the interpolation; `failed`: whether a constraint or an implicit equation was not
-        solved.
+        contains the arguments of the interpolation; `failed`: whether an equation was not solved.
         """
 
     def first_tangents(

@@ -30,8 +30,7 @@ class StepEstimate(eqx.Module):
         have an estimate.
     - `response`: the power of these factors by which to change the next step alone, with the earlier steps given.
     - `limit`: the largest factor by which the next step may grow.
-    - `work`: evaluations of the vector field, and matrices computed. Not integers, which diffrax does not expect in an
-        error.
+    - `work`: evaluations of the vector field, and matrices computed. Not integers, unexpected by diffrax in an error.
     """
 
     error: Float[Array, ""]

@@ -75,8 +75,7 @@ def restarts(
     def restarted(*along):
         if moved.jumps is None or guards is None:
             return tangents(moved.jumps is not None, *along)
-        # The start of a run, or of the motion after an impact, is not at the time of a jump, and nothing precedes the
-        # start.
+        # The start of a run, or of the motion after an impact, is not at a jump, and nothing precedes the start.
         is_jump = any_of_batch(_is_jump(moved.jumps, jump))
         return lax.cond(is_jump, lambda: tangents(True, *along), lambda: tangents(False, *along))
 
@@ -91,8 +90,7 @@ def restarts(
         return push
     raveled = jax.numpy_dtype_promotion("standard")(ravel_pytree)
     _, unraveled = raveled((moved, jump.y, jump.f))
-    # The transpose of a program that finds an event would be a second program of the same size; a matrix is transposed
-    # at once.
+    # The transpose of a program that finds an event would be a second one of its size; a matrix is transposed at once.
     column = lambda unit: jnp.concatenate(restarted(*unraveled(unit)))
     every = lambda: jax.vmap(column)(jnp.eye(columns, dtype=jump.y.dtype))
     none = jnp.zeros((columns, n * len(blank)), jump.y.dtype)

@@ -54,8 +54,7 @@ class _Solve(NamedTuple):
 def loop(*, init_state: Any, outer_while_loop: Callable[..., Any], **given: Any) -> tuple[Any, dict[str, Any]]:
     """The last state of the loop, and its statistics (none), for an adjoint.
 
-    **Arguments:** as of diffrax's loop; `outer_while_loop(proceed, advance, state, max_steps=, buffers=)`: the loop
-    over steps.
+    **Arguments:** as of diffrax's loop; `outer_while_loop(proceed, advance, state, max_steps=, buffers=)`: over steps.
     """
     constants = constant_fields(init_state, **given)
     return ended(stepped(init_state, outer_while_loop, constants, **given), constants, **given), {}

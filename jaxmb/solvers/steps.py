@@ -28,8 +28,7 @@ class LinearStep(NamedTuple):
     """A step as linear maps of tangents.
 
     **Fields:** `push(dmoved, w, memory)`: the tangents of the raveled state at the end, of the solver's memory, and of
-    the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time in the step, from the dense
-    output.
+    the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time, from the latter.
     """
 
     push: Callable[..., tuple[Array, PyTree, PyTree]]

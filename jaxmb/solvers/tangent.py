@@ -26,13 +26,12 @@ from .._compat import with_inner
 from .evaluation import freeze, ravel, unravel_like
 from .scales import ends_of
 
-# The tolerance of a tangent, in units of the state's tolerance; and its absolute part, as a fraction of the largest
-# entry.
+# The tolerance of a tangent, in units of the state's tolerance; and its absolute part, relative to the largest entry.
 _LOOSER, _FLOOR = 5.0, 0.01
 # The start of a tangent that parameters cause, instead of zero, in units of the other start. So the first step has a
 # length, and a mode that is excited late is followed until then. Fainter effects of parameters are resolved relative to
-# this start. (From 1e-12 the first steps are so short that rounding errors make derivatives of different modes differ
-# by 1e-10.)
+# this start. (From 1e-12 the first steps are so short that rounding makes derivatives of different modes differ by
+# 1e-10.)
 _FAINT = 1e-4
 # The largest rounding errors of a tangent, in units of its largest entry so far and of eps. The tangents of a body that
 # constraints hold or drive consist of nothing else.
@@ -90,8 +89,7 @@ class TangentControl(eqx.Module):
     def on_constraints(self, restore: Any, term: PyTree, y0: PyTree) -> "TangentControl":
         """The same with starts that are tangents of the states returned by `restore(term, y)`, for a term.
 
-        Otherwise a solver that returns its steps to constraints would end the first step, however short, at another
-        tangent.
+        Otherwise a solver that projects its steps would end the first one, however short, at another tangent.
         """
         none = jax.tree.map(lambda _: None, term)
         starts = [
