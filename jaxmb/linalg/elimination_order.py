@@ -115,8 +115,8 @@ def _eliminate(graph: list[set[int]], size: int, cap: int, after: Sequence[Itera
     n = len(graph)
     waiting = [0] * n
     followers: list[list[int]] = [[] for _ in range(n)]
-    for node, adjacent in enumerate(after or ()):
-        for first in adjacent:
+    for node, firsts in enumerate(after or ()):
+        for first in firsts:
             waiting[node] += 1
             followers[first].append(node)
     left = set(range(n))

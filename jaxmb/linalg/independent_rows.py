@@ -63,8 +63,8 @@ def sparse_pivots(
     """
     elimination = _Elimination(rows, rounding)
     kept: list[int] = []
-    for lowest in sorted(set(level)):
-        kept += elimination.run([r for r in range(len(rows)) if level[r] == lowest], zero)
+    for current in sorted(set(level)):
+        kept += elimination.run([r for r in range(len(rows)) if level[r] == current], zero)
     dependent = sorted(set(range(len(rows))) - set(kept))
     return SparsePivots(np.array(kept + dependent, int), len(kept), elimination.ratios)
 
@@ -174,9 +174,9 @@ def dense_pivots(
     work = A / np.maximum(size, least_size(size))[:, None]
     is_left = np.ones(m, bool)
     kept = []
-    for lowest in np.unique(level):
+    for current in np.unique(level):
         while n and len(kept) < min(m, n):
-            sizes = np.where((is_left & (level == lowest))[:, None], np.abs(work), 0.0)
+            sizes = np.where((is_left & (level == current))[:, None], np.abs(work), 0.0)
             r, c = np.unravel_index(np.argmax(sizes), sizes.shape)
             if not sizes[r, c] > eps**zero:
                 break
