@@ -68,8 +68,8 @@ from .system import (
 )
 from .trajectory import Trajectory as Trajectory, load as load
 
-# What not every motion needs is imported at its first use (PEP 562). Only a type checker, which has to see the names,
-# imports them here.
+# Parts that not every motion needs are imported at their first use (PEP 562). Only a type checker, which must see the
+# names, imports them here.
 _warn_of_jaxlib()
 
 if TYPE_CHECKING:

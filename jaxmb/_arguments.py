@@ -1,4 +1,4 @@
-"""Checks of arguments that users pass, with messages that name the argument."""
+"""Checks of users' arguments, with messages that name the argument."""
 
 import importlib
 import warnings
@@ -24,7 +24,7 @@ def check_kind(name: str, value: Any, kind: type, expected: str, cure: str) -> N
 def real_array(name: str, value: Any, dtype: Any, shapes: tuple[tuple[int, ...], ...] | None = ((),)) -> Any:
     """An argument as an array of the given dtype, a NumPy array unless it is traced.
 
-    **Arguments:** `shapes`: the allowed shapes, default that of a number; None for any.
+    **Arguments:** `shapes`: the allowed shapes, default a number's; None for any.
 
     **Raises:** `ValueError` for anything but real numbers, another shape, and NaN.
     """
@@ -34,7 +34,7 @@ def real_array(name: str, value: Any, dtype: Any, shapes: tuple[tuple[int, ...],
             raise ValueError(f"{name} must be a real number, got an array of shape {shape}.")
         raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {shape}.")
     array = as_array(value, dtype)
-    # NaN alone differs from itself; `np.isnan` takes four times as long, and every call comes by here.
+    # NaN alone differs from itself; `np.isnan` takes four times as long, and every call passes here.
     if not is_traced(array) and (array != array).any():
         raise ValueError(f"{name} must not be NaN, got {value!r}.")
     return array
@@ -55,11 +55,11 @@ def real_shape(name: str, value: Any, expected: str = "a real number or an array
 
 
 def whole_number(name: str, value: Any, least: int = 1, otherwise: str = "") -> int:
-    """An integer argument, of Python or NumPy, as one of Python.
+    """An integer argument, of Python or NumPy, as a Python integer.
 
-    **Arguments:** `otherwise`: what else the argument may be, for the message: `", or None"`.
+    **Arguments:** `otherwise`: the alternative to name in the message: `", or None"`.
 
-    **Raises:** `ValueError` for another kind of value, True and False among them, and for one below the least.
+    **Raises:** `ValueError` for another kind of value, True and False among them, and for a value below the least.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}{otherwise}, got {value!r}.")
@@ -89,7 +89,7 @@ def warn_of_degrees(label: str, angle: Any, stacklevel: int) -> None:
 
 
 def package_for_tables(name: str, install: str) -> Any:
-    """A package that makes tables, imported at its first use."""
+    """A package for tables, imported at its first use."""
     try:
         return importlib.import_module(name)
     except ImportError:

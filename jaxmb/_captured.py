@@ -1,8 +1,8 @@
-"""Functions of the user's as JAX traced them, which do not change with what they read.
+"""Functions of the user as JAX traced them, which do not change with the values that they read.
 
 A function may read a global variable, an attribute or a dictionary. JAX keeps programs by the function alone, and would
-return the old motion after a change. So a system holds traced programs in place of functions: they stay what they were
-when it was compiled, and are equal where they compute the same.
+return the old motion after a change. So a system holds traced programs in place of functions: they stay as they were
+when it was compiled, and are equal if they compute the same.
 """
 
 from collections.abc import Callable, Iterable
@@ -23,18 +23,18 @@ _SHAPED = (*ARRAYS, jax.ShapeDtypeStruct)
 
 
 class Captured:
-    """A function, and its programs for the arguments that it was called with before it was kept.
+    """A function, and its programs for the arguments with which it was called before it was kept.
 
-    It computes with these programs, whatever has become of what the function reads; with arguments of other shapes it
-    calls the function. Two are equal where all their programs compute the same. A function that was not called, or that
-    closes over values that JAX traces, has no programs, and is as the function itself.
+    It computes with these programs, even if the values that the function reads have changed; with arguments of other
+    shapes it calls the function. Two are equal if all their programs compute the same. A function that was not called,
+    or that closes over traced values, has no programs and is compared as a function.
     """
 
     def __init__(self, function: Callable[..., Any]):
         self.function = function
         self._programs: dict[Any, _Program | None] = {}
         self._examples: list[Any] = []
-        # What tells it from others: until it is kept, that it is another object.
+        # Its identity for comparison: until it is kept, the object itself.
         self._key: tuple[Any, ...] = ("open", id(self))
         # The hashes of its programs, the same in every process.
         self.digests: tuple[bytes, ...] = ()
@@ -43,15 +43,15 @@ class Captured:
         if self._key[0] == "open":
             self.trace(*args, **named)
         leaves, structure = jax.tree.flatten((args, named))
-        # A number of Python's may stand for an array, as a time.
-        for own in (leaves, [_as_array(x) for x in leaves]):
-            program = self._programs.get((structure, tuple(map(_kind, own))))
+        # A Python number may stand for an array, such as a time.
+        for values in (leaves, [_as_array(x) for x in leaves]):
+            program = self._programs.get((structure, tuple(map(_kind, values))))
             if program is not None:
-                return program.computed([x for x in own if isinstance(x, _SHAPED)])
+                return program.computed([x for x in values if isinstance(x, _SHAPED)])
         return self.function(*args, **named)
 
     def trace(self, *args: Any, **named: Any) -> None:
-        """Find the program for arguments of these shapes, for which arrays or `jax.ShapeDtypeStruct` stand."""
+        """Trace the program for arguments of these shapes; arrays or `jax.ShapeDtypeStruct` stand for arrays."""
         leaves, structure = jax.tree.flatten((args, named))
         kinds = structure, tuple(map(_kind, leaves))
         if kinds not in self._programs:
@@ -59,10 +59,10 @@ class Captured:
             self._examples.append(jax.tree.unflatten(structure, map(_like, leaves)))
 
     def keep(self) -> None:
-        """From now on, compute with the programs that there are."""
+        """From now on, compute with the present programs."""
         keys = tuple((kinds, program.key) for kinds, program in self._programs.items() if program is not None)
-        known = 0 < len(keys) == len(self._programs)
-        self._key = ("known", keys) if known else ("alone", self.function)
+        has_programs = 0 < len(keys) == len(self._programs)
+        self._key = ("known", keys) if has_programs else ("alone", self.function)
         self.digests = tuple(key[0] for _, key in keys)
 
     def __eq__(self, other: object) -> bool:
@@ -83,20 +83,19 @@ class Captured:
 
 
 class CapturedModule(eqx.Module):
-    """A captured function, differentiable by the arrays of an equinox module, and by traced values that a function
-    closes over.
+    """A captured function, differentiable by the arrays of an equinox module and by closed-over traced values.
 
-    **Fields:** `module`: what has these, None for a function without; `known`: the function, of the module as well
-    where there is one.
+    **Fields:** `module`: the module with these arrays, None for a function without; `known`: the function, which takes
+    the module first if there is one.
     """
 
     module: Any
     known: Captured = eqx.field(static=True)
 
     def __init__(self, function: Callable[..., Any]):
-        own = opened(function)
-        is_module = isinstance(own, eqx.Module)
-        self.module = own if is_module else None
+        module = opened(function)
+        is_module = isinstance(module, eqx.Module)
+        self.module = module if is_module else None
         self.known = Captured(_called if is_module else function)
 
     def __call__(self, *args: Any, **named: Any) -> Any:
@@ -132,9 +131,9 @@ def _again(function: Callable[..., Any], examples: list[Any], digests: tuple[byt
 class _Program(NamedTuple):
     """A traced function.
 
-    **Fields:** `function` of the list of all arrays among its arguments, which returns those among its results; the
-    `structure` of results and their `rest`, None for each array; `key`: equal where programs compute the same; `held`:
-    objects that the key has the addresses of.
+    **Fields:** `function` of the list of all arrays among its arguments, which returns the arrays among its results;
+    the `structure` of results and their `rest`, None for each array; `key`: equal if programs compute the same; `held`:
+    objects whose addresses are in the key.
     """
 
     function: Callable[..., list[Any]]
@@ -148,10 +147,10 @@ class _Program(NamedTuple):
 
 
 def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> _Program | None:
-    """The program of a function for arguments like these; None if it closes over values that are traced."""
+    """The program of a function for arguments like these; None if it closes over traced values."""
     results: list[Any] = []
 
-    # JAX remembers what it has traced, by the function: this one is new each time.
+    # JAX keeps traces by the function: this one is new each time.
     def of_arrays(*arrays: Any) -> list[Any]:
         args, named = _filled(leaves, structure, arrays)
         out, tree = jax.tree.flatten(function(*args, **named))
@@ -163,9 +162,9 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
         return None
     tree, rest = results
     digest = digest_of_program(closed, rules=True)
-    own = [_own(v, constant) for v, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True)]
+    constants = [_own(v, constant) for v, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True)]
     key = digest.value, tuple(map(id, digest.unknown)), tree, rest
-    return _Program(jaxpr_as_function(ClosedJaxpr(closed.jaxpr, own)), tree, rest, key, digest.unknown)
+    return _Program(jaxpr_as_function(ClosedJaxpr(closed.jaxpr, constants)), tree, rest, key, digest.unknown)
 
 
 def _own(variable: Any, constant: Any) -> Any:
@@ -193,6 +192,6 @@ def _dtype(array: Any) -> Any:
 
 def _filled(leaves: Iterable[Any], structure: Any, arrays: Iterable[Any]) -> Any:
     """A pytree of these leaves, with other arrays, one after the other, in place of arrays and of None."""
-    left = iter(arrays)
-    own = [next(left) if x is None or isinstance(x, _SHAPED) else x for x in leaves]
-    return jax.tree.unflatten(structure, own)
+    remaining = iter(arrays)
+    filled = [next(remaining) if x is None or isinstance(x, _SHAPED) else x for x in leaves]
+    return jax.tree.unflatten(structure, filled)

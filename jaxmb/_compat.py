@@ -1,7 +1,7 @@
-"""Names and habits of JAX, equinox, diffrax and the standard library that their documentation does not promise.
+"""Undocumented names and behaviour of JAX, equinox, diffrax and the standard library.
 
-Each stands here once, with what it does and the versions that it was found in; `tests/package/test_compat.py` has a
-test of each, which says what is missing when an update takes it away.
+Each stands here once, with its purpose and the versions where it was found. `tests/package/test_compat.py` tests each
+of them, and says what is missing when an update removes it.
 """
 
 import functools
@@ -34,8 +34,8 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.interpreters.ad import Zero
 from jaxtyping import Array
 
-# The makers of new operations of JAX. (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10.)
-# The base of what keeps compiled programs. (jax._src.compilation_cache_interface, 0.9 and 0.10.)
+# The makers of new operations of JAX. (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10.) The base class of
+# stores of compiled programs. (jax._src.compilation_cache_interface, 0.9 and 0.10.)
 __all__ = ["CacheInterface", "Primitive", "ShapedArray", "Zero", "ad", "batching", "mlir", "partial_eval"]
 
 T = TypeVar("T")
@@ -43,14 +43,14 @@ T = TypeVar("T")
 # JAX
 
 
-# Rules of functions in a batch: one that is given, and one member after the other. (jax.custom_batching, 0.7 to 0.10.)
+# Rules of functions in a batch: a given rule, and one member after the other. (jax.custom_batching, 0.7 to 0.10.)
 custom_vmap = jax.custom_batching.custom_vmap
 sequential_vmap = jax.custom_batching.sequential_vmap
 
-# The parts of traced programs. (jax.extend.core, 0.7 to 0.10; jax 0.11 changes what `scan` holds.)
+# The parts of traced programs. (jax.extend.core, 0.7 to 0.10; jax 0.11 changes the parameters of `scan`.)
 ClosedJaxpr, Jaxpr, Literal = core.ClosedJaxpr, core.Jaxpr, core.Literal
-# What equations of functions with derivative rules of their own hold besides: functions of Python, `bwd` only where
-# there is one for reverse mode. (custom_jvp_call and custom_vjp_call, 0.9 and 0.10.)
+# Parameters of equations of functions with custom derivative rules: Python functions, `bwd` only with a rule for
+# reverse mode. (custom_jvp_call and custom_vjp_call, 0.9 and 0.10.)
 REVERSE = "bwd"
 RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
 # A closed jaxpr as a function of its operands. (jax.extend.core.jaxpr_as_fun, 0.9 and 0.10.)
@@ -58,7 +58,7 @@ jaxpr_as_function = core.jaxpr_as_fun
 
 
 def current_trace() -> Any:
-    """The trace that operations go to now, to be compared with another.
+    """The trace that operations go to now, for comparison with another.
 
     (jax.extend.core.get_opaque_trace_state, 0.9 and 0.10.)
     """
@@ -66,18 +66,20 @@ def current_trace() -> Any:
 
 
 def with_rest_computed(function: Callable[[Array], Array], like: Array) -> Callable[[Array], Array]:
-    """The same function of an array, in which everything that does not depend on the array is computed now, and not at
-    each call: a loop that calls it holds nothing else. `like`: an example of the array.
+    """The same function of an array, with all parts that do not depend on the array computed now: a loop that calls it
+    contains nothing else. `like`: an example of the array.
 
     (jax._src.interpreters.partial_eval.partial_eval_jaxpr_nounits, 0.10.)
     """
-    known, rest, *_ = partial_eval_jaxpr_nounits(jax.make_jaxpr(function)(like), [True], instantiate=True)
-    found = jaxpr_as_function(known)()
-    return lambda x: jaxpr_as_function(rest)(*found, x)[0]
+    constant_part, varying_part, *_ = partial_eval_jaxpr_nounits(
+        jax.make_jaxpr(function)(like), [True], instantiate=True
+    )
+    constants = jaxpr_as_function(constant_part)()
+    return lambda x: jaxpr_as_function(varying_part)(*constants, x)[0]
 
 
 def like_of(aval: Any) -> jax.ShapeDtypeStruct:
-    """Shape and dtype of a value in a traced program, and whether the dtype is that of a number of Python.
+    """Shape and dtype of a value in a traced program, and whether the dtype comes from a Python number.
 
     (jax.core.ShapedArray.weak_type, 0.7 to 0.10.)
     """
@@ -93,12 +95,12 @@ def default_float() -> np.dtype:
 
 
 def canonical(dtype: Any) -> np.dtype:
-    """The type that JAX makes of one: of single precision unless `jax_enable_x64` is on."""
+    """JAX's version of a type: in single precision unless `jax_enable_x64` is on."""
     return jax.dtypes.canonicalize_dtype(dtype)
 
 
 def has_started() -> bool:
-    """Whether JAX has looked for its devices, after which it takes no options of XLA any more.
+    """Whether JAX has searched for its devices, after which it ignores further options of XLA.
 
     (jax._src.xla_bridge.backends_are_initialized, 0.9 and 0.10.)
     """
@@ -122,7 +124,7 @@ def computes_on_processors() -> bool:
 
 @functools.cache
 def takes_option(name: str) -> bool:
-    """Whether this XLA takes an option in `XLA_FLAGS`; an option that it does not know ends the process.
+    """Whether this XLA takes an option in `XLA_FLAGS`; an unknown option ends the process.
 
     (Names of options are strings in the libraries of jaxlib, which end with a zero; jaxlib 0.9 to 0.12.)
     """
@@ -136,7 +138,7 @@ def _holds(path: Path, text: bytes) -> bool:
 
 
 def keep_programs_as(store: type[CacheInterface]) -> None:
-    """Let JAX make such a store of the folder that it keeps compiled programs in, as `store(path, max_size=bytes)`.
+    """Let JAX use such a store for its folder of compiled programs, as `store(path, max_size=bytes)`.
 
     (jax._src.compilation_cache.LRUCache, which JAX makes when it first compiles, 0.9 and 0.10.)
     """
@@ -144,7 +146,7 @@ def keep_programs_as(store: type[CacheInterface]) -> None:
 
 
 def is_weakly_typed(array: Array) -> bool:
-    """Whether an array takes the type of what it is combined with, as Python's numbers do.
+    """Whether an array takes the type of its partner in an operation, as Python's numbers do.
 
     (`aval.weak_type` of arrays and tracers, jax 0.7 to 0.10.)
     """
@@ -161,7 +163,7 @@ def define_bilinear(
     """A new operation of JAX on two arrays of one type, linear in each, with its derivatives, its transposes and a rule
     for batches; see `jaxmb.linalg.bilinear`.
 
-    (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10; `ad.defbilinear` makes derivatives and transposes of
+    (jax.extend.core.Primitive and jax.interpreters, 0.7 to 0.10; `ad.defbilinear` makes derivatives and transposes from
     the gradients.)
     """
 
@@ -171,16 +173,16 @@ def define_bilinear(
             jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             for x, axis in zip(operands, axes, strict=True)
         ]
-        return own.bind(*front, **static), 0
+        return op.bind(*front, **static), 0
 
     of_a, of_b = gradients
-    own = Primitive(name)
-    own.def_impl(jax.jit(evaluate, static_argnames=parameters))
-    own.def_abstract_eval(lambda a, b, **static: ShapedArray(shape(a, b, **static), a.dtype))
-    mlir.register_lowering(own, mlir.lower_fun(evaluate, multiple_results=False))
-    ad.defbilinear(own, lambda c, a, b, **static: of_a(c, b, **static), lambda c, a, b, **static: of_b(c, a, **static))
-    batching.primitive_batchers[own] = batched
-    return own.bind
+    op = Primitive(name)
+    op.def_impl(jax.jit(evaluate, static_argnames=parameters))
+    op.def_abstract_eval(lambda a, b, **static: ShapedArray(shape(a, b, **static), a.dtype))
+    mlir.register_lowering(op, mlir.lower_fun(evaluate, multiple_results=False))
+    ad.defbilinear(op, lambda c, a, b, **static: of_a(c, b, **static), lambda c, a, b, **static: of_b(c, a, **static))
+    batching.primitive_batchers[op] = batched
+    return op.bind
 
 
 def define_linear(
@@ -197,29 +199,29 @@ def define_linear(
     """
 
     def batched(operands, axes, *, lead, **static):
-        return own.bind(jnp.moveaxis(operands[0], axes[0], 0), lead=lead + 1, **static), 0
+        return op.bind(jnp.moveaxis(operands[0], axes[0], 0), lead=lead + 1, **static), 0
 
-    own = Primitive(name)
-    own.def_impl(jax.jit(evaluate, static_argnames=("lead", *parameters)))
-    own.def_abstract_eval(lambda a, **static: ShapedArray(shape(a.shape, **static), a.dtype))
-    mlir.register_lowering(own, mlir.lower_fun(evaluate, multiple_results=False))
-    ad.deflinear2(own, lambda c, a, **static: [transpose(c, a.aval.shape, **static)])
-    batching.primitive_batchers[own] = batched
-    return functools.partial(own.bind, lead=0)
+    op = Primitive(name)
+    op.def_impl(jax.jit(evaluate, static_argnames=("lead", *parameters)))
+    op.def_abstract_eval(lambda a, **static: ShapedArray(shape(a.shape, **static), a.dtype))
+    mlir.register_lowering(op, mlir.lower_fun(evaluate, multiple_results=False))
+    ad.deflinear2(op, lambda c, a, **static: [transpose(c, a.aval.shape, **static)])
+    batching.primitive_batchers[op] = batched
+    return functools.partial(op.bind, lead=0)
 
 
 def let_go(primitive: Primitive, rule: Callable[[list[bool], Any], tuple[list[bool], Any]]) -> None:
-    """Let JAX leave out the results of an operation that nothing uses, by `rule(used results, equation)`, which returns
-    the operands that are used and the new equation.
+    """Let JAX omit unused results of an operation, by `rule(used results, equation)`, which returns the used operands
+    and the new equation.
 
-    (jax.interpreters.partial_eval.dce_rules, 0.7 to 0.12; from 0.12 on a rule takes the operands that are used
-    elsewhere before the equation.)
+    (jax.interpreters.partial_eval.dce_rules, 0.7 to 0.12; from 0.12 on a rule also takes the operands used elsewhere,
+    before the equation.)
     """
-    partial_eval.dce_rules[primitive] = lambda used, *more: rule(used, more[-1])
+    partial_eval.dce_rules[primitive] = lambda used, *arguments: rule(used, arguments[-1])
 
 
 def used_inputs(function: Callable[[Any], Any], x: Any) -> Any:
-    """Which arrays of the pytree x a function is computed from, as a pytree of truth values; nothing is compiled.
+    """Which arrays of the pytree x a function uses, as a pytree of truth values; nothing is compiled.
 
     (jax.interpreters.partial_eval.dce_jaxpr, 0.7 to 0.10.)
     """
@@ -240,21 +242,21 @@ def any_of_batch(pred: Any) -> Any:
 
 
 def cond_of_any_lane(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
-    """`lax.cond` that stays a branch under `vmap`: computed if any lane takes it, and used only by those that do."""
+    """`lax.cond` that stays a branch under `vmap`: computed if any lane takes it, used only by these lanes."""
     new = lax.cond(any_of_batch(pred), true_fn, false_fn, operand)
     return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, false_fn(operand))
 
 
-# How many lanes take a branch at once on a GPU, on which thousands of them cost as much as one.
+# The number of lanes that take a branch at once on a GPU, where thousands of them cost as much as one.
 _LANES = 4096
 
 
 def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
     """`lax.cond` that under `vmap` is computed only for the lanes that take it, one after the other on a CPU.
 
-    So what a lane takes rarely costs the others nothing. Elsewhere up to `_LANES` of them go at once. Where it is
-    differentiated it is `cond_of_any_lane`.
-    (jax.custom_batching.custom_vmap within jax.custom_jvp, 0.7 to 0.10; equinox.filter_closure_convert, 0.13.)
+    So a branch that a lane takes rarely costs the others nothing. Elsewhere up to `_LANES` lanes go at once. Under
+    differentiation it is `cond_of_any_lane`. (jax.custom_batching.custom_vmap within jax.custom_jvp, 0.7 to 0.10;
+    equinox.filter_closure_convert, 0.13.)
     """
     taken, static = eqx.partition((eqx.filter_closure_convert(true_fn, operand), operand), eqx.is_array)
     other, rest = eqx.partition(false_fn(operand), eqx.is_array)
@@ -269,15 +271,15 @@ def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any
 
     @of_lane.def_vmap
     def of_lanes(size, batched, pred, taken, other):
-        of_all = lambda x, own: x if own else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+        of_all = lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
         pred, other = of_all(pred, batched[0]), jax.tree.map(of_all, other, batched[2])
         lanes, all_batched = jnp.nonzero(pred, size=size, fill_value=size)[0], jax.tree.map(lambda x: True, other)
         together = 1 if jax.default_backend() == "cpu" else min(size, _LANES)
 
         def compute(lanes, out):
-            own = jax.tree.map(lambda x, own: x[lanes] if own else x, taken, batched[1])
-            axes = jax.tree.map(lambda own: 0 if own else None, batched[1])
-            new = jax.vmap(branch, (axes,))(own) if jnp.ndim(lanes) else branch(own)
+            lane_operands = jax.tree.map(lambda x, is_batched: x[lanes] if is_batched else x, taken, batched[1])
+            axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched[1])
+            new = jax.vmap(branch, (axes,))(lane_operands) if jnp.ndim(lanes) else branch(lane_operands)
             return jax.tree.map(lambda x, new: x.at[lanes].set(new, mode="drop"), out, new)
 
         if size == 1:
@@ -302,10 +304,10 @@ def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any
 
 
 def loop_of_lanes(together: Callable, going: Callable, advance: Callable, start: Any) -> Any:
-    """`lax.while_loop` of what is `going` on, without derivatives, in which under `vmap` few lanes hold up the others.
+    """`lax.while_loop`, without derivatives, in which under `vmap` few lanes hold up the others.
 
-    Lanes advance side by side while `together` holds for them; those that then still go on do so as in `cond_of_lanes`.
-    (jax.custom_batching.custom_vmap, 0.7 to 0.10; equinox.filter_closure_convert, 0.13.)
+    Lanes advance side by side while `together` holds for them; then the lanes still `going` continue as in
+    `cond_of_lanes`. (jax.custom_batching.custom_vmap, 0.7 to 0.10; equinox.filter_closure_convert, 0.13.)
     """
     start = lax.stop_gradient(start)
     closed, static = eqx.partition(eqx.filter_closure_convert(advance, start), eqx.is_array)
@@ -321,11 +323,11 @@ def loop_of_lanes(together: Callable, going: Callable, advance: Callable, start:
     def of_lanes(_, batched, closed, start):
         def alone(closed, start):
             first = advanced(together, closed, start)
-            more = lambda state: advanced(going, closed, state)
-            return cond_of_lanes(going(first), more, lambda state: state, first)
+            finish = lambda state: advanced(going, closed, state)
+            return cond_of_lanes(going(first), finish, lambda state: state, first)
 
-        axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
-        return jax.vmap(alone, axes)(closed, start), jax.tree.map(lambda own: True, batched[1])
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+        return jax.vmap(alone, axes)(closed, start), jax.tree.map(lambda is_batched: True, batched[1])
 
     return of_lane(lax.stop_gradient(closed), start)
 
@@ -335,12 +337,12 @@ while_loop = eqxi.while_loop
 
 
 def buffer_set(buffer: Any, index: Any, x: Array, pred: Any = True) -> Any:
-    """The same with an entry, which is written once; where `pred` is false, the same."""
+    """The same with an entry, which is written once; unchanged if `pred` is false."""
     return eqxi.buffer_at_set(buffer, index, x, pred=pred)
 
 
 def is_enumerated(x: Any) -> bool:
-    """Whether something is an item of an `equinox.Enumeration`, such as a result of diffrax.
+    """Whether an object is an item of an `equinox.Enumeration`, such as a result of diffrax.
 
     (EnumerationItem._enumeration, 0.13.)
     """
@@ -348,12 +350,12 @@ def is_enumerated(x: Any) -> bool:
 
 
 def messages_of(item: Any) -> dict[str, str]:
-    """The names and messages of all items of the enumeration of one, in the order of their codes.
+    """The names and messages of all items of an item's enumeration, in the order of their codes.
 
     (Enumeration._name_to_item, 0.13.)
     """
     kind = item._enumeration
-    return {name: kind[own] for name, own in kind._name_to_item.items()}
+    return {name: kind[entry] for name, entry in kind._name_to_item.items()}
 
 
 def set_message(item: Any, message: str) -> None:
@@ -367,7 +369,7 @@ def codes_of(item: Any) -> np.ndarray:
 
 
 def with_values(kind: type[T], values: Mapping[str, Any]) -> T:
-    """A module of a class with these values of all fields, as they are: without `__init__`, converters, checks.
+    """A module of a class with these values of all fields, without `__init__`, converters and checks.
 
     (Modules are frozen dataclasses whose instances `object.__new__` makes and `object.__setattr__` fills, 0.13.)
     """
@@ -378,14 +380,13 @@ def with_values(kind: type[T], values: Mapping[str, Any]) -> T:
 
 
 def changed(module: T, **values: Any) -> T:
-    """The same module with other values of some fields, as they are and unchecked; `equinox.tree_at` takes ten times as
-    long.
+    """The same module with other values of some fields, unchecked; `equinox.tree_at` takes ten times as long.
 
-    (Fields are among what `vars` finds, 0.13.)
+    (Fields are among `vars`, 0.13.)
     """
     any_module: Any = module
-    own = {name: x for name, x in vars(module).items() if name in any_module.__dataclass_fields__}
-    return with_values(type(module), own | values)
+    fields = {name: x for name, x in vars(module).items() if name in any_module.__dataclass_fields__}
+    return with_values(type(module), fields | values)
 
 
 # diffrax
@@ -402,12 +403,12 @@ def unwrapped(term: Any) -> Any:
 
 
 def inner_term(term: Any) -> Any:
-    """The term inside that which makes time increase. (WrapTerm.term, 0.7.)"""
+    """The term inside the wrapper that makes time increase. (WrapTerm.term, 0.7.)"""
     return term.term
 
 
 def direction_of(term: Any) -> Any:
-    """The sign of the user's time in that of a solver; 1 for a term that is not wrapped. (WrapTerm.direction, 0.7.)"""
+    """The sign of the user's time in the solver's time; 1 for an unwrapped term. (WrapTerm.direction, 0.7.)"""
     return term.direction if isinstance(term, WrapTerm) else 1
 
 
@@ -419,9 +420,9 @@ def with_inner(terms: Any, inner: Any, direction: Any) -> Any:
 def from_controller(tolerances: Callable[..., T]) -> T:
     """Tolerances with `rtol`, `atol` and `norm` that diffrax fills in from the step size controller.
 
-    A solver is never told its controller. Only the root finder of an implicit solver receives tolerances: those of
-    `diffrax.with_stepsize_controller_tols`, which is public, at the place `solver.root_finder`. So a multistep method
-    calls itself implicit, and its `root_finder` is not one. (0.7.)
+    A solver is never told its controller. Only the root finder of an implicit solver receives tolerances: the public
+    `diffrax.with_stepsize_controller_tols`, at the place `solver.root_finder`. So a multistep method calls itself
+    implicit, and its `root_finder` is not a root finder. (0.7.)
     """
     return diffrax.with_stepsize_controller_tols(tolerances)()  # pyright: ignore[reportArgumentType]
 
@@ -429,8 +430,8 @@ def from_controller(tolerances: Callable[..., T]) -> T:
 class WrappedSolver(diffrax.AbstractWrappedSolver):
     """A diffrax solver inside another one, to which diffrax's settings are passed on.
 
-    diffrax's adjoints set `scan_kind`, of solvers that are, or wrap, Runge–Kutta methods: the kind of loop over stages,
-    without which it is not differentiable in forward mode or by `DirectAdjoint`. (0.7.)
+    diffrax's adjoints set `scan_kind` of solvers that are, or wrap, Runge–Kutta methods: the kind of loop over stages.
+    Without it the solver is not differentiable in forward mode or by `DirectAdjoint`. (0.7.)
     """
 
     solver: diffrax.AbstractSolver
@@ -444,7 +445,7 @@ class WrappedSolver(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self):  # pyright: ignore
         return self.solver.interpolation_cls
 
-    # Of implicit solvers: where diffrax looks for their tolerances, and fills them in.
+    # For implicit solvers: the place where diffrax fills in their tolerances.
     @property
     def root_finder(self) -> Any:
         return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
@@ -464,23 +465,23 @@ class WrappedSolver(diffrax.AbstractWrappedSolver):
 
     @property
     def inner(self) -> Any:
-        """The solver, with the loops that the adjoint asked for."""
+        """The solver, with the loops chosen by the adjoint."""
         return self.with_own_loops(self.solver)
 
     def with_own_loops(self, solver: Any) -> Any:
-        """Another solver with them."""
+        """Another solver with these loops."""
         return with_loops(solver, self.scan_kind)
 
 
 def with_loops(solver: Any, kind: Any) -> Any:
-    """A solver with loops of a kind over its stages, where it has any."""
+    """A solver with loops of a kind over its stages, if it has any."""
     if kind is None or not hasattr(solver, "scan_kind"):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
 def save_states(state: Any) -> list[Any]:
-    """What a state of diffrax's loop holds of each series of saved states: `ts`, `ys` and counts.
+    """The parts of a state of diffrax's loop for each series of saved states: `ts`, `ys` and counts.
 
     (diffrax._integrate.SaveState, 0.7; the loop's state has the fields `y`, `tprev`, `tnext`, `made_jump`,
     `solver_state`, `num_accepted_steps`, `dense_infos` and `event_dense_info`.)

@@ -3,7 +3,7 @@
 import importlib.metadata
 import warnings
 
-# For each package and version, what is wrong and what to install.
+# For each package and version, the fault and the cure.
 FAULTS = {
     (
         "jaxlib",
@@ -19,7 +19,7 @@ FAULTS = {
 
 
 def fault_of(package: str) -> str | None:
-    """What is wrong with the installed version of a package, `"jaxlib 0.10.2: …"`; None if nothing is known."""
+    """The fault of the installed version of a package, `"jaxlib 0.10.2: …"`; None if none is known."""
     try:
         version = importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -29,7 +29,7 @@ def fault_of(package: str) -> str | None:
 
 
 def warn_of_jaxlib() -> None:
-    """Warn where the numbers of this package may be wrong."""
+    """Warn if the numbers of this package may be wrong."""
     fault = fault_of("jaxlib")
     if fault is not None:
         warnings.warn(f"{fault}.", stacklevel=2)

@@ -21,8 +21,8 @@ _PLAIN = {bool, int, float, complex, str, bytes, type(None), type(Ellipsis)}
 class Digest(NamedTuple):
     """The hash of a program.
 
-    **Fields:** `value`: the same in every process; `unknown`: functions of the user's that the program calls from
-    Python, and objects that only their address tells apart. Of these the hash has the names.
+    **Fields:** `value`: the same in every process; `unknown`: functions of the user that the program calls from Python,
+    and objects that only their address distinguishes. The hash contains their names.
     """
 
     value: bytes
@@ -33,22 +33,22 @@ def digest_of_program(program: Any, *, rules: bool) -> Digest:
     """The hash of a closed jaxpr: its equations with all their parameters, the programs within, literals and constants.
 
     **Arguments:** `rules`: whether derivative rules of functions count, `custom_jvp` and `custom_vjp`. A program that
-    is not differentiated has no use for them.
+    is not differentiated does not use them.
     """
-    own = _Digest()
-    value = own.of(program)
-    if rules and own.rules:
-        value = _joined("rules", [value, own.of_derivative(program)])
-    return Digest(value, tuple(own.unknown))
+    digest = _Digest()
+    value = digest.of(program)
+    if rules and digest.rules:
+        value = _joined("rules", [value, digest.of_derivative(program)])
+    return Digest(value, tuple(digest.unknown))
 
 
 class _Digest:
-    """Hashes of programs, of which the `rules` are named that equations have for derivatives."""
+    """Hashes of programs; `rules`: the names of the derivative rules of their equations."""
 
     def __init__(self):
         self.unknown: list[Any] = []
         self.rules: set[str] = set()
-        # Programs that occur several times. With each hash the program itself, so that no other one gets its address.
+        # Programs that occur several times. Each hash keeps its program, so that no other program gets its address.
         self._done: dict[int, tuple[Any, bytes]] = {}
         self._shapes: dict[Any, str] = {}
 
@@ -82,7 +82,7 @@ class _Digest:
         if isinstance(value, types.FunctionType):
             return self._function(value)
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            fields = [(own.name, getattr(value, own.name, None)) for own in dataclasses.fields(value)]
+            fields = [(entry.name, getattr(value, entry.name, None)) for entry in dataclasses.fields(value)]
             return _joined(name, [part for field in fields for part in map(self.of, field)])
         if (wrapped := getattr(value, "__wrapped__", None)) is not None:
             return _joined(name, [self.of(wrapped)])
@@ -117,22 +117,22 @@ class _Digest:
         return _joined("program", [*parts, *given(program.outvars)])
 
     def of_derivative(self, program: Any) -> bytes:
-        """The hash of the derivative of a program, in which the rules of its equations are used."""
+        """The hash of the derivative of a program, which uses the rules of its equations."""
         function = jaxpr_as_function(program)
         likes = [like_of(x) for x in program.in_avals]
         real = [k for k, like in enumerate(likes) if jnp.issubdtype(like.dtype, jnp.floating)]
 
         def derivative(values: list[Any]) -> Any:
-            of_real = lambda *own: function(*(dict(enumerate(values)) | dict(zip(real, own, strict=True))).values())
-            own = [values[k] for k in real]
+            of_real = lambda *reals: function(*(dict(enumerate(values)) | dict(zip(real, reals, strict=True))).values())
+            reals = [values[k] for k in real]
             if REVERSE in self.rules:
-                out, pull = jax.vjp(of_real, *own)
+                out, pull = jax.vjp(of_real, *reals)
                 return pull(jax.tree.map(jnp.ones_like, out))
-            return jax.jvp(of_real, own, [jnp.ones_like(x) for x in own])
+            return jax.jvp(of_real, reals, [jnp.ones_like(x) for x in reals])
 
         try:
             return self.of(jax.make_jaxpr(derivative)(likes))
-        except Exception:  # Whatever a rule raises that is not meant for this derivative: it is like no other.
+        except Exception:  # A rule may raise anything for a derivative that it does not support.
             self.unknown.append(program)
             return b""
 
@@ -146,13 +146,13 @@ class _Digest:
             self.unknown.append(value)
             return b""
         if isinstance(value, jax.Array) and not isinstance(value.dtype, np.dtype):
-            # The key of random numbers.
+            # A key of random numbers.
             return _joined(repr(value.dtype), [self._array(jax.random.key_data(value))])
         array = np.asarray(value)
         return _joined(f"{array.dtype} {array.shape}", [array.tobytes()])
 
     def _function(self, function: types.FunctionType) -> bytes:
-        """A function that is called from Python, as in a callback: one of a package counts by its name."""
+        """A function that is called from Python, as in a callback: a package's function counts by its name."""
         if not is_installed(function.__code__.co_filename):
             self.unknown.append(function)
         return _joined("function", [f"{function.__module__}.{function.__qualname__}".encode()])
@@ -166,7 +166,7 @@ class _Digest:
 
 
 def _joined(tag: str, parts: list[bytes]) -> bytes:
-    """A hash of parts that tells where one ends and the next begins."""
+    """A hash of parts that depends on where each part ends."""
     digest = hashlib.sha256(tag.encode())
     for part in parts:
         digest.update(len(part).to_bytes(8, "little") + part)

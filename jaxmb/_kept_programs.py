@@ -9,21 +9,21 @@ from pathlib import Path
 
 from ._compat import CacheInterface
 
-# What JAX appends to the hash of a program: for the program, and for a file that is written when it is used.
+# The endings that JAX appends to the hash of a program: for the program, and for a file written at each use.
 _PROGRAM, _USED = "-cache", "-atime"
-# What is being written has this ending; from this age on [s] the process that wrote it has died.
+# The ending of a file that is being written; at this age [s] its process has died.
 _NEW, _DEAD = ".new", 3600.0
-# A process looks for the size of the folder when it has written so large a share of the bound.
+# A process measures the folder when it has written this share of the bound.
 _SHARE = 1 / 32
 
 
 class KeptPrograms(CacheInterface):
     """Programs by their hashes, of at most `max_size` bytes together; no process waits for another one.
 
-    JAX's class locks the folder, and reads the times of all programs whenever it writes one: a dozen processes that
-    compile small programs so wait for longer than it allows, and each time warn. Here a program is renamed to its place
-    when it has been written, so it is read as a whole, without a lock. Programs that have not been used for longest are
-    dropped at times; until then the folder may exceed its bound by a 32nd for each process that writes.
+    JAX's class locks the folder, and reads the times of all programs whenever it writes one. A dozen processes that
+    compile small programs then wait for longer than it allows, and warn each time. Here a complete program is renamed
+    to its place, so it is read as a whole, without a lock. The programs unused for longest are dropped at times; until
+    then each process that writes may exceed the bound of the folder by a 32nd.
     """
 
     def __init__(self, path: str, *, max_size: int):
@@ -43,7 +43,7 @@ class KeptPrograms(CacheInterface):
         return value
 
     def put(self, key: str, value: bytes) -> None:
-        """Keep a program, in place of one that could not be read. A folder that cannot be written to is one warning."""
+        """Keep a program, in place of an unreadable one. A folder that cannot be written to gives one warning."""
         if not self._can_write or len(value) > self._max_size >= 0:
             return
         self._unseen += len(value)
@@ -69,17 +69,17 @@ class KeptPrograms(CacheInterface):
         """Drop programs until there is room for one of this size."""
         files = {}
         with os.scandir(self._path) as entries:
-            for own in entries:
+            for file in entries:
                 with contextlib.suppress(FileNotFoundError):
-                    files[own.name] = own.stat()
-        sizes = {name.removesuffix(_PROGRAM): own.st_size for name, own in files.items() if name.endswith(_PROGRAM)}
+                    files[file.name] = file.stat()
+        sizes = {name.removesuffix(_PROGRAM): file.st_size for name, file in files.items() if name.endswith(_PROGRAM)}
         used = {key: files.get(f"{key}{_USED}", files[f"{key}{_PROGRAM}"]).st_mtime for key in sizes}
-        dropped = [name for name, own in files.items() if name.endswith(_NEW) and own.st_mtime < time.time() - _DEAD]
-        left = sum(sizes.values()) + size
+        dropped = [name for name, file in files.items() if name.endswith(_NEW) and file.st_mtime < time.time() - _DEAD]
+        total = sum(sizes.values()) + size
         for key in sorted(sizes, key=used.__getitem__):
-            if left <= self._max_size:
+            if total <= self._max_size:
                 break
-            left -= sizes[key]
+            total -= sizes[key]
             dropped += [f"{key}{_PROGRAM}", f"{key}{_USED}"]
         for name in dropped:
             # A file that another process reads stays on some systems.

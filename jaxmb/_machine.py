@@ -10,14 +10,14 @@ def cores() -> int:
 
 
 def threads() -> int:
-    """The number of threads that computations may take: by the environment, as XLA reads it, or all cores."""
+    """The number of threads for computations: by the environment, as XLA reads it, or all cores."""
     return limit_of_threads() or cores()
 
 
 def limit_of_threads() -> int | None:
-    """The whole number in `PJRT_NPROC` or, without one there, in `NPROC`, at least one; None without a number.
+    """The whole number in `PJRT_NPROC`, else in `NPROC`, at least one; None without a number.
 
-    XLA takes less than one for one, and passes over any other text, such as `auto`.
+    XLA reads numbers below one as one, and ignores any other text, such as `auto`.
     """
     for variable in ("PJRT_NPROC", "NPROC"):
         given = os.environ.get(variable, "").strip()

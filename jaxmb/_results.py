@@ -6,7 +6,7 @@ from ._compat import set_message
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """Outcomes; diffrax's, and those of mechanics. Each text says what to try next.
+    """Outcomes of diffrax, and of mechanics. Each text names the next thing to try.
 
     ```python
     motion = jaxmb.simulate(system, state, t1=1.0, throw=False)
@@ -46,7 +46,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A parameter is not finite, or not in the range that its part asks for, or a direction is not a unit vector, "
         "or a design variable is outside its bounds. `jaxmb.with_parameters` with numbers that are not traced names it."
     )
-    # The last ones, in the order in which they came, since results are stored by their numbers.
+    # The last results, in the order of their introduction, since results are stored by their numbers.
     saved_outside = "A saved time is not between `t0` and `t1`, or not a number, or before the one that it follows."
     input_ended = "An input is a `Series` that is not known for the whole motion, from `t0` to `t1`."
     impacts_backward = "Impacts cannot be undone: with contacts `t1` must be after `t0`."
@@ -57,5 +57,5 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
-# That of diffrax is empty, which shows nothing of a good run.
+# The message of diffrax is empty, which says nothing of a good run.
 set_message(RESULTS.successful, "successful")

@@ -1,4 +1,4 @@
-"""JAX at the head of a script: its precision, how programs are compiled, and that they are kept on disk."""
+"""JAX at the head of a script: its precision, the compilation of programs, and their cache on disk."""
 
 import gc
 import os
@@ -14,10 +14,10 @@ import jax
 from ._compat import computes_on_processors, has_started, keep_programs_as, takes_option
 from ._kept_programs import KeptPrograms
 
-# What XLA is told to compile quickly: one kernel of a simulation is a few numbers, for which its older way to emit
-# loops gives code that is as fast and compiles in half the time; the passes pay for themselves in large arrays only. A
-# loop that reads and writes less than 64 KiB in a turn, such as an elimination, becomes one kernel; it is long for
-# LLVM, which at its highest level unrolls it, for nothing.
+# Options of XLA for quick compilation. One kernel of a simulation is a few numbers: XLA's older loop emitter gives code
+# that is as fast and compiles in half the time. The disabled passes pay for themselves in large arrays only. A loop
+# that reads and writes less than 64 KiB in a turn, such as an elimination, becomes one kernel. It is long for LLVM,
+# whose highest level unrolls it without gain.
 _PASSES = (
     "while-loop-invariant-code-motion",
     "while-loop-constant-sinking",
@@ -33,21 +33,21 @@ _QUICKLY = {
     "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**16}",
     "xla_disable_hlo_passes": ",".join(_PASSES),
 }
-# For speed the loop over steps becomes one kernel too, unless it contains what XLA leaves to a library, as it does
-# products of matrices by one of these passes. Calling a hundred kernels takes most of the time of a step. In large
-# arrays it takes none of it, and what is too long takes LLVM minutes: no loops of more than 1 MiB.
+# For speed the loop over steps becomes one kernel too, unless it contains library calls, which one of these passes
+# makes of products of matrices. Calling a hundred kernels takes most of the time of a step. With large arrays the calls
+# cost nothing, and LLVM takes minutes for a long kernel: so loops of more than 1 MiB are excluded.
 _FOR_SPEED = _QUICKLY | {
     "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**20}",
     "xla_disable_hlo_passes": ",".join((*_PASSES, "dot-library-rewriter")),
 }
 _OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, None: {}}
-# Python looks for garbage after so many more new objects than have gone. A program is traced into a million of them,
-# among which there is little, and the search takes a sixth of that time when it comes after 700, as by default.
+# Python collects garbage after so many more new than deleted objects. Tracing a program makes a million objects with
+# little garbage, and with the default of 700 the collection takes a sixth of the time.
 _NEW_OBJECTS = 50_000
-# The folder in place of that which a program names, or `off`.
+# The folder in place of the program's choice, or `off`.
 VARIABLE = "JAXMB_CACHE"
 MAX_BYTES = 2**27
-# What JAX is told besides the folder: to keep every program, as hundreds of small ones take seconds together too.
+# Settings of JAX besides the folder: to keep every program, since hundreds of small ones take seconds together too.
 SETTINGS = {
     "jax_compilation_cache_max_size": MAX_BYTES,
     "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -70,23 +70,23 @@ def setup(
     jaxmb.setup()  # At the head of a script or notebook, before anything is computed.
     ```
 
-    It changes settings of JAX for the whole process. Importing jaxmb changes none; the command line calls this, but for
-    reports. `jaxmb help compiling` has more.
+    It changes settings of JAX for the whole process. Importing jaxmb changes none; the command line calls this, except
+    for reports. `jaxmb help compiling` has more.
 
     **Arguments:**
 
     - `x64`: whether JAX computes in double precision; False leaves its precision as it is.
-    - `compile`: `"quickly"` lets programs compile in about six tenths of the time, `"for speed"` lets those of small
-        machines run in a third to three quarters of it. Results differ in rounding. Both are options of XLA for
-        processors, in the environment variable `XLA_FLAGS`; those that are set there already stay. None sets none,
-        and where JAX has an accelerator none are set.
+    - `compile`: with `"quickly"` programs compile in about six tenths of the time, with `"for speed"` programs of small
+        machines run in a third to three quarters of the time. Results differ in rounding. Both set options of XLA for
+        processors in the environment variable `XLA_FLAGS`; options that are set there already stay. None sets none, and
+        if JAX has an accelerator none are set.
     - `keep`: whether compiled programs are kept on disk, for this and later processes; or the folder to keep them in,
-        by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME`, in `~/.cache`, on macOS
-        `~/Library/Caches`, on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes its place:
-        another folder, or `off`. Where JAX has a folder already, that stays, with its settings.
-    - `max_bytes`: size of the folder beyond which programs that have not been used for longest are dropped [bytes].
+        by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME`, in `~/.cache`, on macOS `~/Library/Caches`,
+        on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes precedence: another folder, or `off`.
+        If JAX has a folder already, it stays, with its settings.
+    - `max_bytes`: size of the folder beyond which the programs unused for longest are dropped [bytes].
 
-    **Raises:** a `ValueError` for other values. `UserWarning`s tell of a folder that cannot be written to, and of JAX
+    **Raises:** a `ValueError` for other values. `UserWarning`s tell of a folder that cannot be written to, and of a JAX
     that has computed something already, after which options of XLA have no effect.
     """
     if compile not in _OPTIONS:
@@ -104,19 +104,19 @@ def setup(
         _keep_programs(None if keep is True else keep, max_bytes)
 
 
-# What this module has set in XLA_FLAGS.
+# The options that this module has set in XLA_FLAGS.
 _told: dict[str, str] = {}
 
 
 def _look_for_garbage_less_often() -> None:
-    first, *others = gc.get_threshold()
-    # Zero switches the search off.
+    first, *older_generations = gc.get_threshold()
+    # Zero switches the collection off.
     if 0 < first < _NEW_OBJECTS:
-        gc.set_threshold(_NEW_OBJECTS, *others)
+        gc.set_threshold(_NEW_OBJECTS, *older_generations)
 
 
 def _tell(flags: dict[str, str]) -> None:
-    """Set options of XLA, in place of those that this module has set before."""
+    """Set options of XLA, in place of the options that this module has set before."""
     given = os.environ.get("XLA_FLAGS", "").split()
     kept = [flag for flag in given if flag not in {f"--{name}={value}" for name, value in _told.items()}]
     names = [name for name in flags if takes_option(name) and not any(flag.startswith(f"--{name}") for flag in kept)]
@@ -136,14 +136,14 @@ def _tell(flags: dict[str, str]) -> None:
 
 
 def bytes_of_kernel_loops() -> int:
-    """The bytes in a turn below which XLA was told to make a loop one kernel; zero where it was not told."""
-    found = re.search(rf"{_KERNEL_LOOPS}=(\d+)", os.environ.get("XLA_FLAGS", ""))
-    return int(found[1]) if found else 0
+    """The bytes in a turn below which XLA was told to make a loop one kernel; zero if it was not told."""
+    flag = re.search(rf"{_KERNEL_LOOPS}=(\d+)", os.environ.get("XLA_FLAGS", ""))
+    return int(flag[1]) if flag else 0
 
 
 def _keep_programs(folder: str | os.PathLike[str] | None, max_bytes: int) -> None:
     """Keep compiled programs on disk, by JAX's persistent compilation cache; any number of processes share the folder,
-    and none waits for another one.
+    and none waits for another.
     """
     told = os.environ.get(VARIABLE)
     if kept_in() is not None or not _setting("jax_enable_compilation_cache") or told == "off":
@@ -179,7 +179,7 @@ def _setting(name: str) -> Any:
 
 
 def _default_folder() -> Path:
-    """That of this package among the user's caches."""
+    """The folder of this package among the user's caches."""
     above = os.environ.get("XDG_CACHE_HOME") or (sys.platform == "win32" and os.environ.get("LOCALAPPDATA"))
     if above:
         return Path(above) / "jaxmb"

@@ -1,6 +1,4 @@
-"""Functions of the user: errors of their own, and messages about the line that needs a number or a name that is not
-there.
-"""
+"""Functions of the user: their errors, and messages about the line that needs a number or an unknown name."""
 
 import ast
 import contextlib
@@ -15,7 +13,7 @@ from typing import Any
 
 import jax
 
-# What JAX raises where a number is asked for that is not known in tracing.
+# The errors that JAX raises if a traced value is needed as a number.
 NEED_NUMBERS = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -28,26 +26,26 @@ _PACKAGES = {
 }
 
 
-# What computes for the user's functions: its errors are about values that they return or pass on.
+# Packages that compute for the user's functions: their errors are about values that these return or pass on.
 _COMPUTE = {"jaxmb", "jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping"}
 
 
 @functools.cache
 def is_installed(file: str | None) -> bool:
     """Whether a file belongs to an installed package, the standard library or jaxmb, and not to the user."""
-    # Code that was never in a file has a name in angle brackets.
+    # Code without a file has a name in angle brackets.
     return file is not None and file[0] != "<" and any(place in _PACKAGES for place in Path(file).resolve().parents)
 
 
 @contextlib.contextmanager
 def traced_by_jax(what: str, argument: str) -> Iterator[None]:
-    """Where a function of the user is traced.
+    """A context in which a function of the user is traced.
 
-    **Arguments:** `what` is traced, such as "the function of a sweep", and what it has no number of, such as "a
+    **Arguments:** `what` is traced, such as "the function of a sweep"; `argument`: a value without a number, such as "a
     parameter".
 
-    **Raises:** `ValueError` that says which line of the user's needs a number, and what to write instead; or which one
-    asks a dictionary among the function's arguments for a name, and what names are in it. Other errors pass.
+    **Raises:** `ValueError` that names the user's line that needs a number and the cure; or the line that asks a
+    dictionary among the function's arguments for a missing name, and the names in it. Other errors pass.
     """
     try:
         yield
@@ -56,8 +54,8 @@ def traced_by_jax(what: str, argument: str) -> Iterator[None]:
         if asked is None:
             _add_note(error, what)
             raise
-        name, there = asked
-        listed = ", ".join(map(repr, there)) or "no names"
+        name, names = asked
+        listed = ", ".join(map(repr, names)) or "no names"
         raise ValueError(f"{_line(error)} asks for {error}, which {what} does not get; {name} has {listed}.") from error
     except NEED_NUMBERS as error:
         raise ValueError(
@@ -77,7 +75,7 @@ def _add_note(error, what):
 
 
 def note_of(what: str) -> str:
-    """What an error of the user's says of the place where it was raised."""
+    """The note for an error of the user, about the place where it was raised."""
     return f"This was raised in {what}."
 
 
@@ -87,8 +85,8 @@ def _users_frames(error):
 
 
 def is_of_user(error: BaseException) -> bool:
-    """Whether a line of the user's raised an error, by itself or through the standard library or another package, and
-    not JAX, NumPy or jaxmb, unless it is that of a file.
+    """Whether a line of the user raised an error, by itself or through the standard library or another package. Errors
+    of JAX, NumPy and jaxmb do not count, unless they are about a file.
     """
     if isinstance(error, OSError):
         return bool(_users_frames(error))
@@ -101,7 +99,7 @@ def is_of_user(error: BaseException) -> bool:
 
 
 def with_note(function: Callable[..., Any], what: str) -> Callable[..., Any]:
-    """A function whose errors have a note if they are the user's; JAX takes its frames out of tracebacks later."""
+    """A function whose errors have a note if they are the user's; JAX removes its frames from tracebacks later."""
 
     @functools.wraps(function)
     def noted(*given):
@@ -116,19 +114,22 @@ def with_note(function: Callable[..., Any], what: str) -> Callable[..., Any]:
 
 
 def asked_argument(error: KeyError) -> tuple[str, Mapping[Any, Any]] | None:
-    """The dictionary among the arguments of the user's function that a line asked for a name that is not in it, with
-    the name that it has there; None for another dictionary, which is the user's, and for an `UnknownNameError`.
+    """The dictionary argument of the user's function that lacks the name that a line asked for, and its name.
+
+    None for another dictionary, which is the user's, and for an `UnknownNameError`.
     """
     walked = list(traceback.walk_tb(error.__traceback__))
     frames = _users_frames(error)
     if isinstance(error, ValueError) or not frames or frames[-1] is not walked[-1][0]:
         return None
     given, last = _arguments(frames[0]), frames[-1]
-    there = {name: own for name, own in last.f_locals.items() if any(own is each for each in given)}
+    candidates = {
+        name: mapping for name, mapping in last.f_locals.items() if any(mapping is argument for argument in given)
+    }
     subscripted = _subscripted(traceback.extract_tb(error.__traceback__)[-1])
     if subscripted is not None:
-        there = {name: own for name, own in there.items() if name == subscripted}
-    missed = ((name, own) for name, own in there.items() if error.args and error.args[0] not in own)
+        candidates = {name: mapping for name, mapping in candidates.items() if name == subscripted}
+    missed = ((name, mapping) for name, mapping in candidates.items() if error.args and error.args[0] not in mapping)
     return next(missed, None)
 
 
@@ -136,7 +137,7 @@ def _arguments(frame: FrameType) -> list[Mapping[Any, Any]]:
     """The dictionaries among the arguments of a call."""
     code = frame.f_code
     names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
-    return [own for name in names if isinstance(own := frame.f_locals.get(name), Mapping)]
+    return [argument for name in names if isinstance(argument := frame.f_locals.get(name), Mapping)]
 
 
 def _subscripted(place: traceback.FrameSummary) -> str | None:
@@ -154,6 +155,6 @@ def _subscripted(place: traceback.FrameSummary) -> str | None:
 
 
 def _line(error: Exception) -> str:
-    """The last line of the user's on the way to an error."""
-    lines = [own for own in traceback.extract_tb(error.__traceback__) if not is_installed(own.filename)]
+    """The last line of the user on the way to an error."""
+    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if not is_installed(frame.filename)]
     return f"{lines[-1].filename}:{lines[-1].lineno}: `{lines[-1].line}`" if lines else "The function"

@@ -27,12 +27,11 @@ class State(eqx.Module):
     released = jaxmb.State(q=state.q, u=jnp.zeros(3))
     ```
 
-    **Fields:** `q`: coordinates, shape `(nq,)`; `u`: velocities, shape `(nu,)`. Their meaning depends on the
-    system: for a planar scene (x, y, angle) [m, m, rad] a body and their rates, for a spatial one (position [m],
-    Euler parameters) and (velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame);
-    contacts and friction have a coordinate each, their mode, behind those of the bodies: see
-    `system.coordinate_names()`. `z`: internal states of first order, shape `(nz,)`, such as the torque of a motor with
-    lag; None where no part has any.
+    **Fields:** `q`: coordinates, shape `(nq,)`; `u`: velocities, shape `(nu,)`. Their meaning depends on the system:
+    for a planar scene (x, y, angle) [m, m, rad] a body and their rates, for a spatial one (position [m], Euler
+    parameters) and (velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame); contacts and
+    friction have a coordinate each, their mode, after the coordinates of the bodies: see `system.coordinate_names()`.
+    `z`: internal states of first order, shape `(nz,)`, such as the torque of a motor with lag; None if no part has any.
     """
 
     q: Float[Array, "... nq"]
@@ -45,8 +44,10 @@ class State(eqx.Module):
 
 
 def _shown(x: Any) -> str:
-    """The numbers of an array where they are known and few, else its shape and type."""
-    known = isinstance(x, Array | np.ndarray) and not isinstance(x, Tracer)
+    """The numbers of an array if they are concrete and few, else its shape and type."""
+    concrete = isinstance(x, Array | np.ndarray) and not isinstance(x, Tracer)
     return (
-        np.array2string(np.asarray(x), precision=6, separator=", ") if known and x.size <= _FEW else eqx.tree_pformat(x)
+        np.array2string(np.asarray(x), precision=6, separator=", ")
+        if concrete and x.size <= _FEW
+        else eqx.tree_pformat(x)
     )

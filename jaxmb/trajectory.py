@@ -32,9 +32,10 @@ from .system.quantities import with_shapes
 
 
 class ConstraintViolation(NamedTuple):
-    """Largest residuals, shape (times,), in units that do not depend on how constraints are written: the changes that
-    restore them, of coordinates in the system's size and radians (`position`), and of velocities in these per second
-    (`velocity`).
+    """Largest residuals, shape (times,), in units that do not depend on the form of the constraints.
+
+    **Fields:** `position`: the changes of coordinates that restore them, in the system's size and radians; `velocity`:
+    the changes of velocities, in these units per second.
     """
 
     position: Float[Array, "times"]
@@ -52,8 +53,8 @@ _SHOWN = 12
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
-    return f"{', '.join(names[:_SHOWN])}{more}"
+    rest_of_names = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
+    return f"{', '.join(names[:_SHOWN])}{rest_of_names}"
 
 
 class _ByName(Mapping[str, Any]):
@@ -78,7 +79,7 @@ class _ByName(Mapping[str, Any]):
 
 
 def _of_each_member(view: Callable[..., Any]) -> Callable[..., Any]:
-    """A view of one motion as that of any batch of motions, whose arrays all have the batch's axes before their own."""
+    """A view of any batch of motions, from a view of one motion; its arrays have the batch's axes first."""
 
     @functools.wraps(view)
     def of_all(trajectory, *arguments):
@@ -90,14 +91,14 @@ def _of_each_member(view: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _view(view: Callable[["Trajectory"], Any]) -> Callable[["Trajectory"], Any]:
-    """A view of one motion as that of any batch of motions, compiled once for all runs of a system."""
+    """A view of any batch of motions, from a view of one motion, compiled once for all runs of a system."""
     compiled = jitted(_of_each_member(view))
 
     @functools.wraps(view)
     def of_motion(trajectory):
-        # How a run ended is no part of the program.
-        others = ("interpolation", "event_mask", "found_events", "closer")
-        return compiled(changed(trajectory, stats={}, result=None, **dict.fromkeys(others)))
+        # The end of a run is not part of the program.
+        unused = ("interpolation", "event_mask", "found_events", "closer")
+        return compiled(changed(trajectory, stats={}, result=None, **dict.fromkeys(unused)))
 
     return of_motion
 
@@ -111,20 +112,20 @@ class Trajectory(eqx.Module):
     ```
 
     **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
-    integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`:
-    accepted steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
+    integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`: accepted
+    steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
     `num_evaluations` of f with its time derivative, `num_matrices` made, `past_points`: accepted steps with 1, 2, …
     points of the past, and `wrong_derivative`: whether differences of f contradict its derivative; `num_events`: times
-    of `events`; and `linearised_steps`: whether derivatives take one linearisation of the equations at each step, and
-    not the derivative of each step as it is, which costs more); `result`, how it ended. `trajectory["crank"]` is the
-    motion of a body, a `BodyMotion`, and `trajectory["hip"]` that of a joint, a frame or a part with internal states, a
+    of `events`; and `linearised_steps`: whether derivatives use one linearisation of the equations at each step, or the
+    derivative of each step as it is, which costs more); `result`, how it ended. `trajectory["crank"]` is the motion of
+    a body, a `BodyMotion`, and `trajectory["hip"]` the motion of a joint, a frame or a part with internal states, a
     `PartMotion`; of a system in generalized coordinates `trajectory["theta"]` is a coordinate and
     `trajectory["theta_rate"]` its rate, shape (times,).
 
     `events` are the impacts of unilateral constraints, as a table.
 
-    In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before those
-    that are given here. `closer` is the same motion at tighter tolerances if `error` asked for it.
+    In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before the
+    axes given here. `closer` is the same motion at tighter tolerances, after `error=True`.
     """
 
     system: Any
@@ -140,8 +141,8 @@ class Trajectory(eqx.Module):
 
     def _is_known(self) -> bool:
         """Whether there are numbers to print."""
-        known = isinstance(self.ts, jax.Array | np.ndarray) and "num_steps" in self.stats
-        return known and not is_traced((self.ts, self.result, self.stats))
+        has_numbers = isinstance(self.ts, jax.Array | np.ndarray) and "num_steps" in self.stats
+        return has_numbers and not is_traced((self.ts, self.result, self.stats))
 
     def __repr__(self) -> str:
         if not self._is_known():
@@ -155,8 +156,8 @@ class Trajectory(eqx.Module):
         else:
             text = f"Trajectory: {finite.size} saved from {span} in {steps} steps; {RESULTS[self.result]}"
         forces = self._force_names()
-        own = f"\nForces, in motion.forces: {_listed(forces)}" if forces else ""
-        return f"{text}\nNames: {_listed(names)}{own}"
+        force_line = f"\nForces, in motion.forces: {_listed(forces)}" if forces else ""
+        return f"{text}\nNames: {_listed(names)}{force_line}"
 
     def __getitem__(self, name: str) -> Any:
         if name in self.system.catalogue.motion_names():
@@ -168,12 +169,12 @@ class Trajectory(eqx.Module):
         raise unknown("body, joint or frame" if self.system.body_names else "coordinate", name, self)
 
     def __getattr__(self, name: str) -> Any:
-        # Private names are what JAX and notebooks look for; fields are missing while an object is made.
+        # JAX and notebooks look for private names; fields are missing while an object is made.
         if not name.startswith("_") and "system" in vars(self):
             for view, names in (("motion", self), ("motion.forces", self._force_names())):
                 if name in names:
                     raise AttributeError(f"A motion has its parts by their names: {view}[{name!r}].")
-        # Python's own error, or that which the property of this name raised.
+        # Python's own error, or the error raised by the property of this name.
         return super().__getattribute__(name)
 
     def _force_names(self) -> tuple[str, ...]:
@@ -181,7 +182,7 @@ class Trajectory(eqx.Module):
 
     def __iter__(self) -> Iterator[str]:
         """The names that `trajectory[name]` takes."""
-        parts = (known.split(".")[0] for known in self.system.quantities())
+        parts = (quantity.split(".")[0] for quantity in self.system.quantities())
         return iter(dict.fromkeys((*self.system.catalogue.motion_names(), *parts)))
 
     def get(self, name: str, default: Any = None) -> Any:
@@ -191,13 +192,12 @@ class Trajectory(eqx.Module):
         return self[name]
 
     def quantity(self, name: str) -> Array:
-        """A quantity by the name that `identify` takes, axis 0 is time: `"rod.position"` or `"rod.acceleration"` of a
-        body, `"A.force"` of a joint; in generalized coordinates `"theta"`, `"theta_rate"`, and `"A.force"` of a
-        constraint.
+        """A quantity by its name in `identify`, axis 0 is time: `"rod.position"` or `"rod.acceleration"` of a body,
+        `"A.force"` of a joint; in generalized coordinates `"theta"`, `"theta_rate"`, and `"A.force"` of a constraint.
         """
-        known = self.system.quantities()
-        if name not in known:
-            raise unknown("quantity", name, known)
+        quantities = self.system.quantities()
+        if name not in quantities:
+            raise unknown("quantity", name, quantities)
         return self._measured((name,))[name]
 
     @property
@@ -214,14 +214,14 @@ class Trajectory(eqx.Module):
             raise ValueError(
                 "There are no events, since the system has neither contacts such as jaxmb.Stop nor jaxmb.DryFriction."
             )
-        # Not a field, so that a copy with other fields is without it.
-        kept: Any = vars(self)
-        if "_events" not in kept:
+        # Not a field, so that a copy with other fields does not have it.
+        attributes: Any = vars(self)
+        if "_events" not in attributes:
             events = contact_events(self.system, self.formulation, self.found_events)
             if is_traced(events):
                 return events
-            kept["_events"] = events
-        return kept["_events"]
+            attributes["_events"] = events
+        return attributes["_events"]
 
     @property
     def error(self) -> "GlobalError":
@@ -236,8 +236,8 @@ class Trajectory(eqx.Module):
         return GlobalError(self, self.closer)
 
     def _measured(self, names):
-        known = self.system.quantities()
-        chosen = {name: known[name] for name in names}
+        quantities = self.system.quantities()
+        chosen = {name: quantities[name] for name in names}
         solved = Solved(*self._solved) if any(quantity.of_forces for quantity in chosen.values()) else None
         return {name: quantity.value(self.ts, self.ys, solved) for name, quantity in chosen.items()}
 
@@ -245,9 +245,9 @@ class Trajectory(eqx.Module):
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints; in a batch, at the
         same times of every member.
 
-        At a jump that was announced to `simulate` velocities are those after it, as in states that are saved; those
-        before it are at the time `numpy.nextafter(t, -numpy.inf)`. Where Newton's method finds no state on the
-        constraints, as between steps that are too long, and outside of the run, the state is NaN.
+        At the time t of an announced jump, velocities are taken after it, as in saved states; at `numpy.nextafter(t,
+        -numpy.inf)` before it. The state is NaN outside of the run, and if Newton's method finds no state on the
+        constraints, as between steps that are too long.
         """
         if self.interpolation is None:
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
@@ -334,8 +334,8 @@ class Trajectory(eqx.Module):
         """Wrenches of the applied forces by name, on each of the part's bodies in order, shape (times, bodies, 3) or
         (times, bodies, 6): force [N] in world axes and moment [N m] about the mass centre, in space in body axes.
 
-        Friction in a joint is among them under its own name, on the bodies of the joint: the reaction of the joint is
-        without it.
+        Friction in a joint is among them under its own name, on the bodies of the joint; the reaction of the joint
+        excludes it.
         """
         return _ByName("force", self.system.catalogue.force_names(), self._wrenches)
 
@@ -365,7 +365,7 @@ class Trajectory(eqx.Module):
         finite = np.isfinite(np.asarray(self.ts))
         if finite.all():
             return self
-        # By NumPy, since each number of times would be a program; but not what is differentiated.
+        # By NumPy, since JAX would compile a program for each number of times; but not for traced arrays.
         kept = lambda x: x[finite] if isinstance(x, Tracer) else jnp.asarray(np.asarray(x)[finite])
         ts, ys = jax.tree.map(kept, (self.ts, self.ys))
         return changed(self, ts=ts, ys=ys)
@@ -405,7 +405,7 @@ class Trajectory(eqx.Module):
         return out
 
     def to_pandas(self, names: Sequence[str] | None = None) -> Any:
-        """A `pandas.DataFrame` with the column `t` [s] and one for each component of each quantity:
+        """A `pandas.DataFrame` with the column `t` [s] and a column for each component of each quantity:
         `"crank.angle"`, `"crank.position.x"`, of Euler parameters `"rotor.orientation.0"`.
 
         **Arguments:** `names` as in `to_xarray`.
@@ -429,14 +429,14 @@ class Trajectory(eqx.Module):
                 f"A table shows a single motion, and this is a batch of shape {self.ts.shape[:-1]}; choose a member, "
                 "such as jax.tree.map(lambda leaf: leaf[0], trajectory)."
             )
-        known = self.system.quantities()
+        quantities = self.system.quantities()
         if names is None:
-            names = ["energy", *(name for name, quantity in known.items() if not quantity.of_forces)]
+            names = ["energy", *(name for name, quantity in quantities.items() if not quantity.of_forces)]
         names = (names,) if isinstance(names, str) else names
         for name in names:
-            if name not in known and name != "energy":
-                raise unknown("quantity", name, ("energy", *known))
-        values = dict(self._measured(tuple(name for name in names if name in known)))
+            if name not in quantities and name != "energy":
+                raise unknown("quantity", name, ("energy", *quantities))
+        values = dict(self._measured(tuple(name for name in names if name in quantities)))
         if "energy" in names:
             values["energy"] = self.energy
         return {name: np.asarray(values[name]) for name in names}
@@ -444,7 +444,7 @@ class Trajectory(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`.
 
-        **Raises:** a `ValueError` for a path that ends otherwise; `to_pandas` has tables for other files.
+        **Raises:** `ValueError` for a path with another suffix; `to_pandas` has tables for other files.
         """
         if Path(path).suffix not in ("", ".npz"):
             raise ValueError(
@@ -454,12 +454,12 @@ class Trajectory(eqx.Module):
 
 
 class PartMotion:
-    """What can be measured of a joint or a frame along a motion, as attributes: of a hinge `.angle`, `.angle_rate`,
-    `.angle_acceleration`, `.force`, …, of a frame `.position`, `.specific_force`, …; `dir` lists them, and the classes
-    of joints and frames describe them. Axis 0 is time, after the batch's axes.
+    """The measurable quantities of a joint or a frame along a motion, as attributes: of a hinge `.angle`,
+    `.angle_rate`, `.angle_acceleration`, `.force`, …, of a frame `.position`, `.specific_force`, …; `dir` lists them,
+    and the classes of joints and frames describe them. Axis 0 is time, after the batch's axes.
 
-    An angle of a joint is continued over full turns; saved times must be so close that its change between two of them
-    differs by less than half a turn from that by the trapezoidal rule of its rate.
+    An angle of a joint is continued over full turns. Saved times must be so close that its change between two of them
+    differs by less than half a turn from the trapezoidal rule of its rate.
     """
 
     def __init__(self, trajectory: Trajectory, name: str):
@@ -469,8 +469,8 @@ class PartMotion:
         return f"Motion of {self._name!r}: {', '.join(dir(self))}"
 
     def __dir__(self) -> list[str]:
-        known = (name.partition(".") for name in self._trajectory.system.quantities())
-        return [field for part, _, field in known if part == self._name]
+        parts = (name.partition(".") for name in self._trajectory.system.quantities())
+        return [field for part, _, field in parts if part == self._name]
 
     def __getattr__(self, field: str) -> Array:
         if field.startswith("_") or field not in dir(self):
@@ -479,11 +479,11 @@ class PartMotion:
 
 
 class GlobalError(NamedTuple):
-    """The estimated global error of a motion: how far it is from the same one at tighter tolerances.
+    """The estimated global error of a motion: its distance from the same motion at tighter tolerances.
 
-    Steps of the closer motion may err a hundredth as much (near rounding, or with a method of a fixed order, a tenth),
-    so the distance is nearly the error itself. Errors of the model, and rounding errors that both motions share, are
-    not seen. In derivatives it is a constant.
+    Steps of the closer motion may err a hundredth as much; near rounding, or with a method of a fixed order, a tenth.
+    So the distance is nearly the error itself. It does not contain errors of the model, nor rounding errors that both
+    motions share. In derivatives it is a constant.
     """
 
     motion: Trajectory
@@ -492,35 +492,35 @@ class GlobalError(NamedTuple):
     def __repr__(self) -> str:
         if not self.motion._is_known() or not isinstance(self.motion.ys, State):
             return f"GlobalError of a {type(self.motion).__name__}"
-        found = np.asarray(self.largest)
-        of_batch = f", in {found.size} runs" if found.ndim else ""
-        return f"GlobalError: at most {np.max(found):.2g} of the largest coordinate or velocity{of_batch}"
+        largest = np.asarray(self.largest)
+        of_batch = f", in {largest.size} runs" if largest.ndim else ""
+        return f"GlobalError: at most {np.max(largest):.2g} of the largest coordinate or velocity{of_batch}"
 
     @property
     def largest(self) -> Array:
         """The largest error of the saved coordinates, velocities and internal states, relative to the largest of each
-        kind: in units of the system's size, or of what is typical of a state, so that metres and radians compare.
+        kind: in units of the system's size, or of a state's typical size, so that metres and radians compare.
         """
         return _largest_error(self.motion)
 
     @property
     def ys(self) -> Any:
-        """Of every saved state, in the units of each coordinate and velocity."""
+        """The error of every saved state, in the units of each coordinate and velocity."""
         return _distance(self.motion.ys, self.closer.ys)
 
     def quantity(self, name: str) -> Array:
-        """Of a quantity, by the name that `Trajectory.quantity` takes."""
+        """The error of a quantity, by its name in `Trajectory.quantity`."""
         return self.of(lambda trajectory: trajectory.quantity(name))
 
     def of(self, observed: Callable[[Trajectory], Any]) -> Any:
-        """Of anything that is computed from a trajectory: `error.of(lambda trajectory: trajectory.energy)`."""
+        """The error of any function of a trajectory: `error.of(lambda trajectory: trajectory.energy)`."""
         return _distance(observed(self.motion), observed(self.closer))
 
 
 def _components(values: Mapping[str, np.ndarray]) -> dict[int, tuple[str, list[Any]]]:
-    """For each number of components that a quantity has, the name of the dimension and the labels along it."""
+    """For each number of components of a quantity, the name of the dimension and the labels along it."""
     sizes = sorted({value.shape[1] for value in values.values() if value.ndim > 1})
-    # Vectors have as many as the space has dimensions.
+    # The number of components of vectors is the dimension of space.
     names = {4: "euler_parameter", 3 if 3 in sizes else 2: "axis"}
     labels = lambda size: list("xyz"[:size]) if names.get(size) == "axis" else list(range(size))
     return {size: (names.get(size, f"component_of_{size}"), labels(size)) for size in sizes}
@@ -536,18 +536,18 @@ def _largest_error(motion):
         error, size = (jnp.max(jnp.abs(x) / scale[None], initial=0.0) for x in (error, values))
         return error / jnp.where(size > 0, size, 1.0)
 
-    found = jax.tree.leaves(jax.tree.map(relative, errors, motion.ys, scales))
-    return lax.stop_gradient(jnp.max(jnp.stack(found)))
+    errors = jax.tree.leaves(jax.tree.map(relative, errors, motion.ys, scales))
+    return lax.stop_gradient(jnp.max(jnp.stack(errors)))
 
 
 def _distance(a, b):
-    # The closer motion is computed without derivatives, so that of the difference would be that of the motion.
+    # The closer motion has no derivatives, so the difference would have the derivative of the motion.
     return lax.stop_gradient(jax.tree.map(lambda a, b: jnp.abs(a - b), a, b))
 
 
 @eqx.filter_jit
 def _between(system, interpolation, ts):
-    # Before a jump a step ends at the number before it, and the next one starts at the number after it.
+    # A step ends at the number before a jump, and the next step starts at the number after it.
     (starts, direction), fixed = lax.stop_gradient((steps_of(interpolation), ts))
     beyond = direction * next_number(fixed, direction)
     jumps = jnp.where(jnp.isin(beyond, starts, method="binary_search"), ts, jnp.inf)
@@ -557,7 +557,7 @@ def _between(system, interpolation, ts):
 
 
 def load(path: str | Path) -> dict[str, np.ndarray]:
-    """Read what `Trajectory.save` wrote, as a dictionary of arrays.
+    """Read a file written by `Trajectory.save`, as a dictionary of arrays.
 
     ```python
     motion.save("motion.npz")

@@ -1,5 +1,5 @@
-"""Laws of dry friction beside those of contacts, of which some hold: contacts that are closed, friction that sticks or
-slips in a direction.
+"""Laws of dry friction beside the laws of contacts, of which some hold: contacts that are closed, friction that sticks
+or slips in a direction.
 
 Source: F. Pfeiffer and Ch. Glocker, "Multibody Dynamics with Unilateral Contacts", Wiley, 1996, §6.3.
 """
@@ -14,12 +14,12 @@ from ..linalg.complementarity import PIVOT, lemke, scale_of
 
 
 class Dry(NamedTuple):
-    """Laws of dry friction beside those of contacts.
+    """Laws of dry friction beside the laws of contacts.
 
-    **Fields:** the number of the contact of each in `contact_of`, -1 for one with a normal force of its own; `pairs`:
-    the numbers of the first laws of those friction that has two, one after the other; the `coefficient`; where it
-    `slips`, 1 or -1, of pairs the components of a unit vector, and 0 where it may stick; the `bound` of the force,
-    which that of the contact adds to.
+    **Fields:** `contact_of`: the number of the contact of each law, -1 for friction with its own normal force; `pairs`:
+    the numbers of the first of two successive laws, for friction in two directions; the `coefficient`; `slips`: 1 or -1
+    where it slips, for pairs the components of a unit vector, and 0 where it may stick; the `bound` of the force, to
+    which the contact's bound is added.
     """
 
     contact_of: tuple[int, ...]
@@ -30,10 +30,11 @@ class Dry(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """Which laws hold: contacts that are `closed`; friction that `sticks`; the direction in which other friction
-    `slips`, 1 or -1, of pairs the components of a unit vector, and 0 where there is no force; whether there is a
-    solution, and no contact that slips has two; friction of pairs that sticks as well, but is `implied` by others, to
-    which its force is given.
+    """Which laws hold.
+
+    **Fields:** contacts that are `closed`; friction that `sticks`; `slips`: the direction of other friction, 1 or -1,
+    for pairs the components of a unit vector, and 0 without force; `solvable`: there is a solution, and no slipping
+    contact has two; `implied`: friction of pairs that sticks by other laws, which carry its force.
     """
 
     closed: Bool[Array, "n"]
@@ -55,8 +56,8 @@ def in_lines(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, among
     size = jnp.max(jnp.abs(jnp.concatenate([b, bound])), initial=0.0)
     size = jnp.where(size > 0, size, 1.0)
     b, bound = b / size, bound / size
-    # The force of friction is `right - coefficient normal - bound`, or that of slip, with `right >= 0` and
-    # `left = 2 coefficient normal + 2 bound - right >= 0`; slip accelerates forwards or backwards where one is zero.
+    # The force of friction is `right - coefficient normal - bound`, or the force of slip, with `right >= 0` and `left =
+    # 2 coefficient normal + 2 bound - right >= 0`. Slip accelerates forwards or backwards if one of them is zero.
     normal = np.zeros((m, n))
     for k, contact in enumerate(dry.contact_of):
         if contact >= 0:
@@ -68,8 +69,8 @@ def in_lines(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, among
     of_normal, fixed = -sign[:, None] * limits, -sign * bound
     of_right = jnp.diag(may.astype(b.dtype))
     to_normal, to_slip = W[:, :n] + _product(W[:, n:], of_normal), W[:, n:] @ of_right
-    # A normal force whose own friction draws the bodies together more than it pushes them apart, in Painlevé's paradox,
-    # has no value or two.
+    # In Painlevé's paradox the friction of a normal force draws the bodies together more than the force pushes them
+    # apart: the force has no value or two.
     of_itself = jnp.diag(W[:n, :n] + _product(W[:n, n:], jnp.where(may[:, None], 0.0, of_normal)))
     unique = jnp.all(of_itself >= -PIVOT)
     free = b + W[:, n:] @ fixed
@@ -87,8 +88,8 @@ def in_lines(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, among
     right = jnp.concatenate(
         [jnp.where(idle, 1.0, free[:n]), jnp.where(may, free[n:], 1.0), jnp.where(may, 2 * bound, 1.0)]
     )
-    found, solvable = lemke(jnp.concatenate([rows_n, rows_r, rows_l]), right)
-    closed, inside, backward = found[:n], found[n : n + m], found[n + m :]
+    nonbasic, solvable = lemke(jnp.concatenate([rows_n, rows_r, rows_l]), right)
+    closed, inside, backward = nonbasic[:n], nonbasic[n : n + m], nonbasic[n + m :]
     pressed = jnp.any(closed[None, :] & (normal > 0), axis=1) | (np.array(dry.contact_of) < 0) | (bound > 0)
     force = among[n:] & pressed
     sticks = force & may & inside & ~backward
@@ -101,13 +102,13 @@ def laws_of(
     W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, answers: Answers
 ) -> tuple[Float[Array, "n_m n_m"], Float[Array, "n_m"]]:
     """The matrix and the right-hand side of the linear equations for the forces, or impulses, x of contacts and
-    friction of which it is known which laws hold; differentiable.
+    friction, given which laws hold; differentiable.
 
     **Arguments:** see `frictional`; of `dry` the coefficients and bounds of slip.
     """
     m = len(dry.contact_of)
     n = b.size - m
-    held = jnp.concatenate([answers.closed, answers.sticks])
+    is_held = jnp.concatenate([answers.closed, answers.sticks])
     of_normal = np.zeros((n + m, n + m), b.dtype)
     for k, contact in enumerate(dry.contact_of):
         if contact >= 0:
@@ -115,7 +116,7 @@ def laws_of(
     slope = jnp.concatenate([jnp.zeros(n, b.dtype), dry.coefficient * answers.slips])
     law = np.eye(n + m, dtype=b.dtype) + slope[:, None] * of_normal
     bounds = jnp.concatenate([jnp.zeros(n, b.dtype), -dry.bound * answers.slips])
-    return jnp.where(held[:, None], W, law), jnp.where(held, -b, bounds)
+    return jnp.where(is_held[:, None], W, law), jnp.where(is_held, -b, bounds)
 
 
 def _product(a, b):

@@ -21,17 +21,19 @@ from ..system import AbstractSystem
 from .guards import ContactGuards
 from .tolerance import ContactTolerance
 
-# Impulses of contacts that are this small beside another one at the same time are none.
+# Impulses of contacts that are this small relative to a simultaneous one count as zero.
 _ROUNDING = 1e-12
-# So many impacts are computed together.
+# The number of impacts that are computed together.
 _TOGETHER = 8
-# What happens to a contact that was open before an event, and is open after it.
+# The kind of an event of a contact, by whether it was open before and is open after.
 _KINDS = {(True, True): "impact", (True, False): "close", (False, True): "open", (False, False): "impulse"}
 
 
 class FoundEvents(NamedTuple):
-    """What a run notes of its events: their `number`, and buffers with the `times` of the ends of steps at which they
-    happen, and the raveled `states` before them; `touch`: gaps that count as closed, in units of the system's size.
+    """The recorded events of a run.
+
+    **Fields:** their `number`; buffers with the `times` of the ends of steps at which they happen, and the raveled
+    `states` before them; `touch`: gaps that count as closed, in units of the system's size.
     """
 
     number: Int[Array, ""]
@@ -50,9 +52,9 @@ class Event(NamedTuple):
     **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
     `"close"`, `"open"`, `"rest"`: the end of infinitely many bounces, or `"impulse"` of a contact that stays closed
     while others strike; of friction `"stick"`, `"slip"`, or `"impact"` for an impulse alone; the `impulse` [N s, N m
-    s]; `kinetic_energy_lost` [J]: how much less kinetic energy all bodies together have after this time than before, so
-    that each part has the same. It is negative where a driver, whose speed is given, does more work at the impact than
-    the impact takes. `ContactEvents.kinetic_energy_lost` has one for each time.
+    s]; `kinetic_energy_lost` [J]: the kinetic energy that all bodies together lose at this time, the same for each
+    part. It is negative if a driver, whose speed is given, does more work at the impact than the impact dissipates.
+    `ContactEvents.kinetic_energy_lost` has one value for each time.
     """
 
     time: float
@@ -71,20 +73,18 @@ class ContactEvents(eqx.Module):
     motion.events.times, motion.events.impulses, motion.events.kinetic_energy_lost
     ```
 
-    Impacts at `t0`, and what happens at announced `jumps`, are part of the motion and are not listed.
-    A state that is saved just at an event may be that before it or that after it. Times, impulses and energies have
-    first derivatives; `rest` counts as a constant.
+    Impacts at `t0` and at announced `jumps` are part of the motion and are not listed. A state that is saved just at an
+    event may be the state before it or after it. Times, impulses and energies have first derivatives; `rest` counts as
+    a constant.
 
-    **Fields:** the `names` of the parts, twice that of friction in space, which has two directions, and how many of
-    them, the first ones, are `contacts`; `times` [s], shape
-    (events,); `impulses` [N s, of angles N m s], shape (events, parts); `kinetic_energy_lost` [J], shape (events,): by
-    all bodies at the impact, negative where a driver gave more; `before` and `after`: modes, of a contact 0 where it is
-    open, 1 where it is closed, 2 where others imply it, of friction 1 and -1 where it slips forwards and backwards, in
-    space 1, 2 where it sticks, 0 where it does nothing;
-    `rest` [s],
-    shape (events, parts): the time from an event to the end of the infinitely many bounces that begin with it and are
-    too low to be resolved, after which the contact is at rest; zero where there are none. Under `jit` or in a batch
-    there are as many events as `max_events`, with times of infinity after the last.
+    **Fields:** the `names` of the parts, twice for friction in space, which has two directions; `contacts`: how many of
+    them, the first ones, are contacts; `times` [s], shape (events,); `impulses` [N s, of angles N m s], shape (events,
+    parts); `kinetic_energy_lost` [J], shape (events,): by all bodies at the impact, negative if a driver gave more;
+    `before` and `after`: modes. A contact has 0 if it is open, 1 if it is closed, 2 if others imply it; friction has 1
+    and -1 if it slips forwards and backwards, in space 1, 2 if it sticks, 0 if it does not act. `rest` [s], shape
+    (events, parts): the time from an event to the end of infinitely many bounces too low to be resolved, after which
+    the contact is at rest; zero without such bounces. Under `jit` or in a batch there are as many events as
+    `max_events`, with infinite times after the last.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -117,7 +117,7 @@ class ContactEvents(eqx.Module):
         if isinstance(self.times, Tracer) or self.times.ndim != 1:
             return repr(self)
         events = self._rows()
-        # The energy that parts lose together stands at the first of them.
+        # The energy that parts lose together is shown at the first of them.
         first = [k == 0 or event.time != events[k - 1].time for k, event in enumerate(events)]
         rows = [
             (f"{e.time:.9g}", e.part, e.kind, f"{e.impulse:.6g}", f"{e.kinetic_energy_lost:.6g}" if shown else "")
@@ -142,17 +142,17 @@ class ContactEvents(eqx.Module):
                 "The events of one motion are a table, those of a batch or under jit are arrays: see the fields of "
                 "ContactEvents."
             )
-        known = jax.tree.map(np.asarray, self)
-        rows = [row for k in np.flatnonzero(np.isfinite(known.times)) for row in known._at(k)]
+        concrete = jax.tree.map(np.asarray, self)
+        rows = [row for k in np.flatnonzero(np.isfinite(concrete.times)) for row in concrete._at(k)]
         return sorted(rows, key=lambda event: event.time)
 
     def _at(self, k: int) -> Iterator[Event]:
-        """The parts that take part in one event, of known numbers."""
+        """The parts that take part in one event, with concrete numbers."""
         time, lost = float(self.times[k]), float(self.kinetic_energy_lost[k])
         impulses, were_open, are_open = self.impulses[k], self.before[k] == OPEN, self.after[k] == OPEN
         of_contacts = impulses[: self.contacts]
         strikes = np.any(of_contacts[were_open[: self.contacts]] > 0)
-        # Contacts that stay closed may have impulses of rounding errors.
+        # Impulses of contacts that stay closed may be rounding errors.
         least = _ROUNDING * np.max(of_contacts, initial=0.0) if strikes else np.inf
         for i, name in enumerate(self.names[: self.contacts]):
             was_open, is_open = bool(were_open[i]), bool(are_open[i])
@@ -161,7 +161,7 @@ class ContactEvents(eqx.Module):
             if self.rest[k, i] > 0 and self.after[k, i] == CLOSED:
                 yield Event(time + float(self.rest[k, i]), name, "rest", 0.0, 0.0)
         for name in dict.fromkeys(self.names[self.contacts :]):
-            # Of friction in two directions both have a row.
+            # Friction in two directions has two rows.
             i, of_both = self.names.index(name), impulses[self.names.index(name) :][: self.names.count(name)]
             impulse = float(np.linalg.norm(of_both) if of_both.size > 1 else of_both[0])
             after, changed = self.after[k, i], self.before[k, i] != self.after[k, i]
@@ -170,61 +170,61 @@ class ContactEvents(eqx.Module):
                 yield Event(time, name, kind if changed else "impact", impulse, lost)
 
 
-def contact_events(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> ContactEvents:
-    """The events of a run, or of a batch of runs, from what is noted of them."""
-    evaluated = _evaluated if is_traced((system, formulation, found)) else _happened
+def contact_events(system: AbstractSystem, formulation: AbstractFormulation, record: FoundEvents) -> ContactEvents:
+    """The events of a run, or of a batch of runs, from their records."""
+    evaluated = _evaluated if is_traced((system, formulation, record)) else _happened
     contacts = system.contacts
-    return ContactEvents(contacts.names, contacts.n, *evaluated(system, formulation, found))
+    return ContactEvents(contacts.names, contacts.n, *evaluated(system, formulation, record))
 
 
-def _happened(system, formulation, found):
-    """The same of numbers that are known: of as many events as there are, in blocks, which all are one program."""
-    most, axis = found.times.shape[-1], found.times.ndim - 1
-    number, times, states = (np.asarray(x) for x in (found.number, found.times, found.states))
+def _happened(system, formulation, record):
+    """The same for concrete numbers: as many events as there are, in blocks that all use one program."""
+    most, axis = record.times.shape[-1], record.times.ndim - 1
+    number, times, states = (np.asarray(x) for x in (record.number, record.times, record.states))
     number, blocks = np.minimum(number, most), []
-    # Also where a function is traced that the run is no argument of.
+    # Concrete also while a function is traced, if the run is not its argument.
     with jax.ensure_compile_time_eval():
         for first in range(0, max(int(np.max(number, initial=0)), 1), _TOGETHER):
-            own = np.minimum(np.arange(first, first + _TOGETHER), most - 1)
-            block = found._replace(number=number - first, times=times[..., own], states=states[..., own, :])
+            places = np.minimum(np.arange(first, first + _TOGETHER), most - 1)
+            block = record._replace(number=number - first, times=times[..., places], states=states[..., places, :])
             blocks.append(_evaluated(system, formulation, block))
     rows = [np.concatenate(column, axis) for column in zip(*blocks, strict=True)]
     count = int(np.sum(np.isfinite(rows[0]))) if axis == 0 else most
     order = np.argsort(np.isinf(rows[0]), axis=axis, kind="stable")[..., :count]
 
-    def placed(x, none):
+    def placed(x, fill):
         along = order.reshape(order.shape + (1,) * (x.ndim - order.ndim))
         happened = np.take_along_axis(x, along, axis)
-        rest = [(0, count - happened.shape[axis] if k == axis else 0) for k in range(x.ndim)]
-        return jax.device_put(np.pad(happened, rest, constant_values=none))
+        padding = [(0, count - happened.shape[axis] if k == axis else 0) for k in range(x.ndim)]
+        return jax.device_put(np.pad(happened, padding, constant_values=fill))
 
     return placed(rows[0], np.inf), *(placed(x, 0.0) for x in rows[1:])
 
 
 @jitted
-def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, found: FoundEvents) -> Any:
-    if found.times.ndim > 1:
-        return eqx.filter_vmap(_evaluated)(system, formulation, found)
-    guards = ContactGuards(system, formulation, ContactTolerance(found.touch))
+def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, record: FoundEvents) -> Any:
+    if record.times.ndim > 1:
+        return eqx.filter_vmap(_evaluated)(system, formulation, record)
+    guards = ContactGuards(system, formulation, ContactTolerance(record.touch))
     nq, nu = system.nq, system.nu
-    # Behind the last event a state is needed that has no failure, nor its derivative.
+    # Entries behind the last event need a state without failure, also of derivatives.
     guess = system.guess
     still = jnp.concatenate([guess.q, guess.u, jnp.zeros(system.nz, guess.q.dtype)])
-    some = found.number > 0
-    first = jnp.where(some, found.states[0], still), jnp.where(some, found.times[0], 0.0)
+    some = record.number > 0
+    first = jnp.where(some, record.states[0], still), jnp.where(some, record.times[0], 0.0)
 
     def single(k, t, flat):
-        taken = k < found.number
-        flat = jnp.where(taken, flat, first[0])
+        is_event = k < record.number
+        flat = jnp.where(is_event, flat, first[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
-        out = guards.impact(jnp.where(taken, t, first[1]), y, dated=True)
-        # Steps also end where it turns out that nothing changes.
+        out = guards.impact(jnp.where(is_event, t, first[1]), y, dated=True)
+        # Steps may also end where nothing changes.
         before, after = out.modes
-        taken = taken & (jnp.any(before != after) | jnp.any(out.impulses != 0))
-        time = jnp.where(taken, t + out.late, jnp.inf)
+        is_event = is_event & (jnp.any(before != after) | jnp.any(out.impulses != 0))
+        time = jnp.where(is_event, t + out.late, jnp.inf)
         values = out.impulses, out.energy, before, after, out.rest
-        return time, *jax.tree.map(lambda x: jnp.where(taken, x, 0.0), values)
+        return time, *jax.tree.map(lambda x: jnp.where(is_event, x, 0.0), values)
 
-    rows = jax.vmap(single)(jnp.arange(found.times.size), found.times, found.states)
+    rows = jax.vmap(single)(jnp.arange(record.times.size), record.times, record.states)
     order = jnp.argsort(jnp.isinf(rows[0]), stable=True)
     return jax.tree.map(lambda x: x[order], rows)

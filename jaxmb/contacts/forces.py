@@ -1,4 +1,4 @@
-"""Forces of contacts and dry friction at a state, and what they are compared with."""
+"""Forces of contacts and dry friction at a state, and their sizes of comparison."""
 
 import jax
 import jax.numpy as jnp
@@ -9,25 +9,25 @@ from ..linalg.elimination import solve
 from ..linalg.pairs import sizes_of
 from ..linalg.rotations import norm
 
-# Forces of several contacts that stick are as small as they can be up to this fraction of them.
+# Forces of several contacts that stick are the smallest possible up to this fraction of them.
 _YIELD = 1e-10
 
 
 def largest_force(system, t, y, multipliers):
-    """The size that forces are compared with."""
+    """The size to which forces are compared."""
     largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, y.q, y.u)))
     return largest + jnp.finfo(largest.dtype).tiny
 
 
 def reserves(system, t, q, u, multipliers):
-    """The forces [N] of contacts, and by how much those of friction that sticks are within their limits."""
+    """The forces [N] of contacts, and the reserve of sticking friction forces below their limits."""
     contacts = system.contacts
     forces, n = contacts.at_rows(multipliers), contacts.n
     if not contacts.m:
         return forces
     normal, dry = norm(system.friction_reactions(t, q, u, multipliers)), forces[n:]
     if len(contacts.pairs) > 1:
-        # Those that are not determined are as small as they can be.
+        # Undetermined forces are as small as possible.
         stick = contacts.modes(q).held
         gradients = jnp.where(stick[:, None], contacts.gradients(system, t, q, u)[n:], 0.0)
         gram = gradients @ gradients.T
@@ -38,8 +38,8 @@ def reserves(system, t, q, u, multipliers):
 
 
 def friction_coefficients(system, t, q, u):
-    """Coefficients of friction and limits of stick, as multiples of the force along the gap of a contact, which is the
-    normal force where the gap grows by one metre a metre.
+    """Coefficients of friction and limits of stick, as multiples of the force along the gap of a contact. That force is
+    the normal force if the gap grows by one metre a metre.
     """
     contacts, numbers = system.contacts, system.contact_numbers
     if contacts.in_joints.all():
@@ -60,16 +60,14 @@ def contact_forces(system, t, q, u):
 
 
 def directions(system, t, q, u):
-    """The rows of A of contacts that are closed, and of friction that sticks; A with the other rows that bind
-    velocities, which are selected.
-    """
+    """The rows of A of contacts and friction; A with the other rows that bind velocities, selected."""
     numbers = system.contacts.rows
     jacobian = system.structured_jacobian(t, system.contacts.bound(q), u)
     unit = np.eye(system.acceleration_rows)[list(numbers)]
     rows = jax.vmap(jacobian.transpose_product)(jnp.asarray(unit, q.dtype))
-    others = tuple(k for k in range(system.velocity_rows) if k not in numbers)
-    # Where contacts are open, and friction slips, their rows bind nothing but their modes.
-    return rows, jacobian.of_rows(others).selected(system.velocity_rank - len(numbers), system.velocity_scale())
+    other_rows = tuple(k for k in range(system.velocity_rows) if k not in numbers)
+    # The rows of open contacts and slipping friction bind only their modes.
+    return rows, jacobian.of_rows(other_rows).selected(system.velocity_rank - len(numbers), system.velocity_scale())
 
 
 def free_accelerations(system, formulation, projector, t, q, u):

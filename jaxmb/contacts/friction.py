@@ -1,5 +1,4 @@
-"""Which contacts are closed, and which dry friction sticks or slips, also in two directions, in which the force is in a
-circular cone.
+"""Which contacts are closed, and which dry friction sticks or slips, also in planes with circular cones.
 
 Source, for the direction of slip: P. Alart and A. Curnier, "A mixed formulation for frictional contact problems prone
 to Newton like solution methods", Computer Methods in Applied Mechanics and Engineering 92, 1991.
@@ -18,22 +17,22 @@ from ..linalg.pairs import for_both, of_pairs, placed_pairs
 from ..linalg.rotations import norm
 from .dry_laws import Answers, Dry, in_lines, laws_of
 
-# Directions of slip are found when they change by less than this, in this many rounds at most, each with this many
-# steps of Newton's method.
+# The search for directions of slip ends when they change by less than this, or after this many rounds, each with this
+# many steps of Newton's method.
 _TURN, _TURNS, _CORRECTIONS = 1e-7, 60, 2
-# The least limit of a force across its direction, as a fraction of that along it.
+# The least limit of a force across its direction, as a fraction of its limit along it.
 _ACROSS = 0.01
-# Where a force of friction in two directions has not the direction of slip, up to this fraction, there is no solution.
+# There is no solution if a force of friction in two directions is off the direction of slip by this fraction.
 _ASIDE = 1e-8
-# Several contacts that stick share forces that are not determined as if they yielded by this fraction of `W`.
+# Several contacts that stick share undetermined forces as if they yielded by this fraction of `W`.
 _YIELD = 1e-8
 
 
 def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, among: Bool[Array, "n_m"]) -> Answers:
-    """Which of some contacts with dry friction are closed, stick and slip; without derivative.
+    """Which contacts with dry friction are closed, stick and slip; without derivative.
 
-    **Arguments:** `W x + b`: accelerations or velocities along the normals and the slips, with their forces or
-    impulses x; `among`: those that may have a force.
+    **Arguments:** `W x + b`: accelerations or velocities along the normals and the slips, with their forces or impulses
+    x; `among`: the laws that may have a force.
     """
     W, b, among, *numbers = lax.stop_gradient((W, b, among, *dry[2:]))
     dry = Dry(dry.contact_of, dry.pairs, *numbers)
@@ -44,13 +43,13 @@ def frictional(W: Float[Array, "n_m n_m"], b: Float[Array, "n_m"], dry: Dry, amo
 class SlipSearch:
     """The search for the directions of slip of friction in two directions.
 
-    In each round the first law of a pair acts along a direction, the second one across it. Where the direction is
-    found, the force of the second law is zero. Directions `e` are unit vectors, shape (pairs, 2).
+    In each round the first law of a pair acts along a direction, the second across it. If the direction is right, the
+    force of the second law is zero. Directions `e` are unit vectors, shape (pairs, 2).
 
-    **Fields:** the matrix of the problem, `rigid`, and one with which several contacts that stick yield, `W`; `b`,
-    `dry` and `among` as in `frictional`, where the second law of a pair is among them only if its direction `may` be
-    any; pairs whose contact `touches`; `step`, the inverse of the largest change of a slip by its force; in `turns` the
-    two matrices by which a pair is turned, times the components of its direction.
+    **Fields:** `rigid`: the matrix of the problem; `W`: a matrix with which several contacts that stick yield; `b`,
+    `dry` and `among` as in `frictional`, but the second law of a pair is among them only if its direction is free
+    (`may`); pairs whose contact `touches`; `step`: the inverse of the largest change of a slip by its force; `turns`:
+    two matrices for each pair which, times the components of its direction, turn the pair.
     """
 
     rigid: Float[Array, "n_m n_m"]
@@ -91,7 +90,7 @@ class SlipSearch:
 
     @property
     def both(self) -> Int[np.ndarray, "pairs 2"]:
-        """The numbers of the laws of each pair, among all."""
+        """The numbers of both laws of each pair, among all laws."""
         return self.n + self.pairs
 
     @property
@@ -99,8 +98,8 @@ class SlipSearch:
         return np.array(self.dry.contact_of)[self.pairs[:, 0]]
 
     @property
-    def known(self) -> Float[Array, "pairs 2"]:
-        """The directions of slip that are given."""
+    def given_slips(self) -> Float[Array, "pairs 2"]:
+        """The given directions of slip."""
         return self.dry.slips[self.pairs]
 
     def answers(self) -> Answers:
@@ -111,34 +110,34 @@ class SlipSearch:
         first = start, none, jnp.zeros_like(self.b), jnp.array(jnp.inf, self.b.dtype), jnp.array(0)
         goes_on = lambda carry: (carry[3] > _TURN) & (carry[4] < _TURNS)
         _, answers, x, turned, _ = lax.while_loop(goes_on, self.advance, first)
-        found, slides = self.with_slips(answers, self.direction(start, x))
+        result, slides = self.with_slips(answers, self.direction(start, x))
         if len(self.pairs) > 1:
-            found = with_implied(self.rigid, found)
-        solvable = found.solvable & (turned <= _TURN) & ~jnp.any(slides & self.misses(found, x))
-        return found._replace(solvable=solvable & jnp.all(jnp.isfinite(x)))
+            result = with_implied(self.rigid, result)
+        solvable = result.solvable & (turned <= _TURN) & ~jnp.any(slides & self.misses(result, x))
+        return result._replace(solvable=solvable & jnp.all(jnp.isfinite(x)))
 
     def start(self) -> Float[Array, "pairs 2"]:
-        """The directions that are given, and of others those in which slip goes without forces."""
-        e = jnp.where(self.may[:, None], self.b[self.both], self.known)
+        """The given directions; for the others, the directions of slip without forces."""
+        e = jnp.where(self.may[:, None], self.b[self.both], self.given_slips)
         size = norm(e)[:, None]
         return jnp.where(size > 0, e / jnp.where(size > 0, size, 1.0), jnp.array([1.0, 0.0], self.b.dtype))
 
     def advance(self, carry):
-        """One round: the laws that hold along the directions and across them, and Newton's method for both."""
+        """One round: the laws that hold along and across the directions, then Newton's method."""
         e, _, _, _, count = carry
-        # The force across is less and less, so that the square of both is near the circle.
+        # The limit across decreases with each round, so that the rectangle of both approaches the circle.
         answers, *straight = self.in_lines(e, jnp.maximum(0.5**count, _ACROSS))
 
-        def correct(k, found):
-            last = self.direction(*found)
-            e = jnp.where(k == 0, found[0], last)
-            newton = self.corrected(answers, e, found[1])
+        def correct(k, iterate):
+            last = self.direction(*iterate)
+            e = jnp.where(k == 0, iterate[0], last)
+            newton = self.corrected(answers, e, iterate[1])
             matrix, right = (jnp.where(k == 0, first, other) for first, other in zip(straight, newton, strict=True))
             return e, solve(matrix, right)
 
         _, x = lax.fori_loop(0, 1 + _CORRECTIONS, correct, (e, jnp.zeros_like(self.b)))
         new = self.direction(e, x)
-        # Directions between which the method goes to and fro are halved.
+        # If the method alternates between two directions, their mean is next.
         between = e + new
         size = norm(between)
         halved = (count % 4 == 3) & (size > 0.1)
@@ -147,12 +146,12 @@ class SlipSearch:
         return new, answers, x, turned, count + 1
 
     def in_lines(self, e, across):
-        """The answers where pairs act along directions and across them, where the force has `across` times the limit
-        that it has along; and the equations for the forces.
+        """The answers if pairs act along directions and across them, where the limit of the force is `across` times the
+        limit along; and the equations for the forces.
         """
         n, m, dry = self.n, len(self.dry.contact_of), self.dry
-        others = np.diag(~np.isin(np.arange(n + m), self.both)).astype(self.W.dtype)
-        turn = jnp.tensordot(e, self.turns, 2) + others
+        unpaired = np.diag(~np.isin(np.arange(n + m), self.both)).astype(self.W.dtype)
+        turn = jnp.tensordot(e, self.turns, 2) + unpaired
         matrix, right = turn @ self.W @ turn.T, turn @ self.b
         share = jnp.where(np.isin(np.arange(m), self.pairs[:, 1]), across, 1.0)
         slips = turn[n:, n:] @ dry.slips
@@ -162,18 +161,18 @@ class SlipSearch:
         return answers, matrix @ turn, right
 
     def direction(self, e, x):
-        """Where slip goes if the force is the nearest one in the cone to what would end it."""
+        """The direction of slip if the force is the point of the cone nearest to the force that would end the slip."""
         ahead = self.step[:, None] * (self.W @ x + self.b)[self.both] - x[self.both]
         size = norm(ahead)
         return jnp.where((self.may & (size > 0))[:, None], ahead / jnp.where(size > 0, size, 1.0)[:, None], e)
 
     def with_slips(self, answers: Answers, e) -> tuple[Answers, Bool[Array, "pairs"]]:
-        """The answers with the laws of stick and slip of pairs, and which pairs slide in directions to be found."""
+        """The answers with the laws of stick and slip of pairs, and which pairs slide in unknown directions."""
         pairs, dry = self.pairs, self.dry
-        # The last entry is that of friction without a contact.
+        # The last entry is for friction without a contact.
         sticks, closed = answers.sticks[pairs].all(1), jnp.concatenate([answers.closed, jnp.ones(1, bool)])
         pressed = closed[self.contact] | (dry.bound[pairs[:, 0]] > 0)
-        slips = jnp.where(self.may[:, None], e, self.known)
+        slips = jnp.where(self.may[:, None], e, self.given_slips)
         slips = jnp.where((self.touches & pressed & ~sticks)[:, None], slips, 0.0)
         slips = placed_pairs(dry.pairs, slips, answers.slips)
         both_stick = for_both(dry.pairs, sticks, answers.sticks)
@@ -184,7 +183,7 @@ class SlipSearch:
         dry, both = self.dry, self.both
         laws, slides = self.with_slips(answers, e)
         matrix, right = laws_of(self.W, self.b, dry, laws)
-        # Along the direction the force is that of slip. Across, force and slip are zero together.
+        # Along the direction the law of slip holds. Across it, force and slip are zero.
         across = jnp.stack([-e[:, 1], e[:, 0]], axis=1)
         along = jnp.einsum("pi,pik->pk", e, matrix[both])
         turned, asked = self.across(e, across, x)
@@ -208,20 +207,20 @@ class SlipSearch:
         turned = turned + (speed / size)[:, None] * jnp.einsum("pi,pik->pk", across, one[both])
         return turned, -load / size * jnp.sum(across * self.b[both], axis=1)
 
-    def misses(self, found: Answers, x) -> Bool[Array, "pairs"]:
-        """Pairs whose force has not the direction of slip, or is not against it."""
-        e, both = found.slips[self.pairs], self.both
+    def misses(self, answers: Answers, x) -> Bool[Array, "pairs"]:
+        """Pairs whose force differs from the direction of slip, or does not oppose it."""
+        e, both = answers.slips[self.pairs], self.both
         rates = (self.W @ x + self.b)[both]
         aside, back = jnp.abs(e[:, 0] * x[both[:, 1]] - e[:, 1] * x[both[:, 0]]), jnp.sum(e * rates, axis=1)
         return (aside > _ASIDE * jnp.max(jnp.abs(x))) | (back < -_ASIDE * jnp.max(jnp.abs(self.b)))
 
 
 def with_implied(W: Float[Array, "n_m n_m"], answers: Answers) -> Answers:
-    """With as many laws of stick as are independent of each other and of the contacts."""
+    """The answers with as many laws of stick as are independent of each other and of the contacts."""
     n, sticks = answers.closed.size, answers.sticks
     closed = jnp.concatenate([answers.closed, jnp.zeros_like(sticks)])
     columns = jnp.where(closed[:, None], W, 0.0)
     matrix = jnp.where(closed[:, None] & closed[None, :], W, jnp.eye(W.shape[0], dtype=W.dtype))
-    left = (W - columns.T @ solve(matrix, columns))[n:, n:]
-    independent = independent_components(left, sticks)
+    reduced = (W - columns.T @ solve(matrix, columns))[n:, n:]
+    independent = independent_components(reduced, sticks)
     return answers._replace(sticks=independent, implied=sticks & ~independent)

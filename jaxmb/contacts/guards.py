@@ -1,4 +1,4 @@
-"""When events of contacts and dry friction are: gaps, forces and slips that become zero along a motion."""
+"""When events of contacts and dry friction happen: gaps, forces and slips that become zero along a motion."""
 
 import dataclasses
 
@@ -18,15 +18,16 @@ from .impact import Impact, impact
 from .impacting import Event, find_event
 from .tolerance import REST, ContactTolerance
 
-# Slip in two directions that begins has the direction of its modes up to this multiple of what is slow.
+# Slip in two directions that begins has the direction of its modes up to this multiple of the slow velocity.
 _SEEN = 4
-# Rates of gaps are zero below this many units in the last place of the largest velocity.
+# Rates of gaps below this many units in the last place of the largest velocity are zero.
 _RATE = 64
 
 
 class ContactGuards(AbstractGuards):
-    """The gaps of open contacts, in units of the system's size, and the forces of closed ones, relative to the largest
-    forces; slips in units of the size per second, and what the forces of stick are below their limits.
+    """The guards of contacts and dry friction: gaps of open contacts, in units of the system's size, and forces of
+    closed contacts, relative to the largest forces; slips, in units of the size per second, and the reserves of
+    sticking friction.
 
     A gap g with a kink at its peak p counts as g (1 - g / 2p), which is smooth and the same near zero.
     """
@@ -61,12 +62,12 @@ class ContactGuards(AbstractGuards):
             largest = largest_force(here, t, dataclasses.replace(y, q=q), multipliers)
             return reserves(here, t, q, y.u, multipliers) / largest
 
-        held = cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free)
-        return jnp.where(acts, held, free / system.length)
+        reserves_of_active = cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free)
+        return jnp.where(acts, reserves_of_active, free / system.length)
 
     def _in_plane(self, slips, modes, rates, u):
-        """With the guards of slip in two directions: that it has not turned by more than 60 degrees from its modes, nor
-        is slow; where it has begun, that it is neither back at rest nor faster.
+        """The slips with the guards of slip in two directions: it has neither turned by more than 60 degrees from its
+        modes nor become slow; slip that has just begun is neither back at rest nor faster.
         """
         system, pairs = self.system, modes.pairs
         if not pairs:
@@ -82,14 +83,14 @@ class ContactGuards(AbstractGuards):
         """The numbers of the event at a state, without derivatives."""
         return find_event(self.system.at(y), self.formulation, self.tolerance, t, y)
 
-    def impact(self, t: Scalar, y: State, dated: bool = False, found: Event | None = None) -> Impact:
+    def impact(self, t: Scalar, y: State, dated: bool = False, event: Event | None = None) -> Impact:
         """The event at a state; see `impact`."""
-        return impact(self.system.at(y), self.formulation, self.tolerance, t, y, dated, found)
+        return impact(self.system.at(y), self.formulation, self.tolerance, t, y, dated, event)
 
     def changed(self, before, after):
         system, before, after = lax.stop_gradient((self.system, before, after))
         kinds = lambda y: system.contacts.modes(system.normalize(y.q)).kinds
-        # Velocities change by rounding errors where impulses are none.
+        # Without impulses, velocities change by rounding errors.
         scale, change = system.velocity_scale(), jnp.abs(after.u - before.u)
         sizes = jnp.abs(after.u) + jnp.abs(before.u)
         least = REST * sizes + _RATE * jnp.finfo(sizes.dtype).eps * jnp.max(sizes / scale) * scale
@@ -117,7 +118,7 @@ class ContactGuards(AbstractGuards):
         t = jnp.asarray(t, q.dtype)
         slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers.peaks
         rates = contacts.rates(system, t, q, y.u)[: contacts.n] * slopes / system.length
-        # Of bodies that move side by side rates are rounding errors, at which nothing closes.
+        # The rates of bodies that move side by side are rounding errors, and close nothing.
         least = _RATE * jnp.finfo(rates.dtype).eps * jnp.max(jnp.abs(y.u) / system.velocity_scale())
         rates = jnp.where(jnp.abs(rates) > least, rates, 0.0)
         rates = jnp.where(contacts.modes(q).open, rates, jnp.inf)
@@ -127,5 +128,5 @@ class ContactGuards(AbstractGuards):
 def contact_guards(
     system: AbstractEquation, formulation: AbstractFormulation, tolerance: ContactTolerance | None
 ) -> ContactGuards | None:
-    """The guards of a system's contacts; None without a tolerance, which a system without contacts has not."""
+    """The guards of a system's contacts; None without a tolerance, as for a system without contacts."""
     return None if tolerance is None else ContactGuards(system, formulation, tolerance)

@@ -1,19 +1,20 @@
 """Impacts, loss of contact, stick and slip: the state after an event of contacts and dry friction.
 
-In an impact the impulses `Λ ≥ 0` of all contacts that touch change the velocities, `M (u⁺ − u⁻) = Aᵀ Λ`. By Newton's
-law a gap that closed at a rate v opens at least at `restitution` times v; where it opens faster its impulse is zero. By
-Poisson's law an impact has two phases: at the end of compression no gap closes any more, and in the expansion each
-contact pushes `restitution` times as much again, or more where its gap would close. With friction Λ is that along slips
-as well, in each phase at most `coefficient` times that of the contact, and against the slip that remains at its end.
-Contacts that do not open then stay closed where their forces push: `λ ≥ 0`, the second derivative of the gap `≥ 0`, and
-one of them zero; friction where slip has ended sticks as long as its force is within its limit. These are linear
-complementarity problems, over the constraints that are always there.
+In an impact the impulses `Λ ≥ 0` of all touching contacts change the velocities, `M (u⁺ − u⁻) = Aᵀ Λ`. By Newton's law
+a gap that closed at a rate v opens at least at `restitution` times v; if it opens faster its impulse is zero. By
+Poisson's law an impact has two phases. At the end of compression no gap closes any more. In the expansion each contact
+pushes `restitution` times as much again, or more if its gap would close.
+
+With friction, Λ includes the impulses along slips. In each phase they are at most `coefficient` times the contact's
+impulse, and oppose the slip at the end of the phase. Contacts that do not open then stay closed if their forces push:
+`λ ≥ 0`, the second derivative of the gap `≥ 0`, and one of them zero. Friction whose slip has ended sticks as long as
+its force is within its limit. These are linear complementarity problems, under the permanent constraints.
 
 Sources: J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", in: Nonsmooth Mechanics and
 Applications, Springer, 1988; Ch. Glocker, "Set-Valued Force Laws", Springer, 2001; for Poisson's law F. Pfeiffer and
 Ch. Glocker, "Multibody Dynamics with Unilateral Contacts", Wiley, 1996, chapter 8. The derivative of the state after an
-event by that before it is the saltation matrix: P. C. Müller, "Calculation of Lyapunov exponents for dynamic systems
-with discontinuities", Chaos, Solitons & Fractals 5, 1995.
+event by the state before it is the saltation matrix: P. C. Müller, "Calculation of Lyapunov exponents for dynamic
+systems with discontinuities", Chaos, Solitons & Fractals 5, 1995.
 """
 
 from typing import NamedTuple
@@ -39,18 +40,16 @@ NO_SECOND_DERIVATIVES = (
     "Second derivatives through impacts are not supported: their times and states have first derivatives only."
 )
 
-# An event is found to this fraction of its time, and more exactly.
+# An event is found to this fraction of its time, or better.
 _AT_ONCE = 1e-10
 
 
 class Impact(NamedTuple):
-    """An event of contacts.
+    """An event of contacts. In lists of contacts and friction, contacts come first.
 
-    Where contacts and friction are listed together, contacts come first.
-
-    **Fields:** the state `after` it, at the time that was asked for; the event is `late` after that; `impulses` of
+    **Fields:** the state `after` it, at the requested time; `late`: the time from then to the event; `impulses` of
     contacts and friction; `modes` before and after it; `rest`: the time from the event until the last of infinitely
-    many bounces that are left out, zero for contacts without any; the `energy` lost; whether it is `solvable`.
+    many omitted bounces, zero for contacts without any; the `energy` lost; whether it is `solvable`.
     """
 
     after: State
@@ -70,21 +69,21 @@ def impact(
     t: Scalar,
     y: State,
     dated: bool = False,
-    found: Event | None = None,
+    given: Event | None = None,
 ) -> Impact:
     """The event of contacts that are about to close, or to open, at a state.
 
-    The first gap that closes is zero later by a small time τ. The state moves on by τ, changes, and moves back by τ
-    with the new equations. So the state after it is right to the second power of τ, and the derivative is that of a
-    motion whose event time depends on the state. `late`, `impulses` and the `energy` have derivatives as well, `rest`
+    The first gap that closes is zero after a small time τ. The state moves on by τ, changes, and moves back by τ with
+    the new equations. So the state after the event is right to second order in τ, and its derivative includes the
+    dependence of the event's time on the state. `late`, `impulses` and the `energy` have derivatives as well, `rest`
     has none. There is no second derivative.
 
-    **Arguments:** `system`: with the internal states of `y`; `dated`: whether `late` has its derivative also where the
-    state after the event does not depend on it, as where a contact opens; `found`: the event, where it is known.
+    **Arguments:** `system`: with the internal states of `y`; `dated`: whether `late` has its derivative even if the
+    state after the event does not depend on it, as when a contact opens; `given`: the event, if it is known.
     """
     t, touch = jnp.asarray(t, y.q.dtype), jnp.asarray(tolerance.touch, y.q.dtype)
-    found = find_event(system, formulation, tolerance, t, y) if found is None else found
-    after, event = _impact(system, t, y, found, ContactTolerance(touch), dated)
+    given = find_event(system, formulation, tolerance, t, y) if given is None else given
+    after, event = _impact(system, t, y, given, ContactTolerance(touch), dated)
     old, new = (system.contacts.as_modes(numbers).kinds for numbers in event.modes)
     return Impact(after, event.late, event.impulses, (old, new), event.rest, event.energy, event.solvable)
 
@@ -99,7 +98,7 @@ def _impact(system, t, y, event, tolerance, dated):
     z = y.z
     if z is not None:
         z = z + event.late * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
-    # Without a solution the motion ends here, at infinite velocities; they are not a number where forces are none.
+    # Without a solution the motion ends here, at infinite velocities, or NaN if the forces are NaN.
     nowhere = jnp.where(jnp.all(jnp.isfinite(event.before)), jnp.inf, jnp.nan)
     u = jnp.where(event.solvable, event.u - event.late * event.after, nowhere)
     return State(q + event.late * (before - after), u, z), event
@@ -114,7 +113,7 @@ def _impact_jvp(primals, tangents):
     contacts = system.contacts
     dq, du, dt = dense(dy.q, y.q), dense(dy.u, y.u), dense(dt, t)
 
-    # The time of the event changes, and so do time and state there, with the equations before it.
+    # The time of the event changes, and with it the time and the state there, by the equations before it.
     dlate = _later(event, (system, t, y.q, y.u), (dsystem, dt, dq, du))
     if dated or any(contacts.releases):
         dlate = dlate + _release(system, tolerance, event, (t, y), (dsystem, dt, dy))
@@ -145,7 +144,7 @@ def _later(event: Event, at, along):
         slowing = contacts.accelerations(system, t, q, event.at, event.before)[contacts.n :]
         both = of_pairs(contacts.pairs)
         if both.size:
-            # Slip in two directions ends where it is zero along its modes.
+            # Slip in two directions ends when it is zero along its modes.
             modes = contacts.as_modes(event.modes[0]).of_friction[both]
             slip = with_entries(slip, both[:, 0], jnp.sum(modes * slip[both], axis=1))
             slowing = with_entries(slowing, both[:, 0], jnp.sum(modes * slowing[both], axis=1))
@@ -154,28 +153,28 @@ def _later(event: Event, at, along):
 
 
 def _release(system, tolerance, event, at, along):
-    """The derivative of the time at which a force reaches its limit: that of a contact that opens, which is zero, or of
-    friction that sticks, where slip begins at the event.
+    """The derivative of the time at which a force reaches its limit. The limit is zero for a contact that opens;
+    friction that sticks begins to slip there.
     """
     (t, y), (dsystem, dt, dy) = at, along
     before, after = map(system.contacts.as_modes, event.modes)
     released = jnp.concatenate([before.closed & after.open, before.sticks & ~after.sticks])
 
     def reserve(system, t, y):
-        """By how much the forces are within their limits, and what they are compared with."""
+        """The reserves of the forces below their limits, and their size of comparison."""
         _, multipliers = contact_forces(system, t, y.q, y.u)
         return reserves(system, t, y.q, y.u, multipliers), largest_force(system, t, y, multipliers)
 
-    left, largest = reserve(system, t, y)
-    k = jnp.argmin(jnp.where(released, jnp.abs(left), jnp.inf))
+    reserve_at_event, largest = reserve(system, t, y)
+    k = jnp.argmin(jnp.where(released, jnp.abs(reserve_at_event), jnp.inf))
     least = lambda system, t, y: reserve(system, t, y)[0][k]
     z = None if y.z is None else system.state_rates(t, y.q, y.u)
     motion = State(system.rates(t, y.q, y.u), event.before, z)
     value = push(least, (system, t, y), (dsystem, dt, dy))
     rate = eqx.filter_jvp(lambda t, y: least(system, t, y), (t, y), (jnp.ones_like(t), motion))[1]
-    # What an impact opens, or sets in motion, is not at its limit before. Where forces balance there may be none to
-    # compare with: then the time to the limit is, with the time itself.
-    is_zero = jnp.abs(left[k]) <= jnp.maximum(tolerance.near * largest, _AT_ONCE * jnp.abs(rate * t))
+    # A contact that an impact opens, or sets in motion, is not at its limit before. Balanced forces may leave no size
+    # of comparison: then the time to the limit is compared with the time.
+    is_zero = jnp.abs(reserve_at_event[k]) <= jnp.maximum(tolerance.near * largest, _AT_ONCE * jnp.abs(rate * t))
     at_limit = jnp.any(released) & ~event.hits & is_zero & (rate < 0)
     return jnp.where(at_limit, -value / jnp.where(at_limit, rate, 1.0), 0.0)
 

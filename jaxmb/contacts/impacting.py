@@ -1,4 +1,4 @@
-"""An event of contacts and dry friction at a state: its time, impulses, forces, and what holds after it."""
+"""An event of contacts and dry friction at a state: its time, impulses and forces, and the laws that hold after it."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -26,22 +26,22 @@ from .forces import directions, free_accelerations, friction_coefficients
 from .problem import Laws, Problem, is_implied
 from .tolerance import REST, ContactTolerance
 
-# The normal forces of joints, which depend on the friction in them, decide on what stays closed and sticks in this many
-# rounds of impulses and forces; without such friction low bounces do in a second one.
+# The number of rounds of impulses and forces that decide which contacts stay closed and which friction sticks, if
+# normal forces of joints depend on the friction in them. Without such friction, low bounces decide in a second round.
 _ROUNDS = 4
-# Rebounds at which no energy is gained are found in this many trials, to this fraction of what adds up in it.
+# Rebounds without gain of energy are found in this many trials, to this fraction of the summands of the energy.
 _TRIALS, _GAIN = 40, 1e-12
 
 
 class Event(NamedTuple):
-    """The numbers of an event, by which its derivative is found as well.
+    """The numbers of an event, for its derivative as well.
 
-    **Fields:** the time until then, `late`, and which gap or slip is `first` to be zero, none where `hits` is false;
-    accelerations before and after; velocities before (`at`) and after (`u`); contacts and friction that are `held`:
-    the rates of gaps are those of the impact, slips are zero; contacts that are `low`: they would bounce lower than can
-    be seen; the direction in which friction `slips` in the impact, zero without; the `share` of the rebounds at which
-    no energy is gained; the `compression` of an impact by Poisson's law, after which `held` and `slips` are those of
-    the expansion; see `Impact` for the others.
+    **Fields:** `late`: the time until then; `first`: the gap or slip that is zero first, none if `hits` is false;
+    accelerations `before` and `after`; velocities before (`at`) and after (`u`); `held`: contacts whose gaps have the
+    rates of the impact, and friction whose slip is zero; `low`: contacts that would bounce lower than the resolution;
+    `slips`: the direction of slip in the impact, or zero; `share` of the rebounds at which no energy is gained;
+    `compression` of an impact by Poisson's law, after which `held` and `slips` belong to the expansion; see `Impact`
+    for the others.
     """
 
     late: Float[Array, ""]
@@ -73,8 +73,9 @@ class Phase(NamedTuple):
 
 
 class When(NamedTuple):
-    """When the event is, see `Event`, with the velocities `u` then, before it, the rates `at` of gaps and slips, and
-    which contacts are `touching`.
+    """The time of the event, see `Event`.
+
+    **Fields:** the velocities `u` then, before it; the rates `at` of gaps and slips; which contacts are `touching`.
     """
 
     late: Float[Array, ""]
@@ -87,8 +88,9 @@ class When(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """The search for the largest `share` of the rebounds at which an impact gives no energy back: it is in the
-    `bracket`, of what is gained; whether it goes on `again`.
+    """The search for the largest `share` of the rebounds at which an impact gains no energy.
+
+    **Fields:** the `bracket` of the share, with the energy gained; `again`: whether the search goes on.
     """
 
     share: Float[Array, ""]
@@ -97,17 +99,17 @@ class Trial(NamedTuple):
 
 
 def next_trial(trial: Trial, gained, size, k) -> Trial:
-    """What is tried next, after `k` trials; before the first one the whole rebound was, and gained some energy."""
+    """The next trial after `k` trials; before the first trial, the whole rebound was tried and gained energy."""
     first = k == 0
     again = jnp.where(first, gained > REST * size, trial.again & (jnp.abs(gained) > _GAIN * size))
     bracket, share = narrowed(trial.bracket, trial.share, gained, k % 3 == 2)
-    # Without a rebound energy is lost.
+    # Without a rebound, energy is lost.
     share = jnp.where(again, jnp.where(first, 0.0, share), trial.share)
     new = Trial(share, bracket, again)
     return jax.tree.map(lambda old, new: jnp.where(k < 0, old, new), trial, new)
 
 
-# Compiled inside the whole program, so that it is traced once.
+# A nested program, so that it is traced once.
 @eqx.filter_jit
 def find_event(system, formulation, tolerance: ContactTolerance, t, y) -> Event:
     """An event at a state, without derivatives; the tolerance is in units of the system's size."""
@@ -117,11 +119,12 @@ def find_event(system, formulation, tolerance: ContactTolerance, t, y) -> Event:
 
 
 class Struck(NamedTuple):
-    """An impact in one round, from the laws that hold in it, `answers`, and its `impulses`.
+    """An impact in one round.
 
-    **Fields:** the velocities `u` after it, and the `rate` of gaps and slips; the accelerations `udot` there without
-    contacts and friction; contacts that are `resting`, and friction whose slip has `ended`; twice the energy that the
-    impulses have `gained`, and the sizes that add up in it; the `share` of the rebounds.
+    **Fields:** `answers`: the laws that hold in it; its `impulses`; the velocities `u` after it, and the `rate` of gaps
+    and slips; the accelerations `udot` there without contacts and friction; contacts that are `resting`, and friction
+    whose slip has `ended`; `gained`: twice the energy gained by the impulses, and the size of its summands; the
+    `share`.
     """
 
     answers: Answers
@@ -138,11 +141,11 @@ class Struck(NamedTuple):
 class Round(NamedTuple):
     """The state of an event after some impulses and forces have been found.
 
-    **Fields:** the `problem` of the impulses or forces that are to be found next; `when` the event is; contacts that
-    bounce too `low` to be seen, and for how long (`rest`); the impact as it is `struck`; the laws that hold with the
-    `forces` after it, `answers`; whether all problems have been `solvable`; in how many `rounds` what stays closed and
-    sticks is known; the `trial` of a share of the rebounds; by Poisson's law the `compression`, and the impulses with
-    which contacts have `pushed` then and push again at least.
+    **Fields:** the `problem` of the next impulses or forces; `when` the event is; contacts that bounce too `low` to be
+    resolved, and for how long (`rest`); `struck`: the impact; `answers`: the laws that hold with the `forces` after it;
+    whether all problems were `solvable`; `rounds`: the number of rounds after which closed contacts and sticking
+    friction are known; the `trial` of a share of the rebounds; by Poisson's law the `compression`; `pushed`: the
+    impulses with which contacts pushed then and at least push again.
     """
 
     problem: Problem
@@ -160,12 +163,11 @@ class Round(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """How velocities respond to impulses along the directions of contacts and friction, where the other constraints
-    hold.
+    """How velocities respond to impulses along the directions of contacts and friction, under the other constraints.
 
     **Fields:** `rows`, the derivatives of the rates of gaps and slips by velocities; the `projector` on the other
-    constraints; `by_unit`, the changes of velocities by unit impulses, and the impulses that the other constraints
-    answer with, `answers`; the change that these ask for themselves, `jump`.
+    constraints; `by_unit`, the changes of velocities by unit impulses, and `answers`, the impulses of the other
+    constraints in response; `jump`, the change that the other constraints need themselves.
     """
 
     rows: Float[Array, "laws nu"]
@@ -179,7 +181,7 @@ class Moves(NamedTuple):
         """The moves at a state, whose velocities leave the rates of all rows `unmet`."""
         rows, jacobian = directions(system, t, q, u)
         projector = jacobian.projector(inertia)
-        # The last one is without an impulse.
+        # The last entry has no impulse.
         impulses = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
         asked = jnp.concatenate([jnp.zeros((len(rows), unmet.size), q.dtype), -unmet[None]])
         moves, answers = jax.vmap(projector.solve)(impulses, asked)
@@ -188,13 +190,13 @@ class Moves(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Impacting:
-    """An event at a state: in each round first impulses are found, in one phase or in the two of Poisson's law, and
-    then the forces after them.
+    """An event at a state. Each round first finds impulses, in one phase or in the two of Poisson's law, and then the
+    forces after them.
 
-    The first impulse is none, and the forces after it are those before the event, which tell when it is.
+    The first impulse is zero, and the forces after it are the forces before the event, which determine its time.
 
     **Fields:** `tolerance` [m, rad]; t, q and the velocities `u`; the `inertia` and the `modes` there; the `gap`s, and
-    the `rates` of gaps and slips; the `moves`; the `laws`; the velocity up to which slip in a plane has ended, `slow`.
+    the `rates` of gaps and slips; the `moves`; the `laws`; `slow`: the velocity up to which slip in a plane has ended.
     """
 
     system: AbstractEquation
@@ -219,8 +221,8 @@ class Impacting:
         moves = Moves.at(system, t, q, u, inertia, unmet)
         laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(system, t, q, u))
         gap, rates = contacts.gaps(system, t, q), contacts.at_rows(unmet)
-        known = inertia, contacts.modes(q), gap, rates, moves, laws, tolerance.slow(system, u)
-        return cls(system, formulation, tolerance, t, q, u, *known)
+        at_state = inertia, contacts.modes(q), gap, rates, moves, laws, tolerance.slow(system, u)
+        return cls(system, formulation, tolerance, t, q, u, *at_state)
 
     @property
     def contacts(self) -> ContactSet:
@@ -246,12 +248,12 @@ class Impacting:
         return self.rates + self.moves.rows @ (u - self.u)
 
     def sizes_of_rates(self, *velocities):
-        """The sizes that add up in the rates at some velocities."""
+        """The sizes of the summands of the rates at some velocities."""
         return jnp.abs(self.moves.rows) @ add_up(map(jnp.abs, velocities))
 
     def accelerated(self, u):
-        """Accelerations without contacts and friction, those along their directions, and the reactions of the joints
-        that have friction, without forces along these and by a unit of each.
+        """Accelerations without contacts and friction, along coordinates and along the laws' directions; and the
+        reactions of the joints with friction, without forces along the laws and by a unit of each.
         """
         system, t, q = self.system, self.t, self.q
         udot, multipliers, opening = free_accelerations(system, self.formulation, self.moves.projector, t, q, u)
@@ -260,13 +262,13 @@ class Impacting:
         reactions = lambda multipliers: system.friction_reactions(t, q, u, multipliers)
         return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], self.moves.answers]))
 
-    # When the event is
+    # The time of the event
 
     def at_event(self, before, curve) -> When:
-        """The first of the zeros that are next, with accelerations until then, and those along the directions."""
+        """The first of the next zeros, by accelerations until then and accelerations along the directions."""
         n, system = self.contacts.n, self.system
         until, about_to = self.zeros(curve)
-        # A zero that is far off in time, since rates are rounding errors, is none.
+        # A zero far off in time does not count: its rates are rounding errors.
         speed = jnp.max(jnp.maximum(jnp.abs(self.u), jnp.abs(before)) / system.velocity_scale()) * system.length
         about_to = about_to & (jnp.abs(until) * speed <= self.tolerance.far)
         first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
@@ -278,8 +280,9 @@ class Impacting:
         return When(late, first, hits, before, at, self.rates_at(at), touching)
 
     def zeros(self, curve):
-        """The times until gaps and slips are zero, and which are about to be; `curve`: their second derivatives, and
-        accelerations.
+        """The times until gaps and slips are zero, and which are about to be zero.
+
+        **Arguments:** `curve`: the second derivatives of gaps, and the accelerations of slips.
         """
         n, gap, closing = self.contacts.n, self.gap, self.rates[: self.contacts.n]
         about_to = self.modes.open & (gap <= self.tolerance.near) & (closing < 0)
@@ -295,8 +298,8 @@ class Impacting:
         return until, jnp.concatenate([about_to, ends])
 
     def slips(self, rates, curve):
-        """Which friction may come to rest, how fast it slips, and how fast that changes, along its modes; of friction
-        in two directions the first number says it.
+        """Which friction may come to rest, how fast it slips, and how fast that changes, along its modes; friction in
+        two directions has these in its first number.
         """
         modes, pairs = self.modes, self.contacts.pairs
         single = modes.slides, modes.of_friction * rates, modes.of_friction * curve
@@ -315,13 +318,13 @@ class Impacting:
         return self.system.contact_numbers.restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
 
     def impulse_of(self, when: When, low, share, reactions) -> Problem:
-        """The problem of the impulses, where contacts that are `low` do not bounce, and others with a share of the
-        whole rebound; by Poisson's law none does at the end of compression.
+        """The problem of the impulses. Contacts that are `low` do not bounce, others bounce with a share of the whole
+        rebound; by Poisson's law none bounces at the end of compression.
         """
         back = jnp.where(low | np.array(self.contacts.by_poisson, bool), 0.0, share * self.bounces(when))
         approach = when.at + self.moves.rows @ self.moves.jump - jnp.pad(back, (0, self.contacts.m))
         if self.contacts.pairs:
-            # Directions of rounding errors have no sense.
+            # Rounding errors have no direction.
             approach = jnp.where(jnp.abs(approach) <= REST * self.sizes_of_rates(when.u), 0.0, approach)
         return self.laws.of_impulses(approach, when.touching, reactions)
 
@@ -330,9 +333,7 @@ class Impacting:
         return when.u + jnp.where(k < self.turns, 0.0, self.moves.jump) + impulses @ self.moves.by_unit
 
     def expand(self, k, before: Round, answers, impulses) -> Round:
-        """The end of the compression, and the impulses that are asked for besides those with which contacts push again
-        in the expansion.
-        """
+        """The end of the compression, and the problem of the expansion: impulses beyond the least ones."""
         when = before.when
         again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]
         pushes = np.array(self.contacts.by_poisson, bool) & ~before.low
@@ -349,7 +350,7 @@ class Impacting:
         )
 
     def strike(self, k, before: Round, answers, impulses) -> Round:
-        """The velocities after an impulse, and the forces that are asked for there."""
+        """The velocities after an impulse, and the problem of the forces there."""
         when, n, solvable = before.when, self.contacts.n, answers.solvable
         if before.pushed is not None:
             impulses, solvable = before.pushed + impulses, solvable & before.solvable
@@ -366,15 +367,15 @@ class Impacting:
         return before._replace(problem=forces, struck=struck, solvable=solvable)
 
     def slips_left(self, rate, sizes):
-        """Which friction no longer slips, and the directions in which other friction does."""
-        # Slip that is not to be seen has ended.
+        """Which friction no longer slips, and the directions of the other slips."""
+        # Slip below the resolution has ended.
         speed = self.laws.sizes(rate)
         least = jnp.where(self.contacts.in_pairs, 2 * self.slow, self.tolerance.near)
         ended = (speed <= REST * self.laws.sizes(sizes)) | (speed <= least)
         return ended, jnp.where(ended, 0.0, rate / jnp.where(ended, 1.0, speed))
 
     def begin(self, k, before: Round, answers, forces) -> Round:
-        """The time of the event, by the equations before it, and its impulses."""
+        """The time of the event, by the equations before it, and the problem of its impulses."""
         del k, answers
         udot, curve = before.struck.udot + forces @ self.moves.by_unit, before.problem.free + self.influence @ forces
         when = self.at_event(udot, curve)
@@ -382,12 +383,12 @@ class Impacting:
         return before._replace(problem=problem, when=when)
 
     def settle(self, k, before: Round, answers, forces) -> Round:
-        """The laws that hold after an impact with their forces, and the impulses that are asked for in a further round,
-        in which other contacts may bounce too low to be seen.
+        """The laws that hold after an impact with their forces, and the problem of the impulses in a further round.
+        Other contacts may bounce too low there to be resolved.
         """
         struck, curve = before.struck, before.problem.free + self.influence @ forces
         low, rest = self.low_bounces(before, curve[: self.contacts.n], k == 2 * self.turns - 1)
-        # Where nothing bounces low, and no force depends on others, a second round would find the same.
+        # Without low bounces, and without forces that depend on others, a second round would give the same result.
         rounds = before.rounds if self.contacts.in_joints.any() else jnp.where(jnp.any(low), 2, 1)
         trial = next_trial(before.trial, *struck.gained, k // self.turns - rounds)
         return before._replace(
@@ -402,8 +403,9 @@ class Impacting:
         )
 
     def low_bounces(self, before: Round, curve, is_first):
-        """Contacts that would open in the first round by less than can be seen, before they close again, and the times
-        until they rest; `curve`: the second derivatives of the gaps.
+        """Contacts whose next bounce in the first round is below the resolution, and the times until they rest.
+
+        **Arguments:** `curve`: the second derivatives of the gaps.
         """
         when, struck, restitution = before.when, before.struck, self.system.contact_numbers.restitution
         rate, bounce = struck.rate[: self.contacts.n], self.bounces(when)
@@ -411,7 +413,7 @@ class Impacting:
         opens = rate**2 <= 2 * falls * self.tolerance.bounce
         low = when.touching & ~struck.resting & (curve < 0) & opens & (restitution < 1)
         low = jnp.where(is_first, low, before.low)
-        # Each bounce takes `restitution` times the time of the one before.
+        # Each bounce takes `restitution` times as long as the previous bounce.
         ratio = jnp.where(low & (bounce > 0), restitution, 0.0)
         rest = jnp.where(low & (bounce > 0), 2 * rate / (falls * (1 - ratio)), 0.0)
         return low, jnp.where(is_first, rest, before.rest)
@@ -419,7 +421,7 @@ class Impacting:
     # The rounds
 
     def start(self) -> Round:
-        """Before the first round."""
+        """The state before the first round."""
         n, m, in_joints = self.contacts.n, self.contacts.m, self.contacts.in_joints.any()
         none, one, yes = jnp.zeros(n + m, self.q.dtype), jnp.ones((), self.q.dtype), jnp.array(True)
         no, idle = Answers(none[:n] > 0, none[n:] > 0, none[n:], yes, none[n:] > 0), none[:n] > 0
@@ -440,22 +442,22 @@ class Impacting:
         )
 
     def goes_on(self, carry):
-        """Whether a round is not at its end, or another one follows."""
+        """Whether a round is not at its end, or another round follows."""
         k, last = carry
-        more = k // self.turns - 1 - last.rounds
-        return (k % self.turns != 0) | (more < 0) | (last.trial.again & (more < _TRIALS))
+        extra_rounds = k // self.turns - 1 - last.rounds
+        return (k % self.turns != 0) | (extra_rounds < 0) | (last.trial.again & (extra_rounds < _TRIALS))
 
     def advance(self, carry):
-        """The next turn; the program that finds impulses or forces is compiled once."""
+        """The next turn; the program for impulses or forces is compiled once."""
         k, last = carry
         turns = self.turns
-        answers, known = self.laws.answers(last.problem), self.laws.of_modes(self.modes, self.rates)
-        answers = jax.tree.map(lambda known, found: jnp.where(k == turns - 1, known, found), known, answers)
-        found = self.laws.solved(last.problem, answers)
+        answers, by_modes = self.laws.answers(last.problem), self.laws.of_modes(self.modes, self.rates)
+        answers = jax.tree.map(lambda by_modes, values: jnp.where(k == turns - 1, by_modes, values), by_modes, answers)
+        values = self.laws.solved(last.problem, answers)
         turn = k % turns
         which = jnp.where((turn == turns - 1) & (k >= turns), turns, turn)
         does = [self.expand, self.strike, self.begin, self.settle][2 - self.phases :]
-        return k + 1, lax.switch(which, does, k, last, answers, found)
+        return k + 1, lax.switch(which, does, k, last, answers, values)
 
     def event(self) -> Event:
         """The event, after all rounds."""
@@ -486,18 +488,18 @@ class Impacting:
         )
 
     def seen(self, impulses, sizes):
-        """The impulses, of which those of rounding errors are none."""
+        """The impulses, with zeros for rounding errors."""
         return jnp.where(jnp.abs(jnp.diag(self.influence) * impulses) <= REST * sizes, 0.0, impulses)
 
     def independent(self, laws):
-        """As many of some laws as are independent of each other."""
+        """As many of the given laws as are independent of each other."""
         return laws & independent_components(self.influence, laws)
 
     def compressed(self, phase: Phase | None) -> Phase | None:
         return None if phase is None else phase._replace(held=self.independent(phase.held))
 
     def new_modes(self, settled: Round):
-        """The modes after the event, and contacts that are closed while others imply them."""
+        """The modes after the event, and contacts whose closure other contacts imply."""
         n, struck, last = self.contacts.n, settled.struck, settled.answers
         implied = struck.resting & ~last.closed & is_implied(self.influence[:n, :n], last.closed)
         of_contacts = modes_of_contacts(last.closed, implied)
@@ -506,24 +508,24 @@ class Impacting:
         return jnp.concatenate([of_contacts, of_friction]).astype(self.q.dtype), implied
 
     def lost(self, settled: Round, implied):
-        """Which laws hold the velocities after the event, and the impulses that take from these what only rounding
-        errors, low bounces and slips that have ended leave.
+        """Which laws hold the velocities after the event, and the impulses that remove the rates left by rounding
+        errors, low bounces and ended slips.
         """
         n, m, struck, last = self.contacts.n, self.contacts.m, settled.struck, settled.answers
-        staying, rate, held = struck.resting, struck.rate, struck.answers.closed | settled.low
+        staying, rate, is_held = struck.resting, struck.rate, struck.answers.closed | settled.low
         if m:
-            # Slips that have ended are zero to all digits. Slip in two directions begins at rest.
+            # Slips that have ended are exactly zero. Slip in two directions begins at rest.
             rests = last.sticks | (self.contacts.in_pairs & struck.ended & (last.slips != 0))
-            held = jnp.concatenate([held | last.closed, rests | struck.answers.sticks])
-            left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(rests, rate[n:], 0.0)])
-            cancelled = held & jnp.concatenate([staying, rests])
+            is_held = jnp.concatenate([is_held | last.closed, rests | struck.answers.sticks])
+            rates_left = jnp.concatenate([jnp.where(staying, rate[:n], 0.0), jnp.where(rests, rate[n:], 0.0)])
+            cancelled = is_held & jnp.concatenate([staying, rests])
         else:
-            left, cancelled = jnp.where(staying, rate, 0.0), held & settled.low
-        held = self.independent(held)
-        cancelled = held & cancelled
+            rates_left, cancelled = jnp.where(staying, rate, 0.0), is_held & settled.low
+        is_held = self.independent(is_held)
+        cancelled = is_held & cancelled
         if m:
-            # Bodies that move side by side would come nearer, at a rate that is too small beside slips to close their
-            # contact, and each step would end with an event.
-            drifts = jnp.pad(staying & ~held[:n] & ~implied & (rate[:n] < 0), (0, m))
+            # Otherwise bodies that move side by side would approach at a rate too small, beside slips, to close their
+            # contact. Each step would end with an event.
+            drifts = jnp.pad(staying & ~is_held[:n] & ~implied & (rate[:n] < 0), (0, m))
             cancelled = self.independent(cancelled | drifts)
-        return held, jnp.where(cancelled, solved_components(self.influence, left, cancelled), 0.0)
+        return is_held, jnp.where(cancelled, solved_components(self.influence, rates_left, cancelled), 0.0)

@@ -1,6 +1,6 @@
-"""The derivatives of the impulses of an impact, and of the velocities after them, by those before it.
+"""The derivatives of the impulses of an impact, and of the velocities after them, by the numbers before it.
 
-Of `M (u⁺ − u⁻) = Aᵀ Λ` and the rates of gaps that are held, and slips that end, each phase has one linear system.
+Each phase has one linear system: `M (u⁺ − u⁻) = Aᵀ Λ`, with the rates of held gaps and of ending slips.
 """
 
 import dataclasses
@@ -26,9 +26,9 @@ from .impacting import Event, Phase
 class Phases:
     """The linear equations of the phases of an impact.
 
-    **Fields:** system, t and q `at` the `event`, their `tangents`, and that of the velocities before it, `du`; the
-    `rows` of A of contacts and friction, the `projector` on the other constraints, and the changes of velocities,
-    `moves`, by unit impulses; contacts that `rebound` by Newton's law; the `coefficients` of friction and their
+    **Fields:** `at`: system, t and q at the `event`; their `tangents`, and `du`, the tangent of the velocities before
+    it; the `rows` of A of contacts and friction; the `projector` on the other constraints; `moves`: the changes of
+    velocities by unit impulses; contacts that `rebound` by Newton's law; the `coefficients` of friction and their
     derivatives.
     """
 
@@ -50,11 +50,11 @@ class Phases:
         projector = jacobian.projector(system.inertia(t, contacts.with_modes(q, 0.0), event.u))
         moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
         rebound = ~event.low & ~np.array(contacts.by_poisson, bool)
-        known = change = jnp.zeros(0, q.dtype)
+        coefficient = change = jnp.zeros(0, q.dtype)
         if contacts.m:
             coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
-            known, change = coefficients(*at), push(coefficients, at, tangents)
-        return cls(event, at, tangents, du, rows, projector, moves, rebound, (known, change))
+            coefficient, change = coefficients(*at), push(coefficients, at, tangents)
+        return cls(event, at, tangents, du, rows, projector, moves, rebound, (coefficient, change))
 
     @property
     def contacts(self) -> ContactSet:
@@ -63,13 +63,13 @@ class Phases:
     def changes(self) -> tuple[Float[Array, "laws"], Float[Array, "nu"]]:
         """The derivatives of all impulses, and of the velocities after them."""
         event, contacts, at = self.event, self.contacts, self.at
-        # By the share of the rebounds velocities and impulses change as well.
+        # Velocities and impulses also change with the share of the rebounds.
         rates = contacts.rates(*at, event.at)
         bounce = _restitution(at[0]) * jnp.maximum(-rates[: contacts.n], 0.0)
         bounce = jnp.pad(jnp.where(self.rebound, bounce, 0.0), (0, contacts.m))
         impulses, change, by_share = (self.in_one if event.compression is None else self.in_two)(bounce)
 
-        # The share is that at which no energy is gained.
+        # At this share no energy is gained.
         both = rates + contacts.rates(*at, event.u)
         changed = push(contacts.rates, (*at, event.at), (*self.tangents, self.du))
         changed = changed + push(contacts.rates, (*at, event.u), (*self.tangents, change))
@@ -81,7 +81,7 @@ class Phases:
 
     def in_one(self, bounce):
         """The derivatives of the impulses and of the velocities at a fixed share of the rebounds, and of the impulses
-        by that share, which asks for the rates `bounce`.
+        by that share, whose rates are `bounce`.
         """
         event = self.event
         last = Phase(event.u, event.held, event.slips, event.impulses)
@@ -90,7 +90,7 @@ class Phases:
         return impulses, change, solve(matrix, jnp.where(event.held, bounce, 0.0))
 
     def in_two(self, bounce):
-        """The same of an impact by Poisson's law."""
+        """The same for an impact by Poisson's law."""
         event, compression, (system, *_) = self.event, self.event.compression, self.at
         assert compression is not None
         n, m = self.contacts.n, self.contacts.m
@@ -110,18 +110,17 @@ class Phases:
 
     def solved(self, before, dbefore, phase: Phase, normal):
         """The derivatives of the impulses of a phase and of the velocities at its end, and the matrix of the equations
-        for the first; see `equations`.
+        for the former; see `equations`.
         """
         plain, matrix, right = self.equations(before, dbefore, phase, normal)
         impulses = solve(matrix, right)
         return impulses, plain + impulses @ self.moves, matrix
 
     def equations(self, before, dbefore, phase: Phase, normal):
-        """The velocities at the end of a phase without a change of its impulses, and the linear equations for that
-        change.
+        """The velocities after a phase without a change of its impulses, and the linear equations for the change.
 
-        **Arguments:** the velocities `before` the phase, and their derivative; the changes of the impulses along the
-        `normal` of contacts that are not held.
+        **Arguments:** the velocities `before` the phase, and their derivative; `normal`: the changes of the normal
+        impulses of contacts that are not held.
         """
         event, (system, t, q), contacts = self.event, self.at, self.contacts
         rows, n = np.array(contacts.rows), contacts.n
@@ -130,7 +129,7 @@ class Phases:
         multipliers = with_entries(multipliers, rows, phase.impulses)
 
         def unmet(system, t, q, first, u):
-            """The rates that are left, and the momentum that is not balanced."""
+            """The remaining rates, and the unbalanced momentum."""
             rates = Instant(system, t, q, phase.u).velocity_rows
             bounce = _restitution(system) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
             bounce = jnp.where(phase.held[:n] & self.rebound, event.share * bounce, 0.0)
@@ -140,7 +139,7 @@ class Phases:
 
         point = system, t, contacts.bound(q), event.at, before
         rates, forces = push(unmet, point, (*self.tangents, self.du, dbefore))
-        # Rows of modes ask for nothing.
+        # Rows of modes have no right-hand side.
         plain, _ = self.projector.solve(-forces, jnp.where(np.isin(np.arange(rates.size), rows), 0.0, -rates))
         asked = -(rates[rows] + self.rows @ plain)
         law, right = jnp.eye(rows.size, dtype=q.dtype), jnp.pad(normal, (0, contacts.m))
@@ -150,20 +149,20 @@ class Phases:
         return plain, matrix, jnp.where(phase.held, asked, right)
 
     def friction_laws(self, plain, phase: Phase, law, right):
-        """The equations with those of friction that slips, whose impulses are in proportion to those of contacts."""
-        contacts, (known, change) = self.contacts, self.coefficients
+        """The equations with the laws of slipping friction, with impulses proportional to the contacts'."""
+        contacts, (coefficient, change) = self.contacts, self.coefficients
         n, contact_of = contacts.n, np.array(contacts.contact_of)
         pushed = jnp.where(contacts.in_joints, 0.0, phase.impulses[contact_of])
         right = jnp.concatenate([right[:n], -change * phase.slips * pushed])
         for k in np.flatnonzero(~contacts.in_joints):
-            law = law.at[n + k, contact_of[k]].set(known[k] * phase.slips[k])
+            law = law.at[n + k, contact_of[k]].set(coefficient[k] * phase.slips[k])
         rates = lambda system, t, q: contacts.rates(system, t, q, phase.u)
         for both in of_pairs(contacts.pairs):
             # The direction of slip changes with the velocity after the impact.
             k, laws, slips = both[0], n + both, phase.slips[both]
             turned, last, speed = push(rates, self.at, self.tangents)[laws], rates(*self.at)[laws], norm(slips)
             across = jnp.eye(2, dtype=law.dtype) - jnp.outer(slips, slips)
-            by = known[k] * pushed[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
+            by = coefficient[k] * pushed[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
             law = law.at[laws].add(by @ self.rows[laws] @ self.moves.T, unique_indices=True)
             right = right.at[laws].add(-by @ (turned + self.rows[laws] @ plain), unique_indices=True)
         return law, right

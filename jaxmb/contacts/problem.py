@@ -18,22 +18,22 @@ from .dry_laws import Answers, Dry, laws_of
 from .friction import frictional
 from .tolerance import REST
 
-# Friction that sticks slips from this fraction below its limit on: an event at which it still held would be followed by
-# the same one at once.
+# Friction that sticks begins to slip at this fraction below its limit: if it still held after the event, the same event
+# would follow at once.
 _REACHED = 1e-7
-# Other friction sticks up to this fraction above its limit: at the limit itself the guard of its force then tells
-# whether it slips, by the first derivative that is not zero.
+# Other friction sticks up to this fraction above its limit. At the limit itself, the guard of its force then decides
+# whether it slips, by the first nonzero derivative.
 _HELD = 1e-8
-# The normal forces of joints, which depend on the friction in them, are found by this many corrections.
+# The normal forces of joints, which depend on the friction in them, take this many corrections.
 _CORRECTIONS = 6
 
 
 class Problem(NamedTuple):
-    """Which impulses, or forces, are asked for.
+    """The unknown impulses, or forces.
 
     **Fields:** `free`: the rates or accelerations along the directions of the laws without them; `among`: the laws that
-    may have any; of friction see `Dry`; `reactions` of the joints that have friction, without forces along these and by
-    a unit of each, None without such friction.
+    may have any; of friction see `Dry`; `reactions` of the joints with friction, without forces along the laws and by a
+    unit of each, None without such friction.
     """
 
     free: Float[Array, "laws"]
@@ -45,8 +45,10 @@ class Problem(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The laws of some `contacts` and their dry friction at a state, with the `influence` of their forces, and the
-    coefficients of slip and stick, as multiples of these.
+    """The laws of `contacts` and their dry friction at a state.
+
+    **Fields:** the `influence` of their forces; the coefficients of slip (`coefficient`) and stick (`limit`), as
+    multiples of the normal forces.
     """
 
     influence: Float[Array, "n_m n_m"]
@@ -55,26 +57,29 @@ class Laws(NamedTuple):
     limit: Float[Array, "m"]
 
     def of_modes(self, modes: Modes, rates: Float[Array, "n_m"]) -> Answers:
-        """Which laws hold in some modes, and at some rates of gaps and slips."""
+        """Which laws hold in given modes, at given rates of gaps and slips."""
         slips = modes.slips(rates[self.contacts.n :])
         return Answers(modes.closed, modes.sticks, slips, jnp.array(True), modes.implied_stick)
 
     def sizes(self, values):
-        """The sizes of what friction in one direction has, and of both where it has two."""
+        """The sizes of friction values: of one direction, or of both directions together."""
         return sizes_of(self.contacts.pairs, values)
 
     def of_impulses(self, approach, touching, reactions) -> Problem:
-        """The impulses of contacts that are `touching`; `approach`: the rates before it, with those of restitution.
+        """The impulses of contacts that are `touching`.
 
-        Friction in joints has no impulse, and asks for no `reactions`, which are zeros of their shape.
+        Friction in joints has no impulse, and needs no `reactions`, which are zeros of their shape.
+
+        **Arguments:** `approach`: the rates before the impact, plus the rates of restitution.
         """
         reactions = jax.tree.map(jnp.zeros_like, reactions)
         none, may = jnp.zeros(self.contacts.m, approach.dtype), self._may(touching) & ~self.contacts.in_joints
         return Problem(approach, jnp.concatenate([touching, may]), self.coefficient, none, none, reactions)
 
     def of_expansion(self, free, again, touching, reactions) -> Problem:
-        """The impulses in an expansion, those of contacts besides what they push `again` at least; `free`: the rates at
-        the end of compression.
+        """The impulses in an expansion, besides the impulses with which contacts push `again` at least.
+
+        **Arguments:** `free`: the rates at the end of compression.
         """
         bound = jnp.zeros(self.contacts.m, free.dtype)
         if self.contacts.m:
@@ -84,11 +89,12 @@ class Laws(NamedTuple):
         return problem._replace(bound=bound)
 
     def of_forces(self, opening, reactions, staying, slips, modes, forces) -> Problem:
-        """The forces after an event, of contacts that are `staying`, and of friction that `slips`, or may stick where
-        this is zero; `opening`: the accelerations without them; `forces`: nearly those, on which the normal forces of
-        joints depend.
+        """The forces after an event, of contacts that are `staying`, and of friction.
+
+        **Arguments:** `opening`: the accelerations without them; `slips`: the direction of slip, zero where friction
+        may stick; `forces`: approximate ones, on which the normal forces of joints depend.
         """
-        # Friction that has just reached its limit is beyond it, up to what the search for the laws that hold resolves.
+        # Friction that has just reached its limit is beyond it, up to the resolution of the search for laws.
         limit = self.limit * jnp.where(modes.sticks, 1 - _REACHED, 1 + _HELD)
         coefficient = jnp.where(self.sizes(slips) == 0, limit, self.coefficient)
         bounds = jnp.zeros(self.contacts.m, opening.dtype)
@@ -115,10 +121,10 @@ class Laws(NamedTuple):
         if not self.contacts.m:
             return solved_components(self.influence, free, answers.closed)
         none = jnp.zeros(self.contacts.m, free.dtype)
-        # The normal forces of joints are found below.
+        # The normal forces of joints follow below.
         bound = jnp.where(self.contacts.in_joints, 0.0, problem.bound)
         matrix, right = laws_of(self.influence, free, self._dry(self.coefficient, none, bound), answers)
-        # Others are zero to all digits.
+        # The other forces are exactly zero.
         act = jnp.concatenate([answers.closed, answers.sticks | (answers.slips != 0)])
         if reactions is None:
             return jnp.where(act, solve(matrix, right), 0.0)
@@ -147,11 +153,11 @@ class Laws(NamedTuple):
 
 
 def is_implied(influence, closed):
-    """Which gaps cannot move where some contacts are closed, up to rounding errors."""
+    """Which gaps cannot move if some contacts are closed, up to rounding errors."""
     if not closed.size:
         return closed
     influence, closed = lax.stop_gradient((influence, closed))
     columns = jnp.where(closed[:, None], influence, 0.0)
     matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))
-    left = influence - columns.T @ solve(matrix, columns)
-    return jnp.diag(left) <= REST * jnp.diag(influence)
+    reduced = influence - columns.T @ solve(matrix, columns)
+    return jnp.diag(reduced) <= REST * jnp.diag(influence)

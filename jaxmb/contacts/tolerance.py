@@ -1,4 +1,4 @@
-"""What counts as zero where contacts close or open, and friction sticks or slips."""
+"""The sizes that count as zero when contacts close or open, and friction sticks or slips."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,17 +7,17 @@ from jaxtyping import Array, Float
 from .._types import Velocities
 from ..system import AbstractEquation
 
-# Rates below this fraction of what adds up in them, and squares of gradients, are zero.
+# Rates below this fraction of their summands, and squares of gradients, are zero.
 REST = 1e-9
 # Multiples of the gap that counts as zero: see the members of `ContactTolerance`.
 _NEAR, _BOUNCE, _FAR = 1e2, 1e3, 1e6
-# Slip in two directions, which has none at rest, ends at this multiple of it per second: errors of integration, that
-# are larger than it, turn slower ones.
+# Slip in two directions, whose direction is undefined at rest, ends at this multiple of it per second: larger errors of
+# integration turn slower slips.
 _SLOW = 1e4
 
 
 class ContactTolerance(eqx.Module):
-    """The sizes of gaps and slips that count as zero at an event, all of which follow from one.
+    """The sizes of gaps and slips that count as zero at an event, all multiples of one.
 
     **Fields:** `touch`: gaps down to minus this count as zero, in units of the system's size, or in metres and radians
     (`in_metres`).
@@ -26,7 +26,7 @@ class ContactTolerance(eqx.Module):
     touch: Float[Array, ""]
 
     def in_metres(self, system: AbstractEquation) -> "ContactTolerance":
-        """The same in metres and radians, of one in units of the system's size."""
+        """The tolerance in metres and radians, from units of the system's size."""
         return ContactTolerance(self.touch * system.length)
 
     @property
@@ -36,14 +36,14 @@ class ContactTolerance(eqx.Module):
 
     @property
     def bounce(self) -> Float[Array, ""]:
-        """The height of the bounces that are left out."""
+        """The height of the bounces that are omitted."""
         return _BOUNCE * self.touch
 
     @property
     def far(self) -> Float[Array, ""]:
-        """How far the state moves at most until the event at which a step ends."""
+        """The largest motion of the state until the event at which a step ends."""
         return _FAR * self.touch
 
     def slow(self, system: AbstractEquation, u: Velocities) -> Float[Array, ""]:
-        """The velocity [m/s] up to which slip in two directions has ended, of a tolerance in metres."""
+        """The velocity [m/s] up to which slip in two directions has ended, for a tolerance in metres."""
         return _SLOW * self.touch * (1 + jnp.max(jnp.abs(u) / system.velocity_scale()))

@@ -2,7 +2,7 @@
 
     minimise ½ (u̇ − M⁻¹F)ᵀ M (u̇ − M⁻¹F)  subject to  A u̇ = γ,    M u̇ = F + Aᵀ λ
 
-All formulations give the same u̇, and the same constraint force Aᵀλ; they differ in cost and in what they need.
+All formulations give the same u̇, and the same constraint force Aᵀλ; they differ in cost and requirements.
 """
 
 import abc
@@ -28,10 +28,10 @@ else:
 class AbstractFormulation(eqx.Module):
     """A method of solving for accelerations and multipliers.
 
-    `inverts_mass` says whether it needs the inverse of the mass matrix, which some systems do not have; `partitions`
+    `inverts_mass` says whether it needs the inverse of the mass matrix, which some systems do not have. `partitions`
     says whether it needs the velocities split into dependent and independent ones. A formulation that does not
-    partition needs only the independent rows, so no pivots are searched for where no row is redundant. `takes_blocks`
-    says whether it takes a Jacobian in blocks as it is; others make one dense matrix of it.
+    partition needs only the independent rows, so no pivots are searched if no row is redundant. `takes_blocks` says
+    whether it takes a Jacobian in blocks as it is; others make one dense matrix of it.
     """
 
     partitions: AbstractVar[bool]
@@ -52,7 +52,7 @@ class AbstractFormulation(eqx.Module):
         """
 
     def prepared(self, inertia: AbstractInertia, jacobian: AbstractJacobian) -> "AbstractFormulation":
-        """The same method for several F and γ, with what it computes of M and A alone."""
+        """The same method for several F and γ, with its results for M and A alone."""
         del inertia, jacobian
         return self
 
@@ -77,13 +77,15 @@ def suitable_jacobian(at: Instant, formulation: AbstractFormulation) -> Abstract
 
 
 def row_levels(system: AbstractEquation) -> Array:
-    """Holonomic rows before nonholonomic ones before those of accelerations, so that the dependent velocities nest."""
+    """Levels for elimination: holonomic rows first, then nonholonomic rows, then rows of accelerations only, so that
+    the dependent velocities nest.
+    """
     row = jnp.arange(system.acceleration_rows)
     return (row >= system.position_rows).astype(int) + (row >= system.velocity_rows).astype(int)
 
 
 def check_mass(system: AbstractEquation, formulation: AbstractFormulation) -> None:
-    """Raise a `ValueError` for a formulation that needs the inverse of a mass matrix that is singular."""
+    """Raise a `ValueError` for a formulation that needs the inverse of a singular mass matrix."""
     if formulation.inverts_mass and not system.positive_definite_mass:
         raise ValueError(
             f"{type(formulation).__name__} needs the inverse of the mass matrix, which is singular in these "

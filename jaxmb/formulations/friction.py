@@ -1,19 +1,18 @@
 """Forces of constraints that depend on the constraints' own multipliers, such as Coulomb friction.
 
-Such a force C changes the multipliers that it depends on: with friction the normal force is not that of the joint
-without. Of the rows that C depends on, the multipliers x solve
+Such a force C changes the multipliers that it depends on: friction changes the normal force of a joint. The multipliers
+x of the rows that C depends on solve
 
     x = x⁰ + P C(x)
 
-where x⁰ are the multipliers without C, and P the influence on them of a force on the velocities. Newton's method starts
-from x⁰; Coulomb's law is piecewise linear where a reaction has one component, and one correction then solves it.
+where x⁰ are the multipliers without C, and P is the influence of a force on them. Newton's method starts from x⁰;
+Coulomb's law is piecewise linear for a reaction with one component, and one correction then solves it.
 
-The solution is the only one wherever `x ↦ x⁰ + P C(x)` contracts, component by component: the spectral radius of
-`|P ∂C/∂x|` is below 1. For one Coulomb law on one row this is exact: at 1, Painlevé's paradox, a solution ceases to
-exist or another one appears (P. Painlevé, "Sur les lois du frottement de glissement", C. R. Acad. Sci. 121, 1895). For
-several it is sufficient, and for laws that are not linear in the size of a single component it holds near the solution.
-A component that cannot change its sign, that of a contact, may weaken itself as much as it likes: there the diagonal
-keeps its sign.
+The solution is unique wherever `x ↦ x⁰ + P C(x)` contracts, component by component: the spectral radius of `|P ∂C/∂x|`
+is below 1. For one Coulomb law on one row this is exact. At 1, Painlevé's paradox, a solution ceases to exist or
+another one appears (P. Painlevé, "Sur les lois du frottement de glissement", C. R. Acad. Sci. 121, 1895). For several
+rows it is sufficient, and for laws that are not linear in the size of a single component it holds near the solution. A
+component that cannot change its sign, of a contact, may weaken itself without limit: there the diagonal keeps its sign.
 """
 
 from collections.abc import Callable
@@ -27,9 +26,9 @@ from ..linalg.elimination import gauss_jordan
 from ..linalg.newton import newton
 
 _CORRECTIONS = 16
-# The correction that is left out is about this many rounding errors, as the last two show.
+# The first omitted correction is at most about this many rounding errors, as the last two corrections show.
 _ROUNDING = 64
-# So many rows are eliminated without a loop.
+# At most this many rows are eliminated without a loop.
 _FEW = 2
 
 
@@ -43,18 +42,18 @@ def find_multipliers(
 
     **Arguments:** `pushes`: components that cannot change their sign.
 
-    **Returns:** x; the coupling `|influence ∂law/∂x|` there, with the sign of what such a component does to itself; and
-    whether the equation failed to have one solution and no other, in which case x is `start`.
+    **Returns:** x; the coupling `|influence ∂law/∂x|` there, with its sign on the diagonal for components that push;
+    and whether the equation failed to have exactly one solution, in which case x is `start`.
     """
     one, sizes = jnp.eye(start.size, dtype=start.dtype), (jnp.abs(start), jnp.abs(influence))
 
     def correct(carry):
         x, _, before = carry
         force, push = jax.linearize(law, x)
-        # As sums: the library for products of matrices takes longer than all else where they are small.
+        # As sums: for small matrices a library call takes longer than all the rest.
         slope = jnp.sum(influence[:, None] * jax.vmap(push)(one)[None], axis=2)
         step = solve_coupled(one - slope, start + influence @ force - x)
-        # Relative to all that adds up to a multiplier: free of units, and above rounding errors.
+        # Relative to the summands of a multiplier: free of units, and above rounding errors.
         size = sizes[0] + jnp.abs(x) + sizes[1] @ jnp.abs(force)
         size = jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
         # Corrections shrink quadratically, so the size of the next one is known.
@@ -78,9 +77,7 @@ def contracts(coupling: Float[Array, "k k"]) -> Bool[Array, ""]:
 
 
 def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Array, "k"]:
-    """Solve with `1 − P ∂C/∂x`. Where the coupling contracts, the diagonal dominates in some units, and its pivots need
-    no search.
-    """
+    """Solve with `1 − P ∂C/∂x`: if the coupling contracts, pivots need no search."""
     if b.size > _FEW:
         return gauss_jordan(matrix, b.size) @ b
     # The inverse, so that the solution stays a linear function of b.
@@ -92,7 +89,7 @@ def solve_coupled(matrix: Float[Array, "k k"], b: Float[Array, "k"]) -> Float[Ar
 
 
 def coupled_most(coupling: Float[np.ndarray, "k k"]) -> Bool[np.ndarray, "k"]:
-    """The rows of T ≥ 0 that its spectral radius comes from."""
+    """The rows of T ≥ 0 that determine its spectral radius."""
     values, vectors = np.linalg.eig(coupling)
     share = np.abs(vectors[:, np.argmax(np.abs(values))])
     return share > 1e-3 * np.max(share)

@@ -18,8 +18,8 @@ def gauss_function(
     jaxmb.formulations.gauss_function(system, 0.0, state.q, state.u, udot)
     ```
 
-    Among the accelerations that ideal constraints allow, those with `system.acceleration_residual(t, q, u, u̇) = 0`, the
-    true ones have the least; others, farther by δ, have more by `δᵀ M δ`.
+    Among the accelerations that ideal constraints allow, with `system.acceleration_residual(t, q, u, u̇) = 0`, the true
+    ones have the least value. Accelerations that differ by δ have a value larger by `δᵀ M δ`.
     """
     at = Instant(system, t, q, u)
     deviation = udot - at.inertia.solve(at.force)

@@ -1,8 +1,8 @@
-"""The laws of constraint forces: ideal ones, and forces C besides that may depend on the multipliers.
+"""The laws of constraint forces: ideal forces, and further forces C that may depend on the multipliers.
 
     M u̇ = F + C(λ) + Aᵀ λ,    A u̇ = γ
 
-The multipliers that C depends on, those of the `friction_rows`, are the memory of a law; None where it depends on none.
+The memory of a law contains the multipliers that C depends on, of the `friction_rows`; None if there are none.
 """
 
 import abc
@@ -29,7 +29,7 @@ Memory: TypeAlias = Float[Array, "k"] | None
 
 
 class Solution(NamedTuple):
-    """Accelerations u̇ and multipliers λ, and whether they `failed` to be determined."""
+    """Accelerations u̇ and multipliers λ; `failed`: whether they are undetermined."""
 
     udot: Float[Array, "nu"]
     multipliers: Float[Array, "m"]
@@ -56,7 +56,7 @@ class AbstractLaws(eqx.Module):
         return None
 
     def recalled(self, at: Instant, multipliers: Float[Array, "m"], memory: Memory) -> Float[Array, "m"]:
-        """All multipliers, with those of the memory."""
+        """All multipliers, with the memory inserted."""
         del at, memory
         return multipliers
 
@@ -69,15 +69,15 @@ class IdealLaws(AbstractLaws):
 
 
 class GivenLaws(AbstractLaws):
-    """C depends on no multiplier, such as viscous friction."""
+    """C does not depend on multipliers, such as viscous friction."""
 
     def applied(self, at, memory):
         return at.force + at.friction_force(at.u[:0])
 
 
 class ReactiveLaws(AbstractLaws):
-    """C depends on multipliers, which it changes: they are solved for together. Where C does not determine them, it is
-    that of the multipliers of ideal constraints.
+    """C depends on multipliers and changes them, so both are solved for together. If the multipliers are undetermined,
+    C uses the multipliers of ideal constraints.
     """
 
     def applied(self, at, memory: Any):
@@ -85,12 +85,12 @@ class ReactiveLaws(AbstractLaws):
 
     def solve(self, at, formulation, jacobian, gamma):
         formulation = formulation.prepared(at.inertia, jacobian)
-        found, _, failed = _friction(at, formulation, jacobian, gamma)
+        start, _, failed = _friction(at, formulation, jacobian, gamma)
 
         def solved(memory):
             return formulation.solve(at.inertia, self.applied(at, memory), jacobian, gamma)
 
-        memory = root(lambda memory: memory - self.remembered(at, solved(memory)[1]), found, lambda _, found: found)
+        memory = root(lambda memory: memory - self.remembered(at, solved(memory)[1]), start, lambda _, start: start)
         return Solution(*solved(memory), failed)
 
     def remembered(self, at, multipliers):
@@ -100,7 +100,7 @@ class ReactiveLaws(AbstractLaws):
         return with_entries(multipliers, at.system.friction_rows, memory)
 
 
-# Made once.
+# The laws, made once.
 _IDEAL, _GIVEN, _REACTIVE = IdealLaws(), GivenLaws(), ReactiveLaws()
 
 
@@ -119,15 +119,15 @@ def accelerations(
     u: Velocities,
     gamma_shift: Float[Array, "m"] | None = None,
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, those of
-    `A u̇ = γ − gamma_shift`. NaN where friction does not determine them.
+    """Accelerations u̇ and multipliers λ of a system at a state on its constraints; with a `gamma_shift`, for `A u̇ = γ
+    − gamma_shift`. NaN where friction does not determine them.
 
     ```python
     method = jaxmb.formulations.Multipliers()
     udot, multipliers = jaxmb.formulations.accelerations(system, method, 0.0, state.q, state.u)
     ```
 
-    **Raises:** `ValueError` for a formulation that needs the inverse of a mass matrix that is singular.
+    **Raises:** `ValueError` for a formulation that needs the inverse of a singular mass matrix.
     """
     return accelerations_at(Instant(system, t, q, u), formulation, 0.0 if gamma_shift is None else gamma_shift)
 
@@ -145,28 +145,25 @@ def accelerations_at(
 
 
 def _friction(at, formulation, jacobian, gamma):
-    """Multipliers of the rows that forces depend on, their coupling, and whether they are not determined; without
-    derivative.
-    """
+    """Multipliers that forces depend on, their coupling, and whether they are undetermined; without derivative."""
     inertia, force, at = lax.stop_gradient((at.inertia, at.force, at))
     formulation, jacobian, gamma = lax.stop_gradient((formulation, jacobian, gamma))
     rows = at.system.friction_rows
-    # The equations are symmetric: what a force does to a multiplier, its row does to the accelerations.
+    # The equations are symmetric: the influence of a force on a multiplier is the influence of its row on the
+    # accelerations.
     units = jnp.asarray(np.eye(gamma.size)[rows], gamma.dtype)
     forces = jnp.concatenate([force[None], jnp.zeros((rows.size, force.size), force.dtype)])
     solve = jax.vmap(lambda force, gamma: formulation.solve(inertia, force, jacobian, gamma))
     udot, multipliers = solve(forces, jnp.concatenate([gamma[None], units]))
     start, influence = unchecked_take(multipliers[0], rows), -udot[1:]
-    # Newton's method evaluates the law again and again, but only for other multipliers.
+    # Newton's method evaluates the law several times, but only for other multipliers.
     law = with_rest_computed(at.friction_force, start)
     contacts = at.system.contacts
     return find_multipliers(law, influence, start, np.isin(rows, contacts.rows[: contacts.n]))
 
 
 def friction_coupling(at: Instant, formulation: AbstractFormulation) -> Float[Array, "k k"]:
-    """How much the multipliers that friction depends on change with themselves, through its force; see `friction`.
-    Without derivative.
-    """
+    """The influence of friction on its own reactions, see `friction`; without derivative."""
     at = lax.stop_gradient(at)
     jacobian = suitable_jacobian(at, formulation)
     return _friction(at, formulation.prepared(at.inertia, jacobian), jacobian, at.gamma)[1]

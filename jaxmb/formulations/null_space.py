@@ -15,8 +15,8 @@ class NullSpace(AbstractFormulation):
     ```
 
     c is the shortest solution of `A c = γ`; both come from an orthogonal factorisation of Aᵀ. No coordinate is
-    preferred over others, so no chart can become singular, and no pivots are searched for where no row is redundant.
-    The mass matrix may be singular, as long as no velocity without mass is free.
+    preferred over others, so no chart can become singular, and no pivots are searched if no row is redundant. The mass
+    matrix may be singular, as long as every velocity without mass is constrained.
 
     **Reference:**
 

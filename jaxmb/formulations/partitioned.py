@@ -19,9 +19,9 @@ class Partitioned(AbstractFormulation):
     ```
 
     E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart.
-    Cheapest where a chart is made anyway and the degrees of freedom are few; the default with `Partition`. Where a
-    light body moves by itself on heavy ones, its accelerations lose as many digits as the ratio of the masses has;
-    `Multipliers` keeps them.
+    Cheapest if a chart is made anyway and the degrees of freedom are few; the default with `Partition`. If a light body
+    moves by itself on heavy ones, its accelerations lose as many digits as the ratio of the masses has; `Multipliers`
+    keeps them.
 
     **Reference:**
 
@@ -49,7 +49,7 @@ class Partitioned(AbstractFormulation):
 
 
 class ReducedPartitioned(AbstractFormulation):
-    """The same with an `inverse` of `EᵀME` that is known already."""
+    """The same with a known `inverse` of `EᵀME`."""
 
     inverse: Float[Array, "f f"]
     partitions: ClassVar[bool] = True
@@ -80,7 +80,5 @@ def _solve(inertia, force, factor, gamma, solve, product=jnp.matmul):
 
 
 def _summed(matrix, x):
-    """A product as sums, for several right-hand sides: XLA hands products of matrices to a library, which takes longer
-    than all else where they are small.
-    """
+    """A product as sums: for small matrices, a library call takes longer than all the rest."""
     return jnp.sum(matrix * x[None], axis=1)

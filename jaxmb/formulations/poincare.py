@@ -13,13 +13,13 @@ class Poincare(AbstractFormulation):
     motion = jaxmb.simulate(system, state, t1=1.0, formulation=jaxmb.formulations.Poincare())
     ```
 
-    There Gauss' function is a squared distance, `𝒢 = |ṡ − L⁻¹F|²`, and the constraints are `B ṡ = γ` with
-    `B = A L⁻ᵀ`. In a frame adapted to them, from an orthogonal factorisation of Bᵀ, the constraints give the components
-    of ṡ along their rows, and nothing changes those across: no equation is left to solve. The multipliers are those of
-    the ideal constraint force `S = Aᵀ λ = L (ṡ − L⁻¹F)`.
+    There Gauss' function is a squared distance, `𝒢 = |ṡ − L⁻¹F|²`, and the constraints are `B ṡ = γ` with `B = A L⁻ᵀ`.
+    In a frame adapted to them, from an orthogonal factorisation of Bᵀ, the constraints give the components of ṡ along
+    their rows, and the components across are unchanged. No equation remains to be solved. The multipliers belong to the
+    ideal constraint force `S = Aᵀ λ = L (ṡ − L⁻¹F)`.
 
-    The condition of B counts once, where in `A M⁻¹ Aᵀ` it counts squared, and large forces that the constraints balance
-    are not subtracted from each other.
+    The condition of B counts once, whereas in `A M⁻¹ Aᵀ` it is squared. Large forces that the constraints balance are
+    not subtracted from each other.
 
     **Reference:**
 

@@ -12,7 +12,7 @@ Method = Literal["moore_penrose", "inverses", "singular_mass"]
 
 
 class UdwadiaKalaba(AbstractFormulation):
-    """Accelerations in closed form, without multipliers; these are found from them afterwards.
+    """Accelerations in closed form, without multipliers; the multipliers follow from the accelerations.
 
     ```python
     method = jaxmb.formulations.UdwadiaKalaba("inverses")
@@ -24,12 +24,12 @@ class UdwadiaKalaba(AbstractFormulation):
 
     - `"moore_penrose"`: `u̇ = a + L⁻ᵀ B⁺ (γ − A a)`, `B = A L⁻ᵀ`. The best known.
     - `"inverses"`: `u̇ = A⁻γ + (I − A⁻A) G⁻ Lᵀ(a − A⁻γ)`, `G = Lᵀ(I − A⁻A)`, with any `A⁻` that solves consistent
-        equations (a {1}-inverse) and any `G⁻` that solves least squares (a {1,3}-inverse). The first is that of the
+        equations (a {1}-inverse) and any `G⁻` that solves least squares (a {1,3}-inverse). The first follows from the
         chart; for the second `(I − A⁻A) G⁻ = E (LᵀE)⁺` in the chart's basis E of the null space.
-    - `"singular_mass"`: `u̇ = [(I − A⁺A) M; A]⁺ [F; γ]`. Needs no inverse of M, which may be singular as long as no
-        velocity without mass is free, `rank [M; A] = n`.
+    - `"singular_mass"`: `u̇ = [(I − A⁺A) M; A]⁺ [F; γ]`. Needs no inverse of M, which may be singular as long as every
+        velocity without mass is constrained, `rank [M; A] = n`.
 
-    Ranks are structural: pseudo-inverses are taken of independent rows, from factors of fixed rank, where derivatives
+    Ranks are structural: pseudo-inverses are taken of independent rows, from factors of fixed rank, so that derivatives
     exist.
 
     **Reference:**
@@ -97,7 +97,7 @@ def _singular_mass(inertia, force, jacobian, gamma):
     project = lambda x: x - rows.range @ (rows.range.T @ x)
     mass = project(inertia.product(jnp.eye(A.shape[1], dtype=A.dtype)))
     stacked = orthogonal_basis(jnp.concatenate([mass, A])).pseudoinverse
-    # The projection of F leaves nothing for least squares to balance, and so loses no digits to it.
+    # With a projected F, least squares have nothing to balance, and lose no digits.
     udot = stacked @ jnp.concatenate([project(force), jacobian.gather_rows(gamma)])
     return udot, jacobian.scatter_rows(rows.pseudoinverse @ (inertia.product(udot) - force))
 

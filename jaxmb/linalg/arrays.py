@@ -32,11 +32,10 @@ def is_traced(tree: Any) -> bool:
 
 
 class Derivatives(NamedTuple):
-    """What is known of the derivatives that are being taken by each leaf of a pytree.
+    """The derivatives that are being taken by each leaf of a pytree.
 
-    **Fields:** their `orders`, as far as these are known: a `jax.jit` that is differentiated as a whole does not know
-    them; whether the values of all leaves are known, as they are where derivatives are taken outside of `jax.jit` and
-    `jax.vmap`.
+    **Fields:** their `orders`, as far as known: under a `jax.jit` that is differentiated as a whole they are not;
+    `known`: whether the values of all leaves are known, as for derivatives outside of `jax.jit` and `jax.vmap`.
     """
 
     orders: tuple[int, ...]
@@ -48,17 +47,17 @@ def derivatives_of(tree: Any) -> Derivatives:
     leaves = jax.tree.leaves(tree)
     tracers = [k for k, x in enumerate(leaves) if isinstance(x, Tracer)]
     traced = [k for k in tracers if jnp.issubdtype(leaves[k].dtype, jnp.inexact)]
-    orders, known = [0] * len(leaves), not tracers
+    orders, is_concrete = [0] * len(leaves), not tracers
 
-    # JAX calls the rule where it takes a derivative, with values by which outer ones are taken.
+    # JAX calls the rule when it takes a derivative, with the values of outer derivatives.
     @jax.custom_jvp
     def probe(*leaves):
         return leaves[0]
 
     def rule(primals, tangents):
-        nonlocal known
-        outer, known = derivatives_of(primals)
-        known = known and traced == tracers
+        nonlocal is_concrete
+        outer, is_concrete = derivatives_of(primals)
+        is_concrete = is_concrete and traced == tracers
         for k, order, tangent in zip(traced, outer, tangents, strict=True):
             orders[k] = order + (not isinstance(tangent, SymbolicZero))
         first = tangents[0]
@@ -67,7 +66,7 @@ def derivatives_of(tree: Any) -> Derivatives:
     probe.defjvp(rule, symbolic_zeros=True)
     if traced:
         probe(*(leaves[k] for k in traced))
-    return Derivatives(tuple(orders), known)
+    return Derivatives(tuple(orders), is_concrete)
 
 
 def as_array(value: Any, dtype: Any) -> Any:
@@ -87,12 +86,12 @@ def replaced(array: Array, index: Any, value: Any) -> Array:
     return jax.device_put(new)
 
 
-# One program: outside of `jit`, under a derivative, this would be a dozen of them.
+# One program: outside of `jit`, under a derivative, this would be a dozen programs.
 @functools.partial(jax.jit, static_argnums=1)
 def _set(array, index, value):
     return array.at[np.array(index)].set(value)
 
 
 def add_up(terms: Iterable[Any]) -> Any:
-    """The sum of some arrays, one at least, term by term; Python's `sum` would add a zero to them."""
+    """The sum of at least one array, term by term; Python's `sum` would add a zero."""
     return functools.reduce(operator.add, terms)

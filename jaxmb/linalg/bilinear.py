@@ -1,8 +1,8 @@
 """Bilinear functions as JAX primitives, whose derivatives are bilinear functions of the same kind.
 
-The products of rotation algebra and of small blocks are written term by term, which XLA fuses with what surrounds them.
-Differentiated term by term, each slice becomes a padded sum that XLA does not fuse: reverse derivatives of rotations
-took five times as long, and half of the operations of a spatial machine's program were those of its rotations.
+The products of rotation algebra and of small blocks are written term by term, and XLA fuses them with the surrounding
+operations. Differentiated term by term, each slice becomes a padded sum, which XLA does not fuse. Reverse derivatives
+of rotations took five times as long, and rotations were half of the operations of a spatial machine's program.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from .._compat import define_bilinear
 from .arrays import add_up, namespace
 
-# A longer result is assembled from columns: a concatenation of many components is a kernel of its own.
+# A longer result is assembled from columns: a concatenation of many components is a separate kernel.
 _FEW = 4
 
 
@@ -81,8 +81,8 @@ class BilinearMap:
 
 
 @functools.cache
-def _transposed(own, axes):
-    return BilinearMap.of(own.table.transpose(axes))
+def _transposed(bilinear_map, axes):
+    return BilinearMap.of(bilinear_map.table.transpose(axes))
 
 
 def _evaluate(a, b, *, of):
@@ -102,12 +102,12 @@ def _by_components(a, b, of):
         else:
             sums[i] = sums[i] + product if value > 0 else sums[i] - product
     zero = jnp.zeros((*a.shape[:-1], 1), a.dtype)
-    return jnp.concatenate([zero if own is None else own for own in sums], axis=-1)
+    return jnp.concatenate([zero if component is None else component for component in sums], axis=-1)
 
 
 def _by_columns(a, b, of):
     # Sums of constant columns, with the leading axes of the operands. A reduction of some thousand numbers would be a
-    # library call: with those the accelerations of the rows of a chain of 200 ball joints take 85 µs instead of 18.
+    # library call: the accelerations of the rows of a chain of 200 ball joints would take 85 µs instead of 18.
     table = of.table.astype(a.dtype).reshape(*(1,) * (a.ndim - 1), *of.shape)
 
     def column(j):

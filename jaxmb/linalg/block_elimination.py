@@ -1,10 +1,10 @@
 """Elimination of block-sparse matrices in a given order of their nodes.
 
-Blocks are of one size, and the pattern is symmetric: there is a block for (i, j) if there is one for (j, i).
-`S = L D Lᵀ` of a symmetric matrix and `S = L D U` of another one, real or complex, without a search for pivots:
-positive definite matrices need none, nor do symmetric quasi-definite ones (positive definite in some nodes, negative
-definite in the others); of others the order must be one in which every pivot is regular. One loop executes the steps of
-a stage of the order; each eliminates some nodes at once.
+Blocks are of one size, and the pattern is symmetric: (i, j) has a block if (j, i) has one. The factors are `S = L D Lᵀ`
+of a symmetric matrix, and `S = L D U` of another one, real or complex, without a search for pivots. Positive definite
+matrices need none, nor do symmetric quasi-definite ones (positive definite in some nodes, negative definite in the
+others). For other matrices every pivot must be regular in the given order. One loop executes the steps of a stage of
+the order; each step eliminates some nodes at once.
 
 Sources: J. W. H. Liu, "The multifrontal method for sparse matrix solution", SIAM Review 34(1), 1992; R. J. Vanderbei,
 "Symmetric quasidefinite matrices", SIAM J. Optim. 5(1), 1995.
@@ -26,8 +26,8 @@ class BlockFactor(eqx.Module):
     """A factored matrix; numbers without derivatives.
 
     **Fields:** for each stage, step and lane the `inverses` (steps, b, b, w) of the pivots, and the columns of the
-    pivots (steps, b, b, d, w) in L, `below`, and in Uᵀ, `right`, which is None where the matrix is symmetric; `rest`:
-    the inverse of the dense matrix of the nodes that are left; the `order`.
+    pivots (steps, b, b, d, w) in L, `below`, and in Uᵀ, `right`, which is None for a symmetric matrix; `rest`: the
+    inverse of the dense matrix of the remaining nodes; the `order`.
     """
 
     inverses: tuple[Inexact[Array, "s b b w"], ...]
@@ -72,10 +72,10 @@ class BlockFactor(eqx.Module):
 def eliminate_blocks(
     lower: Inexact[Array, "blocks b b"], order: NodeOrder, upper: Inexact[Array, "blocks b b"] | None = None
 ) -> BlockFactor:
-    """The factor of a matrix from its stored blocks, those of fill zero; see `NodeOrder`.
+    """The factor of a matrix from its stored blocks, with zeros for fill; see `NodeOrder`.
 
-    **Arguments:** `lower`: the blocks whose row is the later node, and those on the diagonal; `upper`: the others of a
-    matrix that is not symmetric, each at the place of the block that mirrors it; on the diagonal anything.
+    **Arguments:** `lower`: the blocks on the diagonal, and the blocks whose row is the later node; `upper`: the other
+    blocks of a matrix that is not symmetric, each at the place of its mirror image; on the diagonal anything.
     """
     sides = [lower] if upper is None else [lower, upper.swapaxes(1, 2)]
     size, dtype = lower.shape[1], lower.dtype
@@ -90,9 +90,9 @@ def eliminate_blocks(
     return BlockFactor(tuple(inverse for inverse, _ in factors), below, right, _dense_inverse(blocks, order), order)
 
 
-# In a step the lanes are the last axis, so that each operation is one on long vectors. The barriers keep XLA from
-# computing an operand of a product anew for each of its entries. Blocks are (n, b, b), those below the diagonal, or, of
-# a matrix that is not symmetric, (n, 2, b, b), with the transposes of those to the right of it.
+# In a step the lanes are the last axis, so that each operation acts on long vectors. The barriers keep XLA from
+# computing an operand of a product again for each entry. Blocks are (n, b, b), below the diagonal; of a matrix that is
+# not symmetric (n, 2, b, b), with the transposes of the blocks to the right of it.
 
 
 def _joined(sides, axis=0):
@@ -115,7 +115,7 @@ def _eliminate(blocks, step):
     ]
     multiples, sides = lax.optimization_barrier((multiples, sides))
     first, second = np.tril_indices(columns.shape[1])
-    # The change of the block (a, b) is L_a times b's part of U, that of (b, a), transposed, is its mirror image.
+    # The change of the block (a, b) is L_a times b's part of U; the change of (b, a), transposed, is its mirror image.
     left = _joined([multiple[:, :, first] for multiple in multiples])
     right = _joined([side[:, :, second] for side in reversed(sides)])
     left, right = lax.optimization_barrier((left, right))
@@ -141,7 +141,7 @@ def _backward(x, step):
 
 
 def _wide_backward(x, step):
-    """As `_backward`, of blocks so wide that their products are not written out."""
+    """As `_backward`, for blocks so wide that their products are not written out."""
     nodes, later, pivot, right = step
     solved = unchecked_take(x, later).T
     change = add_up([right[i] * solved[i, None] for i in range(solved.shape[0])])

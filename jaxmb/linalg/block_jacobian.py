@@ -1,12 +1,12 @@
 """The Jacobian of constraints as blocks of joints on bodies, and its Gram matrix by sparse elimination.
 
-The Gram matrix `A M⁻¹ Aᵀ` couples the joints that share a body. A body of very many joints would couple them all, so
-such a body is a node of the elimination itself, eliminated after the joints that hang on it:
+The Gram matrix `A M⁻¹ Aᵀ` couples the joints that share a body. A body of very many joints would couple them all. Such
+a body is a node of the elimination itself, eliminated after its joints:
 
     [ G    C ] [λ]   [b]       C = A_hubs L⁻ᵀ,   M = L Lᵀ,   G of the other bodies,
     [ Cᵀ  −1 ] [z] = [0]
 
-a symmetric quasi-definite matrix. No other body couples to another through M.
+a symmetric quasi-definite matrix. M couples no other bodies.
 """
 
 import dataclasses
@@ -39,18 +39,18 @@ class JointOrder:
 
     - `rows` (joints, r): index of the rows of each joint among all m; padding has the index m.
     - `kept` (joints, r): whether a row is independent of the others; not of padding.
-    - `place` (m,): index of each row among those of the joints in order, raveled.
-    - `bodies` (joints, k): the bodies; their number for none.
-    - `blocks` (joints, k, r, v): index of their entries among the blocks of all joints as `block_jacobian` takes them;
-        padding has the index of the zero at their end.
-    - `on_bodies`: sums of what joints do to bodies, (joints · k) entries, for each body.
+    - `place` (m,): index of each row among the rows of the joints in order, raveled.
+    - `bodies` (joints, k): the bodies; padding has the number of bodies.
+    - `blocks` (joints, k, r, v): index of their entries among the blocks of all joints as given to `block_jacobian`;
+        padding has the index of the zero at the end.
+    - `on_bodies`: sums of the actions of joints on each body, from (joints · k) entries.
     - `velocity_index` (bodies + 1, v): index of each body's velocities among all n; padding, and the last row, for no
-      body, have the index n.
-    - `velocity_place` (n,): index of each velocity among those of the bodies, raveled.
-    - `first`, `second` (products,): the blocks, by joint and body raveled, whose products make up G; `products`: sums
-        of these for the stored blocks of the matrix.
-    - `hubs` (h,): the bodies that are nodes of their own, after the joints; `on_hubs` (entries,): the blocks, by joint
-        and body raveled, of joints on hubs, and `hub_places` their places among the stored blocks.
+        body, have the index n.
+    - `velocity_place` (n,): index of each velocity among the velocities of the bodies, raveled.
+    - `first`, `second` (products,): the blocks, by joint and body raveled, whose products add up to G; `products`: the
+        sums of products for the stored blocks of the matrix.
+    - `hubs` (h,): the bodies that are nodes, after the joints; `on_hubs` (entries,): the blocks, by joint and body
+        raveled, of joints on hubs, and `hub_places` their places among the stored blocks.
     - `nodes`: the order of elimination of joints and hubs.
     - `left_out`: rows that are not eliminated, and `absolute`: numbers of parts that bind bodies to the world, not only
         to each other; as given.
@@ -84,7 +84,7 @@ class JointOrder:
 
     @property
     def uniform(self) -> bool:
-        """Whether every body has all its velocities, so that those of the bodies are a plain reshape of all."""
+        """Whether every body has all its velocities, so that they are a plain reshape of all velocities."""
         return self.velocity_place.size == self.velocity_index[:-1].size
 
     @property
@@ -93,15 +93,15 @@ class JointOrder:
         return self.kept.reshape(-1)[self.place]
 
     def of_rows(self, numbers: tuple[int, ...]) -> "JointOrder":
-        """The same order with these rows kept at most."""
+        """The same order with at most these rows kept."""
         return dataclasses.replace(self, key=(self.key, numbers), kept=self.kept & np.isin(self.rows, numbers))
 
 
 class BlockJacobian(AbstractJacobian):
-    """Blocks of joints on bodies; products and elimination take a time that the graph of the joints determines, for
-    trees and local loops in proportion to the number of joints.
+    """Blocks of joints on bodies. The graph of the joints determines the time of products and elimination: for trees
+    and local loops it is proportional to the number of joints.
 
-    **Fields:** `blocks` (joints, k, r, v): those of each joint on its bodies; the `order` of elimination.
+    **Fields:** `blocks` (joints, k, r, v): of each joint on its bodies; the `order` of elimination.
     """
 
     blocks: Float[Array, "j k r v"]
@@ -112,8 +112,8 @@ class BlockJacobian(AbstractJacobian):
 
     def on_joints(self, v: Float[Array, "n"]) -> Float[Array, "j r"]:
         """`A v`, joint by joint."""
-        own = unchecked_take(_of_bodies(self.order, v), self.order.bodies)
-        along = vector_products(self.blocks, own)
+        of_bodies = unchecked_take(_of_bodies(self.order, v), self.order.bodies)
+        along = vector_products(self.blocks, of_bodies)
         return functools.reduce(jnp.add, [along[:, k] for k in range(along.shape[1])])
 
     def transpose_product(self, multipliers):
@@ -129,8 +129,8 @@ class BlockJacobian(AbstractJacobian):
         return BlockJacobian(jnp.abs(self.blocks), self.order).product(jnp.abs(v))
 
     def row_norms(self, scale):
-        own = unchecked_take(_of_bodies(self.order, scale), self.order.bodies)
-        return self._all_rows(jnp.sqrt(jnp.sum((self.blocks * own[:, :, None, :]) ** 2, axis=(1, 3))))
+        of_bodies = unchecked_take(_of_bodies(self.order, scale), self.order.bodies)
+        return self._all_rows(jnp.sqrt(jnp.sum((self.blocks * of_bodies[:, :, None, :]) ** 2, axis=(1, 3))))
 
     def gather_rows(self, values):
         return jnp.where(self.order.kept, self._joint_rows(values), 0.0)
@@ -166,7 +166,7 @@ class BlockJacobian(AbstractJacobian):
 
 
 class BlockGram(AbstractPositiveDefinite):
-    """`A M⁻¹ Aᵀ` of the independent rows, and the identity of the others; its vectors are (joints, r)."""
+    """`A M⁻¹ Aᵀ` for independent rows, and the identity for the others; its vectors are (joints, r)."""
 
     jacobian: BlockJacobian
     inertia: AbstractInertia
@@ -183,9 +183,9 @@ class BlockGram(AbstractPositiveDefinite):
         root = _of_bodies(order, self.inertia.root().solve(_units(order, blocks.dtype)))
         scaled = scaled.reshape(joints * k, r, v)
         root = unchecked_take(root, order.bodies.reshape(-1)).swapaxes(1, 2)
-        # Barriers keep XLA from computing the factors anew for each entry of a product.
+        # Barriers keep XLA from computing the factors again for each entry of a product.
         scaled = lax.optimization_barrier(matrix_products(scaled, root))
-        first, second = (unchecked_take(scaled, own) for own in (order.first, order.second))
+        first, second = (unchecked_take(scaled, of_joints) for of_joints in (order.first, order.second))
         first, second = lax.optimization_barrier((first, second))
         products = lax.optimization_barrier(matrix_products(first, second.swapaxes(1, 2)))
         stored = order.products(products)
@@ -201,17 +201,17 @@ class BlockGram(AbstractPositiveDefinite):
         stored = stored + jnp.asarray(_identities(order, size), blocks.dtype)
         shift = None
         if share is not None:
-            own = stored[:joints]
-            largest = jnp.max(jnp.diagonal(own, axis1=1, axis2=2)) + jnp.finfo(blocks.dtype).tiny
+            of_joints = stored[:joints]
+            largest = jnp.max(jnp.diagonal(of_joints, axis1=1, axis2=2)) + jnp.finfo(blocks.dtype).tiny
             shift = share * largest
-            stored = stored.at[:joints].set(own + shift * jnp.eye(size, dtype=blocks.dtype)[None])
+            stored = stored.at[:joints].set(of_joints + shift * jnp.eye(size, dtype=blocks.dtype)[None])
         factor = eliminate_blocks(stored, order.nodes)
-        # The first stored blocks are those on the diagonal.
+        # The first stored blocks are on the diagonal.
         return BlockGramFactor(self, shift, factor, jnp.diagonal(stored[: order.nodes.nodes], axis1=1, axis2=2))
 
 
 class BlockGramFactor(AbstractPositiveFactor):
-    """A factored Gram matrix: that of the joints and hubs, and the `diagonal` (nodes, b) before elimination."""
+    """A factored Gram matrix: the factor of joints and hubs, and the `diagonal` (nodes, b) before elimination."""
 
     matrix: BlockGram
     shift: Any

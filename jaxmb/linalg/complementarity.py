@@ -1,4 +1,4 @@
-"""Linear complementarity problems: `W x + b ≥ 0`, `x ≥ 0`, of which one is zero for each component.
+"""Linear complementarity problems: `W x + b ≥ 0`, `x ≥ 0`, and for each component one of the two is zero.
 
 Source: R. W. Cottle, J.-S. Pang and R. E. Stone, "The Linear Complementarity Problem", SIAM, 2009, §4.4 (Lemke's
 method).
@@ -11,18 +11,18 @@ from jaxtyping import Array, Bool, Float
 
 from .elimination import solve
 
-# Entries of a column below this multiple of its largest one are rounding errors, and no pivots.
+# Entries of a column below this multiple of its largest one are rounding errors, not pivots.
 PIVOT = 1e-9
 # Right-hand sides are displaced by this multiple of their largest entry, differently in each row, since equal ones
-# could make the method return to where it was.
+# could make the method cycle.
 _APART = 1e-10
 
 
 def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
-    """Which components of the solution are not zero, and whether there is a solution; without derivative.
+    """Which components of the solution are nonzero, and whether there is a solution; without derivative.
 
-    The columns of W of these components are independent, also where W is singular. For a positive semidefinite W there
-    is a solution if any x ≥ 0 has `W x + b ≥ 0`; for others the method may end without one.
+    The columns of W of these components are independent, also for a singular W. For a positive semidefinite W there is
+    a solution if any x ≥ 0 has `W x + b ≥ 0`; for others the method may end without one.
     """
     W, b = lax.stop_gradient((W, b))
     scale = scale_of(W)
@@ -35,59 +35,57 @@ def scale_of(W: Float[Array, "k k"]) -> Float[Array, "k"]:
 
 
 def lemke(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
-    """The same of a W of any symmetry, in units in which its entries are of the size of one."""
+    """The same for a W of any symmetry, in units in which its entries are of the size of one."""
     k, dtype = b.size, b.dtype
     right = b + _APART * jnp.max(jnp.abs(b), initial=0.0) * jnp.asarray(np.arange(1, k + 1) / k, dtype)
     # Columns: w, x, the artificial variable, the right-hand side; `basis`: the variable of each row.
     table = jnp.concatenate([jnp.eye(k, dtype=dtype), -W, -jnp.ones((k, 1), dtype), right[:, None]], axis=1)
 
     def proceed(carry):
-        _, _, left, solvable, count = carry
-        return (left != 2 * k) & solvable & (count < 20 + 10 * k)
+        _, _, leaving, solvable, count = carry
+        return (leaving != 2 * k) & solvable & (count < 20 + 10 * k)
 
     def advance(carry):
-        table, basis, left, _, count = carry
+        table, basis, leaving, _, count = carry
         # At first the artificial variable enters, for the row that is furthest from a solution.
         is_first = count == 0
-        entering = jnp.where(is_first, 2 * k, jnp.where(left < k, left + k, left - k))
+        entering = jnp.where(is_first, 2 * k, jnp.where(leaving < k, leaving + k, leaving - k))
         column, right = table[:, entering], table[:, -1]
         least = PIVOT * jnp.max(jnp.abs(column), initial=0.0)
         ratio = jnp.where(column > least, right / jnp.where(column > least, column, 1.0), jnp.inf)
         ratio = jnp.where(is_first, right, ratio)
-        # Of equal ratios the artificial variable leaves.
+        # Among equal ratios the artificial variable leaves.
         tied = (basis == 2 * k) & (ratio <= jnp.min(ratio) * (1 + 1e-12) + jnp.finfo(dtype).tiny)
         row = jnp.where(jnp.any(tied), jnp.argmax(tied), jnp.argmin(ratio))
         solvable = jnp.isfinite(ratio[row])
         leaves, changes = np.arange(k) == row, solvable & (np.arange(k) == row)
         pivot = table[row] / table[row, entering]
         table = jnp.where(leaves[:, None], 0.0, table) + jnp.where(leaves, 1.0, -column)[:, None] * pivot[None, :]
-        left = jnp.where(solvable, basis[row], left)
-        return table, jnp.where(changes, entering, basis), left, solvable, count + 1
+        leaving = jnp.where(solvable, basis[row], leaving)
+        return table, jnp.where(changes, entering, basis), leaving, solvable, count + 1
 
     # A solution without forces needs no step.
-    left = jnp.where(jnp.min(right) >= 0, 2 * k, -1)
-    first = table, jnp.arange(k), left, jnp.array(True), jnp.array(0)
-    _, basis, left, solvable, _ = lax.while_loop(proceed, advance, first)
-    found = jnp.any(basis[None, :] == np.arange(k, 2 * k)[:, None], axis=1)
-    return found, solvable & (left == 2 * k)
+    leaving = jnp.where(jnp.min(right) >= 0, 2 * k, -1)
+    first = table, jnp.arange(k), leaving, jnp.array(True), jnp.array(0)
+    _, basis, leaving, solvable, _ = lax.while_loop(proceed, advance, first)
+    positive = jnp.any(basis[None, :] == np.arange(k, 2 * k)[:, None], axis=1)
+    return positive, solvable & (leaving == 2 * k)
 
 
 def independent_components(W: Float[Array, "k k"], among: Bool[Array, "k"]) -> Bool[Array, "k"]:
-    """Some components whose columns are independent, of which those of all others among some are combinations; for a
-    positive semidefinite W; without derivative.
-    """
+    """A largest set `among` components with independent columns; for a semidefinite W, without derivative."""
     W, among = lax.stop_gradient((W, among))
     scale = scale_of(W)
 
     def advance(_, carry):
-        # The Cholesky factorisation with pivots: the next one is furthest from the span of those before it.
-        left, found, others = carry
-        rest = jnp.where(others, jnp.diag(left), 0.0)
-        k = jnp.argmax(rest)
-        is_next, pivot = np.arange(among.size) == k, rest[k]
+        # The Cholesky factorisation with pivots: the next component is furthest from the span of the previous ones.
+        reduced, chosen, candidates = carry
+        distances = jnp.where(candidates, jnp.diag(reduced), 0.0)
+        k = jnp.argmax(distances)
+        is_next, pivot = np.arange(among.size) == k, distances[k]
         is_pivot = pivot > PIVOT
-        left = left - left[:, k, None] * (left[k] / jnp.where(is_pivot, pivot, jnp.inf))[None, :]
-        return left, found | (is_next & is_pivot), others & ~is_next
+        reduced = reduced - reduced[:, k, None] * (reduced[k] / jnp.where(is_pivot, pivot, jnp.inf))[None, :]
+        return reduced, chosen | (is_next & is_pivot), candidates & ~is_next
 
     first = W / scale[:, None] / scale[None, :], jnp.zeros_like(among), among
     return lax.fori_loop(0, among.size, advance, first)[1]

@@ -1,11 +1,11 @@
 """Gaussian elimination with full pivoting inside `lax`: which columns depend on which, and the influence matrix.
 
-A constraint Jacobian `A` (m × n) of rank r splits its columns in r dependent and n − r independent ones, `A_d δx_d +
-A_i δx_i = 0`, so `δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ A_i`. Full pivoting chooses the split for
-which H stays of order one, and leaves m − r rows that are implied by the others.
+A constraint Jacobian `A` (m × n) of rank r has r dependent and n − r independent columns, `A_d δx_d + A_i δx_i = 0`. So
+`δx_d = H δx_i` with the influence matrix `H = −A_d⁻¹ A_i`. Full pivoting chooses the split for which H stays of order
+one. The other m − r rows are implied.
 
-Searching for pivots is the expensive part, so it is done only when a chart is made (`full_pivot`); at every other
-state the same split is used without search (`eliminate`). Pivots are integers and carry no derivative; values do.
+Searching for pivots is the expensive part, so it is done only when a chart is made (`full_pivot`); at every other state
+the same split is used without search (`eliminate`). Pivots are integers without a derivative; values have one.
 
 Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension Reduction in Analysis of
 Constrained Dynamic Systems", J. Mech. Design 104(1), 1982.
@@ -81,7 +81,7 @@ class Factor(eqx.Module):
     rows: Int[Array, "r"] | None
 
     def for_matrix(self, matrix: Float[Array, "m n"]) -> "Factor":
-        """The same numbers with the derivatives of the factor of a matrix, of the same value in the same split."""
+        """The same numbers, with the derivatives of the factor of a matrix of the same value in the same split."""
         return _for_matrix(self, matrix)
 
 
@@ -115,8 +115,7 @@ def full_pivot(
         (n,); the matrix is equilibrated with it, and its rows brought to unit norm, before pivots are compared.
     - `level`: rows of level 0 are eliminated before rows of higher levels, shape (m,). This nests the dependent columns
         of nonholonomic rows in the independent columns of the holonomic ones.
-    - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, the nearest of true
-        ranks 1e-4.
+    - `tol`: an equilibrated pivot below this is zero. Default √eps: implied rows give 1e-16, others at least 1e-4.
     """
     m, n = A.shape
     A = lax.stop_gradient(A)
@@ -131,8 +130,8 @@ def full_pivot(
     unused = jnp.iinfo(jnp.int32).max
     rows, columns = jnp.arange(m), jnp.arange(n)
 
-    # The matrix is transposed: XLA finds the largest entry of each row four times as fast so, and the largest of these
-    # faster than that of a matrix.
+    # The matrix is transposed: XLA then finds the largest entry of each row four times as fast, and the largest of
+    # these faster than the largest of a matrix.
     def step(k, carry):
         work, row_order, column_order, smallest, largest, rank = carry
         size = jnp.abs(work)
@@ -145,15 +144,15 @@ def full_pivot(
         of_rows = jnp.max(candidates, axis=0)
         r = jnp.argmax(of_rows)
         c = jnp.argmax(candidates[:, r])
-        here, there = rows == r, columns == c
+        is_row, is_column = rows == r, columns == c
         pivot = of_rows[r]
-        found = pivot > 0
-        ratio = jnp.where(open_row & ~here & found, work[c] / jnp.where(found, work[c, r], 1.0), 0.0)
+        has_pivot = pivot > 0
+        ratio = jnp.where(open_row & ~is_row & has_pivot, work[c] / jnp.where(has_pivot, work[c, r], 1.0), 0.0)
         work = work - ratio[None, :] * work[:, r][:, None]
-        row_order = jnp.where(here & found, k, row_order)
-        column_order = jnp.where(there & found, k, column_order)
-        smallest = jnp.where(found, jnp.minimum(smallest, pivot), smallest)
-        return work, row_order, column_order, smallest, jnp.maximum(largest, pivot), rank + found.astype(rank.dtype)
+        row_order = jnp.where(is_row & has_pivot, k, row_order)
+        column_order = jnp.where(is_column & has_pivot, k, column_order)
+        smallest = jnp.where(has_pivot, jnp.minimum(smallest, pivot), smallest)
+        return work, row_order, column_order, smallest, jnp.maximum(largest, pivot), rank + has_pivot.astype(rank.dtype)
 
     start = (
         work.T,
@@ -170,7 +169,7 @@ def full_pivot(
 
 
 def _places(keys: Int[Array, "n"]) -> Int[Array, "n"]:
-    """The places of numbers in their order, equal ones in the order that they have."""
+    """The places of numbers in ascending order; equal numbers keep their order."""
     index = np.arange(keys.size, dtype=np.int32)
     before = (keys[None, :] < keys[:, None]) | ((keys[None, :] == keys[:, None]) & (index[None, :] < index[:, None]))
     return jnp.sum(before, axis=1, dtype=np.int32)
@@ -182,7 +181,7 @@ def _inverse(permutation: Int[Array, "n"]) -> Int[Array, "n"]:
 
 
 def eliminate(A: Float[Array, "m n"], order: PivotOrder, rank: int) -> Factor:
-    """Eliminate in the order a chart already has, without search; differentiable in `A`.
+    """Eliminate in the order of a chart, without search; differentiable in `A`.
 
     **Arguments:** `A`: the matrix; `order` from `PivotSearch`; `rank`: its rank, static.
     """
@@ -194,7 +193,7 @@ def eliminate(A: Float[Array, "m n"], order: PivotOrder, rank: int) -> Factor:
     if rank == 0:
         return Factor(jnp.zeros((n, m), A.dtype), identity, rows)
     # Each gather by pairs of indices is one kernel, in the layout that the next operation needs. The first is in
-    # bounds; the others clip the indices of independent columns, whose values are not used.
+    # bounds; the others clip the indices of independent columns, whose values are unused.
     swept = gauss_jordan(_gather(A, rows[:, None], order.columns[None, :], "promise_in_bounds"), rank)
     dependent = column < rank
     right_inverse = jnp.where(dependent & (row < rank), _gather(swept, column, row, "clip"), 0.0)
@@ -267,13 +266,13 @@ def _sweep_jvp(primals, tangents):
     inverse = swept[:, :r]
     dinverse = -inverse @ dB[:, :r] @ inverse
     if B.shape[1] == r:
-        # Empty arrays are avoided: jaxlib 0.10.2 has lost its LAPACK calls in programs with products of them.
+        # Empty arrays are avoided: jaxlib 0.10.2 loses its LAPACK calls in programs with products of empty arrays.
         return swept, dinverse
     return swept, jnp.concatenate([dinverse, inverse @ (dB[:, r:] - dB[:, :r] @ swept[:, r:])], axis=1)
 
 
 def gauss_jordan(B: Float[Array, "r n"], r: int) -> Float[Array, "r n"]:
-    """`[B_d⁻¹, B_d⁻¹ B_i]` for `B = [B_d, B_i]` whose first r columns are eliminated on the diagonal, in place."""
+    """`[B_d⁻¹, B_d⁻¹ B_i]` for `B = [B_d, B_i]`, whose first r columns are eliminated on the diagonal, in place."""
     if r == 0:
         return B
     assert B.shape[0] == r
@@ -290,13 +289,15 @@ def positive_solver(M: Float[Array, "n n"]) -> Callable[[Float[Array, "n *k"]], 
 
 
 def solve_positive(M: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """The same for one b."""
+    """The same for a single b."""
     return positive_solver(M)(b)
 
 
 def solve(A: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """`A⁻¹ b` for any regular matrix. Up to forty rows no library is called, for which XLA would leave its loop over
-    steps; one correction gives the residual of an elimination, up to a condition of 1e10.
+    """`A⁻¹ b` for any regular matrix.
+
+    Up to forty rows no library is called, since XLA would leave its loop over steps for the call. One correction gives
+    the residual of an elimination, up to a condition of 1e10.
     """
     n = A.shape[0]
     if n == 0:
@@ -312,7 +313,7 @@ def solve(A: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k
 
 @jax.custom_jvp
 def _inverse_of(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """By elimination with the largest pivot of each column."""
+    """The inverse, by elimination with the largest pivot of each column."""
     n = A.shape[0]
     index = np.arange(n, dtype=np.int32)
 
@@ -340,7 +341,7 @@ def _inverse_of_jvp(primals, tangents):
 def cholesky(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A root L of a symmetric positive definite matrix, `M = L Lᵀ`, lower triangular.
 
-    `L U` with an orthogonal U is another root. Derivatives are those of a root that follows M without staying
+    `L U` with an orthogonal U is another root. The derivatives belong to a root that follows M without staying
     triangular; they are right, to every order, for results that do not depend on the choice of the root.
     """
     n = M.shape[0]

@@ -1,10 +1,9 @@
-"""The order in which the nodes of a symmetric block-sparse matrix are eliminated: graph arithmetic on integers.
+"""The order of elimination of the nodes of a symmetric block-sparse matrix: graph arithmetic on integers.
 
-Nodes that are not neighbours are eliminated together. Each level takes nodes of low degree, so that a chain of n nodes
-needs about log₂ n levels (it is cyclic reduction there), and a tree loses its leaves and its paths at once. A level is
-cut into steps of a fixed number of lanes, so that one loop executes all steps of a stage, and the size of a program
-does not depend on the number of nodes. Where few nodes are left, or most of them are neighbours of each other, they are
-eliminated together as one dense matrix.
+Nodes that are not neighbours are eliminated together. Each level takes nodes of low degree. So a chain of n nodes needs
+about log₂ n levels (cyclic reduction), and a tree loses its leaves and its paths at once. A level is cut into steps of
+a fixed number of lanes. So one loop executes all steps of a stage, and the size of a program does not depend on the
+number of nodes. The last nodes, when few are left or most are neighbours, are eliminated together as one dense matrix.
 
 Sources: J. W. H. Liu, "The role of elimination trees in sparse factorization", SIAM J. Matrix Anal. Appl. 11(1), 1990
 (fill); M. Luby, SIAM J. Comput. 15(4), 1986 (independent sets).
@@ -19,15 +18,15 @@ import numpy as np
 from .digest import digest
 
 _CAPS = (2, 3, 4, 6, 8, 12)
-# Costs of one step of the loop in µs on one core of 2 GHz: of the step itself, and of one multiplication in a lane.
+# Costs in µs on one core of 2 GHz: of one step of the loop, and of one multiplication in a lane.
 _STEP = 1.2
 _FLOP = 0.0006
-# Of a dense matrix: each column costs a step of its own elimination.
+# Costs of a dense matrix: each column is a step of its elimination.
 _DENSE_STEP = 0.15
 _DENSE_FLOP = 0.0003
-# The largest number of nodes that are left for a dense matrix.
+# The largest number of nodes of the dense matrix.
 _LARGEST_REST = 400
-# So many levels are executed in one stage, and avoided where all bounds on the degree are tried.
+# More levels than this are executed in one stage, and avoided if all bounds on the degree are tried.
 _MOST_LEVELS = 128
 _LANES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 
@@ -36,8 +35,8 @@ _LANES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 class Stage:
     """Steps of elimination that one loop executes; in each, w nodes (lanes) that are not neighbours of each other.
 
-    Padding lanes have the index of the node after the last; blocks of padding are the one after the last, which is
-    zero, and for the diagonal the one after that, which is the identity.
+    Padding lanes have the index of the node after the last. Blocks of padding have the index after the last block, a
+    zero block; on the diagonal the next index, the identity.
 
     **Fields:** `nodes` (steps, w): the nodes; `later` (steps, w, d): their neighbours that are eliminated later, in
     order of elimination; `diagonal` (steps, w) and `columns` (steps, w, d): places of their blocks; `targets` (steps,
@@ -57,14 +56,14 @@ class NodeOrder:
 
     **Fields:**
 
-    - `nodes`: their number; `size` of their blocks; `levels`: how many sets of them are eliminated one after the other,
-        before the rest.
-    - `blocks`: the number of stored blocks, original ones and fill, in the lower triangle with respect to the order,
-        those on the diagonal first, in the order of the nodes.
-    - `row`, `column` (blocks,): the nodes of each, the row the later of the two.
+    - `nodes`: their number; `size` of their blocks; `levels`: the number of sets of nodes that are eliminated one after
+        the other, before the rest.
+    - `blocks`: the number of stored blocks, original ones and fill, in the lower triangle with respect to the order;
+        the diagonal blocks come first, in the order of the nodes.
+    - `row`, `column` (blocks,): the nodes of each; the row is the later of the two.
     - `stages`: the steps.
-    - `rest`: the nodes that are eliminated last, as one dense matrix; `rest_blocks` (rest, rest): places of its blocks,
-        those above the diagonal by the place of the transposed block.
+    - `rest`: the nodes that are eliminated last, as one dense matrix; `rest_blocks` (rest, rest): places of its blocks;
+        a block above the diagonal has the place of the transposed block.
     """
 
     key: Any
@@ -97,15 +96,15 @@ def order_nodes(
 
     **Arguments:** `neighbours` of each node, without itself; `size` of a block; `after`: the nodes that must be
     eliminated before each node; `every_bound`: whether to try orders that eliminate nodes of higher degrees at once
-    even if one of low degrees exists, which may follow a chain from its end and take a level for each node.
+    even if a node of low degree exists. Low degrees first may follow a chain and take a level for each node.
     """
     tries = []
     for cap in _CAPS:
-        tries.append(_eliminate([set(own) for own in neighbours], size, cap, after))
+        tries.append(_eliminate([set(adjacent) for adjacent in neighbours], size, cap, after))
         if cap >= tries[-1][3] and not every_bound:
             break
     if every_bound:
-        # On other machines than that of the estimate, steps that wait for each other cost more.
+        # On other machines than the one of the estimate, steps that wait for each other may cost more.
         tries = [tried for tried in tries if len(tried[1]) <= _MOST_LEVELS] or tries
     cost, levels, rest, _ = min(tries, key=lambda tried: tried[0])
     return _laid_out(neighbours, levels, rest, size, cost)
@@ -116,15 +115,15 @@ def _eliminate(graph: list[set[int]], size: int, cap: int, after: Sequence[Itera
     n = len(graph)
     waiting = [0] * n
     followers: list[list[int]] = [[] for _ in range(n)]
-    for node, own in enumerate(after or ()):
-        for first in own:
+    for node, firsts in enumerate(after or ()):
+        for first in firsts:
             waiting[node] += 1
             followers[first].append(node)
     left = set(range(n))
     ready = [k for k in range(n) if not waiting[k]]
     levels, highest = [], 0
     dense = _dense_costs(n, size)
-    # The cost of the levels before each, and of the rest as one dense matrix there.
+    # The cost of the levels so far, and the least total with the remaining nodes as one dense matrix.
     spent, best = 0.0, (dense[n], 0)
     while left:
         candidates = sorted((len(graph[k]), k) for k in ready)
@@ -142,13 +141,13 @@ def _eliminate(graph: list[set[int]], size: int, cap: int, after: Sequence[Itera
         left -= chosen
         entries = []
         for node in level:
-            own = graph[node]
-            highest = max(highest, len(own))
-            entries.append((node, tuple(own)))
-            for k in own:
+            adjacent = graph[node]
+            highest = max(highest, len(adjacent))
+            entries.append((node, tuple(adjacent)))
+            for k in adjacent:
                 other = graph[k]
                 other.discard(node)
-                other |= own
+                other |= adjacent
                 other.discard(k)
             for k in followers[node]:
                 waiting[k] -= 1
@@ -174,7 +173,7 @@ def _step_flops(d, size):
 
 
 def _level_cost(entries, size):
-    d = max(len(own) for _, own in entries)
+    d = max(len(adjacent) for _, adjacent in entries)
     return min(-(-len(entries) // w) * (_STEP + w * _FLOP * _step_flops(d, size)) for w in _LANES)
 
 
@@ -194,8 +193,8 @@ def _laid_out(neighbours, levels, rest, size, cost):
     sorted_levels = []
     for level in levels:
         entries = []
-        for node, own in level:
-            later = sorted(own, key=rank.__getitem__)
+        for node, adjacent in level:
+            later = sorted(adjacent, key=rank.__getitem__)
             columns = [place(k, node) for k in later]
             targets = [place(a, b) if a != b else diagonal[a] for i, a in enumerate(later) for b in later[: i + 1]]
             entries.append((node, later, columns, targets))
@@ -210,8 +209,9 @@ def _laid_out(neighbours, levels, rest, size, cost):
 
 
 def _cut(levels, size, most=2):
-    """Levels grouped in at most so many stages, each of one number of lanes and one of later neighbours. (A third stage
-    saves no time in chains, trees and nets of up to 10 000 bodies, and takes 10 to 25 % longer to compile.)
+    """Levels grouped in at most `most` stages, each with one number of lanes and one of later neighbours.
+
+    (A third stage saves no time in chains, trees and nets of up to 10 000 bodies, and compiles 10 to 25 % longer.)
     """
     count = len(levels)
     if not count:
@@ -237,8 +237,8 @@ def _cut(levels, size, most=2):
             for a in range(b):
                 before = best.get((stages - 1, a))
                 if before is not None:
-                    own, w = cost(a, b)
-                    options.append((before[0] + own + 5.0, [*before[1], (a, b, w)]))
+                    stage_cost, w = cost(a, b)
+                    options.append((before[0] + stage_cost + 5.0, [*before[1], (a, b, w)]))
             if options:
                 best[stages, b] = min(options, key=lambda o: o[0])
     chosen = min((best[stages, count] for stages in range(1, most + 1) if (stages, count) in best), key=lambda o: o[0])
@@ -257,10 +257,10 @@ def _stage(part, diagonal_of, n, blocks):
     columns = np.full((len(steps), w, d), blocks, np.int32)
     targets = np.full((len(steps), w, d * (d + 1) // 2), blocks, np.int32)
     for s, step in enumerate(steps):
-        for lane, (node, own, blocks_of, changed) in enumerate(step):
+        for lane, (node, neighbours, blocks_of, changed) in enumerate(step):
             nodes[s, lane] = node
             diagonal[s, lane] = diagonal_of[node]
-            later[s, lane, : len(own)] = own
-            columns[s, lane, : len(own)] = blocks_of
+            later[s, lane, : len(neighbours)] = neighbours
+            columns[s, lane, : len(neighbours)] = blocks_of
             targets[s, lane, : len(changed)] = changed
     return Stage(nodes, later, diagonal, columns, targets)

@@ -12,7 +12,7 @@ Tree = TypeVar("Tree")
 
 
 def nan_where(failed: Bool[Array, ""], values: Tree, inputs: PyTree = None) -> Tree:
-    """The values, and NaN where a computation failed, as are their derivatives with respect to all `inputs`, also those
+    """The values, or NaN if a computation failed, and the same for their derivatives by all `inputs`, even by inputs
     that the computation did not reach.
     """
     factor, total = jnp.where(failed, jnp.nan, 1.0), _sum(inputs)

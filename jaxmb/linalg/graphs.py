@@ -1,5 +1,4 @@
-"""Graphs of bodies and joints: what is connected, the biconnected components with the vertices where they meet, and
-shortest loops.
+"""Graphs of bodies and joints: connected and biconnected components, the vertices between these, shortest loops.
 
 Source: J. Hopcroft and R. Tarjan, "Efficient algorithms for graph manipulation", Comm. ACM 16(6), 1973.
 """
@@ -10,7 +9,7 @@ from typing import NamedTuple
 
 
 def connected(count: int, edges: Iterable[Sequence[int]]) -> list[int]:
-    """For each of some vertices the first one that it is connected to, perhaps itself."""
+    """For each vertex the first vertex connected to it, perhaps itself."""
     # A union-find forest, whose trees have their first vertex as the root.
     parent = list(range(count))
 
@@ -20,15 +19,15 @@ def connected(count: int, edges: Iterable[Sequence[int]]) -> list[int]:
             vertex = parent[vertex]
         return vertex
 
-    for own in edges:
-        first = min(map(root, own))
-        for vertex in own:
+    for edge in edges:
+        first = min(map(root, edge))
+        for vertex in edge:
             parent[root(vertex)] = first
     return [root(vertex) for vertex in range(count)]
 
 
 class Component(NamedTuple):
-    """Joints that are on loops together, or a single one: a tree of components, of which each is below one vertex.
+    """Joints that are on loops together, or a single one. Components form a tree, each below one vertex.
 
     **Fields:** the numbers of its `joints`; `top`: the vertex that it shares with components above it, or the root.
     """
@@ -40,15 +39,15 @@ class Component(NamedTuple):
 def components(joints: Sequence[Collection[int]], ground: int) -> list[Component]:
     """The biconnected components, each below its top.
 
-    **Arguments:** `joints`: the bodies of each, the ground among them; `ground`: its number, one more than those of the
-    bodies. The root of a tree is the ground where it is connected to it, else the body of most joints.
+    **Arguments:** `joints`: the bodies of each, the ground among them; `ground`: its number, one more than the last
+    body's. The root of a tree is the ground if it is connected, else the body of most joints.
     """
     # Edges (vertex, other, joint); a joint of three bodies is a triangle of edges.
     adjacent: list[list[tuple[int, int]]] = [[] for _ in range(ground + 1)]
     edges: list[tuple[int, int, int]] = []
     alone: list[tuple[int, int]] = []
-    for joint, own in enumerate(joints):
-        vertices = sorted(set(own))
+    for joint, bodies in enumerate(joints):
+        vertices = sorted(set(bodies))
         if len(vertices) == 1:
             alone.append((joint, vertices[0]))
         for i, a in enumerate(vertices):
@@ -91,25 +90,25 @@ def _search(root, adjacent, edges, depth, out):
             parent = stack[-1][0]
             low[parent] = min(low[parent], low[vertex])
             if low[vertex] >= depth[parent]:
-                own: dict[int, None] = {}
+                on_component: dict[int, None] = {}
                 while True:
                     edge = open_edges.pop()
-                    own[edges[edge][2]] = None
+                    on_component[edges[edge][2]] = None
                     if edge == above:
                         break
-                out.append(Component(tuple(sorted(own)), parent))
+                out.append(Component(tuple(sorted(on_component)), parent))
 
 
 def vertices_before(edges: Sequence[tuple[int, ...]], ground: int) -> list[tuple[int, ...]]:
-    """The vertices that each edge waits for in an elimination: one of a spanning tree for that below it, another one
-    for those of a shortest loop through it.
+    """The vertices that each edge waits for in an elimination. An edge of a spanning tree waits for the vertex below
+    it, another edge for the vertices of a shortest loop through it.
 
-    **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its number, one more than theirs.
+    **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its number, after the last vertex.
     """
     at: list[list[int]] = [[] for _ in range(ground + 1)]
-    vertices = [own if len(own) > 1 else (*own, ground) for own in edges]
-    for edge, own in enumerate(vertices):
-        for vertex in own:
+    vertices = [ends if len(ends) > 1 else (*ends, ground) for ends in edges]
+    for edge, ends in enumerate(vertices):
+        for vertex in ends:
             at[vertex].append(edge)
     before: list[tuple[int, ...]] = [()] * len(edges)
     reached = [False] * (ground + 1)
@@ -126,16 +125,16 @@ def vertices_before(edges: Sequence[tuple[int, ...]], ground: int) -> list[tuple
                     reached[below] = waits[edge] = True
                     before[edge] = (below,)
                     queue.append(below)
-    for edge, own in enumerate(vertices):
+    for edge, ends in enumerate(vertices):
         if not waits[edge]:
-            before[edge] = tuple(vertex for vertex in _shortest_loop(edge, own, at, vertices) if vertex != ground)
+            before[edge] = tuple(vertex for vertex in _shortest_loop(edge, ends, at, vertices) if vertex != ground)
     return before
 
 
-def _shortest_loop(edge, own, at, vertices):
-    """The vertices of a shortest loop through an edge; those of the edge where it is on none."""
-    start, *ends = own
-    found = set(own)
+def _shortest_loop(edge, edge_vertices, at, vertices):
+    """The vertices of a shortest loop through an edge; of the edge alone if it is on none."""
+    start, *ends = edge_vertices
+    on_loop = set(edge_vertices)
     for end in ends:
         above = {start: start}
         queue = collections.deque([start])
@@ -149,5 +148,5 @@ def _shortest_loop(edge, own, at, vertices):
                             queue.append(far)
         while end in above and end != start:
             end = above[end]
-            found.add(end)
-    return found
+            on_loop.add(end)
+    return on_loop

@@ -1,7 +1,7 @@
 """The Jacobian A of the constraints by its structure: one full matrix, or blocks of joints on bodies.
 
-Both have the same interface, so that formulations, projections and assembly are written once. A `MassProjector` solves
-with `A M⁻¹ Aᵀ` by an elimination that follows the structure.
+Both have the same interface, so formulations, projections and assembly are written once. A `MassProjector` solves with
+`A M⁻¹ Aᵀ` by an elimination that follows the structure.
 """
 
 import abc
@@ -20,7 +20,7 @@ from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor,
 from .rotations import norm
 from .sums import unchecked_take
 
-# A solution is refined until its rows are met to this many rounding errors of what adds up in them, or as often.
+# A solution is refined until its rows are met to this many rounding errors of their summands, or this many times.
 _ROUNDING = 512
 _REFINEMENTS = 4
 # Conjugate gradients: reduction of the residual, and largest number of iterations.
@@ -29,9 +29,7 @@ _GRADIENTS = 300
 
 
 class AbstractJacobian(eqx.Module):
-    """The Jacobian A (m × n) of all constraint rows. Some rows may be implied by the others; `gather_rows` keeps the
-    independent ones.
-    """
+    """The Jacobian A (m × n) of all constraint rows, of which some may be implied by others."""
 
     @abc.abstractmethod
     def product(self, v: Float[Array, "n"]) -> Float[Array, "m"]:
@@ -43,7 +41,7 @@ class AbstractJacobian(eqx.Module):
 
     @abc.abstractmethod
     def sizes(self, v: Float[Array, "n"]) -> Float[Array, "m"]:
-        """The sum of the sizes of what adds up in each row of `A v`."""
+        """The sum of the sizes of the terms in each row of `A v`."""
 
     @abc.abstractmethod
     def row_norms(self, scale: Float[Array, "n"]) -> Float[Array, "m"]:
@@ -51,15 +49,15 @@ class AbstractJacobian(eqx.Module):
 
     @abc.abstractmethod
     def gather_rows(self, values: Float[Array, "m"]) -> Float[Array, "*r"]:
-        """The values of the independent rows, in the shape that `gram` takes."""
+        """The values of the independent rows, in the shape for `gram`."""
 
     @abc.abstractmethod
     def scatter_rows(self, values: Float[Array, "*r"]) -> Float[Array, "m"]:
-        """The values of all rows from those of the independent ones: zero for implied rows."""
+        """The values of all rows from the values of the independent ones: zero for implied rows."""
 
     @abc.abstractmethod
     def gram(self, inertia: AbstractInertia) -> AbstractPositiveDefinite:
-        """`A M⁻¹ Aᵀ` of the independent rows."""
+        """`A M⁻¹ Aᵀ` for the independent rows."""
 
     @abc.abstractmethod
     def dense(self) -> "DenseJacobian":
@@ -71,7 +69,7 @@ class AbstractJacobian(eqx.Module):
 
     @abc.abstractmethod
     def selected(self, rank: int, scale: Float[Array, "n"], level: Int[Array, "m"] | None = None) -> "AbstractJacobian":
-        """The same matrix with independent rows selected, as many as the `rank`, where that is not known yet.
+        """The same matrix with as many independent rows selected as the `rank`, unless they are known already.
 
         **Arguments:** `scale` of the columns; `level` of the rows, as in `full_pivot`.
         """
@@ -79,7 +77,7 @@ class AbstractJacobian(eqx.Module):
     @property
     @abc.abstractmethod
     def active(self) -> Float[Array, "m"]:
-        """One for the independent rows, zero for those that they imply."""
+        """One for independent rows, zero for implied ones."""
 
     def projector(self, metric: AbstractInertia, factor: AbstractPositiveFactor | None = None) -> "MassProjector":
         """The projector in a metric M. `factor`: an existing factor of a Gram matrix of the same value."""
@@ -100,10 +98,10 @@ class MassProjector(eqx.Module):
     def solve(self, force: Float[Array, "n"], rows: Float[Array, "m"]) -> tuple[Float[Array, "n"], Float[Array, "m"]]:
         """x and λ of `M x = f + Aᵀ λ`, `A x = b`, for a metric without infinite entries; λ is zero for implied rows.
 
-        Where light bodies are between heavy ones, what the heavy ones add to `A M⁻¹ Aᵀ` is lost in rounding errors of
-        what the light ones do. So x is refined, with the residuals of the rows themselves, until it meets them to
-        rounding errors: one refinement restores all digits for ratios of masses up to 1e8. It is differentiated
-        implicitly, by the equations that it solves.
+        With light bodies between heavy ones, the contribution of the heavy bodies to `A M⁻¹ Aᵀ` is lost in the rounding
+        errors of the light ones. So x is refined with the residuals of the rows until it meets them to rounding errors.
+        One refinement restores all digits for ratios of masses up to 1e8. It is differentiated implicitly, by the
+        equations that it solves.
 
         Source: N. J. Higham, "Accuracy and Stability of Numerical Algorithms", 2nd ed., SIAM, 2002, chapter 12
         (iterative refinement in fixed precision, tested by the componentwise backward error of Oettli and Prager).
@@ -112,7 +110,7 @@ class MassProjector(eqx.Module):
         target = jacobian.gather_rows(rows)
         fixed = lax.stop_gradient(self)
 
-        # One vector of both: the transpose of a solution needs every part of the right-hand side to have a derivative.
+        # One vector for both: the transpose of a solution needs a derivative of every part of the right-hand side.
         join = lambda x, multipliers: jnp.concatenate([x, multipliers.ravel()])
         split = lambda both: (both[:n], both[n:].reshape(target.shape))
 
@@ -162,8 +160,9 @@ class MassProjector(eqx.Module):
         return self.metric.solve(self.jacobian.transpose_product(multipliers))
 
     def cancel(self, residual: Float[Array, "m"]) -> Float[Array, "n"]:
-        """The smallest displacement that changes the rows by `−residual`, to the digits that the factor has: for
-        iterations, which evaluate the residual again. A metric with infinite entries holds these velocities.
+        """The smallest displacement that changes the rows by `−residual`, to the digits of the factor.
+
+        For iterations, which evaluate the residual again. A metric with infinite entries holds these velocities.
         """
         return -self.direction(self.multipliers(residual))
 
@@ -174,15 +173,15 @@ class MassProjector(eqx.Module):
     def null_space_solution(
         self, curved: Callable[[Float[Array, "n"]], Float[Array, "n"]], force: Float[Array, "n"]
     ) -> Float[Array, "n"]:
-        """`v` in the null space of A with `H v + Aᵀ δμ = force`, by projected conjugate gradients, where `curved` gives
-        `H v`. Where a direction of negative curvature is met, what was found until then, or that direction.
+        """`v` in the null space of A with `H v + Aᵀ δμ = force`, by projected conjugate gradients; `curved` is `v -> H
+        v`. At a direction of negative curvature the iteration ends; at the start, with that direction.
 
         Source: N. I. M. Gould, M. E. Hribar and J. Nocedal, "On the solution of equality constrained quadratic
         programming problems arising in optimization", SIAM J. Sci. Comput. 23(4), 2001.
         """
 
         def project(force):
-            # Of a residual only its part along the null space is kept: the constraint forces would grow beside it.
+            # Only the part of a residual along the null space is kept: constraint forces would grow beside it.
             force = force - self.jacobian.transpose_product(self.balancing(force))
             towards = self.metric.solve(force)
             return force, towards - self.direction(self.multipliers(self.jacobian.product(towards)))
@@ -191,16 +190,16 @@ class MassProjector(eqx.Module):
         size = jnp.vdot(force, towards)
 
         def correct(carry):
-            x, left, along, size, k, _ = carry
+            x, remaining, along, size, k, _ = carry
             curve = curved(along)
             curvature = jnp.vdot(along, curve)
             convex = curvature > 0
             length = jnp.where(convex, size / jnp.where(convex, curvature, 1.0), jnp.where(k == 0, 1.0, 0.0))
             x = x + length * along
-            left, towards = project(left - length * curve)
-            new = jnp.vdot(left, towards)
+            remaining, towards = project(remaining - length * curve)
+            new = jnp.vdot(remaining, towards)
             along = towards + jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0) * along
-            return x, left, along, new, k + 1, convex
+            return x, remaining, along, new, k + 1, convex
 
         def proceed(carry):
             return (carry[3] > _REDUCTION**2 * size) & (carry[4] < _GRADIENTS) & carry[5]
@@ -212,8 +211,8 @@ class MassProjector(eqx.Module):
 class DenseJacobian(AbstractJacobian):
     """A full matrix.
 
-    **Fields:** `matrix` (m × n); its `factor` in a chart, or None without one; the independent `rows`, or None where
-    all with these `numbers`, default all rows, are independent and no pivots were searched for.
+    **Fields:** `matrix` (m × n); its `factor` in a chart, or None without one; the independent `rows`, or None if all
+    rows with these `numbers`, default all rows, are independent and no pivots were searched.
     """
 
     matrix: Float[Array, "m n"]
@@ -254,7 +253,7 @@ class DenseJacobian(AbstractJacobian):
         if self.rows is None:
             if self.numbers is None:
                 return values
-            # Zeros at the end for the others.
+            # The other rows take the zero at the end.
             place = np.full(m, len(self.numbers))
             place[list(self.numbers)] = np.arange(len(self.numbers))
             return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), place)

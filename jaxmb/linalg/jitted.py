@@ -14,17 +14,16 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
-# A program that is called a few times compiles in half of the time so.
+# Programs that are called a few times then compile in half the time.
 _FOR_FEW_CALLS = {"xla_backend_optimization_level": 0}
 
 
 def jitted(
     function: Callable[_Arguments, _Result], options: dict[str, Any] | None = None
 ) -> Callable[_Arguments, _Result]:
-    """`jax.jit` of a function of pytrees, whose leaves that are no arrays belong to the program; all leaves of the
-    result are arrays.
+    """`jax.jit` of a function of pytrees. Leaves that are not arrays belong to the program; results have arrays only.
 
-    `equinox.filter_jit` does the same for any function, and takes twice as long to call one of many numbers.
+    `equinox.filter_jit` does the same for any function, and takes twice as long to call a program of many numbers.
 
     **Arguments:** `options` of the compiler.
     """
@@ -33,11 +32,11 @@ def jitted(
 
     def of_arrays(arrays, program):
         structure, rest = program
-        left = iter(arrays)
-        arguments, named = jax.tree.unflatten(structure, [next(left) if x is None else x for x in rest])
+        remaining = iter(arrays)
+        arguments, named = jax.tree.unflatten(structure, [next(remaining) if x is None else x for x in rest])
         return any_function(*arguments, **named)
 
-    # The name that profiles and logs of compilations show.
+    # The name in profiles and logs of compilations.
     of_arrays.__name__ = function.__name__.lstrip("_")
     compiled = jax.jit(of_arrays, static_argnums=1, compiler_options=options)
 
@@ -46,16 +45,14 @@ def jitted(
         leaves, structure = jax.tree.flatten((arguments, named))
         # A pytree has no leaves that are None.
         rest = tuple(None if isinstance(x, ARRAYS) else x for x in leaves)
-        arrays = [x for x, own in zip(leaves, rest, strict=True) if own is None]
+        arrays = [x for x, static in zip(leaves, rest, strict=True) if static is None]
         return compiled(arrays, (structure, rest))
 
     return called
 
 
 def on_host(function: Callable[_Arguments, Any]) -> Callable[_Arguments, Any]:
-    """`jitted` of a function of concrete numbers that is called a few times, with a result in NumPy, also while JAX
-    traces something else.
-    """
+    """`jitted` for concrete numbers and a few calls, with a result in NumPy, even while JAX traces something else."""
     program = jitted(function, _FOR_FEW_CALLS)
 
     @functools.wraps(function)

@@ -1,4 +1,4 @@
-"""Functions of many members, computed for as many at once as the cache of a core holds."""
+"""Functions of many members, computed for as many at once as fit in the cache of a core."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,15 +8,16 @@ import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
-# As many states of a motion are computed at once as have matrices that fit in these bytes, and at least so many.
-# (Projecting 512 states on the constraints, µs for each with 1, 8, 64 and all at once: four-bar 5.4, 2.8, 2.1, 2.7;
-# Andrews' mechanism 20, 18, 20, 36; a chain of 100 links 100, 83, 122, 340; a tree of 300 links 246, 247, 446, 1222.)
+# As many states of a motion are computed at once as have matrices that fit in these bytes, and at least the second
+# number. (Projecting 512 states on the constraints, µs for each with 1, 8, 64 and all at once: four-bar 5.4, 2.8, 2.1,
+# 2.7; Andrews' mechanism 20, 18, 20, 36; a chain of 100 links 100, 83, 122, 340; a tree of 300 links 246, 247, 446,
+# 1222.)
 _CACHE, _FEWEST = 2**17, 8
 
 
 def in_blocks(function: Callable[[PyTree], PyTree], members: PyTree, most: int) -> PyTree:
-    """A function of members along axis 0 of all arrays, as `jax.vmap` of one of a single member is, applied to at most
-    `most` of them at once, one block after the other. The last block is filled up with the last member.
+    """Apply a function of members along axis 0 of all arrays, such as a `jax.vmap`, to at most `most` members at once,
+    one block after the other. Copies of the last member fill up the last block.
     """
     count = jax.tree.leaves(members)[0].shape[0]
     number = -(-count // most)
@@ -25,21 +26,23 @@ def in_blocks(function: Callable[[PyTree], PyTree], members: PyTree, most: int) 
     together = -(-count // number)
     places = np.minimum(np.arange(number * together), count - 1)
     blocks = jax.tree.map(lambda x: x[places].reshape(number, together, *x.shape[1:]), members)
-    found = lax.map(function, blocks)
-    return jax.tree.map(lambda x: x.reshape(number * together, *x.shape[2:])[:count], found)
+    results = lax.map(function, blocks)
+    return jax.tree.map(lambda x: x.reshape(number * together, *x.shape[2:])[:count], results)
 
 
 def vmap_states(function: Callable[..., Any], numbers: int) -> Callable[..., Any]:
-    """`jax.vmap` of a function of the states of a motion, along axis 0 of all arrays; on a CPU in blocks that fit the
-    cache. A loop over blocks costs a tenth more to compile in a derivative, so few states have none.
+    """`jax.vmap` of a function of the states of a motion, along axis 0 of all arrays; on a CPU in blocks of the cache's
+    size.
 
-    **Arguments:** `numbers`: how many there are in the largest matrix of a state.
+    A loop over blocks takes a tenth longer to compile in a derivative, so few states are not divided.
+
+    **Arguments:** `numbers`: the size of the largest matrix of a state.
     """
     together, most = jax.vmap(function), max(_CACHE // (8 * max(numbers, 1)), _FEWEST)
 
     def of_all(*states):
         if jax.default_backend() != "cpu":
             return together(*states)
-        return in_blocks(lambda own: together(*own), states, most)
+        return in_blocks(lambda block: together(*block), states, most)
 
     return of_all

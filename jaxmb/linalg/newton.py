@@ -58,16 +58,16 @@ def chord(
 ) -> tuple[PyTree, Int[Array, ""], Bool[Array, ""]]:
     """Newton's method with one matrix for all corrections.
 
-    Corrections shrink by a constant factor, so the size of the next one is known and needs no iteration. The iteration
-    ends where the next correction is below `tol`, or at the level of rounding errors, where corrections stop shrinking;
-    it fails where a correction is too large.
+    Corrections shrink by a constant factor, so the size of the next correction is known without iterating. The
+    iteration ends if the next correction is below `tol`, or at the level of rounding errors, where corrections stop
+    shrinking. It fails if a correction is too large.
 
-    **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size that the
-    first correction is compared with (1: the error of the matrix is as large as the first correction; 0: unknown, and a
+    **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size to which
+    the first correction is compared (1: the error of the matrix is as large as the first correction; 0: unknown, and a
     second correction is made); `tol`; `most`: the largest number of corrections; `rate`: a lower bound of the factor by
     which they shrink; `rounding`: the size below which they may stop shrinking, default some thousand rounding errors;
-    `peel`: whether the first correction precedes the loop, which saves half a microsecond where corrections are small
-    programs, and compiles them twice.
+    `peel`: whether the first correction precedes the loop, which saves half a microsecond for small programs, and
+    compiles them twice.
 
     **Returns:** the last iterate, the number of corrections, and whether the iteration failed.
     """

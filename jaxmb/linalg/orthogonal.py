@@ -1,8 +1,8 @@
 """Orthonormal bases of the range of a matrix and of its complement, by Householder reflections inside `lax`.
 
-A basis is unique only up to a rotation within its span, and so is its derivative; the derivatives here have no such
+A basis is unique only up to a rotation within its span, and so is its derivative; the derivatives here contain no such
 rotation (parallel transport). Results that do not depend on the choice, such as projections, pseudo-inverses and
-solutions, have their true derivatives of every order; single columns have none.
+solutions, have true derivatives of every order; single columns have none.
 
 Source: G. H. Golub and V. Pereyra, "The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose
 Variables Separate", SIAM J. Numer. Anal. 10(2), 1973.

@@ -1,4 +1,4 @@
-"""Symmetric positive definite matrices by their structure: factored once, solved with as often as needed."""
+"""Symmetric positive definite matrices by their structure: factored once, for any number of solutions."""
 
 import abc
 from typing import TYPE_CHECKING, Any
@@ -25,15 +25,16 @@ class AbstractPositiveDefinite(eqx.Module):
 
     @abc.abstractmethod
     def eliminate(self, share: Float[ArrayLike, ""] | None = None) -> "AbstractPositiveFactor":
-        """Eliminate once, for any number of right-hand sides. With a `share`, this one of the largest entry is added to
-        the diagonal, so that implied rows have a pivot.
+        """Eliminate once, for any number of right-hand sides.
+
+        **Arguments:** `share`: this share of the largest entry is added to the diagonal, for pivots of implied rows.
         """
 
 
 class AbstractPositiveFactor(eqx.Module):
-    """A factored matrix. The `matrix` carries derivatives; the numbers of its elimination carry none.
+    """A factored matrix. The `matrix` carries derivatives; the numbers of its elimination do not.
 
-    **Fields:** `matrix`; `shift`: what was added to its diagonal before it was eliminated, None for nothing.
+    **Fields:** `matrix`; `shift`: the number added to its diagonal before elimination, None for nothing.
     """
 
     matrix: AbstractVar[Any]
@@ -45,15 +46,15 @@ class AbstractPositiveFactor(eqx.Module):
 
     @abc.abstractmethod
     def smallest_pivot(self) -> Float[Array, ""]:
-        """The smallest pivot of a Gram matrix relative to its diagonal, between 0 (a row implied by those before it)
+        """The smallest pivot of a Gram matrix relative to its diagonal, between 0 (a row implied by the rows before it)
         and 1 (a row orthogonal to them).
         """
 
     def refined(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """`(T + shift)⁻¹ b`, substituted and refined once: pivots of implied rows are small, and amplify roundings."""
         x = self.substitute(b)
-        rest = b - self.matrix.product(x)
-        return x + self.substitute(rest if self.shift is None else rest - self.shift * x)
+        residual = b - self.matrix.product(x)
+        return x + self.substitute(residual if self.shift is None else residual - self.shift * x)
 
     def solve(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """`T⁻¹ b`, differentiated implicitly, by the equation `T x = b`."""

@@ -1,4 +1,4 @@
-"""Tangents of values as arrays, zeros where a value does not depend on what moves."""
+"""Tangents of values as arrays, zeros for values that do not depend on the moving numbers."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 
 def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:
-    """The tangent of a function's value, zeros where it does not depend on what moves."""
+    """The tangent of a function's value, with zeros for None."""
     value, tangent = eqx.filter_jvp(function, at, along)
     if isinstance(value, tuple):
         return tuple(dense(*both) for both in zip(tangent, value, strict=True))

@@ -1,7 +1,7 @@
 """Reciprocal square roots whose derivatives, of any order, are products.
 
-XLA compiles a root or a quotient that several numbers need as a kernel of its own. The rules of JAX for `sqrt` and for
-quotients have another quotient in every derivative; here one root serves the value and all of them.
+XLA compiles a root or a quotient that several numbers need as a separate kernel. JAX's rules for `sqrt` and quotients
+add another quotient in every derivative; here one root serves the value and all derivatives.
 """
 
 from typing import Any

@@ -85,7 +85,7 @@ def rotation_matrix(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 @jax.custom_jvp
 def _square(p):
-    """The nine entries of the matrix, a quadratic form: its derivative is one product, where a bilinear map has two."""
+    """The nine entries of the matrix, a quadratic form: its derivative is one product, not two."""
     return _ROTATION(p, p)
 
 

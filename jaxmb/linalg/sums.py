@@ -1,7 +1,7 @@
 """Entries at static places, and sums of entries by static places, each the transpose of the other.
 
-Both are gathers alone. The transpose of JAX's own gather is a scatter, which XLA makes a loop on processors, and which
-is slow on other devices: they were a quarter of the kernels of a gradient in space.
+Both consist of gathers. The transpose of JAX's gather is a scatter, which XLA compiles to a loop on CPUs, and which is
+slow on other devices. Scatters were a quarter of the kernels of a gradient in space.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from .._compat import define_linear
 from .digest import digest
 
-# Entries of one place that one pass adds up; more take another pass, so the work is proportional to the entries.
+# The number of entries of a place that one pass adds up; more take another pass: the work is proportional to them.
 _WIDTH = 4
 
 
@@ -40,22 +40,22 @@ class PlacedSums:
 
 
 def placed_sums(place: Int[np.ndarray, "e"], places: int) -> PlacedSums:
-    """From the place of each entry; entries with a place out of bounds are left out."""
+    """The sums by the place of each entry; entries with a place out of bounds are dropped."""
     passes = []
     if np.array_equal(place, np.arange(places)):
         return PlacedSums(digest([]), ())
     kept = np.flatnonzero((place >= 0) & (place < places))
     order, entries = kept[np.argsort(place[kept], kind="stable")], place.size
     while True:
-        own = place[order]
-        counts = np.bincount(own, minlength=places)
-        number = np.arange(own.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        ordered_places = place[order]
+        counts = np.bincount(ordered_places, minlength=places)
+        number = np.arange(ordered_places.size) - np.repeat(np.cumsum(counts) - counts, counts)
         last = np.max(counts, initial=0) <= _WIDTH
-        # The sum that each entry is part of: of its place, or of its place and of its group of entries there.
+        # The sum that contains each entry: of its place, or of its group of entries at that place.
         groups = np.ones(places, int) if last else -(-counts // _WIDTH)
         first = np.cumsum(groups) - groups
         index = np.full((int(groups.sum()), min(_WIDTH, max(1, np.max(counts, initial=0)))), entries, np.int32)
-        index[first[own] + number // _WIDTH, number % _WIDTH] = order
+        index[first[ordered_places] + number // _WIDTH, number % _WIDTH] = order
         passes.append(index)
         if last:
             break
@@ -65,7 +65,7 @@ def placed_sums(place: Int[np.ndarray, "e"], places: int) -> PlacedSums:
 
 
 def with_entries(values: Float[Array, "n"], places: Int[np.ndarray, "e"], entries: Float[Array, "e"]) -> Array:
-    """A copy of values with other entries at static places, all different."""
+    """A copy of the values with new entries at static places, all different."""
     return jnp.where(np.isin(np.arange(values.size), places), placed_sums(places, values.size)(entries), values)
 
 
@@ -92,7 +92,7 @@ def _gather(values, index, lead):
 
 
 def _sums_of_entries(cotangent, shape, *, of, lead):
-    """The cotangent of the values, whose shape is given, from that of the entries at an index."""
+    """The cotangent of the values, of the given shape, from the cotangent of the entries at an index."""
     end = lead + of.index.ndim
     entries = cotangent.reshape(*cotangent.shape[:lead], of.index.size, *cotangent.shape[end:])
     sums = placed_sums(of.index.ravel(), shape[lead])

@@ -1,12 +1,12 @@
 """Policies that keep the state on its constraints.
 
 Dense linear algebra suits up to some tens of bodies: `Partition`, which integrates independent coordinates. Scenes of
-many joints use sparse elimination, which follows the graph of bodies and joints, in time proportional to the number of
-bodies where loops are local: chains, trees, rings, nets, bodies with many branches. From 30 constraint rows on (150
-where rows are redundant) `simulate` chooses `Projection` with `Adams`, and from 40 velocities on with `Hermite`, which
-eliminates bodies on stiff springs along with the joints; `print(system)` reports this choice and the order of
-elimination. Joint friction costs O(n³) in the number n of constraint rows with friction. `Hermite` needs dense
-matrices for friction, servos and internal states.
+many joints use sparse elimination, which follows the graph of bodies and joints. Its time is proportional to the number
+of bodies if loops are local: chains, trees, rings, nets, bodies with many branches. From 30 constraint rows on (150 if
+rows are redundant) `simulate` chooses `Projection` with `Adams`. From 40 velocities on it does so with `Hermite`, which
+eliminates bodies on stiff springs along with the joints. `print(system)` reports this choice and the order of
+elimination. Joint friction costs O(n³) in the number n of constraint rows with friction. `Hermite` needs dense matrices
+for friction, servos and internal states.
 """
 
 from ..contacts.guards import contact_guards as contact_guards

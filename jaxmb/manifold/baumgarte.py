@@ -28,9 +28,9 @@ class Baumgarte(AbstractManifold):
     motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Baumgarte(rate=20.0))
     ```
 
-    Constraints between positions satisfy `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, those between velocities `ψ̇ + rate ψ = 0`: the
-    state is near the constraints, not on them, and a rate much above that of the motion makes the equations stiff. For
-    comparison with `Partition`, which needs no such number.
+    Constraints between positions satisfy `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, constraints between velocities `ψ̇ + rate ψ =
+    0`. The state is near the constraints, not on them, and a rate much faster than the motion makes the equations
+    stiff. For comparison with `Partition`, which needs no such number.
 
     **Arguments:** `rate` [1/s] > 0.
     """
@@ -49,7 +49,7 @@ class Baumgarte(AbstractManifold):
         return diffrax.ODETerm(StabilisedField(system, formulation, self.rate)), solver
 
     def correction(self, interpolated):
-        # How far the states are off the constraints is of interest, and stays.
+        # The distance from the constraints is of interest, and stays.
         return normalize_state
 
 

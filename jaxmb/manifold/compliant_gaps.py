@@ -26,5 +26,5 @@ class CompliantGaps(AbstractGaps):
 
 
 def compliant_gaps(system: AbstractEquation) -> CompliantGaps | None:
-    """The gaps of a system's forces; None where none of them has a gap."""
+    """The gaps of a system's forces; None if no force has a gap."""
     return CompliantGaps(system) if system.has_gaps else None

@@ -1,12 +1,12 @@
-"""The constraints at a state, and return to them from a state close by.
+"""The constraints at a state, and return to them from a nearby state.
 
-A step of a multistep method evaluates at a prediction, and then at a corrected state beside it. Only the first of them
-needs an elimination: with the factor of the prediction, Newton's method (with one matrix, the chord method) restores
-positions and velocities, and corrects the accelerations of the prediction. Each correction leaves an error of the size
-of the distance between the two states, so at tolerances of 1e-6 and below the first one of each suffices.
+A step of a multistep method evaluates at a prediction, and then at a corrected state beside it. Only the prediction
+needs an elimination. With its factor, Newton's method with one matrix (the chord method) restores positions and
+velocities, and corrects the accelerations of the prediction. Each correction leaves an error of the size of the
+distance between the two states. So at tolerances of 1e-6 and below one correction of each suffices.
 
-Derivatives follow from the equations at the state that is found, with a factor of that state, by the implicit function
-theorem, not from the algorithm: they are independent of the formulation, and cannot pick up a frozen iterate.
+Derivatives follow by the implicit function theorem from the equations at the restored state, with a factor of that
+state. They do not depend on the algorithm or the formulation, and cannot contain a frozen iterate.
 """
 
 import abc
@@ -26,10 +26,10 @@ from ..system.instant import Instant
 
 
 class AbstractConstraints(eqx.Module):
-    """The constraints that are active, linearised at an instant.
+    """The active constraints, linearised at an instant.
 
     A chart solves for the dependent coordinates and velocities and keeps the independent ones; a projector makes the
-    smallest changes in a metric. What they do to residuals is linear, so JAX transposes it.
+    smallest changes in a metric. Both are linear in the residuals, so JAX transposes them.
     """
 
     @abc.abstractmethod
@@ -46,9 +46,7 @@ class AbstractConstraints(eqx.Module):
 
     @abc.abstractmethod
     def push_positions(self, at: Instant, along: Instant) -> Float[Array, "nq"]:
-        """The tangent of restored coordinates, from the instant of this linearisation and its tangent before they are
-        restored.
-        """
+        """The tangent of restored coordinates, from the tangent of the instant before the restoration."""
 
     @abc.abstractmethod
     def cancel_velocities(self, residual: Float[Array, "m"]) -> Float[Array, "nu"]:
@@ -66,20 +64,20 @@ class AbstractConstraints(eqx.Module):
     def cancel_residuals(
         self, at: Instant, multipliers: Float[Array, "m"], rows: Float[Array, "m"], forces: Float[Array, "nu"]
     ) -> tuple[Float[Array, "nu"], Float[Array, "k"] | None]:
-        """The change of accelerations, together with one of the multipliers λ, that changes `A u̇ − γ` by `−rows` and
-        `M u̇ − F − Aᵀ λ − C(λ)` by `−forces`; and the change of the multipliers that C depends on, None without any.
+        """The change of accelerations that, with a change of the multipliers λ, changes `A u̇ − γ` by `−rows` and `M u̇
+        − F − Aᵀ λ − C(λ)` by `−forces`; and the change of the multipliers that C depends on, None without any.
         """
 
 
-# The constraints linearised at an instant, a pytree.
+# A function that linearises the constraints at an instant, a pytree.
 Linearise: TypeAlias = Callable[[Instant], AbstractConstraints]
 
 
 class SolvedState(eqx.Module):
     """A state whose equations of motion are solved; constants.
 
-    **Fields:** the `constraints` there; the accelerations `udot`; the `multipliers`, or None if they are not known; in
-    a chart those that friction depends on.
+    **Fields:** the `constraints` there; the accelerations `udot`; the `multipliers`, or None if unknown; in a chart the
+    multipliers that friction depends on.
     """
 
     constraints: AbstractConstraints
@@ -90,9 +88,9 @@ class SolvedState(eqx.Module):
 class RestoredState(eqx.Module):
     """A state on the constraints and its accelerations.
 
-    **Fields:** `q`, `u`, `udot`; `multipliers`, or None if they are not known, in a chart those that friction depends
-    on; the number of `iterations` for positions and whether any iteration `failed`, None in tangents, as are
-    multipliers that friction does not depend on.
+    **Fields:** `q`, `u`, `udot`; `multipliers`, or None if unknown, in a chart the multipliers that friction depends
+    on; the number of `iterations` for positions and whether any iteration `failed`. The latter two are None in
+    tangents, as are multipliers that friction does not depend on.
     """
 
     q: Coordinates
@@ -103,35 +101,35 @@ class RestoredState(eqx.Module):
     failed: Bool[Array, ""] | None = None
 
 
-# Wrapped in a compiled function, so that it is traced once for all its places.
+# A nested program, so that it is traced once for all its uses.
 @eqx.filter_jit
 def restore(at: Instant, near: SolvedState, tol: Scalar) -> RestoredState:
     """Restore a state to the constraints and find the accelerations there.
 
-    Derivatives are exact in a chart; those of a projector for a state on the constraints, and off them wrong by the
-    size of the displacement.
+    Derivatives are exact in a chart. Those of a projector are exact for a state on the constraints, and off them wrong
+    by the size of the displacement.
 
-    **Arguments:** `at`: near the constraints, where a chart keeps the independent entries of the state; `near`: a state
-    close by at the same time; `tol`: size of the corrections that are left out, relative to the system's size, its
-    speed and its accelerations.
+    **Arguments:** `at`: near the constraints; a chart keeps the independent entries of the state; `near`: a nearby
+    state at the same time; `tol`: the size of omitted corrections, relative to the system's size, speed and
+    accelerations.
     """
-    # The factor of the other state solves the equations, but only that of this state differentiates them.
+    # The factor of the nearby state solves the equations, but only the factor of this state differentiates them.
     return implicitly(near.constraints.at, at, near.constraints.restore(*lax.stop_gradient((at, near, tol))))
 
 
 def solved(linearise: Linearise, at: Instant, udot: Float[Array, "nu"], memory: Memory = None) -> RestoredState:
-    """A state on the constraints with its accelerations, all known, with the derivatives that `restore` gives them."""
+    """A known state on the constraints with its known accelerations, with the derivatives of `restore`."""
     return implicitly(linearise, at, RestoredState(at.q, at.u, udot, memory))
 
 
 @eqx.filter_custom_jvp
-def implicitly(linearise: Linearise, at: Instant, found: RestoredState) -> RestoredState:
-    """A state that satisfies the constraints and the equations of motion, with the derivatives that these give it.
+def implicitly(linearise: Linearise, at: Instant, restored: RestoredState) -> RestoredState:
+    """A state that satisfies the constraints and the equations of motion, with its derivatives by them.
 
-    **Arguments:** `at`: the instant that it was restored from; `found`: the state, whose derivatives do not count.
+    **Arguments:** `at`: the instant that it was restored from; `restored`: the state, whose derivatives are ignored.
     """
     del linearise, at
-    return found
+    return restored
 
 
 @implicitly.def_jvp
@@ -148,7 +146,7 @@ def _implicitly_jvp(primals, tangents):
 def rates_along(
     linearise: Linearise, at: Instant, udot: Float[Array, "nu"], along: State | None
 ) -> tuple[State, State, State]:
-    """A state with its rate, both known, and the rate of that, as `AbstractManifoldTerm.along_solution` has them."""
+    """A known state with its known rate, and the rate of the latter, as of `AbstractManifoldTerm.along_solution`."""
     if along is None:
         out = solved(linearise, at, udot)
         at, udot = at.with_(q=out.q, u=out.u), out.udot
@@ -162,9 +160,9 @@ def rates_along(
 
 @eqx.filter_custom_jvp
 def _accelerated(linearise, at, udot, along):
-    """A known state as `solved` has it, and the rate of its accelerations along a rate of the state.
+    """A known state as of `solved`, and the rate of its accelerations along a rate of the state.
 
-    Derivatives are those of the equations of motion, and of these differentiated in time, so that no factor is
+    Derivatives follow from the equations of motion and from their derivative in time, so that no factor is
     differentiated. Friction must not depend on multipliers.
     """
     return RestoredState(at.q, at.u, udot), _rates(linearise(at), at, udot, along)[1]
@@ -218,5 +216,5 @@ def _on_constraints(here, at, along):
 
 
 def dense_along(along: Instant, at: Instant) -> Instant:
-    """The tangent of an instant, zeros for None in coordinates and velocities."""
+    """The tangent of an instant, with zeros for None in coordinates and velocities."""
     return along.with_(q=dense(along.q, at.q), u=dense(along.u, at.u))

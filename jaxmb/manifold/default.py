@@ -1,4 +1,4 @@
-"""The policy of a simulation that names none, and the one of systems without constraints."""
+"""The default policy of a simulation, and the policy of systems without constraints."""
 
 from typing import ClassVar
 
@@ -21,8 +21,8 @@ class Unconstrained(AbstractManifold):
     ```
 
     The policy of systems without constraints. With constraints the integration drifts off them by its error, which is
-    for comparison only: states that are saved are the nearest ones on the constraints. Euler parameters are normalised
-    where they are used, so their length does not matter.
+    for comparison only: saved states are the nearest ones on the constraints. Euler parameters are normalised where
+    they are used, so their length does not matter.
     """
 
     restores: ClassVar[bool] = False
@@ -32,23 +32,23 @@ class Unconstrained(AbstractManifold):
         return diffrax.ODETerm(VectorField(system, formulation)), solver
 
     def correction(self, interpolated):
-        # No step ends on the constraints, and Euler parameters are not of unit length.
+        # Steps do not end on the constraints, and Euler parameters are not of unit length.
         return project_normalized
 
 
-# Defaults, made once: their construction takes as long as all the rest of a call.
+# Defaults, made once: their construction takes as long as the rest of a call.
 _UNCONSTRAINED, _PROJECTION, _PARTITION = Unconstrained(), Projection(), Partition()
 
 
 def default_manifold(
     system: AbstractEquation, solver: diffrax.AbstractSolver, formulation: AbstractFormulation | None
 ) -> AbstractManifold:
-    """The policy that suits a system, a solver, and a formulation if one is given."""
+    """The policy for a system, a solver, and a formulation if one is given."""
     implicit = isinstance(solver, AbstractMultistep) and solver.solves_implicitly
     if system.acceleration_rows == 0:
         return _PROJECTION if implicit and system.implicit_in_blocks else _UNCONSTRAINED
     if not isinstance(solver, AbstractMultistep):
         return _PROJECTION
-    # Block elimination serves multipliers only: it singles out no independent columns.
+    # Block elimination serves multipliers only: it does not select independent columns.
     in_blocks = system.elimination is not None and (formulation is None or formulation.takes_blocks)
     return _PROJECTION if in_blocks and (system.implicit_in_blocks or not implicit) else _PARTITION

@@ -15,20 +15,20 @@ from ..formulations.laws import friction_coupling
 from ..linalg.elimination import full_pivot
 from ..system.instant import Instant
 
-# Result of a step whose end could not be returned to the constraints, until the simulation is diagnosed. It ends a run
-# only where no error estimate shortens the step.
+# The result of a step whose end could not be returned to the constraints, until the simulation is diagnosed. It ends a
+# run only if no error estimate shortens the step.
 NOT_PROJECTED: Any = diffrax.RESULTS.nonlinear_max_steps_reached
 # The same among the results of a motion.
 _NOT_PROJECTED: Any = RESULTS.nonlinear_max_steps_reached
 # A smallest pivot below this at the end of a failed run means that the constraints are losing rank.
 _SINGULAR_PIVOT = 1e-3
-# The same for the coupling of friction with its own reactions, which it is this close to a singular one.
+# The coupling of friction with its own reactions counts as singular if this close to it.
 _SINGULAR_COUPLING = 1e-3
 
 
 def diagnose(at: Instant, singular: Bool[Array, ""], result: Any, failed: Bool[Array, ""]) -> Any:
-    """Tell singular configurations, and failures of Newton's method, from other failures of a simulation whose steps
-    end on the constraints.
+    """Distinguish singular configurations, and failures of Newton's method, from other failures of a simulation whose
+    steps end on the constraints.
 
     **Arguments:** `at` the last state; `singular`: whether the chart there has lost rank already; `result`: a
     `RESULTS`; `failed`: whether it is a failure.
@@ -42,15 +42,15 @@ def diagnose(at: Instant, singular: Bool[Array, ""], result: Any, failed: Bool[A
         pivots = full_pivot(at.jacobian, scale=system.velocity_scale(), level=row_levels(system))
         return jnp.where(pivots.rank < system.acceleration_rank, 0.0, pivots.smallest)
 
-    known = failed & jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.u))
-    pivot = lax.cond(known, smallest_pivot, lambda: jnp.ones((), at.q.dtype))
+    is_finite = failed & jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.u))
+    pivot = lax.cond(is_finite, smallest_pivot, lambda: jnp.ones((), at.q.dtype))
     singular = failed & ((pivot < _SINGULAR_PIVOT) | singular)
     result = RESULTS.where(singular, RESULTS.singular_configuration, result)
     return diagnose_newton(result, failed & ~singular)
 
 
 def diagnose_newton(result: Any, failed: Bool[Array, ""]) -> Any:
-    """Tell failures of Newton's method from others; arguments as in `diagnose`."""
+    """Distinguish failures of Newton's method from others; arguments as in `diagnose`."""
     unsolved = (result == RESULTS.dt_min_reached) | (result == _NOT_PROJECTED)
     return RESULTS.where(failed & unsolved, RESULTS.newton_failed, result)
 
@@ -58,11 +58,11 @@ def diagnose_newton(result: Any, failed: Bool[Array, ""]) -> Any:
 def diagnose_friction(
     at: Instant, formulation: AbstractFormulation, result: Any, failed: Bool[Array, ""]
 ) -> tuple[Any, Float[Array, "k k"]]:
-    """Tell failures where friction has no solution, or more than one.
+    """Detect failures because friction has no solution, or more than one.
 
     **Arguments:** as in `diagnose`.
 
-    **Returns:** the result, and the coupling of friction with its own reactions; zero where it is not the reason.
+    **Returns:** the result, and the coupling of friction with its own reactions; zero if it is not the reason.
     """
     none = jnp.zeros((at.system.friction_rows.size,) * 2, at.q.dtype)
     # Without a search for pivots.

@@ -1,4 +1,4 @@
-"""Jumps of prescribed rates: the velocities after them, and a search for them."""
+"""Jumps of prescribed rates: the velocities after them, and a search for jumps."""
 
 import dataclasses
 from typing import NamedTuple
@@ -17,25 +17,25 @@ from ..system import AbstractEquation
 from ..system.instant import Instant
 from .orthogonal_projection import project_velocities
 
-# Jumps are looked for in this number of intervals in all, and in no fewer between two restarts.
+# Jumps are searched in this number of intervals in all, and in at least the second number between two restarts.
 _INTERVALS, _FEWEST = 256, 16
-# Each row's least smooth place between two restarts is followed; of more places than this, those that look most like
-# jumps. The program follows some at once.
+# Each row's least smooth place between two restarts is followed, up to this number of places, the likeliest jumps
+# first. The program follows some at once.
 _PLACES, _AT_ONCE = 64, 8
-# A place is divided into this number of parts, and three of them are left, this number of times: down to rounding.
+# A place is divided into this number of parts, and three of them are kept, this number of times: down to rounding.
 _PARTS, _ROUNDS = 8, 38
-# Variations smaller than these fractions of the largest value, of their row and of all rows, are not looked at.
+# Variations smaller than these fractions of the largest value, of their row and of all rows, are ignored.
 _VISIBLE, _ROUNDED = 1e-6, 1e-11
-# At a jump the second difference of the changes is at least this fraction of the largest change, and this fraction of
-# that is left in the end; of a smooth function next to nothing is.
+# At a jump the second difference of the changes is at least the first fraction of the largest change. At least the
+# second fraction of that change remains in the end; of a smooth function next to nothing remains.
 _UNEVEN, _LEFT = 0.02, 0.01
-# Rows are looked at with this number of coordinates beside those of the state.
+# Rows are examined at this number of configurations beside the state's.
 _OTHERS = 2
 
 
 def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*batch"]:
-    """The next larger number, or smaller one for a direction of −1, as solvers have it that stop just before a jump:
-    after zero the least normal number.
+    """The next larger number, or the next smaller one for a direction of −1; next to zero the least normal number, as
+    in solvers that stop just before a jump.
     """
     sign = jnp.asarray(direction, t.dtype)
     return jnp.where(t == 0, sign * jnp.finfo(t.dtype).tiny, jnp.nextafter(t, sign * jnp.inf))
@@ -44,14 +44,15 @@ def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*
 def after_jumps(
     t: Float[Array, "*batch"], jumps: Float[Array, "jumps"], t0: Scalar, t1: Scalar
 ) -> Float[Array, "*batch"]:
-    """Times of a run from `t0` to `t1`, those at jumps replaced by the next number, and its last by the one before it;
-    the derivative is one.
+    """Times of a run from `t0` to `t1`, with the next number for times at jumps, and the previous number for the last
+    time; the derivative is one.
 
     They are then on the same side of a jump as the states of a solver that stops just before and restarts just after.
     """
     fixed = lax.stop_gradient(t)
     at_jump = jnp.isin(fixed, jumps, method="binary_search")
-    # A run backward that began before a jump at its start had that time for its last. One without a step has one only.
+    # A run backward from a jump begins at the number before it, which is then its last time. Without a step it has one
+    # time.
     last, earlier = jnp.maximum(t0, t1), next_number(fixed, -1)
     at_end = ((fixed == last) | (earlier == last)) & (t0 != t1)
     moved = jnp.where(at_end, earlier, jnp.where(at_jump, next_number(fixed, 1), fixed))
@@ -61,8 +62,8 @@ def after_jumps(
 def after_impulse(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state just after a time at which prescribed rates jump: `M (u⁺ − u⁻) = Aᵀ Λ`, `ψ(t, q, u⁺) = 0`.
 
-    Where no rate jumps the impulses Λ are zero. Constraints are taken as ideal. Where Newton's method fails, as it can
-    for constraints that are not linear in the velocities, these are NaN.
+    If no rate jumps, the impulses Λ are zero. Constraints are taken as ideal. Velocities are NaN if Newton's method
+    fails, as it can for constraints that are not linear in the velocities.
 
     Source: L. A. Pars, "A Treatise on Analytical Dynamics", Heinemann, 1965 (impulsive motion).
     """
@@ -77,17 +78,20 @@ def found_at_jump(guards: ContactGuards | None, t: Scalar, y: State) -> Event | 
 
 
 def after_jump(
-    system: AbstractEquation, guards: ContactGuards | None, t: Scalar, y: State, found: Event | None = None
+    system: AbstractEquation, guards: ContactGuards | None, t: Scalar, y: State, event: Event | None = None
 ) -> State:
-    """The state after prescribed rates have jumped, or contacts closed or opened; `guards` are None without contacts,
-    and `found` is the event where it is known.
+    """The state after prescribed rates have jumped, or contacts closed or opened.
+
+    **Arguments:** `guards`: None without contacts; `event`: the event, if it is known.
     """
-    return after_impulse(system, t, y) if guards is None else guards.impact(t, y, found=found).after
+    return after_impulse(system, t, y) if guards is None else guards.impact(t, y, event=event).after
 
 
 class Jump(NamedTuple):
-    """A jump of a prescribed rate or of its derivative: the first time after it [s], in the precision of the state, and
-    the number of the `row`, among those of ψ and of A one after the other.
+    """A jump of a prescribed rate or of its derivative.
+
+    **Fields:** `t`: the first time after it [s], in the precision of the state; `row`: its number among the rows of ψ
+    followed by the rows of A.
     """
 
     t: np.floating
@@ -97,30 +101,30 @@ class Jump(NamedTuple):
 def find_jumps(
     system: AbstractEquation, q: Coordinates, t0: Scalar, t1: Scalar, restarts: Float[ArrayLike, "times"]
 ) -> list[Jump]:
-    """Look for times between two others at which prescribed rates, or their derivatives, jump.
+    """Search for times between two others at which prescribed rates, or their derivatives, jump.
 
-    Each row is looked at between each two neighbouring `restarts`. Where its changes in equal intervals are least even
-    is followed into the parts where they remain so, again and again: a smooth function becomes even, one that jumps
+    Each row is examined between each two neighbouring `restarts`. The place with the least even changes in equal
+    intervals is divided, and the least even part is followed, again and again. A smooth function becomes even, a jump
     does not. At most one jump of a row is found between two restarts.
 
-    Coordinates are the same at all times. An angle's row wraps where the prescribed angle is half a turn away from
-    theirs, and its rates jump there. With other coordinates it does so at other times, and what is prescribed jumps at
-    the same ones: so only what is uneven with all of several coordinates counts. Kinks of an angle in space that makes
-    a turn in fewer than about 20 intervals may so be missed.
+    Coordinates are the same at all times. An angle's row wraps where the prescribed angle is half a turn away from the
+    coordinates, and its rates jump there. With other coordinates it wraps at other times, but prescribed rates jump at
+    the same times. So a place counts only if it is uneven with all of several coordinates. Kinks of an angle in space
+    that makes a turn in fewer than about 20 intervals may be missed.
     """
     dtype = q.dtype
     first, last = sorted((np.asarray(t0, dtype), np.asarray(t1, dtype)))
     inside = np.unique(np.asarray(restarts, dtype))
     inside = inside[(inside > first) & (inside < last)]
-    # A restart is no part of the intervals beside it.
+    # A restart is not part of the intervals beside it.
     starts = np.append(first, np.nextafter(inside, np.array(np.inf, dtype)))
     ends = np.append(np.nextafter(inside, np.array(-np.inf, dtype)), last)
     count = max(_INTERVALS // starts.size, _FEWEST)
     shifts = np.random.default_rng(0).standard_normal((_OTHERS, q.size)).astype(dtype)
     shifts = np.concatenate([np.zeros_like(shifts[:1]), shifts])
-    each = [np.asarray(_unevenness(system, q, shift, starts, ends, count)) for shift in shifts]
+    by_shift = [np.asarray(_unevenness(system, q, shift, starts, ends, count)) for shift in shifts]
     # With some coordinates a row may not be defined.
-    uneven = np.nan_to_num(np.fmin.reduce(each))
+    uneven = np.nan_to_num(np.fmin.reduce(by_shift))
     likeness, k = np.max(uneven, axis=1), np.argmax(uneven, axis=1) + 1
     between, rows = np.nonzero(likeness > _UNEVEN)
     order = np.argsort(-likeness[between, rows], kind="stable")[:_PLACES]
@@ -128,17 +132,17 @@ def find_jumps(
     width = (ends[between] - starts[between]) / count
     at = starts[between] + k[between, rows] * width
     a, b = np.maximum(at - width, starts[between]), np.minimum(at + 2 * width, ends[between])
-    found = []
+    all_jumps = []
     for n in range(0, rows.size, _AT_ONCE):
         several = slice(n, n + _AT_ONCE)
-        own = [np.resize(x[several], _AT_ONCE) for x in (a.astype(dtype), b.astype(dtype), rows)]
-        times, jumps = (np.asarray(x)[: rows[several].size] for x in _followed(system, q, shifts, *own))
-        found += [Jump(t, int(row)) for t, jump, row in zip(times, jumps, rows[several], strict=True) if jump]
-    return sorted(found)
+        batch = [np.resize(x[several], _AT_ONCE) for x in (a.astype(dtype), b.astype(dtype), rows)]
+        times, jumps = (np.asarray(x)[: rows[several].size] for x in _followed(system, q, shifts, *batch))
+        all_jumps += [Jump(t, int(row)) for t, jump, row in zip(times, jumps, rows[several], strict=True) if jump]
+    return sorted(all_jumps)
 
 
 def _prescribed(system, q, shift, t):
-    """What ψ and A have where nothing moves, with coordinates that are shifted."""
+    """The residuals of ψ and A where nothing moves, with shifted coordinates."""
     rest = jnp.zeros(system.nu, q.dtype)
     at = Instant(system, t, system.normalize(q + system.coordinate_scale() * shift), rest)
     return jnp.concatenate([at.velocity_residual, at.acceleration_residual(rest)])
@@ -146,7 +150,7 @@ def _prescribed(system, q, shift, t):
 
 @eqx.filter_jit
 def _unevenness(system, q, shift, starts, ends, count):
-    """How much each row looks like a jump in each interval, between all restarts."""
+    """The likeness of each row to a jump in each interval, between all restarts."""
     share = jnp.arange(count + 1, dtype=q.dtype) / count
     grid = starts[:, None] + (ends - starts)[:, None] * share[None]
     values = lax.map(jax.vmap(lambda t: _prescribed(system, q, shift, t)), grid)
@@ -159,7 +163,7 @@ def _unevenness(system, q, shift, starts, ends, count):
 
 @eqx.filter_jit
 def _followed(system, q, shifts, starts, ends, rows):
-    """The times at which rows jump between others, and whether they do."""
+    """The times at which rows jump between given times, and whether they do."""
     share = jnp.arange(_PARTS + 1, dtype=q.dtype) / _PARTS
 
     def follow(a, b, row):
@@ -173,13 +177,13 @@ def _followed(system, q, shifts, starts, ends, rows):
         least = lambda changes: jnp.nan_to_num(jnp.nanmin(jnp.abs(changes) / largest, axis=0))
 
         def narrow(_, ends):
-            grid, own = values(*ends)
-            k = jnp.argmax(least(jnp.diff(own, n=3)))
+            grid, rows_there = values(*ends)
+            k = jnp.argmax(least(jnp.diff(rows_there, n=3)))
             return grid[k], grid[k + 3]
 
-        grid, own = values(*lax.fori_loop(0, _ROUNDS, narrow, (a, b)))
-        left = least(jnp.diff(own))
-        k = jnp.argmax(left)
-        return grid[k + 1], left[k] > _LEFT
+        grid, rows_there = values(*lax.fori_loop(0, _ROUNDS, narrow, (a, b)))
+        remaining = least(jnp.diff(rows_there))
+        k = jnp.argmax(remaining)
+        return grid[k + 1], remaining[k] > _LEFT
 
     return jax.vmap(follow)(starts, ends, rows)

@@ -13,7 +13,7 @@ from ..system import AbstractSystem
 def state_blocks(system: AbstractSystem, rate: Any) -> tuple[Block, ...]:
     """The blocks of a raveled state.
 
-    **Arguments:** `rate`: that of velocities where nothing is known of them, in their natural units [1/s].
+    **Arguments:** `rate`: the expected size of velocities at rest, in their natural units [1/s].
     """
     kinds = np.diff([0, *system.state_ends])
     return (
@@ -24,8 +24,8 @@ def state_blocks(system: AbstractSystem, rate: Any) -> tuple[Block, ...]:
 
 
 def counted_components(system: AbstractSystem) -> tuple[int, ...] | None:
-    """The indices of the components of a raveled state whose sizes and errors count: all but the modes of contacts and
-    dry friction, which have none; None for all.
+    """The indices of the components of a raveled state whose sizes and errors count, None for all. The modes of
+    contacts and dry friction have no sizes or errors.
     """
     if not system.contacts:
         return None
@@ -37,6 +37,6 @@ def counted_components(system: AbstractSystem) -> tuple[int, ...] | None:
 
 
 def natural_units(system: AbstractSystem, velocities: Float[Array, " nu"], dtype: Any) -> Float[Array, " n"]:
-    """The natural sizes of the components of a raveled state, with given ones of velocities."""
+    """The natural sizes of the components of a raveled state, with the given sizes of velocities."""
     units = [system.coordinate_scale(), velocities, *([system.state_scale()] if system.nz else [])]
     return jnp.concatenate(units).astype(dtype)

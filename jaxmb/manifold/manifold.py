@@ -35,8 +35,8 @@ _MULTIPLIERS, _NULL_SPACE = Multipliers(), NullSpace()
 class AbstractManifold(eqx.Module):
     """A policy that turns a system into a term, and a solver into one that respects the constraints.
 
-    `restores` says whether every step ends on the constraints, `newton_tol` up to which size of the last Newton
-    correction of positions, where it is given, `takes_impulses` whether velocities follow a jump of prescribed rates,
+    `restores` says whether every step ends on the constraints, and `newton_tol`, if given, up to which size of the last
+    Newton correction of positions. `takes_impulses` says whether velocities follow a jump of prescribed rates,
     `uses_charts` whether independent coordinates are chosen.
     """
 
@@ -49,27 +49,25 @@ class AbstractManifold(eqx.Module):
     def prepare(
         self, system: AbstractEquation, formulation: AbstractFormulation, solver: diffrax.AbstractSolver, rtol: Scalar
     ) -> tuple[diffrax.AbstractTerm, diffrax.AbstractSolver]:
-        """The term to integrate and the solver to do it with.
+        """The term to integrate and the solver for it.
 
         **Raises:** `ValueError` for a solver that the policy cannot work with.
         """
 
     def default_formulation(self, system: AbstractEquation) -> AbstractFormulation:
-        """The formulation of a simulation that names none: the cheapest one that the mass matrix allows, of those that
-        need no partition of the velocities.
-        """
+        """The default formulation: the cheapest one without a partition that the mass matrix allows."""
         return _MULTIPLIERS if system.positive_definite_mass else _NULL_SPACE
 
     @abc.abstractmethod
     def correction(self, interpolated: bool) -> Correction | None:
-        """The function that returns saved states to the constraints; None where they are on them already.
+        """The function that returns saved states to the constraints; None if they are on them already.
 
-        **Arguments:** `interpolated`: whether states between steps are among those that are saved.
+        **Arguments:** `interpolated`: whether states between steps are saved.
         """
 
     def contact_tolerance(self, system: AbstractEquation, rtol: Scalar) -> ContactTolerance | None:
-        """What counts as zero where contacts close: gaps up to a thousandth of the tolerance of integration, and up to
-        a given tolerance of positions, relative to the system's size; None without contacts.
+        """The sizes that count as zero when contacts close, relative to the system's size; None without contacts. Gaps
+        count as zero up to a thousandth of the tolerance of integration, and up to a given tolerance of positions.
         """
         if not system.contacts:
             return None
@@ -82,21 +80,19 @@ class AbstractManifold(eqx.Module):
         return {}
 
     def violated(self, system: AbstractEquation, t: Scalar, y: State) -> Any:
-        """Whether the end of a simulation violates rows of the constraints that the policy leaves out; False if it
-        leaves out none.
-        """
+        """Whether the end of a simulation violates constraint rows that the policy omits; False if it omits none."""
         del system, t, y
         return False
 
     def evidence(self, solver_state: Any) -> PyTree[Array]:
-        """What `diagnose` needs of the final state of the solver."""
+        """The data for `diagnose` from the final state of the solver."""
         del solver_state
         return None
 
     def diagnose(
         self, system: AbstractEquation, t: Scalar, y: State, evidence: PyTree[Array], result: Any, failed: Any
     ) -> Any:
-        """The outcome of a simulation that failed, made precise where the policy knows why.
+        """The outcome of a simulation that failed, made precise if the policy knows the reason.
 
         **Arguments:** `t`, `y`: the last state; `evidence` of the solver there; `result`: a `RESULTS`; `failed`:
         whether it is a failure that starts from finite numbers.
@@ -123,15 +119,13 @@ class VectorField(AbstractVectorField):
 
 
 def normalize_state(system: AbstractEquation, t: Scalar, y: State) -> State:
-    """The state with its coordinates' own invariants satisfied."""
+    """The state with normalised coordinates."""
     del t
     return dataclasses.replace(y, q=system.normalize(y.q))
 
 
 def newton_tolerance(given: float | None, rtol: Scalar) -> Any:
-    """Size of the last Newton correction of positions relative to the system's size: as given, or tied to the tolerance
-    of integration.
-    """
+    """The size of the last Newton correction relative to the system's size: as given, or by the tolerance `rtol`."""
     dtype = jnp.result_type(float)
     if given is not None:
         return as_array(given, dtype)

@@ -1,8 +1,8 @@
 """Projection of states on the constraints along the shortest way, with exact derivatives.
 
-`ProjectorConstraints` restore a state from one close by, in the metric of the mass matrix. `project` makes the smallest
-change in the scales of the coordinates; `project_in_metric` the smallest one in any metric of the velocities, by the
-projector of the Jacobian's structure.
+`ProjectorConstraints` restore a state from a nearby one, in the metric of the mass matrix. `project` makes the smallest
+change in the scales of the coordinates. `project_in_metric` makes the smallest change in any metric of the velocities,
+by the projector of the Jacobian's structure.
 
 Source: E. Hairer, C. Lubich and G. Wanner, "Geometric Numerical Integration", §IV.4 (standard projection method).
 """
@@ -30,14 +30,14 @@ _ITERATIONS = 8
 # Corrections shrink at least by this multiple of the distance to the state of the factor, in scales of the coordinates.
 # (Measured in chains of ball joints: up to 4, of accelerations 13.)
 _RATE = 10.0
-# The chord method of `project` may converge slowly where a step is long and no error estimate shortens it.
+# The chord method of `project` may converge slowly after a long step that no error estimate shortens.
 _CHORDS = 32
-# Newton's method ends with a correction that is not measured, so the one before may be of this power of eps.
+# Newton's method ends with an unmeasured correction, so the previous correction may be of this power of eps.
 _MEASURED = 0.6
-# The last measured correction of velocities that constraints are not linear in, relative to the speed, as a power of
-# eps: the error that is left is of the size of its square.
+# The last measured correction of velocities for nonlinear constraints, relative to the speed, as a power of eps: the
+# remaining error is of the size of its square.
 _MEASURED_SPEED = 0.4
-# Corrections of velocities near constraints that are not linear in them, and those that follow from farther away.
+# The number of corrections of velocities near constraints not linear in them, and of further ones from far away.
 _FEW, _MORE = 3, 5
 
 
@@ -47,9 +47,7 @@ def projector_constraints(at: Instant) -> "ProjectorConstraints":
 
 
 class ProjectorConstraints(AbstractConstraints):
-    """Constraints that are linear in velocities, by the `projector` at coordinates `q` in the metric of the mass
-    matrix.
-    """
+    """Constraints linear in velocities, by the `projector` at coordinates `q` in the metric of the mass matrix."""
 
     q: Coordinates
     projector: MassProjector
@@ -73,8 +71,8 @@ class ProjectorConstraints(AbstractConstraints):
             step = fixed.cancel(at.with_(u=u).velocity_residual)
             return u + step, _largest(step, scale) / speed
 
-        # Velocities and accelerations are known to rounding errors of all that adds up to them. Both equations are
-        # linear, so that corrections may be large: those of a body at rest are all that there is.
+        # Velocities and accelerations are exact to the rounding errors of their summands. Both equations are linear, so
+        # corrections may be large: for a body at rest nothing else remains.
         rounding, any_size = jnp.finfo(start.dtype).eps ** 0.5, jnp.inf
         u, _, failed_u = chord(
             turn, at.u, first=one, tol=tol, most=_ITERATIONS, rate=rate, rounding=rounding, largest=any_size
@@ -87,8 +85,8 @@ class ProjectorConstraints(AbstractConstraints):
             _, multipliers = x
             free = given + inertia.solve(here.constraint_force(multipliers))
             change = -fixed.multipliers(here.acceleration_residual(free))
-            # What the constraints add to free accelerations is the size that shrinks with the distance. Those of a
-            # light body between heavy ones are off by much more than its acceleration changes.
+            # The part that the constraints add to free accelerations shrinks with the distance. For a light body
+            # between heavy ones it is wrong by much more than the body's acceleration changes.
             step = fixed.direction(change)
             return (free + step, multipliers + change), _largest(step, scale) / strength
 
@@ -138,23 +136,21 @@ def _nonzero(size):
 
 
 def project_normalized(system: AbstractEquation, t: Scalar, y: State) -> State:
-    """`project` from coordinates that need not satisfy their own invariants, such as interpolated ones."""
+    """`project` from coordinates that need not be normalised, such as interpolated ones."""
     return project(system, t, normalize_state(system, t, y))
 
 
 def project(system: AbstractEquation, t: Scalar, y: State) -> State:
-    """The state on the constraints that a scaled orthogonal correction reaches; differentiable to every order where the
-    Jacobian is one dense matrix. Where Newton's method fails the state and its derivatives are NaN.
+    """The state on the constraints after a scaled orthogonal correction; differentiable to every order if the Jacobian
+    is one dense matrix. The state and its derivatives are NaN if Newton's method fails.
     """
-    found, failed = projected(system, t, y)
+    projected_state, failed = projected(system, t, y)
     factor = jnp.where(failed, jnp.nan, 1.0)
-    return jax.tree.map(lambda x: x * factor.astype(x.dtype), found)
+    return jax.tree.map(lambda x: x * factor.astype(x.dtype), projected_state)
 
 
 def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Bool[Array, ""]]:
-    """The state that `project` reaches, and whether Newton's method failed; a state that was not found has no meaning,
-    and finite derivatives.
-    """
+    """The state of `project`, meaningless but finite after a failure, and whether Newton's method failed."""
     eps, at = jnp.finfo(y.q.dtype).eps, Instant.of(system, jnp.asarray(t, y.q.dtype), y)
     failed = jnp.array(False)
     if system.elimination is not None:
@@ -181,7 +177,7 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
 
 def project_velocities(at: Instant, metric: AbstractInertia) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
     """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed, as it
-    can where ψ is not linear in them.
+    can if ψ is not linear in them.
     """
     system = at.system
 
@@ -202,7 +198,7 @@ def project_velocities(at: Instant, metric: AbstractInertia) -> tuple[Float[Arra
         return ~(_largest(change, scale) <= small * _largest(u, scale))
 
     def go_on(u):
-        # Derivatives need all corrections, and a loop whose length is not known keeps none.
+        # Derivatives need all corrections, and a loop of unknown length keeps none.
         u, changes = lax.scan(corrected, u, length=_MORE)
         return u, is_far(u, changes[-1])
 
@@ -215,15 +211,15 @@ def _is_finite(y: Instant) -> Bool[Array, ""]:
 
 
 def independent_rows(jacobian: Array, scale: Array, rank: int) -> Any:
-    """Indices of as many independent rows as the rank."""
+    """Indices of independent rows, as many as the rank."""
     return slice(None) if jacobian.shape[0] == rank else full_pivot(jacobian, scale=scale).order.rows[:rank]
 
 
 def _multipliers(residual, gram: Array, unscaled: Array) -> tuple[Array, Bool[Array, ""]]:
     """The root of the residual, by the chord method from zero multipliers, and whether it failed; then they are zero.
 
-    **Arguments:** `gram`: the derivative of the residual at zero, with the other sign; `unscaled`: the displacement of
-    the coordinates that the multipliers make, in scales of the coordinates.
+    **Arguments:** `gram`: minus the derivative of the residual at zero; `unscaled`: the displacement of the coordinates
+    by the multipliers, in scales of the coordinates.
     """
     start = jnp.zeros(gram.shape[0], gram.dtype)
     gram, unscaled = lax.stop_gradient((gram, unscaled))
@@ -236,8 +232,8 @@ def _multipliers(residual, gram: Array, unscaled: Array) -> tuple[Array, Bool[Ar
 
         unknown = jnp.zeros((), start.dtype)
         x, _, failed = chord(correct, start, first=unknown, tol=64 * eps, most=_CHORDS, rounding=eps**0.5)
-        # The derivative at a root that was not found would not be finite. The flag is a number, since JAX gives a truth
-        # value no tangent of the right type here.
+        # After a failure the derivative would not be finite. The flag is a number, since JAX gives a truth value no
+        # tangent of the right type here.
         return jnp.where(failed, start, x), failed.astype(x.dtype)
 
     x, failed = lax.custom_root(residual, start, solve, solve_linear, has_aux=True)
@@ -251,9 +247,9 @@ def project_in_metric(
 
     Derivatives are exact for a state on the constraints, and off them wrong by the size of the displacement.
 
-    **Arguments:** `metric_of(at)`: the metric at an instant; `linearized_at`: the projector at a state close by, whose
-    derivatives do not count, for a chord method; None for Newton's method; `tol`: size of the last correction, relative
-    to the system's size.
+    **Arguments:** `metric_of(at)`: the metric at an instant; `linearized_at`: the projector at a nearby state, whose
+    derivatives are ignored, for a chord method, or None for Newton's method; `tol`: the size of the last correction,
+    relative to the system's size.
 
     **Returns:** the instant, the projector there, the number of iterations, and whether they failed.
     """
@@ -270,7 +266,7 @@ def project_in_metric(
 
     moved = lambda q, step: before.with_(q=q).moved(step).q
     if fixed is None:
-        found, own, iterations, failed = _by_newton(projector_at, correction, moved, before, tol)
+        projected_q, projector_there, iterations, failed = _by_newton(projector_at, correction, moved, before, tol)
     else:
 
         def correct(q):
@@ -278,20 +274,20 @@ def project_in_metric(
             return moved(q, step), size
 
         first = jnp.ones((), at.q.dtype)
-        found, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
-        own = projector_at(found)
-    # The solution depends on the state that it was found from as one Newton correction at it does, with constant
-    # matrices. What coordinates are normalised by has no part in it: constraints hold for normalised ones.
+        projected_q, iterations, failed = chord(correct, before.q, first=first, tol=tol, most=_ITERATIONS)
+        projector_there = projector_at(projected_q)
+    # The solution depends on the initial state like one Newton correction at the solution, with constant matrices. The
+    # norm of unnormalised coordinates does not enter: constraints hold for normalised ones.
     start = at.system.normalize(at.q)
-    at = at.with_(q=found + (start - lax.stop_gradient(start)))
-    at = at.moved(own.displacement(-at.position_rows))
-    here = at.binding_velocities.projector(metric_of(at), own.factor)
+    at = at.with_(q=projected_q + (start - lax.stop_gradient(start)))
+    at = at.moved(projector_there.displacement(-at.position_rows))
+    here = at.binding_velocities.projector(metric_of(at), projector_there.factor)
     return at.with_(u=at.u + here.displacement(-at.velocity_rows)), here, iterations, failed
 
 
 def _by_newton(projector_at, correction, moved, start, tol):
     """Coordinates whose Newton correction is below `tol`, with the projector there, the number of iterations, and
-    whether they failed. The loop starts with no correction, so that its program holds one elimination only.
+    whether they failed. The loop starts with an empty correction, so that its program contains a single elimination.
     """
 
     def advance(carry):
@@ -303,16 +299,16 @@ def _by_newton(projector_at, correction, moved, start, tol):
         return q, step, projector, size, jnp.where(rounded, 0.0, size), k + 1
 
     def proceed(carry):
-        _, _, _, size, left, k = carry
-        return (k == 0) | ((left > tol) & (size < 1.0) & (k < _ITERATIONS))
+        _, _, _, size, ahead, k = carry
+        return (k == 0) | ((ahead > tol) & (size < 1.0) & (k < _ITERATIONS))
 
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(projector_at, start.q))
     far = jnp.full((), jnp.inf, start.q.dtype)
-    q, _, projector, _, left, k = lax.while_loop(
+    q, _, projector, _, ahead, k = lax.while_loop(
         proceed, advance, (start.q, jnp.zeros_like(start.u), empty, far, far, jnp.array(0))
     )
-    failed = ~(left <= tol)
-    # Derivatives at a root that was not found would not be finite.
+    failed = ~(ahead <= tol)
+    # After a failure derivatives would not be finite.
     q = jnp.where(failed, start.q, q)
     projector = jax.tree.map(lambda x: jnp.where(failed, jnp.ones((), x.dtype), x), projector)
     return q, projector, k, failed

@@ -2,10 +2,11 @@
 
 A step evaluates twice. `acceleration` takes predicted coordinates close to the manifold and factors the Jacobian there:
 the one elimination of the step. `ChartConstraints` take the corrected state, keep its independent coordinates and
-velocities, solve `Φ = 0` and `ψ = 0` for the dependent ones, and find the accelerations there by one Newton correction
-of those of the prediction: it needs no Jacobian and no elimination, and costs a fifth. Where no state nearby has been
-evaluated, `restore_positions` is followed by `acceleration`. Its derivatives are those of the equations at their
-solution, and the factors that these need have the derivatives of their matrices, so higher derivatives are right.
+velocities, and solve `Φ = 0` and `ψ = 0` for the dependent ones. One Newton correction of the prediction's
+accelerations gives the accelerations there, without a Jacobian and an elimination, at a fifth of the cost.
+
+Without an evaluation nearby, `restore_positions` is followed by `acceleration`. Derivatives follow from the equations
+at their solution, and the factors have the derivatives of their matrices, so higher derivatives are right.
 
 Sources: R. A. Wehage and E. J. Haug, J. Mech. Design 104(1), 1982; P. E. Nikravesh and I. S. Chung, J. Mech. Design
 104(4), 1982; P. E. Nikravesh and E. J. Haug, J. Mech. Transm. Autom. Des. 105(3), 1983 (nonholonomic).
@@ -58,22 +59,22 @@ else:
 # A stored position factor is refreshed after this many steps, or when Newton's method takes this many iterations.
 _AGE = 4
 _SLOW = 3
-# It is of no use where the nearness to a loss of rank has changed by this factor since it was made, nor on the other
-# side of that position: there one of this state takes its place. (A parallelogram in space that lies flat several
-# times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40 cases end soon after that position, as Newton's
-# method fails at steps of any length; with this none of 200.)
+# The stored factor is useless if the nearness to a loss of rank has changed by this factor since it was made, and on
+# the other side of that position. A factor of the present state then replaces it. (A parallelogram in space that lies
+# flat several times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40 cases end soon after that position, as
+# Newton's method fails at steps of any length; with this replacement none of 200.)
 _MOVED = 1.5
 # A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten
 # seconds: 1e-7 with 4, 1e-8 with 2 and 4e-9 with 1.1, at 664, 628 and 623 steps. A chain of ten rods makes 19 charts
 # in 1200 steps.)
 _GROWTH = 1.1
-# The same for the solution of the rows that were kept. Where others are redundant, the kept ones can lose rank at a
-# position where all of them do not, and H shows nothing of it.
+# The same for the solution of the kept rows. If other rows are redundant, the kept rows can lose rank at a position
+# where all rows together do not, and H does not show it.
 _ROW_GROWTH = 4.0
-# No step ends nearer to a position where the rows lose rank than it began, by this factor: at its end round-off would
-# be divided by the cube of the distance, and the steps after it would creep. The retry, of 0.7 of the length, ends at a
-# third of the distance, and the next step crosses. (Linkages that lie flat several times, 60 speeds: without this nine
-# end there at rtol 1e-10, and energies are off by up to 7e-4 at 1e-6; with it none, and 2e-6.)
+# No step ends nearer, by this factor, to a position where the rows lose rank than it began. Otherwise round-off at its
+# end would be divided by the cube of the distance, and the next steps would creep. The retry, of 0.7 of the length,
+# ends at a third of the distance, and the next step crosses. (Linkages that lie flat several times, 60 speeds: without
+# this bound nine end there at rtol 1e-10, and energies are off by up to 7e-4 at 1e-6; with it none, and 2e-6.)
 _NEARER = 8.0
 # Redundant rows may be violated by this multiple of Newton's tolerance, or of the pivots that count as zero.
 _ALLOWED = 8.0
@@ -82,9 +83,9 @@ _ALLOWED = 8.0
 class ConstrainedAcceleration(eqx.Module):
     """Velocities on the manifold of their coordinates, and accelerations.
 
-    **Fields:** `u`, `udot`; the `factor` of the velocities' Jacobian; that of `every` row of A, None where none binds
-    accelerations only; the `memory` of the system's laws; whether these `failed` to determine the accelerations. The
-    factors are without derivatives.
+    **Fields:** `u`, `udot`; the `factor` of the velocities' Jacobian; the factor of `every` row of A, None if no row
+    binds accelerations only; the `memory` of the system's laws; `failed`: whether the laws failed to determine the
+    accelerations. The factors have no derivatives.
     """
 
     u: Velocities
@@ -95,7 +96,7 @@ class ConstrainedAcceleration(eqx.Module):
     failed: Bool[Array, ""]
 
 
-# Wrapped in a compiled function, so that it is traced once for all its places.
+# A nested program, so that it is traced once for all its uses.
 @eqx.filter_jit
 def acceleration(at: Instant, formulation: AbstractFormulation, split: AbstractSplit) -> ConstrainedAcceleration:
     """Accelerations at coordinates on the manifold or near it.
@@ -104,8 +105,8 @@ def acceleration(at: Instant, formulation: AbstractFormulation, split: AbstractS
     """
     out = _acceleration(*lax.stop_gradient((at, formulation, split)))
     linearise = eqx.Partial(_at_coordinates, split, out.factor, out.every)
-    found = implicitly(linearise, at, RestoredState(at.q, out.u, out.udot, out.memory))
-    return ConstrainedAcceleration(found.u, found.udot, out.factor, out.every, found.multipliers, out.failed)
+    solution = implicitly(linearise, at, RestoredState(at.q, out.u, out.udot, out.memory))
+    return ConstrainedAcceleration(solution.u, solution.udot, out.factor, out.every, solution.multipliers, out.failed)
 
 
 def _acceleration(at, formulation, split):
@@ -125,9 +126,9 @@ def _acceleration(at, formulation, split):
 
 
 def _at_coordinates(split, factor, every, at):
-    """The constraints of velocities and accelerations at coordinates as they are, by the factors of `acceleration`."""
+    """The constraints of velocities and accelerations at fixed coordinates, by the factors of `acceleration`."""
     if not at.system.linear:
-        # Those are of other velocities, on which the Jacobian depends.
+        # The given factors belong to other velocities, on which the Jacobian depends.
         here = _chart_constraints(split, at)
         factor, every = here.factor, here.every
     factor = factor.for_matrix(at.jacobian[: at.system.velocity_rows])
@@ -146,9 +147,9 @@ def _chart_constraints(split, at):
 class ChartConstraints(AbstractConstraints):
     """The constraints in a chart: independent coordinates and velocities keep their values.
 
-    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`, `Independent` where coordinates stay
-    as they are; the factor of `every` row of A, None where none binds accelerations only; whether the split's matrix is
-    known to be `outdated`.
+    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`, `Independent` for fixed coordinates;
+    the factor of `every` row of A, None if no row binds accelerations only; `outdated`: whether the split's matrix is
+    known to be useless.
     """
 
     factor: Factor
@@ -158,16 +159,16 @@ class ChartConstraints(AbstractConstraints):
 
     def restore(self, at, near, tol):
         q, iterations, failed = restore_positions(at, self.split, self.outdated, tol)
-        # The factor is wrong by the distance of the two states, so the first correction leaves its square, and the
-        # second its cube.
+        # The factor is wrong by the distance of the two states: the first correction leaves its square, the second its
+        # cube.
         right_inverse, at = self.factor.right_inverse, at.with_(q=q)
         at = at.with_(u=at.u - right_inverse @ at.velocity_residual)
         if not at.system.linear:
             step = right_inverse @ at.velocity_residual
             at = at.with_(u=at.u - step)
             failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(at.u))))
-        # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`. The accelerations are wrong by
-        # the square of the distance; by the distance only where a multiplier that friction depends on changes its sign.
+        # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`. The accelerations are then
+        # wrong by the square of the distance, or by the distance where a reaction with friction changes its sign.
         rows = at.acceleration_residual(near.udot)
         unbalanced = self._unbalanced(at, near)
         multipliers = self._of_accelerations.right_inverse.T @ unbalanced
@@ -184,7 +185,7 @@ class ChartConstraints(AbstractConstraints):
         return self._of_accelerations.right_inverse.T @ self._unbalanced(at, restored)
 
     def _unbalanced(self, at, solution):
-        """`M u̇ − F − C`, the forces that ideal constraints have to balance, from the memory of the laws."""
+        """`M u̇ − F − C`, the forces that ideal constraints must balance, from the memory of the laws."""
         return at.inertia.product(solution.udot) - laws_of(at.system).applied(at, solution.multipliers)
 
     def push_positions(self, at, along):
@@ -198,7 +199,7 @@ class ChartConstraints(AbstractConstraints):
         return self.factor if self.every is None else self.every
 
     def _cancelling(self, inertia):
-        """`(rows, forces) -> change`, what `cancel_residuals` does without C."""
+        """`(rows, forces) -> change`, the function of `cancel_residuals` without C."""
         factor = self._of_accelerations
         solve = positive_solver(factor.null_space.T @ inertia.product(factor.null_space))
 
@@ -217,7 +218,7 @@ class ChartConstraints(AbstractConstraints):
         change = cancel(rows, forces)
         if places.size == 0:
             return change, None
-        # Friction answers a change of the multipliers that it depends on, and so changes them again.
+        # Friction responds to a change of the multipliers that it depends on, and so changes them again.
         frictions = jax.jacfwd(at.friction_force)(unchecked_take(multipliers, places)).T
         responses = jax.vmap(lambda force: cancel(jnp.zeros_like(rows), -force))(frictions)
         balance = unchecked_take(self._of_accelerations.right_inverse.T, places)
@@ -240,19 +241,19 @@ class Partition(AbstractManifold):
 
     There are `nq − rank Φ_q` independent coordinates and `nu − rank [Φ; ψ]` independent velocities; with nonholonomic
     constraints these are two nested charts. Only independent components are integrated; the others satisfy the
-    constraints to Newton's tolerance at the end of every step. The error of a step is measured on all of them. A chart
-    is replaced when its influence matrix H has grown by the factor `max_influence`, or when redundant rows would serve
-    better than those it keeps; the solver's history is that of all components, so a new chart costs no restart. No step
-    ends much nearer to a position where rows lose rank, as where a linkage lies flat, than it began: it is made
-    shorter, so that the next one passes over that position.
+    constraints to Newton's tolerance at the end of every step. The error of a step is measured on all components. A
+    chart is replaced when its influence matrix H has grown by the factor `max_influence`, or when redundant rows would
+    serve better than the kept ones. The solver's history contains all components, so a new chart needs no restart. No
+    step ends much nearer than it began to a position where rows lose rank, such as a linkage that lies flat. It is made
+    shorter, so that the next step passes over that position.
 
-    The formulation finds the accelerations of predicted states; those of corrected states follow by one step of
-    Newton's method with the same factor.
+    The formulation finds the accelerations of predicted states; the accelerations of corrected states follow by one
+    step of Newton's method with the same factor.
 
     **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to its value when the chart was made,
-    whichever is larger: errors of the independent components reach the dependent ones multiplied by H and its
-    rates; `newton_tol`: size of the last Newton correction relative to the system's size, default tied to the
-    tolerance of integration.
+    whichever is larger: errors of the independent components reach the dependent ones multiplied by H and its rates;
+    `newton_tol`: size of the last Newton correction relative to the system's size, default tied to the tolerance of
+    integration.
     """
 
     max_influence: float = eqx.field(static=True, default=_GROWTH)
@@ -293,14 +294,12 @@ class Partition(AbstractManifold):
         result = diagnose(Instant.of(system, t, y), singular, result, failed)
         if violation is None:
             return result
-        # Steps were refused until they led up to the violation that is allowed.
+        # Steps were refused until they reached the allowed violation.
         return RESULTS.where(failed & (violation > 0.5), RESULTS.inconsistent_constraints, result)
 
 
 class RedundantRows(eqx.Module):
-    """The `sizes` of the rows of ψ, and the `violation` of redundant ones at the end of the last step relative to what
-    is allowed.
-    """
+    """The `sizes` of the rows of ψ, and the `violation` of redundant rows in units of the allowed one."""
 
     sizes: Float[Array, "velocity_rows"]
     violation: Float[Array, ""]
@@ -309,9 +308,9 @@ class RedundantRows(eqx.Module):
 class Chart(eqx.Module):
     """The index sets with their quality and counters.
 
-    **Fields:** `split`; `quality` at the last evaluation and at the `fresh` chart: largest scaled |H|, with redundant
-    rows the largest entry of the solution of the kept ones, and the `nearness` to a loss of rank, in `fresh` that where
-    the position factor was made; `counters`: see the properties; `redundant`: None where all rows are independent;
+    **Fields:** `split`; `quality` at the last evaluation and of the `fresh` chart: the largest scaled |H|; with
+    redundant rows the largest entry of the solution of the kept ones; and the `nearness` to a loss of rank, in `fresh`
+    as of the position factor; `counters`: see the properties; `redundant`: None if all rows are independent;
     `multipliers`: the memories of the system's laws at the prediction of the last step and at its end, None without
     any.
     """
@@ -325,12 +324,12 @@ class Chart(eqx.Module):
 
     @property
     def nearness(self) -> Float[Array, ""]:
-        """To a loss of rank: the largest entry on the diagonal of the inverse that elimination ends with."""
+        """The nearness to a loss of rank: the largest diagonal entry of the inverse in the elimination."""
         return self.quality[-1]
 
     @property
     def outdated(self) -> Bool[Array, ""]:
-        """Whether the stored position factor is of no use, so near or so far is a loss of rank."""
+        """Whether the stored position factor is useless, because the nearness to a loss of rank has changed."""
         change = self.nearness / self.fresh[-1]
         return (change > _MOVED) | (change < 1 / _MOVED)
 
@@ -363,14 +362,14 @@ class Chart(eqx.Module):
 class AbstractChartTerm(AbstractConstrainedTerm):
     """A system as a term with charts."""
 
-    # The error is measured on all components: where dependent ones change fast, that of the independent ones alone
+    # The error is measured on all components: if dependent ones change fast, the error of the independent ones alone
     # shows it too late. (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a
     # spatial slider-crank 3107 against 3867.)
 
     max_influence: AbstractVar[float]
 
     def init_chart(self, t, y, args):
-        # A chart of no use, so that charts are chosen in one place.
+        # A useless chart, so that charts are chosen in one place.
         at = lax.stop_gradient(self.at(t, y))
         choose = lambda at: _choose(at, at.coordinate_jacobian)
         split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, at))
@@ -400,7 +399,7 @@ class AbstractChartTerm(AbstractConstrainedTerm):
 
     @abc.abstractmethod
     def _kept(self, chart: Chart, k: int) -> Any:
-        """See `kept`, from the memory of the laws at the prediction of a step, 0, or at its end, 1."""
+        """See `kept`; from the memory of the laws at the prediction of a step, 0, or at its end, 1."""
 
     def kept(self, chart):
         return self._kept(chart, 1)
@@ -411,7 +410,7 @@ class AbstractChartTerm(AbstractConstrainedTerm):
     def chart_after_jump(self, chart):
         if not self.system.contacts:
             return chart
-        # Contacts that close or open make the chart one of other rows.
+        # Contacts that close or open change the rows of the chart.
         return dataclasses.replace(chart, quality=jnp.full_like(chart.quality, jnp.inf))
 
     def free(self, chart):
@@ -437,7 +436,7 @@ class AbstractChartTerm(AbstractConstrainedTerm):
 
 
 class PartitionTerm(AbstractChartTerm):
-    """A constrained system; `at_contact`: what counts as zero there, None without contacts."""
+    """A constrained system; `at_contact`: the sizes that count as zero at contacts, None without contacts."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
@@ -463,13 +462,13 @@ class PartitionTerm(AbstractChartTerm):
     def _kept(self, chart, k):
         return chart.split.orders(), jax.tree.map(lambda memories: memories[k], chart.multipliers)
 
-    def known(self, kept):
+    def linearisation(self, kept):
         split, memory = kept
         return eqx.Partial(_chart_constraints, split), memory
 
 
 class FreeTerm(AbstractChartTerm):
-    """A system without constraints, whose coordinates have invariants at most."""
+    """A system without constraints, whose coordinates may need normalisation."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
@@ -487,12 +486,12 @@ class FreeTerm(AbstractChartTerm):
     def _kept(self, chart, k):
         return chart
 
-    def known(self, kept):
+    def linearisation(self, kept):
         return None
 
 
 def _both(first, second):
-    """Two memories of laws, one after the other."""
+    """Two memories of laws, stacked."""
     return jax.tree.map(lambda *memories: jnp.stack(memories), first, second)
 
 
@@ -505,9 +504,9 @@ def _counted(chart, iterations):
 
 @eqx.filter_jit
 def _updated(at, chart, max_influence):
-    """The chart, refreshed or chosen anew where it has become worse."""
+    """The chart, refreshed or chosen anew if it has become worse."""
     bounds = np.array([max_influence, _ROW_GROWTH])[: chart.fresh.size - 1]
-    # Of no quality, not a number, are charts that are none.
+    # Useless charts have a NaN or infinite quality.
     worse = lambda chart: ~jnp.all(chart.quality[:-1] <= bounds * chart.fresh[:-1])
 
     def renewed(chart, jacobian):
@@ -526,7 +525,7 @@ def _updated(at, chart, max_influence):
         jacobian = at.coordinate_jacobian
         split, of_coordinates = chart.split.refreshed(at.system, jacobian)
         quality = chart.quality.at[:-1].max(of_coordinates)
-        # Only a chart that has been refreshed can be worse.
+        # Only a refreshed chart can be worse.
         fresh, counters = chart.fresh.at[-1].set(chart.nearness), chart.counters.at[0].set(0)
         refreshed = dataclasses.replace(chart, split=split, quality=quality, fresh=fresh, counters=counters)
         return renewed(refreshed, jacobian)
@@ -539,15 +538,15 @@ def _updated(at, chart, max_influence):
 
 @eqx.filter_jit
 def _violation(at, sizes, newton_tol):
-    """The violation of redundant rows relative to what the solution of the others may leave."""
+    """The violation of redundant rows relative to the allowance for the solution of the others."""
     allowed = _ALLOWED * jnp.maximum(newton_tol, jnp.finfo(at.q.dtype).eps ** 0.5)
     return at.violation_of_dropped_rows(sizes) / allowed
 
 
 def _choose(at, of_coordinates):
-    """A chart by full pivoting, its quality, and whether the rank is less than it was when the scene was compiled.
+    """A chart by full pivoting, its quality, and whether the rank is less than when the scene was compiled.
 
-    It may be higher: where the state is on the constraints to Newton's tolerance only, so are redundant rows redundant.
+    The rank may be higher: at a state within Newton's tolerance, redundant rows are only nearly redundant.
     """
     system, jacobian, rows = at.system, at.jacobian, at.system.velocity_rows
     scale, levels = system.velocity_scale(), row_levels(system)
@@ -565,7 +564,7 @@ def _choose(at, of_coordinates):
 
 
 def _velocity_quality(system, solved, order):
-    """The quality of a chart, as `Chart` has it."""
+    """The quality of a chart, as in `Chart`."""
     solved, rank = lax.stop_gradient(solved), system.velocity_rank
     diagonal = solved.right_inverse.at[order.columns[:rank], order.rows[:rank]]
     nearness = jnp.max(jnp.abs(diagonal.get(mode="promise_in_bounds", wrap_negative_indices=False)), initial=0.0)

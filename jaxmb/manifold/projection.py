@@ -40,9 +40,9 @@ from .orthogonal_projection import (
 )
 from .term import AbstractConstrainedTerm
 
-# Result of an accepted step that violates redundant rows, until the simulation is diagnosed.
+# The result of an accepted step that violates redundant rows, until the simulation is diagnosed.
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
-# Size of the corrections that are left out, as a power of eps: 1e-12 in double precision.
+# The size of omitted corrections, as a power of eps: 1e-12 in double precision.
 _LEFT_OUT = 0.77
 # Redundant rows may be violated by this multiple of the pivots that count as zero.
 _ALLOWED = 8.0
@@ -57,27 +57,27 @@ class Projection(AbstractManifold):
     ```
 
     With a Runge–Kutta solver the projection is the smallest change in the coordinates' scales, first of the
-    configuration, then of the velocities. A first-same-as-last derivative is kept across it: the difference is of the
-    size of the local error.
+    configuration, then of the velocities. A first-same-as-last derivative is kept across the projection: the difference
+    is of the size of the local error.
 
-    With `Adams` it is the smallest change in the metric of the mass matrix, and one factor of `A M⁻¹ Aᵀ` a step, that
-    of its prediction, serves positions, velocities and accelerations. The elimination follows the graph of joints: for
-    chains, trees and local loops a step takes time and memory in proportion to the number of joints. Constraints must
-    be linear in velocities. Where some are not ideal or act on accelerations, each evaluation has a factor of its own:
-    servos need a second one, and friction a solution for each row of the joints that rub, and a full matrix of the size
-    of all these rows. Rows that others imply are left out where a scene is large enough for sparse elimination, the
-    same ones throughout a motion; in smaller scenes no row may be redundant.
+    With `Adams` the projection is the smallest change in the metric of the mass matrix. One factor of `A M⁻¹ Aᵀ` for
+    each step, at its prediction, serves positions, velocities and accelerations. The elimination follows the graph of
+    joints: for chains, trees and local loops a step takes time and memory in proportion to the number of joints.
+    Constraints must be linear in velocities. If some are not ideal or act on accelerations, each evaluation needs a
+    separate factor. Servos need a second factor; friction needs a solution for each row of the joints with friction,
+    and a full matrix of the size of all these rows. In a scene large enough for sparse elimination implied rows are
+    omitted, the same ones throughout a motion; in smaller scenes no row may be redundant.
 
-    With `Hermite` it is the same projection, of every iterate of Newton's method; constraints must be ideal and bind
-    positions or velocities. The matrix of a scene has blocks for
-    bodies that share a force or a joint, and is eliminated along with the joints in an order that their graph
-    determines: for trains, cables, trees and local loops a step takes time in proportion to the number of bodies. Of
-    the eigenvalues, which decide what formulas and steps are stable, those are found that matter: some near the
-    inverse of the step. Newton's matrix leaves out how directions of joints and forces change in a step, so it takes up
-    to 40 % more iterations than with `Partition`; derivatives are those of the exact equations.
+    With `Hermite` the same projection is applied to every iterate of Newton's method; constraints must be ideal and
+    bind positions or velocities. The matrix of a scene has blocks for bodies that share a force or a joint. It is
+    eliminated along with the joints in an order that follows from their graph. For trains, cables, trees and local
+    loops a step takes time in proportion to the number of bodies. The eigenvalues near the inverse of the step decide
+    which formulas and steps are stable; only these are computed. Newton's matrix omits the change of the directions of
+    joints and forces in a step, so it takes up to 40 % more iterations than with `Partition`. Derivatives follow from
+    the exact equations.
 
-    **Arguments:** `newton_tol`: with `Adams` and `Hermite`, size of the Newton corrections that are left out, of
-    positions, velocities and accelerations relative to the system's, default 1e-12 or a thousandth of the tolerance of
+    **Arguments:** `newton_tol`: with `Adams` and `Hermite`, the size of omitted Newton corrections of positions,
+    velocities and accelerations, relative to the system's; default 1e-12 or a thousandth of the tolerance of
     integration.
     """
 
@@ -120,7 +120,7 @@ class Projection(AbstractManifold):
     def diagnose(self, system, t, y, evidence, result, failed):
         if system.elimination is None:
             return diagnose(Instant.of(system, t, y), jnp.array(False), result, failed)
-        # The rank of constraints that are eliminated along the graph of joints is not looked at.
+        # The rank of constraints that are eliminated along the graph of joints is not examined.
         return diagnose_newton(result, failed) if system.velocity_rows else result
 
 
@@ -140,7 +140,7 @@ def _violated(at):
 
 
 def _check_multistep(system, formulation, solver):
-    """Refuse systems and formulations that one factor of `A M⁻¹ Aᵀ` does not serve."""
+    """Refuse systems and formulations for which one factor of `A M⁻¹ Aᵀ` does not suffice."""
     if not system.positive_definite_mass:
         raise ValueError(
             f"Projection with {solver} needs the inverse of the mass matrix, which is singular in these velocities; "
@@ -177,8 +177,8 @@ class AbstractProjectionTerm(AbstractConstrainedTerm):
 
 
 class ProjectionTerm(AbstractProjectionTerm):
-    """A constrained system, projected in the metric of the mass matrix; `at_contact`: what counts as zero there, None
-    without contacts.
+    """A constrained system, projected in the metric of the mass matrix; `at_contact`: the sizes that count as zero at
+    contacts, None without contacts.
     """
 
     system: AbstractEquation
@@ -193,17 +193,17 @@ class ProjectionTerm(AbstractProjectionTerm):
     def project_near(self, t, y, linearized_at, args):
         at, near, chart = self.at(t, y), linearized_at.factors, linearized_at.chart
         if not self.system.ideal_on_velocities:
-            found = project_in_metric(at, _inertia, near.constraints.projector, self.newton_tol)
-            return self._solved(*found, chart)
+            projection = project_in_metric(at, _inertia, near.constraints.projector, self.newton_tol)
+            return self._solved(*projection, chart)
         out: Any = restore(at, near, self.newton_tol)
         return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart + out.iterations, out.failed)
 
     def project_cold(self, t, y, chart, args):
-        # The guess may be far from the constraints: accelerations are found with a factor of the state that is found.
+        # The guess may be far from the constraints: accelerations need a factor at the projected state.
         return self._solved(*project_in_metric(self.at(t, y), _inertia, None, self.newton_tol), chart)
 
     def _solved(self, at, projector: MassProjector, iterations, failed, chart):
-        """The evaluation in a state on the constraints, whose projector is known."""
+        """The evaluation at a state on the constraints with a known projector."""
         near = ProjectorConstraints(at.q, projector)
         if self.system.acceleration_rows > self.system.velocity_rows:
             projector = at.structured_jacobian.projector(projector.metric)
@@ -212,12 +212,12 @@ class ProjectionTerm(AbstractProjectionTerm):
         near = SolvedState(near, udot, multipliers)
         return self.evaluated(at, udot, chart + iterations, failed | undetermined, near)
 
-    def known(self, kept):
+    def linearisation(self, kept):
         return (projector_constraints, None) if self.system.ideal_on_velocities else None
 
 
 class NormalisedTerm(AbstractProjectionTerm):
-    """A system whose rows, if there are any, bind accelerations only: its coordinates are normalised."""
+    """A system whose rows, if any, bind accelerations only: its coordinates are normalised."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
@@ -234,7 +234,7 @@ class NormalisedTerm(AbstractProjectionTerm):
     def project_cold(self, t, y, chart, args):
         return self.evaluate(t, y, chart, args)
 
-    def known(self, kept):
+    def linearisation(self, kept):
         return None
 
 
@@ -250,7 +250,7 @@ class ProjectedSolver(WrappedSolver):
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)
 
-    # Compiled inside the whole program, so that it is traced once.
+    # A nested program, so that the step is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system, direction = inner_term(terms).vector_field.system, direction_of(terms)
@@ -262,14 +262,13 @@ class ProjectedSolver(WrappedSolver):
         y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
         t1 = t1 * direction
         y1, failed = projected(system, t1, y1)
-        # Of a step whose end was not found nothing is known, so that its error is infinite; where no error estimate
-        # shortens it, the run ends with it.
+        # A step without a projected end has an infinite error. If no error estimate shortens it, the run ends there.
         unknown = lambda x: jnp.where(failed, jnp.nan, x) if eqx.is_inexact_array(x) else x
         y1, dense_info = jax.tree.map(unknown, (y1, dense_info))
         error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed, NOT_PROJECTED, result)
         if drops_rows(system):
-            # diffrax forgets the result of a step that is rejected.
+            # diffrax discards the result of a rejected step.
             violated = _violated(lax.stop_gradient(Instant.of(system, t1, y1)))
             result = diffrax.RESULTS.where(violated, _FAILED, result)
         if self.guards is not None:

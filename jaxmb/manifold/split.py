@@ -1,4 +1,4 @@
-"""How coordinates return to the position constraints in a chart, where some of them depend on the others.
+"""The return of coordinates to the position constraints in a chart, in which some coordinates depend on the others.
 
 There are three kinds of splits: coordinates that share the split of the velocities, coordinates with another split, and
 coordinates that are all independent, without position constraints.
@@ -34,8 +34,8 @@ Restored = tuple[Float[Array, "nq"], Int[Array, ""] | None, Bool[Array, ""] | No
 class AbstractSplit(eqx.Module):
     """The index sets of a chart.
 
-    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `acceleration`: that of all rows of A,
-    None where no row binds accelerations only; `ages`: whether a stored matrix is that of an earlier state.
+    **Fields:** `velocity`: order of elimination of the velocities' Jacobian; `acceleration`: order of all rows of A,
+    None if no row binds accelerations only; `ages`: whether the stored matrix belongs to an earlier state.
     """
 
     velocity: AbstractVar[PivotOrder]
@@ -52,11 +52,11 @@ class AbstractSplit(eqx.Module):
         solved: Factor,
         quality: Float[Array, "k"],
     ) -> tuple[Self, Float[Array, "k"], Any]:
-        """The split with these orders of velocities and accelerations; the quality with that of the coordinates;
-        whether these have lost rank.
+        """The split with these orders of velocities and accelerations; the quality, with the coordinates included;
+        whether the coordinates have lost rank.
 
-        **Arguments:** the coordinates' Jacobian, None where no split ages; the factor of the velocities' Jacobian, and
-        its quality.
+        **Arguments:** `of_coordinates`: the coordinates' Jacobian, None if the split does not age; `solved`: the factor
+        of the velocities' Jacobian, and its `quality`.
         """
 
     @abc.abstractmethod
@@ -73,7 +73,7 @@ class AbstractSplit(eqx.Module):
 
     @abc.abstractmethod
     def push(self, at: Instant, along: Instant, factor: Factor | None) -> Float[Array, "nq"]:
-        """The tangent of coordinates on the constraints, from that of coordinates that were restored there.
+        """The tangent of coordinates on the constraints, from the tangent before the restoration.
 
         **Arguments:** the `factor` of the velocities' Jacobian, if it is known.
         """
@@ -84,7 +84,7 @@ class AbstractSplit(eqx.Module):
         return self
 
     def at_guess(self, at: Instant) -> Self:
-        """The split at a state where nothing has been evaluated."""
+        """The split at a state without an evaluation."""
         del at
         return self
 
@@ -117,9 +117,9 @@ class Independent(AbstractSplit):
 
 
 class Shared(AbstractSplit):
-    """The split of velocities, which is that of coordinates: q̇ = u, and no row binds velocities only.
+    """The split of velocities, shared by the coordinates: q̇ = u, and no row binds velocities only.
 
-    **Fields:** `right_inverse`, that of the velocities' Jacobian at the last evaluation.
+    **Fields:** `right_inverse` of the velocities' Jacobian at the last evaluation.
     """
 
     velocity: PivotOrder
@@ -137,7 +137,7 @@ class Shared(AbstractSplit):
         return at.with_(q=at.q - self.right_inverse @ at.coordinate_residual)
 
     def restore(self, at, outdated, tol):
-        # The factor is of this time, and wrong by the first correction only.
+        # The factor belongs to this time, and is wrong by the first correction only.
         return _newton(at, self.right_inverse, 1.0, tol)
 
     def push(self, at, along, factor):
@@ -150,7 +150,7 @@ class Shared(AbstractSplit):
         return Shared(self.velocity, self.acceleration, factor.right_inverse)
 
     def at_guess(self, at):
-        # The stored matrix is that of the state before the step.
+        # The stored matrix belongs to the state before the step.
         return self.at_evaluation(self._factor(at))
 
     def orders(self):
@@ -158,10 +158,10 @@ class Shared(AbstractSplit):
 
 
 class Separate(AbstractSplit):
-    """The split of velocities, and beside it that of coordinates.
+    """The split of velocities, and another split of coordinates.
 
-    **Fields:** `coordinate`: order of elimination of the coordinates' Jacobian; `right_inverse` of that, at a state of
-    this step or of an earlier one.
+    **Fields:** `coordinate`: order of elimination of the coordinates' Jacobian; its `right_inverse`, at a state of this
+    step or of an earlier one.
     """
 
     velocity: PivotOrder
@@ -174,8 +174,8 @@ class Separate(AbstractSplit):
     def chosen(cls, at, of_coordinates: Any, orders, solved, quality):
         system = at.system
         pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
-        split, own = cls(*orders, pivots.order, jnp.zeros(())).refreshed(system, of_coordinates)
-        return split, quality.at[:-1].max(own), pivots.rank < system.coordinate_rank
+        split, of_split = cls(*orders, pivots.order, jnp.zeros(())).refreshed(system, of_coordinates)
+        return split, quality.at[:-1].max(of_split), pivots.rank < system.coordinate_rank
 
     def independent(self, system):
         return self.coordinate.columns[system.coordinate_rank :]
@@ -184,14 +184,14 @@ class Separate(AbstractSplit):
         return at.with_(q=at.q - self.right_inverse @ at.coordinate_residual)
 
     def restore(self, at, outdated, tol):
-        # Of an older matrix nothing is known.
-        found = _newton(at, self.right_inverse, 0.0, tol)
+        # The error of an older matrix is unknown.
+        restored = _newton(at, self.right_inverse, 0.0, tol)
 
-        def with_factor_of_this_state(found):
+        def with_factor_of_this_state(restored):
             corrected, iterations, failed = _newton(at, self._factor(at).right_inverse, 1.0, tol)
-            return corrected, found[1] + iterations, failed
+            return corrected, restored[1] + iterations, failed
 
-        return cond_of_lanes(found[2] | outdated, with_factor_of_this_state, lambda found: found, found)
+        return cond_of_lanes(restored[2] | outdated, with_factor_of_this_state, lambda restored: restored, restored)
 
     def push(self, at, along, factor):
         del factor
@@ -203,7 +203,7 @@ class Separate(AbstractSplit):
     def refreshed(
         self, system: AbstractEquation, jacobian: Float[Array, "mq nq"]
     ) -> tuple["Separate", Float[Array, "k"]]:
-        """The split with the matrix of a state, from the coordinates' Jacobian there, and the quality of that."""
+        """The split with the matrix of a state, from the coordinates' Jacobian there, and its quality."""
         solved = eliminate(jacobian, self.coordinate, system.coordinate_rank)
         quality = quality_of(system, solved, system.coordinate_scale(), self.coordinate, system.coordinate_rank)
         return dataclasses.replace(self, right_inverse=solved.right_inverse), quality
@@ -224,7 +224,7 @@ def kind_of_split(system: AbstractEquation) -> type[AbstractSplit]:
 def restore_positions(at: Instant, split: AbstractSplit, outdated: Bool[Array, ""], tol: float) -> Restored:
     """Solve `Φ = 0` for the dependent coordinates by Newton with a fixed matrix: `(q, iterations, failed)`.
 
-    **Arguments:** `outdated`: whether the stored matrix is known to be of no use here.
+    **Arguments:** `outdated`: whether the stored matrix is known to be useless here.
     """
     return split.restore(at, outdated, tol)
 
@@ -255,8 +255,8 @@ def _pushed(factor, at, along):
 def quality_of(
     system: AbstractEquation, solved: Factor, scale: Float[Array, "n"], order: PivotOrder, rank: int
 ) -> Float[Array, "k"]:
-    """The quality of a factor: its largest |H| in units of the `scale`; where rows are redundant, the largest entry of
-    the solution of the others as well.
+    """The quality of a factor: its largest |H| in units of the `scale`; with redundant rows also the largest entry of
+    the solution of the others.
     """
     influence = jnp.abs(solved.null_space) * scale[order.columns[rank:]][None, :] / scale[:, None]
     largest = [jnp.max(influence, initial=1.0)]

@@ -27,8 +27,8 @@ else:
 class AbstractConstrainedTerm(AbstractManifoldTerm):
     """A constrained system, with its internal states if it has any.
 
-    **Fields:** `at_contact`: what counts as zero there, None without contacts; `newton_tol`: size of the corrections
-    that are left out.
+    **Fields:** `at_contact`: the sizes that count as zero at contacts, None without contacts; `newton_tol`: the size of
+    omitted corrections.
     """
 
     system: AbstractVar[AbstractEquation]
@@ -37,38 +37,38 @@ class AbstractConstrainedTerm(AbstractManifoldTerm):
     at_contact: AbstractVar[ContactTolerance | None]
 
     def at(self, t: Any, y: State) -> Instant:
-        """The system in a state."""
+        """The system at a state."""
         return Instant.of(self.system, t, y)
 
     def evaluated(
         self, at: Instant, udot: Float[Array, "nu"], chart: Any, failed: Any, near: SolvedState | None = None
     ) -> ManifoldEvaluation:
-        """The evaluation in a state whose accelerations are known.
+        """The evaluation at a state with known accelerations.
 
-        **Arguments:** `near`: the state as one that others are restored from, None where no other will be.
+        **Arguments:** `near`: the data for restoring other states from this one, None if there will be no others.
         """
         return ManifoldEvaluation(at.state, at.motion(udot), chart, failed, near)
 
     @abc.abstractmethod
-    def known(self, kept: Any) -> tuple[Linearise, Memory] | None:
-        """The constraints at a solution, as functions of an instant, and the memory of the laws there; None where the
+    def linearisation(self, kept: Any) -> tuple[Linearise, Memory] | None:
+        """The constraints at a solution, as a function of an instant, and the memory of the laws there; None if the
         equations are solved again.
         """
 
     def at_solution(self, t, y, f, kept, args):
-        known = self.known(kept)
-        if known is None:
+        linearisation = self.linearisation(kept)
+        if linearisation is None:
             return super().at_solution(t, y, f, kept, args)
-        at, (linearise, memory) = self.at(t, y), known
+        at, (linearise, memory) = self.at(t, y), linearisation
         out = solved(linearise, at, f.u, memory)
         at = at.with_(q=out.q, u=out.u)
         return at.state, at.motion(out.udot)
 
     def along_solution(self, t, y, f, along, kept, args):
-        known = self.known(kept)
-        if known is None or known[1] is not None or y.z is not None:
+        linearisation = self.linearisation(kept)
+        if linearisation is None or linearisation[1] is not None or y.z is not None:
             return super().along_solution(t, y, f, along, kept, args)
-        return rates_along(known[0], self.at(t, y), f.u, along)
+        return rates_along(linearisation[0], self.at(t, y), f.u, along)
 
     def vf(self, t, y, args):
         return VectorField(self.system, self.formulation)(t, y, args)

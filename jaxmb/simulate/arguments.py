@@ -19,7 +19,7 @@ from ..solvers.tolerances import closer_tolerance
 from ..system import AbstractSystem
 
 DEFAULT_RTOL = 1e-8
-# The least `rtol` with an error estimate, in units of the machine precision: a second run has a tenth.
+# The least `rtol` with an error estimate, in units of the machine precision: the second run has a tenth of it.
 _CLOSEST = 100
 
 _KINDS: dict[str, tuple[type, str]] = {
@@ -45,21 +45,21 @@ def check_kinds(*given: Any) -> None:
 
 
 def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
-    """Refuse steps without error estimates for a method that chooses its order by them, unless it has tolerances."""
+    """Refuse steps without error estimates for a method that chooses its order by tolerances and has none."""
     estimates = stepsize_controller is None or isinstance(
         stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
     )
     if not estimates and isinstance(solver, AbstractMultistep) and not solver.tolerances.fixed:
-        own, steps = type(solver).__name__, type(stepsize_controller).__name__
+        method, steps = type(solver).__name__, type(stepsize_controller).__name__
         raise ValueError(
-            f"{own} chooses its order by tolerances, which {steps} does not have: give them to the solver, as in "
-            f"solver=jaxmb.solvers.{own}(rtol=1e-8, atol=1e-10), or take a method of one order, as diffrax.Tsit5(). "
+            f"{method} chooses its order by tolerances, which {steps} does not have: give them to the solver, as in "
+            f"solver=jaxmb.solvers.{method}(rtol=1e-8, atol=1e-10), or take a method of one order, as diffrax.Tsit5(). "
             "Steps that are only bounded have simulate(..., dtmax=0.01)."
         )
 
 
 def check_error_estimate(steps: Any, stepsize_controller: Any, event: Any, rtol: Any) -> None:
-    """Refuse runs whose times a second run would not share, and tolerances that leave it no room.
+    """Refuse runs whose times a second run would not share, and tolerances too close to rounding for a second run.
 
     **Arguments:** `steps`: whether states are saved at the ends of steps.
     """
@@ -81,8 +81,10 @@ def check_error_estimate(steps: Any, stepsize_controller: Any, event: Any, rtol:
 
 
 def closer_tolerances(solver: Any, rtol: Any, atol: Any) -> tuple[Any, Any]:
-    """The tolerances of the second run of an error estimate, whose steps may err a hundredth as much; a tenth where the
-    order is fixed, and a hundredth may take many times the steps.
+    """The tolerances of the second run of an error estimate.
+
+    Its steps may err a hundredth as much. With a fixed order they may err a tenth as much, since a hundredth may take
+    many times the steps.
     """
     is_multistep = isinstance(solver, AbstractMultistep)
     closer = closer_tolerance(rtol, solver.finest, rtol.dtype) if is_multistep else rtol / 10
@@ -115,7 +117,7 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
         warnings.warn(
             f"{whose}={rtol:g} is below what single precision can do; {least:.1e} is used instead. Switch double "
             'precision on before anything else: import jax; jax.config.update("jax_enable_x64", True).',
-            # The user's place, from `simulate` by `Run.checked`.
+            # The caller of `simulate`, which calls `Run.checked`.
             stacklevel=5,
         )
         relative = as_array(least, dtype)
@@ -123,13 +125,13 @@ def checked_tolerances(rtol: Any, atol: Any, state: State) -> tuple[Any, Any]:
 
 
 def _rounded_up(bound: float) -> str:
-    """Two digits of a lower bound that are not below it, so that the value that a message names is accepted."""
+    """A lower bound with two digits, rounded up, so that the value in a message is accepted."""
     return f"{1.05 * bound:.1e}"
 
 
 def checked_state(system: AbstractSystem, state: Any) -> State:
     cure = "jaxmb.assemble(system) makes one, and so does jaxmb.State(q, u) or, with internal states, State(q, u, z)"
-    # A concrete class: a state is nothing but its fields.
+    # A concrete class: a state consists of its fields.
     check_kind("state", state, State, "a jaxmb.State", cure)
     nq, nu, nz = system.nq, system.nu, system.nz
     if (state.z is None) != (nz == 0):

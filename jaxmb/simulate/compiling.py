@@ -1,4 +1,4 @@
-"""What a user is told while a first call compiles."""
+"""Messages to the user while a first call compiles."""
 
 import contextlib
 import functools
@@ -12,16 +12,17 @@ import jax
 
 from ..system import AbstractSystem
 
-# After these seconds a user is told.
+# The time [s] after which a user is told.
 _PATIENCE = 2.0
-# What JAX reports at the end of a compilation; those that take less than this time [s] are of single operations.
+# The event that JAX reports at the end of a compilation; shorter compilations than this [s] are of single operations.
 _COMPILED, _LONG = "/jax/core/compile/backend_compile_duration", 0.5
 
 
 class _Wait:
     """A wait for a program.
 
-    **Fields:** when its tracing began, and its compilation `ended`, None before; whether the user is `told`.
+    **Fields:** `began`: when its tracing began; `ended`: when its compilation ended, None before; `told`: whether the
+    user was.
     """
 
     def __init__(self, system: AbstractSystem):
@@ -37,7 +38,7 @@ class _Wait:
         self.timer.start()
 
     def _tell(self):
-        # From here on a program runs that takes its time.
+        # If compilation has ended, the program itself takes that long.
         if self.ended is None:
             self.told = True
             print(f"jaxmb: compiling {_motion_of(self.system)} ...", end="", file=sys.stderr, flush=True)
@@ -56,9 +57,9 @@ _waiting = threading.local()
 
 @contextlib.contextmanager
 def told_of_compiling(system: AbstractSystem) -> Iterator[None]:
-    """A simulation whose program may have to be compiled: a user at a terminal or in a notebook is told after a while.
+    """A context for a simulation that may have to compile: a user at a terminal or in a notebook is told after a while.
 
-    Within it the program runs to its end.
+    The program must run to its end within the context.
     """
     if not (sys.stderr.isatty() or "ipykernel" in sys.modules) or getattr(_waiting, "now", None) is not None:
         yield
@@ -73,7 +74,7 @@ def told_of_compiling(system: AbstractSystem) -> Iterator[None]:
 
 
 def tracing_begins() -> None:
-    """Called where a program is traced, which happens before it is compiled."""
+    """To be called at the start of tracing, which precedes compilation."""
     wait = getattr(_waiting, "now", None)
     if wait is not None and not wait.began:
         wait.begin()
@@ -92,8 +93,8 @@ def _compiled(event: str, duration_secs: float, **_: Any) -> None:
 
 def _motion_of(system: AbstractSystem) -> str:
     names = system.body_names or tuple(system.catalogue.motion_names())
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return f"a motion of {', '.join(names[:3])}{more}"
+    rest_of_names = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"a motion of {', '.join(names[:3])}{rest_of_names}"
 
 
 def _in_words(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""The integration of a motion by diffrax's protocol, whose mesh resolves derivatives where they are taken."""
+"""The integration of a motion by diffrax's protocol; if it is differentiated, its mesh resolves derivatives."""
 
 import dataclasses
 from typing import Any
@@ -26,17 +26,17 @@ def integrated(
     """The solution of `diffrax.diffeqsolve`, with derivatives.
 
     **Arguments:** `integration`: term, solver and options of `diffeqsolve`; `control` of tangents, None for none;
-    whether states return to constraints after steps (`projects_steps`); whether it is known to be `differentiated`.
+    `projects_steps`: whether states return to constraints after steps; `differentiated`: whether it is known to be.
     """
     if differentiated:
-        # Where that is known, a run without derivatives is not traced.
+        # Then the run without derivatives is not traced.
         return _with_tangents(integration, control, room, projects_steps)
     return _on_mesh(integration, control, room, projects_steps)
 
 
 @eqx.filter_custom_jvp
 def _on_mesh(integration, control, room, projects_steps):
-    """The solution, whose mesh resolves the motion; where it is differentiated, tangents as well."""
+    """The solution on a mesh that resolves the motion, and tangents as well if it is differentiated."""
     del control, projects_steps
     term, solver, options = integration
     return _solution(term, solver, options, room, None)
@@ -69,7 +69,7 @@ def _with_tangents(integration, control, room, projects_steps):
 
 
 def _solution(term, solver, options, room, derivatives):
-    """The solution with states saved first, and then the user's function of them."""
+    """The solution, whose states are saved before the user's function is applied to them."""
     adjoint, saveat = room.adjoint, options["saveat"]
     function = saveat.subs[0].fn
     if function is not STATES and derivatives is not None:

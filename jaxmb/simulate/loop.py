@@ -1,4 +1,4 @@
-"""The loop of a run, with what diffrax's own would check in the compiled program, or compile anew for each number."""
+"""The loop of a run, without diffrax's checks in the program, and without a program for each number of steps."""
 
 from typing import Any
 
@@ -15,11 +15,11 @@ from ..solvers.stepping import loop
 class Loop(diffrax.AbstractAdjoint):
     """diffrax's loop with saved times and a number of steps that have been checked.
 
-    diffrax checks times by a host callback, with which JAX keeps no compiled program for later processes, and makes a
-    program for each number of steps.
+    diffrax checks times by a host callback, and JAX does not cache programs with callbacks for later processes. It also
+    compiles a program for each number of steps.
 
-    **Fields:** the `times` of the first series of saved states, None if it has none; whether that series ends with the
-    `end`; `limit`: the largest number of steps; `derivatives`: those on the mesh, or None for a run without any.
+    **Fields:** the `times` of the first series of saved states, None if it has none; `end`: whether that series ends
+    with the end of the run; `limit`: the largest number of steps; `derivatives` on the mesh, or None.
     """
 
     times: Any
@@ -29,9 +29,9 @@ class Loop(diffrax.AbstractAdjoint):
 
     @classmethod
     def around(cls, saveat: diffrax.SaveAt, limit: Any, derivatives: MeshAdjoint | None):
-        """A loop for `saveat`, and what diffrax is told instead."""
+        """A loop for `saveat`, and the `SaveAt` for diffrax instead."""
         first, *rest = saveat.subs
-        # diffrax takes no empty series.
+        # diffrax does not take an empty series.
         placeholder = first.t1 or first.ts is not None
         told = diffrax.SubSaveAt(t0=first.t0, t1=placeholder, steps=first.steps, fn=first.fn)
         saveat = eqx.tree_at(lambda saveat: saveat.subs, saveat, (told, *rest))
@@ -57,8 +57,8 @@ class Loop(diffrax.AbstractAdjoint):
         first, *rest = saveat.subs
         times = self.times * jnp.asarray(direction, self.times.dtype)
         series = diffrax.SubSaveAt(t0=first.t0, t1=self.end, ts=times, steps=first.steps, fn=first.fn)
-        more = times.size + int(self.end) - int(first.t1)
-        longer = lambda x: jnp.full((x.shape[0] + more, *x.shape[1:]), jnp.inf, x.dtype)
+        extra_rows = times.size + int(self.end) - int(first.t1)
+        longer = lambda x: jnp.full((x.shape[0] + extra_rows, *x.shape[1:]), jnp.inf, x.dtype)
         tables = init_state.save_state[0]
         tables = eqx.tree_at(
             lambda s: (s.ts, s.ys), tables, (direction * longer(tables.ts), jax.tree.map(longer, tables.ys))

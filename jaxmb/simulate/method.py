@@ -22,10 +22,10 @@ from ..system import AbstractSystem
 
 
 class Method(NamedTuple):
-    """How a motion is computed.
+    """The numerical method of a motion.
 
-    **Fields:** `controller`, None for that of `rtol` and `atol`; `atol`, None for running scales; `dtmax`, the longest
-    step, None for any.
+    **Fields:** `controller`, None for a controller by `rtol` and `atol`; `atol`, None for running scales; `dtmax`, the
+    longest step, None for any.
     """
 
     solver: diffrax.AbstractSolver
@@ -43,17 +43,17 @@ class Method(NamedTuple):
         solver: diffrax.AbstractSolver,
         manifold: AbstractManifold | None,
         formulation: AbstractFormulation | None,
-        **others: Any,
+        **tolerances: Any,
     ) -> "Method":
-        """The method with those that suit the system and the solver where the user names none."""
+        """The method, with defaults by the system and the solver for arguments that are None."""
         policy = default_manifold(system, solver, formulation) if manifold is None else manifold
         formulation = policy.default_formulation(system) if formulation is None else formulation
-        return cls(solver, policy, formulation, **others)
+        return cls(solver, policy, formulation, **tolerances)
 
     def check_impulses(self, system: AbstractSystem, jumps: bool) -> None:
-        """Raise a `ValueError` where the velocities after an impulse would not be known.
+        """Raise a `ValueError` if the velocities after an impulse would not be known.
 
-        **Arguments:** `jumps`: whether a run restarts at jumps of inputs, or at those that the user announces.
+        **Arguments:** `jumps`: whether a run restarts at jumps of inputs or at announced jumps.
         """
         jumps = jumps and system.velocity_rows > 0
         if not jumps and not system.contacts:
@@ -66,15 +66,15 @@ class Method(NamedTuple):
             )
 
     def projects_steps(self, system: AbstractSystem) -> bool:
-        """Whether states return to constraints after the steps of a method that does not know of them."""
+        """Whether states return to constraints after the steps of a method that does not know of constraints."""
         return system.velocity_rows > 0 and not isinstance(self.solver, AbstractMultistep)
 
     def watches_gaps(self, system: AbstractSystem) -> bool:
-        """Whether steps pass over no force that acts in a gap; those of a fixed length may."""
+        """Whether steps must not pass over a force that acts in a gap; steps of fixed length may."""
         return system.has_gaps and adapts(self.controller)
 
     def prepared(self, system: AbstractSystem) -> tuple[Any, Any]:
-        """The term of a system, and the solver, prepared for it."""
+        """The term of a system, and the solver, prepared for the term."""
         term, solver = self.policy.prepare(system.prepared(), self.formulation, self.solver, self.rtol)
         if self.watches_gaps(system) and not isinstance(solver, AbstractMultistep):
             solver = GapSolver(solver)
@@ -94,13 +94,13 @@ class Method(NamedTuple):
 
 
 def adapts(controller: Any) -> bool:
-    """Whether a controller, None for the default, chooses steps by their errors."""
+    """Whether a controller chooses steps by their errors, as the default (None) does."""
     return controller is None or isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
 
 
 def running_scales(system: AbstractSystem, state: State, duration: Any) -> RunningScales:
-    """Natural units of coordinates, velocities and internal states; what is expected of velocities where nothing moves
-    yet is one unit in the whole duration [s].
+    """Scales in natural units of coordinates, velocities and internal states. The expected size of velocities at rest
+    is one unit in the whole duration [s].
     """
     units = natural_units(system, system.velocity_scale(), state.q.dtype)
     units, rate = lax.stop_gradient((units, 1 / jnp.where(duration > 0, duration, 1.0)))

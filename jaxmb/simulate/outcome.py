@@ -18,29 +18,29 @@ from ..states.consistency import contradiction
 from ..states.refusals import LostRank, lost_rank, violated_joints
 from .span import Span
 
-# Gaps below this fraction of the system's size are named where contacts have no solution.
+# A message about contacts without solution names gaps below this fraction of the system's size.
 _TOUCH = 1e-6
-# Stiffness is not looked for after fewer steps than this, and found in this number.
+# Stiffness is tested after at least this many steps, within this number of further steps.
 _ENOUGH, _LOOKED = 200, 512
-# So many joints of a singular configuration are named.
+# A message names at most this many joints of a singular configuration.
 _NAMED = 8
-# Residuals count beyond the end of a motion from this part of the displacement on.
+# Beyond the end of a motion, residuals above this part of the displacement count.
 _UNMET = 0.1
 
-# What steps resolve in single precision and, at the default tolerance, in double precision, relative to the size of the
-# system.
+# The motion that steps resolve in single precision and, at the default tolerance, in double precision, relative to the
+# size of the system.
 _MOVED_SINGLE, _MOVED = 1e-6, 1e-11
-# The jumps of the last few systems and intervals: a loop of simulations looks for them once.
+# The jumps of the last few systems and intervals: a loop of simulations searches for them once.
 _jumps = Recent(8)
 
 
 class Flags(NamedTuple):
-    """What is looked at after a simulation.
+    """The flags that are read after a simulation.
 
-    **Fields:** whether it `failed`; whether its start violates the constraints (`inconsistent`); whether it got `stuck`
-    on its way; whether nothing of what was to be saved is missing (`whole`); whether there were too few steps
-    (`ran_out`); whether it took at least as many as derivatives keep at most (`long`); whether differences of the
-    vector field contradict its derivative, where a solver looks (`wrong_derivative`).
+    **Fields:** `failed`; `inconsistent`: its start violates the constraints; `stuck`: it got stuck on its way; `whole`:
+    every requested state was saved; `ran_out`: there were too few steps; `long`: it took at least as many steps as
+    derivatives keep at once; `wrong_derivative`: differences of the vector field contradict its derivative, if the
+    solver compares them.
     """
 
     failed: Any
@@ -55,9 +55,9 @@ class Flags(NamedTuple):
 class Outcome(NamedTuple):
     """How a simulation ended, beside its `Trajectory`.
 
-    **Fields:** `flags`, one array of those that `Flags` names; the last time `t` and state `y`; `step`: the length of
-    the next step, None where the controller does not tell; `coupling` of friction with its own reactions where that is
-    the reason of a failure, None without friction; `evidence` by which the manifold diagnoses a failure.
+    **Fields:** `flags`, as one array in the order of `Flags`; the last time `t` and state `y`; `step`: the length of
+    the next step, None if the controller does not know it; `coupling` of friction with its own reactions if it caused a
+    failure, None without friction; `evidence` by which the manifold diagnoses a failure.
     """
 
     flags: Any
@@ -69,8 +69,8 @@ class Outcome(NamedTuple):
 
 
 def about_friction(system, coupling) -> str:
-    own = system.friction_rows[coupled_most(np.asarray(coupling))]
-    names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in own))
+    coupled_rows = system.friction_rows[coupled_most(np.asarray(coupling))]
+    names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in coupled_rows))
     return (
         f"The friction of {names} came to a singular configuration: its force changes the reaction that it depends on "
         "so much that there is no solution, or more than one (Painlevé's paradox). A smaller coefficient or a "
@@ -79,7 +79,7 @@ def about_friction(system, coupling) -> str:
 
 
 def about_contacts(system, outcome: Outcome) -> str:
-    """Which bodies touch where no forces of contacts and friction are possible."""
+    """The message about touching bodies for which no forces of contacts and friction are possible."""
     q = system.normalize(outcome.y.q)
     contacts = system.contacts
     touch = np.asarray(contacts.gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
@@ -95,7 +95,7 @@ def has_failed(result) -> Any:
 def first_of(reasons: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
     """The result of the first reason that holds.
 
-    **Arguments:** `reasons`: pairs of whether it holds, False where that is known before, and its result.
+    **Arguments:** `reasons`: pairs `(holds, result)`; `holds` may be the constant False.
     """
     result = otherwise
     for holds, reason in reversed(reasons):
@@ -123,21 +123,22 @@ def warn_of_wrong_derivative() -> None:
 
 
 def warn_of_jumps(system, outcome: Outcome, span: Span, restarts, announced) -> None:
-    """Warn of jumps of prescribed rates between restarts of a motion that is not traced; `announced` are those that the
-    user gave, or None.
+    """Warn of jumps of prescribed rates between the restarts of a concrete motion.
+
+    **Arguments:** `announced`: the jumps that the user gave, or None.
     """
     q, t0, t1 = outcome.y.q, span.t0, span.t1
     restarts = np.zeros(0) if restarts is None else np.asarray(restarts)
-    # What is prescribed jumps at the same times with other coordinates.
-    found = _jumps.found((system, t0, t1, restarts), lambda: find_jumps(system, q, t0, t1, restarts))
-    if not found:
+    # Prescribed rates jump at the same times for all coordinates.
+    jumps = _jumps.found((system, t0, t1, restarts), lambda: find_jumps(system, q, t0, t1, restarts))
+    if not jumps:
         return
-    # The rows of ψ, then those of A.
+    # The rows of ψ, then the rows of A.
     rows = (*system.rows[: system.velocity_rows], *system.rows)
-    names = " and ".join(dict.fromkeys(repr(rows[jump.row][0]) for jump in found))
-    times = list(dict.fromkeys(jump.t for jump in found))
-    known = [] if announced is None else list(np.asarray(announced, times[0].dtype))
-    every = ", ".join(str(t) for t in sorted({*known, *times}))
+    names = " and ".join(dict.fromkeys(repr(rows[jump.row][0]) for jump in jumps))
+    times = list(dict.fromkeys(jump.t for jump in jumps))
+    announced_times = [] if announced is None else list(np.asarray(announced, times[0].dtype))
+    every = ", ".join(str(t) for t in sorted({*announced_times, *times}))
     warnings.warn(
         f"The motion that {names} prescribes has a jump or a kink at t = {' and '.join(str(t) for t in times)}, which "
         "an integration passes without an impulse or in many steps; "
@@ -147,7 +148,7 @@ def warn_of_jumps(system, outcome: Outcome, span: Span, restarts, announced) -> 
 
 
 def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solver, probe) -> str:
-    """Why a simulation with a solver failed, and where; `probe` as in `is_stiff_at_end`."""
+    """Why and where a simulation failed; `probe` as in `is_stiff_at_end`."""
     if is_traced((system, outcome, span)):
         return RESULTS[result]
     if np.any(outcome.coupling):
@@ -164,17 +165,16 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
 
 
 def how_far(outcome: Outcome, span: Span) -> str:
-    """The time at the end and that to be reached, with six digits of the time that they differ from the start."""
+    """The time that was reached and the time to be reached, with six digits of their difference from the start."""
     t0, t, t1 = float(span.t0), float(outcome.t), float(span.t1)
     digits = 6 + max(0, int(np.log10(max(abs(t0), 1e-300) / max(abs(t1 - t0), 1e-300))))
     return f"The motion came to t = {t:.{digits}g} of {t1:.{digits}g}."
 
 
 def about_steps(outcome: Outcome, span: Span, stats, stiff) -> str:
-    """How far a motion came in the largest number of steps, and what takes it further.
+    """How far a motion came in the largest number of steps, and the cure.
 
-    **Arguments:** `stiff`: whether it is stiff at its end, None where that is not known, and False with a solver for
-    stiff motions.
+    **Arguments:** `stiff`: whether it is stiff at its end, None if unknown, and False with a solver for stiff motions.
     """
     steps = int(stats["num_steps"])
     length = "" if outcome.step is None else f", with steps of about {abs(float(outcome.step)):.2g} in the end"
@@ -184,17 +184,17 @@ def about_steps(outcome: Outcome, span: Span, stats, stiff) -> str:
             "It is stiff there: stability is the limit of its steps. simulate(..., solver=jaxmb.solvers.Hermite()) "
             "takes longer ones."
         )
-    more = "A larger max_steps or a coarser rtol takes it further"
+    cure = "A larger max_steps or a coarser rtol takes it further"
     if stiff is None:
-        more += (
+        cure += (
             '; or it may be stiff, which solver="auto" detects: solver=jaxmb.solvers.Hermite() then takes longer steps'
         )
-    return text + more + "."
+    return text + cure + "."
 
 
 def is_stiff_at_end(probe, stats, solver) -> bool | None:
-    """Whether a motion that took the largest number of steps is stiff where it stopped; None where too few of them
-    were taken to tell, or where Adams' method cannot go on from there.
+    """Whether a motion that took the largest number of steps is stiff at its end; None if it took too few steps to
+    tell, or if Adams' method cannot go on from there.
 
     **Arguments:** `probe(solver, steps)`: the trajectory from there with a solver, in at most this number of steps.
     """
@@ -205,7 +205,7 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
     if stats["num_steps"] < _ENOUGH:
         return None
     with warnings.catch_warnings():
-        # The motion's own are said already.
+        # The motion's own warnings have been given.
         warnings.simplefilter("ignore")
         try:
             return bool(probe(Adams(stiffness="count"), _LOOKED).stats["stiff"])
@@ -214,8 +214,8 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
 
 
 def reason_of_failure(system, result, span: Span, outcome: Outcome) -> str:
-    """Why a simulation ended at a finite state: numbers that are not finite there or just beyond, the joints whose
-    constraints lose rank, those that cannot be met, or times that are too coarse.
+    """Why a simulation ended at a finite state. The reasons are numbers that are not finite there or just beyond,
+    joints whose constraints lose rank or cannot be met, and times that are too coarse.
     """
     t, y = outcome.t, outcome.y
     system = system.at(y)
@@ -236,7 +236,7 @@ def reason_of_failure(system, result, span: Span, outcome: Outcome) -> str:
 
 
 def about_lost_rank(lost: LostRank) -> str:
-    """Which joints make a configuration singular, and which drives lead beyond it."""
+    """The message about joints that make a configuration singular, and about drives that lead beyond it."""
     text = (
         "The mechanism came to a singular configuration there (toggle, lock-up or bifurcation): the constraints of "
         f"{', '.join(lost.joints[:_NAMED])} are no longer independent"
@@ -251,8 +251,8 @@ def about_lost_rank(lost: LostRank) -> str:
 
 
 def about_unmet(system, outcome: Outcome, ahead, rates) -> str:
-    """The joints with the largest residuals where a motion goes on without constraints, by the next step or a shorter
-    one; empty where residuals are small beside the displacement, as smooth constraints leave them.
+    """The joints with the largest residuals just beyond the end, by the next step without constraints or a shorter one;
+    empty if residuals are small beside the displacement, as for smooth constraints.
     """
     t, y = outcome.t, outcome.y
     speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=0.0)
@@ -267,9 +267,7 @@ def about_unmet(system, outcome: Outcome, ahead, rates) -> str:
 
 
 def about_coarse_times(system, span: Span, t, y) -> str:
-    """What to do where a motion changes by more than it resolves from one number for the time to the next; empty where
-    it does not.
-    """
+    """The cure if a motion changes by more than it resolves between two adjacent numbers for the time; else empty."""
     coarse = float(np.spacing(np.abs(np.asarray(t))))
     speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=1 / abs(span.t1 - span.t0))
     moved = coarse * float(speed)

@@ -1,4 +1,4 @@
-"""For how many steps the program of a run has room."""
+"""The number of steps for which the program of a run has buffers."""
 
 import collections
 import math
@@ -10,23 +10,23 @@ import numpy as np
 
 from .._types import State
 
-# What is kept of steps takes this memory at first [bytes], or that of so many steps.
+# Buffers of steps take this memory at first [bytes], or hold this many steps if that is more.
 _MEMORY, _FEWEST_STEPS = 2**24, 1024
-# A motion that takes more steps than there was room for is computed again with so many times as much.
+# A motion that takes more steps than its buffers hold is computed again with this many times as many.
 _MORE = 8
-# Derivatives keep numbers of this many steps, of fewer where they do not fit in this many bytes.
+# Derivatives keep the rows of this many steps, or of fewer if they do not fit in this many bytes.
 MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
-# The structures of the last systems and solvers of which a motion in this process, with or without derivatives, took as
-# many steps as derivatives keep at once: the next derivative outside of `jit` does not try with room for no more. Only
-# so many are kept, since structures hold the functions of their users.
+# The structures of systems and solvers with long motions in this process, with or without derivatives: at least as many
+# steps as derivatives keep at once. The next derivative outside of `jit` then does not try the smaller program first.
+# Only a few are kept, since structures hold the functions of users.
 _long: collections.deque[Any] = collections.deque(maxlen=16)
 
 
 class Room(NamedTuple):
-    """Room for steps.
+    """Buffers for steps.
 
-    **Fields:** `rows`: as many as the program has room for; `limit`: the largest number of steps; the user's
-    `adjoint`, None for derivatives on the mesh.
+    **Fields:** `rows`: the number of steps that fit; `limit`: the largest number of steps; the user's `adjoint`, None
+    for derivatives on the mesh.
     """
 
     rows: int
@@ -38,15 +38,15 @@ class Room(NamedTuple):
 
 
 def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool, tries: bool) -> list[int]:
-    """How many steps programs have room for, of which the next is used where a motion takes more steps than the last.
+    """The numbers of steps for which programs have buffers; if a motion takes more steps, the next program is used.
 
-    If nothing is kept of each step, the next power of 4 from `max_steps`, so that one program serves several numbers.
-    Derivatives keep numbers of each step; a derivative of more steps than `kept_steps` has a program that finds them
-    again, so where one `tries`, as it can where values are known, the first has room for no more.
+    If no numbers of single steps are kept, the next power of 4 from `max_steps`, so that one program serves several
+    numbers. A derivative of more steps than `kept_steps` has a program that recomputes rows. So the first program has
+    only `kept_steps` if it `tries`, which needs concrete values.
 
-    If states are kept, `max_steps` in a program that is traced, and else first as many as take little memory.
+    If states of steps are kept, `max_steps` under a trace, and otherwise first a number that takes little memory.
     """
-    # Of dense output as many numbers for each of the state as a multistep method has in its history.
+    # Dense output keeps, for each number of the state, the history of a multistep method.
     kept = 16 if saveat.dense else int(saveat.subs[0].steps)
     if not kept:
         room, fewer = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9), kept_steps(state)
@@ -65,13 +65,13 @@ def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool
 
 
 def kept_steps(state: State) -> int:
-    """Of how many steps derivatives keep numbers at once."""
+    """The number of steps whose rows derivatives keep at once."""
     size = 2 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
     return max(min(MOST_ROWS, _ROW_BYTES // max(size, 1)), _FEWEST_ROWS)
 
 
 def was_long(system: Any, solver: Any) -> bool:
-    """Whether a motion of a system like this took as many steps as derivatives keep at once."""
+    """Whether a motion of such a system took at least as many steps as derivatives keep at once."""
     return jax.tree.structure((system, solver)) in _long
 
 

@@ -1,4 +1,4 @@
-"""A motion that is asked for: checked, solved, and finished."""
+"""A requested motion: checked, solved, and finished."""
 
 import contextlib
 import dataclasses
@@ -50,7 +50,7 @@ from .span import Span
 from .stops import Stops, breaks_of, checked_jumps, turns_of
 from .watch import Watch, parameter_changes
 
-# Defaults, made once: their construction would take as long as the rest of a call.
+# Defaults, made once: their construction takes as long as the rest of a call.
 _ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
 _HIDDEN = (
     "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
@@ -59,7 +59,7 @@ _HIDDEN = (
 
 
 class Asked(NamedTuple):
-    """The arguments of `simulate`, as the user gave them."""
+    """The arguments of `simulate`, as given by the user."""
 
     system: Any
     state: Any
@@ -86,14 +86,14 @@ class Asked(NamedTuple):
     progress_meter: Any
 
 
-# Of another run of the same motion, which the user does not see.
+# Arguments of another run of the same motion that the user does not see.
 _ALONE = {"event": None, "direction": None, "error": False, "throw": False, "progress_meter": None}
 
 
 class Ended(NamedTuple):
     """A run that was solved.
 
-    **Fields:** how it ended (`outcome`), and its `flags` as numbers, None under a trace.
+    **Fields:** its `outcome`, and the `flags` of it as numbers, None under a trace.
     """
 
     problem: Problem
@@ -106,14 +106,15 @@ class Ended(NamedTuple):
 class Run:
     """A motion with checked arguments.
 
-    **Fields:** `asked`, with the system that has the inputs; the `problem` of the program; the `rooms` for steps that
-    are tried one after the other; whether values are `known`, so that it can be seen after it how many steps it took.
+    **Fields:** `asked`: the arguments, with inputs included in the system; the `problem` of the program; the `rooms`
+    for steps, tried one after the other; `is_concrete`: whether values are concrete, so that the number of steps is
+    known afterwards.
     """
 
     asked: Asked
     problem: Problem
     rooms: list[int]
-    known: bool
+    is_concrete: bool
 
     @classmethod
     def checked(cls, asked: Asked) -> "Run":
@@ -124,7 +125,7 @@ class Run:
         system = asked.system if asked.inputs is None else with_inputs(asked.system, asked.inputs)
         state = checked_state(system, asked.state)
         asked = asked._replace(system=system, state=state, inputs=None)
-        # Numbers become arrays, so that other tolerances and times do not compile anew.
+        # Numbers become arrays, so that other tolerances and times do not compile again.
         rtol, atol = checked_tolerances(asked.rtol, asked.atol, state)
         span = Span.checked(asked.t0, asked.t1, asked.dt0, asked.saveat, state.q.dtype)
         method = _method(asked, rtol, atol)
@@ -142,16 +143,16 @@ class Run:
         return cls(asked, *_settled(problem, asked))
 
     def solved(self) -> Ended:
-        """The motion, again with more room where it took more steps than the program had room for."""
+        """The motion, repeated with larger buffers if it took more steps than fit."""
         problem, max_steps = self.problem, self.asked.max_steps
-        if not self.known:
+        if not self.is_concrete:
             return Ended(problem, *solved(problem), None)
         with contextlib.nullcontext() if problem.traced else told_of_compiling(problem.system):
             trajectory, outcome = solved(problem)
             if is_traced(outcome.flags) and not problem.traced:
                 raise ValueError(_HIDDEN)
             for rows in self.rooms[1:]:
-                # A value that is traced and hidden in a function leaves it open whether the steps sufficed.
+                # With a traced value hidden in a function, the number of steps is unknown.
                 if is_traced(outcome.flags) or not Flags(*np.asarray(outcome.flags)).ran_out:
                     break
                 problem = problem._replace(room=problem.room.of(rows, max_steps))
@@ -168,10 +169,10 @@ class Run:
         return Ended(problem, trajectory, outcome, None if problem.traced else flags)
 
     def finished(self, ended: Ended) -> Trajectory:
-        """The motion that the user gets.
+        """The motion for the user.
 
         **Raises:** `ValueError` for a start that violates the constraints; `RuntimeError` for a motion that failed,
-        unless the user does not want it.
+        unless `throw` is false.
         """
         asked, stats = self.asked, ended.trajectory.stats
         if asked.solver == "switch" and stats["stiff"]:
@@ -193,7 +194,7 @@ class Run:
         return trajectory
 
     def _explained(self, ended):
-        """A motion whose numbers are known, with the precise reason where it failed."""
+        """A motion with concrete numbers, and if it failed, with the precise reason."""
         problem, trajectory, outcome, flags = ended
         system, span, asked = problem.system, problem.span, self.asked
         if flags.inconsistent:
@@ -201,7 +202,7 @@ class Run:
         if flags.stuck:
             result, coupling = made_precise(problem, trajectory.result, outcome)
             if result == RESULTS.newton_failed and lost_rank(system.at(outcome.y), outcome.t, outcome.y) is not None:
-                # Elimination in blocks does not tell.
+                # Elimination in blocks does not detect lost rank.
                 result = RESULTS.singular_configuration
             trajectory = eqx.tree_at(lambda motion: motion.result, trajectory, result)
             outcome = outcome._replace(coupling=coupling)
@@ -214,10 +215,10 @@ class Run:
         return trajectory if flags.whole else trajectory.trimmed()
 
     def _probe(self, problem, outcome):
-        """The same motion from its end on, by a solver in a number of steps."""
+        """The same motion continued from its end, as a function of a solver and a number of steps."""
         end = self.asked._replace(state=outcome.y, t0=outcome.t, rtol=problem.method.rtol, atol=problem.method.atol)
         if problem.method.policy.restores:
-            # What was chosen for another method need not serve the one that looks for stiffness.
+            # The user's choice for another method need not suit the method that tests for stiffness.
             end = end._replace(formulation=None, manifold=None)
         on = end._replace(**_ALONE, saveat=None, dt0=None, stepsize_controller=None, adjoint=None)
         return lambda solver, steps: _motion(on._replace(solver=solver, max_steps=steps))
@@ -246,12 +247,12 @@ def _method(asked, rtol, atol):
     check_kinds(solver, asked.formulation, asked.manifold, controller, asked.adjoint, asked.event, asked.progress_meter)
     check_fixed_steps(solver, controller)
     dtmax = checked_longest_step(asked.dtmax, controller, solver, asked.state.q.dtype)
-    others = {"controller": controller, "rtol": rtol, "atol": atol, "dtmax": dtmax}
-    return Method.chosen(asked.system, solver, asked.manifold, asked.formulation, **others)
+    tolerances = {"controller": controller, "rtol": rtol, "atol": atol, "dtmax": dtmax}
+    return Method.chosen(asked.system, solver, asked.manifold, asked.formulation, **tolerances)
 
 
 def _settled(problem, asked):
-    """The problem with what depends on what is traced, the rooms for its steps, and whether values are known."""
+    """The problem with the parts that depend on tracing, the rooms for its steps, and whether values are concrete."""
     system, state, span = problem.system, problem.state, problem.span
     traced = is_traced(problem)
     if traced and asked.solver == "switch":
@@ -267,9 +268,9 @@ def _settled(problem, asked):
     orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
     if max(orders, default=0) > 1 and system.contacts:
         raise ValueError(NO_SECOND_DERIVATIVES)
-    # Where values are known, so is after it how many steps a motion took.
-    known = not traced or (taken is not None and taken.known)
-    tries = traced and known and not was_long(system, problem.method.solver)
+    # With concrete values, the number of steps is known afterwards.
+    is_concrete = not traced or (taken is not None and taken.known)
+    tries = traced and is_concrete and not was_long(system, problem.method.solver)
     rooms = [asked.max_steps]
     if asked.adjoint is None:
         rooms = rooms_for(asked.max_steps, problem.saveat, state, traced, tries)
@@ -282,4 +283,4 @@ def _settled(problem, asked):
         room=problem.room.of(rooms[0], asked.max_steps),
         traced=traced,
     )
-    return problem, rooms, known
+    return problem, rooms, is_concrete

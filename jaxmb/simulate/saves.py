@@ -1,4 +1,4 @@
-"""The states that a run saves: at which times, on the constraints, and the user's function of them."""
+"""The saved states of a run: their times, their return to the constraints, and the user's function of them."""
 
 import functools
 import math
@@ -20,14 +20,14 @@ from ..system import AbstractSystem
 from .captured import captured_call
 from .span import Span, at_moving_times
 
-# A program saves at this number of times, or at a power of 2 of them.
+# The least number of saved times of a program; others are powers of 2.
 _FEWEST_TIMES = 4
 
 # The state at the end, alone and after the user's series: for statistics and diagnosis.
 _AT_END = diffrax.SubSaveAt(t1=True)
 _END = diffrax.SaveAt(subs=_AT_END)
 _ENDS = diffrax.SaveAt(subs=(_AT_END, _AT_END), solver_state=True, controller_state=True)
-# What saves states as they are.
+# The function of diffrax that saves states unchanged.
 STATES = _AT_END.fn
 
 
@@ -67,7 +67,7 @@ def _check_saved_times(times: Any, start: Any, end: Any) -> Any:
 
 
 def with_end(saveat: diffrax.SaveAt, t: Any, state: State) -> diffrax.SaveAt:
-    """The user's series, and the end state."""
+    """The user's series, and the state at the end."""
     if saveat is _END:
         return _ENDS
     first = _AT_END if saveat.subs is None else saveat.subs
@@ -80,10 +80,10 @@ def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
     """The same with times behind the end of the run, which are not saved: one program serves several numbers."""
     first, last = saveat.subs
     if first.ts is None or first.ts.shape[0] == 0 or start == end:
-        # In no time at all every time would be saved.
+        # In an empty interval every time would be saved.
         return saveat
-    more = max(_FEWEST_TIMES, 2 ** math.ceil(math.log2(first.ts.shape[0]))) - first.ts.shape[0]
-    never = np.full(more, np.inf if end > start else -np.inf, first.ts.dtype)
+    missing = max(_FEWEST_TIMES, 2 ** math.ceil(math.log2(first.ts.shape[0]))) - first.ts.shape[0]
+    never = np.full(missing, np.inf if end > start else -np.inf, first.ts.dtype)
     times = np.concatenate([np.asarray(first.ts), never])
     return changed(saveat, subs=(changed(first, ts=times), last))
 
@@ -91,8 +91,8 @@ def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
 class SavedTimes(NamedTuple):
     """The user's series of saved states in the program of a run.
 
-    **Fields:** the `series` as it was asked for, whose times have derivatives; the `times` without them, None where it
-    has none; `after`: the same, but behind jumps; whether times are `outside` of the run, or turn back.
+    **Fields:** the `series` as given, whose times have derivatives; the `times` without derivatives, None if it has
+    none; `after`: the same, moved behind jumps; `outside`: whether times lie outside of the run, or turn back.
     """
 
     series: diffrax.SubSaveAt
@@ -102,40 +102,38 @@ class SavedTimes(NamedTuple):
 
     @classmethod
     def of(cls, series: diffrax.SubSaveAt, t0: Any, t1: Any, traced: bool) -> "SavedTimes":
-        """Those between the ends of a run, as far as this is not known before."""
+        """The times clipped to the ends of a run, unless that was checked before."""
         asked: Any = series.ts
         outside: Any = False
         times = lax.stop_gradient(asked)
         if traced and asked is not None:
             ends = jnp.sort(jnp.stack([t0, t1]))
             inside = jnp.clip(times, *ends)
-            # A time that is computed as t1 is may differ from it by rounding errors.
+            # A time that is computed like t1 may differ from it by rounding errors.
             rounding = 8 * jnp.finfo(ends.dtype).eps * jnp.max(jnp.abs(ends))
             ordered = jnp.all(jnp.where(t0 <= t1, 1, -1) * jnp.diff(times) >= 0)
             outside, times = ~(jnp.all(jnp.abs(inside - times) <= rounding) & ordered), inside
-            # Without the derivatives that clipping takes from the times at the ends.
+            # Restore the derivatives of times at the ends, which clipping removes.
             series = changed(series, ts=times + asked - lax.stop_gradient(asked))
         return cls(series, times, times, outside)
 
     def behind_jumps(self, jumps: Any, t0: Any, t1: Any) -> "SavedTimes":
-        """States that are saved at a jump are those after it, also in a run that comes to it from there."""
+        """The times for which states saved at a jump are the states after it, also in a run backward."""
         if jumps is None or self.times is None:
             return self
         return self._replace(after=after_jumps(self.times, jumps, t0, t1))
 
     def told(self, saveat: diffrax.SaveAt, t0: Any, finite: Any, function: Any) -> diffrax.SaveAt:
-        """What the solver is told to save: a function of states, all at once where no `finite` numbers are to start
-        from.
-        """
+        """The `SaveAt` for the solver: a function of states, saved all at once if the start has no `finite` numbers."""
         times = None if self.after is None else jnp.where(finite, self.after, t0)
         first, *rest = saveat.subs
         return changed(saveat, subs=(changed(first, ts=times, fn=function), *rest))
 
     def restored(self, ts: Any, start: Any, finite: Any) -> Any:
-        """The times that were asked for, of those at which states were saved.
+        """The requested times, from the times at which states were saved.
 
-        **Arguments:** `start`: the time at the start where a run may begin just before it, else None; whether the run
-        started from `finite` numbers.
+        **Arguments:** `start`: the time at the start if a run may begin just before it, else None; `finite`: whether
+        the run started from finite numbers.
         """
         if start is not None and self.series.t0:
             ts = ts.at[0].set(lax.stop_gradient(start))
@@ -145,7 +143,7 @@ class SavedTimes(NamedTuple):
 
 
 def moved(series: diffrax.SubSaveAt, term: Any, span: Span, y0: State, ts: Any, ys: Any) -> tuple[Any, Any]:
-    """Saved times and states with the derivatives of the times that move; `y0` is the state at a start that moves."""
+    """Saved times and states with the derivatives of moving times; `y0`: the state at a moving start."""
     if not any(span.moving):
         return ts, ys
     ts, moves = _moving_times(series, ts, span)
@@ -156,28 +154,28 @@ def moved(series: diffrax.SubSaveAt, term: Any, span: Span, y0: State, ts: Any, 
     return ts, ys
 
 
-def _moving_times(series, found, span):
-    """The times of a series of saved states with the derivatives of those that were asked for, and the moves of these:
-    zeros with their derivatives.
+def _moving_times(series, saved, span):
+    """The times of a series of saved states with the derivatives of the requested times, and their moves: zeros with
+    these derivatives.
 
-    **Arguments:** `found`: the times without derivatives, but for those of events.
+    **Arguments:** `saved`: the times without derivatives, except for times of events.
     """
     start, end = span.t0, span.t1
     if series.steps:
-        # Only the ends of a run move among its steps.
-        asked = jnp.broadcast_to(end, found.shape)
-        asked = asked.at[0].set(jnp.where(found[0] == lax.stop_gradient(start), start, end)) if series.t0 else asked
+        # Among the ends of steps, only the ends of the run move.
+        asked = jnp.broadcast_to(end, saved.shape)
+        asked = asked.at[0].set(jnp.where(saved[0] == lax.stop_gradient(start), start, end)) if series.t0 else asked
     else:
         asked = ([start[None]] if series.t0 else []) + ([] if series.ts is None else [series.ts])
         asked = jnp.concatenate(asked + ([end[None]] if series.t1 else []))
     frozen = lax.stop_gradient(asked)
-    is_asked = found == frozen
-    return jnp.where(is_asked, asked, found), jnp.where(is_asked, asked - frozen, 0.0)
+    is_asked = saved == frozen
+    return jnp.where(is_asked, asked, saved), jnp.where(is_asked, asked - frozen, 0.0)
 
 
 def seen(function: Any, ts: Any, ys: Any, start: tuple[Any, State]) -> Any:
     """The values of a user's function of saved states. Entries after the end of a run, whose states are infinite, are
-    infinite, whole numbers zero, and have no derivatives.
+    infinite, or zero for integers, and have no derivatives.
     """
     never = lambda x: jnp.inf if jnp.issubdtype(x.dtype, jnp.inexact) else 0
 
@@ -190,11 +188,9 @@ def seen(function: Any, ts: Any, ys: Any, start: tuple[Any, State]) -> Any:
 
 
 def corrected(correction: Any, system: AbstractSystem, ts: Any, ys: Any, start: tuple[Any, State]) -> tuple[Any, Any]:
-    """Saved states, returned to the constraints, and whether one of them could not be; entries after the end of a run
-    stay as they are.
-    """
+    """Saved states, returned to the constraints, and whether one failed; unchanged after the end of a run."""
     finite = jnp.isfinite(ts)
-    # Elsewhere something is corrected that has no failure and no derivative.
+    # Elsewhere the start is corrected instead, which has no failure and no derivative.
     at_start, y0 = lax.stop_gradient(start)
     inside = jax.tree.map(lambda y, y0: jnp.where(finite[:, None], y, y0[None]), ys, y0)
     every = vmap_states(lambda t, y: correction(system, t, y), system.coordinate_rows * system.nq)
@@ -207,7 +203,7 @@ def corrected(correction: Any, system: AbstractSystem, ts: Any, ys: Any, start: 
 
 
 def _replaced(values, old, new):
-    """Values with those that are among the `old` ones, which run up or down, replaced by the `new` ones."""
+    """Values in which the `old` ones, which run up or down, are replaced by the `new` ones."""
     order = jnp.argsort(old)
     k = order[jnp.clip(jnp.searchsorted(old[order], values), 0, old.size - 1)]
     return jnp.where(values == old[k], new[k], values)

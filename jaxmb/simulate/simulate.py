@@ -52,11 +52,11 @@ def simulate(
     motion["bar"].angle, motion.energy, motion.reactions["pin"].force
     ```
 
-    The first call for a system compiles a program, which takes seconds. Later ones with other numbers, times and
-    tolerances do not. `jax.jit` is not needed: it compiles the motion anew, as a part of its function.
+    The first call for a system compiles a program, which takes seconds. Later calls with other numbers, times and
+    tolerances do not. `jax.jit` is not needed: it compiles the motion again, as a part of its function.
 
-    `jaxmb help` has more on `tolerances`, `derivatives`, `contacts`, `inputs`, `throw` (motions that
-    fail) and `large-scenes`.
+    `jaxmb help` has more on `tolerances`, `derivatives`, `contacts`, `inputs`, `throw` (motions that fail) and
+    `large-scenes`.
 
     **Main arguments:**
 
@@ -72,21 +72,22 @@ def simulate(
 
     **Other arguments, rarely needed:**
 
-    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is `Adams`,
-        which warns of stiff motions; `"switch"` simulates these again with `Hermite`, not under a trace.
+    - `solver`: default `Adams()`; for stiff motions `Hermite()`; any diffrax Runge–Kutta solver. `"auto"` is `Adams`
+        with a warning for stiff motions; `"switch"` simulates stiff motions again with `Hermite`, not under a trace.
     - `formulation`: how accelerations are solved for, `Partitioned()`, `Multipliers()`, `NullSpace()`, …; default by
         the scene.
     - `manifold`: how the state stays on the constraints, `Partition()`, `Projection()` or others; default by the scene.
     - `dt0`: first step [s], default chosen from the motion. `dtmax`: longest step [s], default none.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
-    - `adjoint`: how to differentiate instead, one of diffrax's.
-    - `direction`: parameters by name with a change of each, whose effect steps resolve where a run is differentiated;
-        default all that derivatives are taken by. `{}` leaves the steps of the motion alone.
+    - `adjoint`: another method of differentiation, one of diffrax's adjoints.
+    - `direction`: parameters by name with a change of each; in a differentiated run, steps resolve the effect of these
+        changes. Default: all parameters with derivatives. `{}` leaves the steps of the motion alone.
     - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector; the solver restarts there.
-    - `event`, `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event sees states between the ends of
-        steps as they are interpolated, off the constraints by about `rtol`.
-    - `max_steps`: the largest number of steps. `max_events`: that of impacts and other events of contacts.
+    - `event`, `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event sees interpolated states between
+        the ends of steps, off the constraints by about `rtol`.
+    - `max_steps`: the largest number of steps. `max_events`: the largest number of impacts and other events of
+        contacts.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
         motion is NaN instead.
 

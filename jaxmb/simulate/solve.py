@@ -36,8 +36,8 @@ from .watch import Watch
 class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
 
-    **Fields:** `system` and `state` at the start; `saveat`: the user's series and the end; whether states are
-    `interpolated`; whether anything is `traced`.
+    **Fields:** `system` and `state` at the start; `saveat`: the user's series and the end; `interpolated`: whether
+    states are interpolated; `traced`: whether any argument is traced.
     """
 
     system: AbstractSystem
@@ -53,7 +53,7 @@ class Problem(NamedTuple):
     traced: bool
 
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
-        """Those of `diffrax.diffeqsolve`."""
+        """The options of `diffrax.diffeqsolve`."""
         system, method = self.system, self.method
         contacts, gaps = bool(system.contacts), method.watches_gaps(system)
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
@@ -74,8 +74,8 @@ class Problem(NamedTuple):
 class Start(NamedTuple):
     """The start of a run.
 
-    **Fields:** `given`, NaN where it violates the constraints, and `y`, which follows a start that moves; whether it is
-    `consistent`, whether parameters are in their range (`valid`), and whether all that and its numbers are `finite`.
+    **Fields:** the `given` state, NaN if it violates the constraints, and `y`, which follows a moving start; whether it
+    is `consistent`; whether parameters are in their range (`valid`); `finite`: all this, and finite numbers.
     """
 
     given: State
@@ -96,14 +96,14 @@ class Start(NamedTuple):
         if span.moving[0]:
             guards = contact_guards(system, method.formulation, method.policy.contact_tolerance(system, method.rtol))
             if guards is not None:
-                # The field is that of the contacts that close or open, and of the friction that slips, at the start.
+                # The field includes the contacts that close or open, and the friction that slips, at the start.
                 y = guards.impact(span.t0, y).after
             y = at_frozen_start(term, span.t0, y)
         return cls(given, y, consistent, valid, finite)
 
 
 class End(NamedTuple):
-    """The end of a run: time, state, the solver's result, the next step, events of contacts (None without)."""
+    """The end of a run: time, state, the solver's result, the next step, and events of contacts or None."""
 
     t: Any
     y: State
@@ -114,37 +114,37 @@ class End(NamedTuple):
     @classmethod
     def of(cls, solution: Any, stops: Stops) -> "End":
         t, y = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
-        found, events = None, events_found(solution.controller_state)
+        contact_events, events = None, events_found(solution.controller_state)
         if events is not None:
-            found = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch)
+            contact_events = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch)
             if stops.event is not None:
-                # The last step is cut off at the user's event, before what was found at its end.
-                later = jnp.isfinite(found.times) & (found.times > t)
-                found = found._replace(number=found.number - jnp.sum(later))
-        return cls(t, y, RESULTS.promote(solution.result), intended_step(solution.controller_state), found)
+                # The last step is cut off at the user's event, before the events at its end.
+                later = jnp.isfinite(contact_events.times) & (contact_events.times > t)
+                contact_events = contact_events._replace(number=contact_events.number - jnp.sum(later))
+        return cls(t, y, RESULTS.promote(solution.result), intended_step(solution.controller_state), contact_events)
 
 
 def solved(problem: Problem) -> tuple[Trajectory, Outcome]:
-    """The motion, and how it ended; where anything is traced, a motion that failed is NaN."""
+    """The motion, and how it ended; under a trace, a motion that failed is NaN."""
     motion, outcome = _solved(problem)
-    # Without its checks, which would take as long as those of all arguments.
+    # Without the checks of `Trajectory`, which would take as long as the checks of all arguments.
     return with_values(Trajectory, {"system": problem.system, "closer": None} | motion), outcome
 
 
 @jitted
 def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
-    """What the program returns: fields of the `Trajectory` but the system, which comes in already."""
+    """The results of the program: fields of the `Trajectory` without the system, which is an argument."""
     tracing_begins()
     system, method, stops, watched = problem.system, problem.method, problem.stops, problem.watched
     method.check_impulses(system, stops.restarts is not None)
     term, solver = method.prepared(system)
     direction = watched.direction(system, lambda system: method.prepared(system)[0])
     start = Start.of(problem, term)
-    # From nowhere there is no step to take: the interval is empty, with every time that is asked for in it.
+    # From a start that is not finite no step is taken: the interval is empty, and contains every requested time.
     whole, first = problem.span.frozen(start.finite), problem.saveat.subs[0]
     saves = SavedTimes.of(first, *lax.stop_gradient(problem.span[:2]), problem.traced)
     saves, span = saves.behind_jumps(stops.restarts, whole.t0, whole.t1), whole.before_jump(stops.restarts)
-    # A user's function is one of states on the constraints, at times that move.
+    # The user's function sees states on the constraints, at moving times.
     correction = method.policy.correction(problem.interpolated)
     later = first.fn is not STATES and (correction is not None or any(problem.span.moving))
     saveat = saves.told(problem.saveat, whole.t0, start.finite, STATES if later else first.fn)
@@ -165,8 +165,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     result, stuck, ran_out, coupling = _verdict(problem, span, start, end, solution, lost, saves.outside)
     motion, failed = (ys, solution.interpolation), has_failed(result)
     if problem.traced:
-        # A derivative would be that of the part before the failure. The error goes with the value, and not with a
-        # derivative that is taken alone.
+        # Otherwise a derivative would belong to the part before the failure. The error belongs to the value, not to a
+        # derivative taken alone.
         inputs = system, problem.state, problem.span, method.formulation, method.policy, stops.event, first.fn
         motion = nan_where(failed, motion, inputs)
     stats = _statistics(problem, solver, solution, end)
@@ -189,15 +189,15 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
 
 
 def _verdict(problem, interval, start, end, solution, lost, outside):
-    """The result of a run: the first reason that holds; whether it is stuck on its way, and whether it had too few
-    steps; the coupling of friction with its own reactions where that is why, None without friction.
+    """The result of a run by the first reason that holds; whether it is stuck on its way; whether it had too few steps;
+    and the coupling of friction with its own reactions if that is the reason, None without friction.
     """
     system, policy, span = problem.system, problem.method.policy, problem.span
     reasons: list[tuple[Any, Any]] = [
         (False if start.valid is True else ~start.valid, RESULTS.invalid_parameters),
         (~start.finite, RESULTS.assembly_failed),
     ]
-    known = start.finite
+    is_usable = start.finite
     if end.events is not None:
         backward, no_state = span.t1 < span.t0, end.result == RESULTS.promote(NO_STATE)
         reasons += [
@@ -205,13 +205,13 @@ def _verdict(problem, interval, start, end, solution, lost, outside):
             (end.events.number > problem.stops.max_events, RESULTS.too_many_events),
             (no_state, RESULTS.contacts_undetermined),
         ]
-        known = start.finite & ~backward & ~no_state
+        is_usable = start.finite & ~backward & ~no_state
     result = first_of(reasons, end.result)
-    # A run without enough steps is stuck where the rest would take a thousand times as many as it had.
+    # A run without enough steps is stuck if the rest would take a thousand times as many steps as it took.
     ran_out = result == RESULTS.max_steps_reached
-    left = jnp.abs(interval.t1 - end.t)
-    creeps = True if end.step is None else left > 1e3 * solution.stats["num_steps"] * jnp.abs(end.step)
-    stuck, coupling = has_failed(result) & known & (creeps | ~ran_out), None
+    remaining = jnp.abs(interval.t1 - end.t)
+    creeps = True if end.step is None else remaining > 1e3 * solution.stats["num_steps"] * jnp.abs(end.step)
+    stuck, coupling = has_failed(result) & is_usable & (creeps | ~ran_out), None
     if problem.traced:
         evidence = policy.evidence(solution.solver_state)
         result, coupling = diagnosed(problem, end.t, end.y, evidence, result, stuck)
@@ -241,14 +241,14 @@ def _statistics(problem, solver, solution, end):
 
 @eqx.filter_jit
 def made_precise(problem: Problem, result: Any, outcome: Outcome) -> tuple[Any, Any]:
-    """As `diagnosed`, of a run that got stuck: a program of its own, which only such runs need."""
+    """As `diagnosed`, for a run that got stuck: a separate program, which only such runs need."""
     stuck = result != RESULTS.inconsistent_constraints
     return diagnosed(problem, outcome.t, outcome.y, outcome.evidence, result, stuck)
 
 
 def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any]:
-    """The result of a run that ended at a state, made precise where it got stuck, and the coupling of friction with its
-    own reactions there, None without friction.
+    """The result of a run that ended at a state, made precise if it is stuck; and the coupling of friction with its own
+    reactions there, None without friction.
     """
     system = problem.system.prepared()
     result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck)

@@ -1,7 +1,7 @@
-"""The interval of a run, and derivatives by its times: its start, its end, and those that states are saved at.
+"""The interval of a run, and derivatives by its times: its start, its end, and the saved times.
 
-The mesh of a run has no derivatives. Where a time moves, the states that belong to it follow by Taylor's series of the
-solution, with coefficients from the field there: its first two terms, so that second derivatives are right as well.
+The mesh of a run has no derivatives. The states at a moving time follow by Taylor's series of the solution, with
+coefficients from the field there. It has two terms, so that second derivatives are right as well.
 """
 
 import contextlib
@@ -26,8 +26,8 @@ _FROZEN = contextvars.ContextVar("frozen", default=False)
 class Span(NamedTuple):
     """The interval of a run.
 
-    **Fields:** `dt0`: the first step, None for the default; whether the start, and the end or a saved time, are
-    `moving`: derivatives may be taken by them.
+    **Fields:** `dt0`: the first step, None for the default; `moving`: whether derivatives may be taken by the start,
+    and by the end or a saved time.
     """
 
     t0: Any
@@ -37,9 +37,7 @@ class Span(NamedTuple):
 
     @classmethod
     def checked(cls, t0: Any, t1: Any, dt0: Any, saved: Any, dtype: Any) -> "Span":
-        """**Arguments:** `saved`: as the user gave it, since under a trace the times of a `SaveAt` that is made here
-        are traced as well.
-        """
+        """**Arguments:** `saved`: as the user gave it, since a trace also traces the times of a new `SaveAt`."""
         start, end = real_array("t0", t0, dtype), real_array("t1", t1, dtype)
         for name, time in (("t0", start), ("t1", end)):
             if not is_traced(time) and not np.isfinite(time):
@@ -55,16 +53,16 @@ class Span(NamedTuple):
         return cls(start, end, step, moving)
 
     def is_backward(self) -> bool:
-        """Whether it is known that the run goes back in time."""
+        """Whether the run is known to go back in time."""
         return not is_traced((self.t0, self.t1)) and self.t1 < self.t0
 
     def frozen(self, finite: Any) -> "Span":
-        """The same without derivatives; no time at all where no `finite` numbers are to start from."""
+        """The same without derivatives; an empty interval if the start has no `finite` numbers."""
         t0, t1, dt0 = lax.stop_gradient((self.t0, self.t1, self.dt0))
         return Span(t0, jnp.where(finite, t1, t0), dt0, (False, False))
 
     def before_jump(self, jumps: Any) -> "Span":
-        """A run backward starts before a jump at its start."""
+        """The same, but a run backward starts before a jump at its start."""
         if jumps is None:
             return self
         before = jnp.isin(self.t0, jumps) & (self.t1 < self.t0)
@@ -73,7 +71,7 @@ class Span(NamedTuple):
 
 @contextlib.contextmanager
 def frozen_times() -> Iterator[None]:
-    """Nothing is differentiated by the times of runs that begin here, though JAX may trace them."""
+    """A context in which runs have no derivatives by their times, though JAX may trace these."""
     token = _FROZEN.set(True)
     try:
         yield
@@ -82,13 +80,13 @@ def frozen_times() -> Iterator[None]:
 
 
 def may_move(times: Any) -> bool:
-    """Whether some times of a run may have derivatives."""
+    """Whether times of a run may have derivatives."""
     return is_traced(times) and not _FROZEN.get()
 
 
 @eqx.filter_custom_jvp
 def at_frozen_start(term: Any, t0: Any, y0: Any) -> Any:
-    """The state that a run from a moving `t0` has at the time where it is now."""
+    """The state of a run from a moving `t0`, at the present value of that time."""
     return y0
 
 
@@ -99,8 +97,10 @@ def _at_frozen_start_jvp(primals, tangents):
 
 @eqx.filter_custom_jvp
 def at_moving_times(term: Any, ts: Any, moves: Any, ys: Any) -> Any:
-    """Saved states at moving times, from those at the times where they are now; `moves` are zeros with the derivatives
-    of the times that move. (Those of events have derivatives with which their states have moved already.)
+    """Saved states at moving times, from the states at the present values of these times.
+
+    **Arguments:** `moves`: zeros with the derivatives of the moving times. (The states of events have moved already
+    with the derivatives of their times.)
     """
     return ys
 
@@ -110,7 +110,7 @@ def _at_moving_times_jvp(primals, tangents):
     def moved(term, ts, moves, ys):
         finite = jnp.isfinite(ts)
         first = jnp.argmax(finite)
-        # Entries after the end of a run have no field.
+        # The field does not exist at entries after the end of a run.
         inside = jax.tree.map(lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, x[first]), (ts, ys))
         new = jax.vmap(lambda t, y, move: _series(term, lax.stop_gradient(t), y, move))(inside[0], inside[1], moves)
         return jax.tree.map(lambda x, y: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, ys)

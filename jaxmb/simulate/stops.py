@@ -1,4 +1,4 @@
-"""Times at which the steps of a run end, and those at which it restarts."""
+"""Times at which the steps of a run end, and times at which it restarts."""
 
 from typing import Any, NamedTuple
 
@@ -16,12 +16,12 @@ from ..system import AbstractSystem
 from ..system.inputs import input_break_times, turning_times
 from .method import adapts
 
-# The stops and the jumps of inputs of the last few runs: a loop of simulations looks for them once.
+# The stops and the jumps of inputs of the last few runs: a loop of simulations searches for them once.
 _turns, _breaks = Recent(8), Recent(8)
 
 
 class Stops(NamedTuple):
-    """Where a run stops, or its steps.
+    """Where a run, or its steps, must stop.
 
     **Fields:** times of `restarts`, or None; times of `turns`, which no step passes, or None; the user's `event`, or
     None; `max_events` of contacts.
@@ -33,8 +33,8 @@ class Stops(NamedTuple):
     max_events: int
 
     def around(self, controller: Any, contacts: bool, gaps: bool) -> Any:
-        """A controller that steps to these times and restarts there, and at events of `contacts`. Where forces have
-        `gaps`, its steps hide none of these.
+        """A controller that steps to these times and restarts there, and at events of `contacts`. If forces have
+        `gaps`, its steps do not hide them.
         """
         controller = EventController(controller, self.max_events) if contacts else controller
         controller = GapController(controller) if gaps else controller
@@ -45,7 +45,7 @@ class Stops(NamedTuple):
 
 def turns_of(system: AbstractSystem, state: State, t0: Any, t1: Any, controller: Any) -> Any:
     """Times that no step of a run may pass, or None."""
-    # Steps of a user's controller of jumps may not be cut at times that it does not know of.
+    # Steps of a user's controller of jumps must not be cut at times unknown to it.
     if not adapts(controller) or isinstance(controller, diffrax.ClipStepSizeController):
         return None
     return _turns.found((system, state, t0, t1), lambda: turning_times(system, state, t0, t1))
@@ -57,7 +57,7 @@ def breaks_of(system: AbstractSystem, t0: Any, t1: Any) -> np.ndarray:
 
 
 def checked_jumps(jumps: Any, of_inputs: np.ndarray) -> Any:
-    """Times at which to restart: those that the user announces and those of inputs; None if there are none."""
+    """Times at which to restart: the announced jumps and the jumps of inputs; None if there are none."""
     if jumps is None:
         return jnp.asarray(of_inputs) if of_inputs.size else None
     times = real_array("jumps", jumps, jnp.result_type(float), None)

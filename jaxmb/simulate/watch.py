@@ -18,23 +18,23 @@ from ..solvers import TangentControl
 from ..system import AbstractSystem
 from ..system.parameters import parameters, with_parameters
 
-# The least change of a parameter whose effect is watched, of one that is next to zero, in its unit.
+# The least change of a watched parameter next to zero, in its unit.
 _LEAST_CHANGE = 1e-4
 
 
 class Watch(NamedTuple):
-    """What is watched while a run is differentiated.
+    """The watched parameters of a run that is differentiated.
 
-    **Fields:** `changes`: values of parameters with changes whose tangent is watched, by name, None for all that are
-    differentiated, and empty for no tangent; by which leaves of the system and the state derivatives are taken
-    (`differentiated`), empty where that is not known.
+    **Fields:** `changes`: values of parameters with their changes, by name, whose tangent is watched; None for all
+    differentiated parameters, and empty for no tangent; `differentiated`: by which leaves of the system and the state
+    derivatives are taken, empty if unknown.
     """
 
     changes: dict[str, tuple[Any, Any]] | None
     differentiated: tuple[bool, ...]
 
     def direction(self, system: AbstractSystem, term_of: Callable[[AbstractSystem], Any]) -> Any:
-        """The tangent of the term along what is watched, None where it is not known yet, or there is none."""
+        """The tangent of the term along the changes; None if they are not known yet, or there are none."""
         if self.changes:
             moved = lambda step: {name: at + step * x for name, (at, x) in (self.changes or {}).items()}
             term = lambda step: term_of(with_parameters(system, moved(step)))
@@ -46,8 +46,8 @@ class Watch(NamedTuple):
         return None
 
     def control(self, system: AbstractSystem, start: State, duration: Any, direction: Any) -> TangentControl | None:
-        """What is known of the sizes of a tangent: those of the coordinates, and of the velocities in the duration [s]
-        of the motion; None where no tangent is watched.
+        """The control of tangents, in the sizes of coordinates, and of velocities in the duration [s] of the motion;
+        None if no tangent is watched.
         """
         if self.changes == {}:
             return None
@@ -71,19 +71,20 @@ def parameter_changes(
     """Values of parameters and their changes, by name; None for all."""
     if direction is None:
         return None
-    known = parameters(system)
+    values = parameters(system)
     if not isinstance(direction, Mapping):
         raise ValueError(f"direction must be a dictionary of parameters by name, got {direction!r}.")
     for name in direction:
-        if name not in known:
-            raise unknown("parameter", name, known)
-    array = lambda name, x: real_array(f"direction[{name!r}]", x, known[name].dtype, (known[name].shape,))
-    return {name: (known[name], array(name, x)) for name, x in direction.items()}
+        if name not in values:
+            raise unknown("parameter", name, values)
+    array = lambda name, x: real_array(f"direction[{name!r}]", x, values[name].dtype, (values[name].shape,))
+    return {name: (values[name], array(name, x)) for name, x in direction.items()}
 
 
 def pushed(function: Callable[..., Any], at: Any, used: Any) -> Any:
-    """The tangent of a function along a change of all the leaves that are `used`, of each by its own size, by one where
-    it is zero, and with random signs, always the same ones; None where none is used.
+    """The tangent of a function along a change of all leaves that are `used`; None if none is.
+
+    Each changes by its size, or by one if it is zero, with random signs, always the same.
     """
     random = np.random.default_rng(0)
 

@@ -1,8 +1,8 @@
 """The choice of formulas that treat stiff components correctly, by the eigenvalues of the Jacobian.
 
-Formulas that are not A-stable amplify oscillations with an eigenvalue λ near the imaginary axis and `|h λ|` of order
-one to ten: lightly damped vibrations of stiff springs. An error estimate detects such oscillations only when they are
-as large as the tolerance, and then keeps steps as short as those of an explicit method. The eigenvalues predict them.
+Formulas that are not A-stable amplify lightly damped vibrations of stiff springs: an eigenvalue λ near the imaginary
+axis with `|h λ|` of order one to ten. An error estimate detects such oscillations only when they are as large as the
+tolerance, and then steps become as short as with an explicit method. The eigenvalues predict them.
 
 A-stable formulas damp components that should grow if `h λ` is large, and their error estimates as well. The equation of
 such a step has several solutions, and Newton's method may find the wrong one.
@@ -36,17 +36,17 @@ _FOLDS = 2.0
 
 @functools.cache
 def sectors(family: str) -> NDArray[np.float64]:
-    """For each number of points k, from zero, and each size of `h λ`: the angle from the negative real axis within
-    which solutions do not grow; infinite if they do not in the whole left half-plane.
+    """The angle from the negative real axis within which solutions do not grow, for each number of points k, from zero,
+    and each size of `h λ`; infinite if they do not grow in the whole left half-plane.
     """
     highest = FAMILIES[family].highest
     out = np.full((highest + 1, _SIZES.size), np.inf)
     for k in range(1, highest + 1):
-        own = formula(family, k)
-        # The locus of roots of this modulus is the boundary locus of the recurrence for the scaled solution.
-        falling = _GROWTH ** -np.arange(len(own.a), dtype=float)
-        a, b, c = (tuple(np.array(x, float) * falling) for x in (own.a, own.b, own.c))
-        scaled = own._replace(a=a, b=b, c=c)
+        rule = formula(family, k)
+        # Roots of this modulus lie on the boundary locus of the recurrence for the scaled solution.
+        falling = _GROWTH ** -np.arange(len(rule.a), dtype=float)
+        a, b, c = (tuple(np.array(x, float) * falling) for x in (rule.a, rule.b, rule.c))
+        scaled = rule._replace(a=a, b=b, c=c)
         locus = boundary_locus(scaled, _THETA).ravel()
         locus = locus[np.isfinite(locus) & (locus.real < 0)]
         bins = np.round(np.log2(np.abs(locus) / _SIZES[0]) * _PER_OCTAVE).astype(int)
@@ -54,11 +54,11 @@ def sectors(family: str) -> NDArray[np.float64]:
             inside = (bins + neighbour >= 0) & (bins + neighbour < _SIZES.size)
             angles = np.pi - np.abs(np.angle(locus[inside]))
             np.minimum.at(out[k], bins[inside] + neighbour, angles)
-        out[k, spectral_radius(own, -_SIZES) > _GROWTH] = 0.0
+        out[k, spectral_radius(rule, -_SIZES) > _GROWTH] = 0.0
     return out
 
 
-# Members of a batch are treated one after the other; see `jaxmb.linalg`.
+# Members of a batch are computed one after the other; see `jaxmb.linalg`.
 @sequential_vmap
 def _lapack_eigenvalues(matrix):
     return jnp.linalg.eigvals(matrix)

@@ -17,17 +17,16 @@ from ._newton import AbstractLinearization, StepEquation
 
 # The matrix is renewed after a step whose corrections shrank more slowly than by this factor.
 _SLOW = 0.2
-# The derivative of the Jacobian along the motion is a difference over this power of the rounding unit, in steps: with
-# longer differences the truncation error, which is stiff, slows Newton's method, with shorter ones the rounding error.
+# The derivative of the Jacobian along the motion is a difference over this power of the rounding unit, in steps. With
+# longer ones the stiff truncation error slows Newton's method, with shorter ones the rounding error.
 _AHEAD = 0.4
 
 
 class DenseLinearization(AbstractLinearization):
-    """Full matrices: how a state and its derivatives in time change with the free components.
+    """Full matrices: how a state and its time derivatives change with the free components.
 
-    **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g where f is held; `spectrum`:
-    the eigenvalues of J, the free rows of `rate`; `renewals`: the number of next steps that must compute their own
-    matrix.
+    **Fields:** derivatives of the `state`, of its `rate` f, and of the `acceleration` g for a held f; `spectrum`: the
+    eigenvalues of J, the free rows of `rate`; `renewals`: the number of next steps that must compute a new matrix.
     """
 
     state: Float[Array, "n free"]
@@ -38,7 +37,7 @@ class DenseLinearization(AbstractLinearization):
 
     @classmethod
     def unknown(cls, y: Float[Array, " n"], free: Int[Array, " free"]) -> "DenseLinearization":
-        """Zeros, and that the first step computes its own."""
+        """Zeros, so that the first step computes its matrix."""
         none = jnp.zeros((y.size, free.size), y.dtype)
         spectrum = lax.complex(*[jnp.zeros(free.size, y.dtype)] * 2)
         return cls(none, none, none, spectrum, jnp.asarray(1, jnp.int32))
@@ -94,27 +93,26 @@ class DenseLinearization(AbstractLinearization):
         units = jnp.zeros((free.size, self.state.shape[0]), self.state.dtype).at[jnp.arange(free.size), free].set(1)
         state, rate, _ = jax.vmap(lambda x: push(x, None), out_axes=-1)(units)
         jacobian = rate[free]
-        # A rate whose free components are held still satisfies the constraints where the state has moved to.
+        # A rate with held free components still satisfies the constraints at the moved state.
         turned = (rate - state @ jacobian).T
         _, _, acceleration = jax.vmap(push, out_axes=-1)(units, turned)
-        held, own_inverses = acceleration[free], inverses_of(jacobian, acceleration[free], a, b)
+        of_g, exact = acceleration[free], inverses_of(jacobian, acceleration[free], a, b)
 
-        def solve(own, load):
-            y, f, g = own
+        def solve(by_numbers, load):
+            y, f, g = by_numbers
             moved = f[free]
             g = g + push(None, f - state @ moved)[2]
 
             def correction(change):
-                # Large terms are combined as in `correction` above, so the result does not depend on the last digits of
-                # an inverse.
+                # Large terms are combined as in `correction` above, so the last digits of an inverse do not matter.
                 slope = moved + jacobian @ change
-                mismatch = change - (load + b * g)[free] - b * held @ change
-                mismatch = mismatch - own_inverses.missing * jacobian @ slope
-                return own_inverses.c @ (own_inverses.p @ mismatch - own_inverses.p_rate @ slope), slope
+                mismatch = change - (load + b * g)[free] - b * of_g @ change
+                mismatch = mismatch - exact.missing * jacobian @ slope
+                return exact.c @ (exact.p @ mismatch - exact.p_rate @ slope), slope
 
             change = -correction(jnp.zeros_like(moved))[0]
-            left, slope = correction(change)
-            slope = slope - jacobian @ left
+            remainder, slope = correction(change)
+            slope = slope - jacobian @ remainder
             f = (f + rate @ change).at[free].set(slope, unique_indices=True)
             return y + state @ change, f, g + acceleration @ change + rate @ slope
 
@@ -129,10 +127,10 @@ def linearize(
     h: Any,
     free: Int[Array, " free"],
 ) -> DenseLinearization:
-    """The derivatives of a field with respect to the free components, for a step h and a held `rate`.
+    """The derivatives of a field by the free components, for a step h and a held `rate`.
 
-    That of g is the derivative of the Jacobian along the motion. A difference is accurate enough for Newton's method;
-    third derivatives of the field would dominate compile time.
+    The derivative of g contains the derivative of the Jacobian along the motion. A difference is accurate enough for
+    Newton's method; third derivatives of the field would dominate compile time.
     """
     unit = jnp.zeros((free.shape[0], y.size), y.dtype).at[jnp.arange(free.shape[0]), free].set(1)
 
@@ -154,11 +152,11 @@ def linearize(
 
 
 class Inverses(NamedTuple):
-    """Inverses for `(P - C) x = r`, with `P = 1 - a J - b J²` and `C = b K`, K the derivative of g at a held rate.
+    """Inverses for `(P - C) x = r`, with `P = 1 - a J - b J²` and `C = b K`, K the derivative of g for a held rate.
 
-    **Fields:** `p`: P⁻¹; `p_rate`: `P⁻¹ (a + b J)`; `missing`: how much less than b the factor of J² in P is; `c`:
-    `(1 - P⁻¹ (C + missing J²))⁻¹`, to be applied after P⁻¹. With a wrong rate `c` can be so small that it hides errors:
-    errors of a step are measured by P⁻¹ alone.
+    **Fields:** `p`: P⁻¹; `p_rate`: `P⁻¹ (a + b J)`; `missing`: b minus the factor of J² in P; `c`: `(1 - P⁻¹ (C +
+    missing J²))⁻¹`, to be applied after P⁻¹. With a wrong rate `c` can be so small that it hides errors: errors of a
+    step are measured by P⁻¹ alone.
     """
 
     p: Float[Array, "free free"]
@@ -167,9 +165,12 @@ class Inverses(NamedTuple):
     c: Float[Array, "free free"]
 
 
-def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free free"], a: Any, b: Any) -> Inverses:
-    """The inverses of Newton's method, each as accurate as one of a matrix with a single J; `held` is the derivative of
-    g at a held rate.
+def inverses_of(
+    jacobian: Float[Array, "free free"], held_acceleration: Float[Array, "free free"], a: Any, b: Any
+) -> Inverses:
+    """The inverses of Newton's method, each as accurate as the inverse of a matrix with a single J.
+
+    **Arguments:** `held`: the derivative of g for a held rate.
     """
     identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
@@ -177,16 +178,16 @@ def inverses_of(jacobian: Float[Array, "free free"], held: Float[Array, "free fr
     product, least = -b - a**2 / 4, a**2 / 1000 + jnp.finfo(jacobian.dtype).tiny
     real, imaginary = a / 2, jnp.sqrt(jnp.maximum(product, least))
     once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
-    # The imaginary parts of r, r^2 and 1 times this inverse, over that of r.
+    # The imaginary parts of r, r^2 and 1 times this inverse, over the imaginary part of r.
     along, across = jnp.real(once), jnp.imag(once) / imaginary
     p_rate = a * along + (real**2 - imaginary**2) * across
     p = along + real * across
     missing = jnp.maximum(least - product, jnp.zeros_like(product))
-    c = inverse(identity - p @ (b * held + missing * jacobian @ jacobian))
+    c = inverse(identity - p @ (b * held_acceleration + missing * jacobian @ jacobian))
     return Inverses(p, p_rate, missing, c)
 
 
-# Members of a batch are treated one after the other; see `jaxmb.linalg`.
+# Members of a batch are computed one after the other; see `jaxmb.linalg`.
 @sequential_vmap
 def _lapack_inverse(matrix):
     return jnp.linalg.inv(matrix)

@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
-# `(t, y, f, along) -> (y, f, g)`: a known state, its f, and g along a rate of the state, f if that is None, with the
-# derivatives that the equations give them; a pytree as well.
+# `(t, y, f, along) -> (y, f, g)`: a known state, its f, and g along a rate of the state (None: f), with their
+# derivatives by the equations; a pytree as well.
 Solution = Callable[..., tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 
 
 class Derivatives(NamedTuple):
-    """A state with its first and second derivative in time; `rest`: the other outputs of the field."""
+    """A state with its first and second time derivatives; `rest`: the other outputs of the field."""
 
     y: Float[Array, " n"]
     f: Float[Array, " n"]
@@ -26,7 +26,7 @@ class Derivatives(NamedTuple):
 
 
 def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
-    """The state, on the manifold, and its derivatives in time."""
+    """The state on the manifold, and its time derivatives."""
     (y, f), push, rest = jax.linearize(field, t, y, has_aux=True)
     return Derivatives(y, f, push(jnp.ones_like(t), f)[1], rest)
 
@@ -34,8 +34,10 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
 def probed_derivatives(
     field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None, along: bool = False
 ) -> tuple[Derivatives, Bool[Array, ""]]:
-    """The same, and whether differences of f contradict its derivative; `size` of the components, if known;
-    `along`: whether to take differences along the manifold only, where a projection returns to it.
+    """The same, and whether differences of f contradict its derivative.
+
+    **Arguments:** `size` of the components, if known; `along`: whether to take differences along the manifold only,
+    where a projection returns to it.
     """
     eps = jnp.finfo(y.dtype).eps
     size = jnp.abs(y) + (jnp.mean(jnp.abs(y)) if size is None else size)
@@ -48,7 +50,7 @@ def probed_derivatives(
         (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
         times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
         (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, way]))
-        # The same way at both states, for the mean of both slopes to be that of the difference to second order.
+        # The same direction at both states: the mean of both slopes is that of the difference to second order.
         way = lax.stop_gradient(move) if along else way
         return (y + way, way), (Derivatives(state, f, g, rest), slope)
 
@@ -62,7 +64,7 @@ def probed_derivatives(
 
 
 def filled(tangent: Array | None, primal: Array) -> Array:
-    """A tangent, zero where there is none."""
+    """A tangent; zeros instead of None."""
     return jnp.zeros_like(primal) if tangent is None else tangent
 
 
@@ -70,7 +72,7 @@ def filled(tangent: Array | None, primal: Array) -> Array:
 def at_start(
     end: tuple[Array, Array, Array], solution: Solution, t: Any, y: Float[Array, " n"]
 ) -> tuple[Array, Array, Array]:
-    """`(y, f, g)` at a state y, which are known, with the derivatives that the equations give them."""
+    """`(y, f, g)` at a known state y, with their derivatives by the equations."""
     del solution, t, y
     return end
 
@@ -85,16 +87,17 @@ def _at_start_jvp(primals, tangents):
 def linearized(
     solution: Callable[[PyTree], Solution], numbers: PyTree, t: Any, y: Float[Array, " n"], f: Float[Array, " n"]
 ) -> tuple[Callable[..., tuple[Array, Array, Array]], Callable[..., tuple[Array, Array, Array]]]:
-    """The tangents of `(y, f, g)` at a known state as linear functions: of those of the `numbers` that the solution
-    depends on and of time, None without any, for a rate that is held; and of those of the state and of the rate that g
-    is along, None for held.
+    """The tangents of `(y, f, g)` at a known state as two linear functions.
+
+    The first takes the tangents of the `numbers` that the solution depends on and of time (None: no tangent), for a
+    held rate. The second takes the tangents of the state and of the rate that g is along (None: held).
     """
     out, push = jax.linearize(lambda x, *at: solution(x)(*at[:2], f, at[2]), numbers, t, y, f)
     zeros, still = jax.tree.map(jnp.zeros_like, (numbers, t, y, f)), jax.tree.map(lambda _: None, numbers)
 
-    def pushed(*tangents):
-        # As a derivative of the linear function, which leaves out what has no tangent.
-        moved = eqx.filter_jvp(push, zeros, tangents)[1]
-        return jax.tree.map(filled, moved, out, is_leaf=lambda x: x is None)
+    def tangents_of(*tangents):
+        # A derivative of the linear function leaves out numbers without tangents.
+        out_tangents = eqx.filter_jvp(push, zeros, tangents)[1]
+        return jax.tree.map(filled, out_tangents, out, is_leaf=lambda x: x is None)
 
-    return lambda along, dt: pushed(along, dt, None, None), lambda y, rate: pushed(still, None, y, rate)
+    return lambda along, dt: tangents_of(along, dt, None, None), lambda y, rate: tangents_of(still, None, y, rate)

@@ -9,7 +9,7 @@ its slope, and at points of the past, and imposes one condition on the polynomia
     B        y   k                      has the second derivative g at the end        k + 1
     Y        y   k, with their slopes   the same                                      2k + 1
 
-A point with its slope is a double node, so all families are one formula on `m` nodes of the past, `m = k` or `2k`, and
+A point with its slope is a double node. So all families are one formula on `m` nodes of the past, `m = k` or `2k`, and
 follow from one table of divided differences. With the Newton basis of these nodes and `s = (t - t_{n+1}) / h`,
 
     p(t) = sum_{i<m} differences[i] basis_i(t) + (a + b s) basis_m(t) / basis_m(t_{n+1}),
@@ -58,8 +58,8 @@ class Family(NamedTuple):
 
 
 _ANY = float("inf")
-# Beyond the highest number of points E and B are stable in no useful sector (A(α) below 13 degrees), and Y in none; H
-# is A-stable with one point only; the others are for comparison.
+# With more points than these, E and B are stable in no useful sector (A(α) below 13 degrees), and Y in none. H is
+# A-stable with one point only; its others are for comparison.
 FAMILIES = {
     "E": Family(True, 1, 7, 2, (_ANY,) * 7),
     "B": Family(False, 1, 8, 3, (_ANY, 3.84, 2.14, 1.57, 1.32, 1.19, 1.11, 1.06)),
@@ -127,14 +127,14 @@ def double(history: History, slope: Float[Array, " n"]) -> History:
     """The history with its latest point doubled by the slope of z there; unchanged if that point is double already."""
     mesh, dtype = history.mesh, history.differences.dtype
     length = mesh.shape[0]
-    own = spans(mesh)[0]
-    gaps = jnp.where(mesh[0] > mesh, mesh[0] - mesh, own)
+    step = spans(mesh)[0]
+    gaps = jnp.where(mesh[0] > mesh, mesh[0] - mesh, step)
     # The slopes of the basis polynomials at the latest point, where all but the first vanish.
-    slopes = jnp.asarray(np.arange(length) > 0, dtype) * (own / gaps).astype(dtype)
+    slopes = jnp.asarray(np.arange(length) > 0, dtype) * (step / gaps).astype(dtype)
     before = jnp.asarray(before_each(length), dtype)
-    new = own.astype(dtype) * slope[None] - (before * slopes[None]) @ history.differences
-    new = jnp.where((np.arange(length, dtype=np.int32) <= history.known)[:, None], new, jnp.zeros((), dtype))
-    new = jnp.concatenate([history.differences[:1], new[1:]])
-    doubled = History(new, jnp.append(mesh[:1], mesh[:-1]), jnp.minimum(history.known + 1, length).astype(np.int32))
+    added = step.astype(dtype) * slope[None] - (before * slopes[None]) @ history.differences
+    added = jnp.where((np.arange(length, dtype=np.int32) <= history.known)[:, None], added, jnp.zeros((), dtype))
+    added = jnp.concatenate([history.differences[:1], added[1:]])
+    doubled = History(added, jnp.append(mesh[:1], mesh[:-1]), jnp.minimum(history.known + 1, length).astype(np.int32))
     already = mesh[0] == mesh[1]
-    return jax.tree.map(lambda old, new: jnp.where(already, old, new), history, doubled)
+    return jax.tree.map(lambda old, added: jnp.where(already, old, added), history, doubled)

@@ -6,8 +6,8 @@ derivatives is
     P(t) = sum_i differences[i] * basis_i(t),    basis_i(t) = prod_{j<i} (t - t_{n-j}) / (t_n - t_{n-j-1}),
 
 where `differences[i]` is the divided difference `f[t_n, ..., t_{n-i}]` times the spans that `basis_i` is divided by.
-All entries have the units of `f`, so no step size causes overflow or underflow, and advancing by one step needs only
-`basis_i` at the new mesh point: there are no loops over the order.
+All entries have the units of `f`, so no step size causes overflow or underflow. Advancing by one step needs only
+`basis_i` at the new mesh point, without loops over the order.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 HIGHEST_ORDER = 13
 LENGTH = HIGHEST_ORDER + 1
 
-# Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, that of the highest basis polynomial.
+# Gauss-Legendre on [0, 1]; seven nodes are exact up to degree 13, the highest of a basis polynomial.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(7)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
 INDEX = np.arange(LENGTH, dtype=np.int32)
@@ -50,16 +50,16 @@ def start(t: Any, f: Float[Array, " n"], spacing: Any) -> History:
 
 
 def spans(mesh: Float[Array, " length"]) -> Float[Array, " length-1"]:
-    """The divisors of the factors of the basis. If the latest point is double, its own span is the next one."""
+    """The divisors of the factors of the basis. If the latest point is double, its span is the next one."""
     out = mesh[0] - mesh[1:]
     return jnp.where(out > 0, out, out[1])
 
 
 def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Array, "length points"]:
-    """The Newton basis of a mesh at some times."""
+    """The Newton basis of a mesh at given times."""
     length = mesh.shape[0]
     factors = (t[None, :] - mesh[:-1, None]) / spans(mesh)[:, None]
-    # A product over a mask is one kernel in XLA, a cumulative product a dozen.
+    # XLA compiles a product over a mask to one kernel, a cumulative product to a dozen.
     factors_of = np.tril(np.ones((length, length - 1), dtype=bool), -1)
     return jnp.prod(jnp.where(factors_of[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
 
@@ -76,7 +76,7 @@ def basis_means(
 
 
 def before_each(length: int) -> np.ndarray:
-    """Square matrix that sums, for each index, over those before it."""
+    """A square matrix that sums, for each index, over the preceding indices."""
     return np.tril(np.ones((length, length)), -1)
 
 
@@ -101,9 +101,9 @@ def advance(history: History, t: Any, z: Float[Array, " n"], partial_sums: Float
 
 
 def known_differences(
-    known: Int[Array, ""], z: Float[Array, " n"], partial_sums: Float[Array, "length n"]
+    count: Int[Array, ""], z: Float[Array, " n"], partial_sums: Float[Array, "length n"]
 ) -> Float[Array, "length n"]:
-    """The divided differences after a step with `z` at its end, from a number of points `known` before."""
-    # Rows that involve placeholders are kept at zero: they are never used but would grow without bound.
-    rows = known >= np.arange(partial_sums.shape[0], dtype=np.int32)
+    """The divided differences after a step with `z` at its end, from the `count` of points before it."""
+    # Rows with placeholders stay zero: they are never used but would grow without bound.
+    rows = count >= np.arange(partial_sums.shape[0], dtype=np.int32)
     return jnp.where(rows[:, None], z[None] - partial_sums, jnp.zeros((), z.dtype))

@@ -30,14 +30,14 @@ class MultistepInterpolation(diffrax.AbstractLocalInterpolation):
 
     @abc.abstractmethod
     def _since_end(self, t: Any) -> Float[Array, " n"]:
-        """The solution at `t` minus that at the end of the step."""
+        """The solution at `t` minus the solution at the end of the step."""
 
 
 class RateInterpolation(MultistepInterpolation):
     """The integral of a polynomial through the derivatives at the end of a step and before.
 
     The evaluation at the end of a step changes this polynomial slightly, so its integral misses the initial value of
-    the step by `mismatch`. A cubic that is flat at both ends compensates for it: the solution is continuously
+    the step by `mismatch`. A cubic that is flat at both ends compensates for it. So the solution is continuously
     differentiable from step to step, and its derivative at mesh points is the vector field.
     """
 

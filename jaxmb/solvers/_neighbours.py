@@ -1,4 +1,4 @@
-"""The formulas of a family beside the one in use, and the steps at which they damp."""
+"""The neighbours of the present formula in its family, and the steps at which formulas damp."""
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,11 @@ from .order import GAIN
 
 
 def ladder(past_points: tuple[int, ...]) -> np.ndarray:
-    """For each number of points: the next lower, itself, and the next higher."""
+    """For each number of points: the next lower number, itself, and the next higher."""
     steps = [*range(1, past_points[0]), *past_points]
     out = np.zeros((past_points[-1] + 1, 3), np.int32)
-    for lower, own, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
-        out[own] = lower, own, upper
+    for lower, points, upper in zip([steps[0], *steps], steps, [*steps[1:], steps[-1]], strict=False):
+        out[points] = lower, points, upper
     return out
 
 
@@ -41,7 +41,7 @@ def damped_growth(
     factors: Float[Array, " formulas"],
 ) -> Float[Array, " formulas"]:
     """The factors by which steps may grow such that the longer steps damp all decaying components."""
-    # One change of a step is not larger than this.
+    # A single change of the step lies within these bounds.
     steps = h * jnp.stack([jnp.clip(factors, 0.5, 4.0), jnp.ones_like(factors)])
     then, now = jax.vmap(lambda steps: are_damped(family, points, steps, spectrum))(steps)
     zero, one = jnp.zeros_like(factors), jnp.ones_like(factors)

@@ -1,8 +1,8 @@
 """Newton's method for the implicit equation of a step that uses the second derivative.
 
-A step solves `y = past + a f(t, y) + b g(t, y)`, where `g` is the time derivative of `f` along the solution: one
-directional derivative of `f`, exact. The iteration is the same for all linearisations: full matrices (`_dense`), and
-those that know their structure (`_structured`).
+A step solves `y = past + a f(t, y) + b g(t, y)`. The time derivative `g` of `f` along the solution is exact: one
+directional derivative. The iteration is the same for all linearisations: full matrices (`_dense`), and matrices that
+know their structure (`_structured`).
 """
 
 import abc
@@ -25,9 +25,9 @@ else:
     from equinox import AbstractVar
 
 _MAX_ITERATIONS = 10
-# If a matrix of an earlier step has failed, this number of steps compute their own.
+# If a matrix of an earlier step has failed, this number of steps compute new ones.
 _DISTRUST = 10
-# If a correction is larger than this fraction of the state and its change, the matrix is not reliable at its end.
+# If a correction is larger than this fraction of the state and its change, the matrix is unreliable after it.
 _FAR = 0.1
 # The largest number of matrices for a step; and the code for success.
 _ATTEMPTS, _DONE = 4, 9
@@ -36,9 +36,8 @@ _ATTEMPTS, _DONE = 4, 9
 class StepEquation(eqx.Module):
     """The equation `y = past + a f(t, y) + b g(t, y)` of a step.
 
-    **Fields:** `field`; `jacobian(y)`: its derivative that knows its structure, with the direction of time, or None;
-    `t`, the end of the step, and `h`, its length; `past`, `a`, `b`; `free`: indices of the unknowns among the
-    components of the state.
+    **Fields:** `field`; `jacobian(y)`: its derivative with known structure and the direction of time, or None; `t`, the
+    end of the step, and `h`, its length; `past`, `a`, `b`; `free`: indices of the unknowns in the state.
     """
 
     field: Field
@@ -52,12 +51,12 @@ class StepEquation(eqx.Module):
 
 
 class AbstractLinearization(eqx.Module):
-    """How a state and its derivatives in time change with the unknowns of a step `y = past + a f + b g`.
+    """How a state and its time derivatives change with the unknowns of a step `y = past + a f + b g`.
 
     **Fields:** `spectrum`: eigenvalues of the derivative J of the field; `renewals`: the number of next steps that must
-    compute their own linearisation.
+    compute a new linearisation.
 
-    `inverses` is what the method of that name returns, the solved form of Newton's equation.
+    The method `inverses` returns the argument `inverses` of the others, the solved form of Newton's equation.
     """
 
     spectrum: AbstractVar[Complex[Array, " k"]]
@@ -85,11 +84,11 @@ class AbstractLinearization(eqx.Module):
 
     @abc.abstractmethod
     def inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> Any:
-        """The solved form of Newton's equation, of a step with these `a`, `b` and unknowns."""
+        """The solved form of Newton's equation, for a step with these `a`, `b` and unknowns."""
 
     @abc.abstractmethod
     def no_inverses(self, a: Any, b: Any, free: Int[Array, " free"]) -> Any:
-        """Zeros in its place."""
+        """Zeros in place of `inverses`."""
 
     @abc.abstractmethod
     def observed(self, inverses: Any, anew: Bool[Array, ""]) -> Any:
@@ -109,16 +108,16 @@ class AbstractLinearization(eqx.Module):
         g: Float[Array, " n"],
         along: Float[Array, " n"],
     ) -> tuple[Float[Array, " free"], Float[Array, " free"], Float[Array, " n"], Float[Array, " n"]]:
-        """The correction of the unknowns, with and without the derivative of g at a held rate, and f and g after it.
+        """The correction of the unknowns, with and without the derivative of g for a held rate, and f and g after it.
 
-        **Arguments:** `f`, `g`: at y, g along a rate `along` that f approaches.
+        **Arguments:** `f`, `g`: at y, g along a rate `along` that approaches f.
         """
 
     @abc.abstractmethod
     def errors(
         self, inverses: Any, free: Int[Array, " free"], changes: Float[Array, "formulas n"]
     ) -> Float[Array, "formulas n"]:
-        """The changes of the solution with those of the past, also of what does not follow from the unknowns."""
+        """The changes of the solution by changes of the past, also in components that do not depend on the unknowns."""
 
     @abc.abstractmethod
     def tangents(
@@ -129,15 +128,16 @@ class AbstractLinearization(eqx.Module):
         free: Int[Array, " free"],
         push: Callable[..., tuple[Array, Array, Array]],
     ) -> Callable[..., tuple[Array, Array, Array]]:
-        """The tangents of `(y, f, g)` at the end of a step, a linear function `(own, load)` of those at a held y and
-        rate, and of that of `past + a f + b g` where f and g are held.
+        """The tangents of `(y, f, g)` at the end of a step, as a linear function of `(by_numbers, load)`. The first are
+        the tangents of `(y, f, g)` for a held y and rate, the second is the tangent of `past + a f + b g` for held f
+        and g.
 
-        **Arguments:** `push`: the tangents of `(y, f, g)` by those of y and of the rate that g is along.
+        **Arguments:** `push`: the tangents of `(y, f, g)` by the tangents of y and of the rate that g is along.
         """
 
 
 class KnownStep(eqx.Module):
-    """A step whose end is known.
+    """A step with a known end.
 
     **Fields:** the `solution` of its equations, and the end `t`; `past`, `a`, `b` and `free` as in `StepEquation`.
     """
@@ -156,7 +156,7 @@ def at_end(
 ) -> tuple[Array, Array, Array]:
     """`(y, f, g)` at the end of a step, the solution of `y = past + a f + b g`, with its exact derivatives.
 
-    **Arguments:** `end`: these numbers; `matrix`: the last of Newton's method.
+    **Arguments:** `end`: these numbers; `matrix`: the last matrix of Newton's method.
     """
     del step, matrix, inverses
     return end
@@ -167,8 +167,8 @@ def _at_end_jvp(primals, tangents):
     _, step, matrix, inverses = primals
     along = tangents[1]
     y, f, g = out = at_end(*primals)
-    has_one = jax.tree.map(lambda d: d is not None, along.solution, is_leaf=lambda x: x is None)
-    numbers, rest = eqx.partition(step.solution, has_one)
+    has_tangent = jax.tree.map(lambda d: d is not None, along.solution, is_leaf=lambda x: x is None)
+    numbers, rest = eqx.partition(step.solution, has_tangent)
     by_numbers, by_state = linearized(lambda x: eqx.combine(x, rest), numbers, step.t, y, f)
     solve = matrix.tangents(inverses, step.a, step.b, step.free, by_state)
     load = filled(along.past, step.past) + filled(along.a, step.a) * f + filled(along.b, step.b) * g
@@ -176,8 +176,10 @@ def _at_end_jvp(primals, tangents):
 
 
 class Solved(NamedTuple):
-    """The end of a step, without derivatives; whether Newton's method `converged`; its last matrix, with the inverses;
-    and its `work`: numbers of evaluations of f and g, and of matrices.
+    """The end of a step, without derivatives.
+
+    **Fields:** whether Newton's method `converged`; its last `matrix`, with the `inverses`; `work`: numbers of
+    evaluations of f and g, and of matrices.
     """
 
     end: Derivatives
@@ -188,8 +190,8 @@ class Solved(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """`change` is the next correction, `size` its norm (the larger of those with and without the derivative of g at a
-    held rate), and `rate` the ratio of `size` to the previous one.
+    """**Fields:** `change`: the next correction; `size`: its norm, the larger of both with and without the derivative
+    of g for a held rate; `rate`: the ratio of `size` to the previous one.
     """
 
     end: Derivatives
@@ -203,21 +205,20 @@ class Newton(eqx.Module):
     """Newton's method for the equation of a step.
 
     The iteration starts from the predicted y and rate, with the current iteration matrix (modified Newton). If
-    iterations with it would cost more than a new matrix, one is computed at the best y so far, for the rate there. The
-    prediction is not good enough where the direction of a stiff spring turns: the error of its rate is multiplied by
-    the stiffness and changes the matrix considerably.
+    iterations with it would cost more than a new matrix, a new one is computed at the best y so far, for the rate
+    there. The prediction is too inaccurate for that where the direction of a stiff spring turns: stiffness multiplies
+    the error of its rate, which changes the matrix considerably.
 
-    g is evaluated along the predicted rate, then along the f after each correction. In f itself the error of y is
-    multiplied by the stiffness; in g it would spoil other components by the change of the Jacobian, times the square of
-    the step: Newton's method would converge only from nearby, and on Robertson's reaction only inside a basin smaller
-    than round-off.
+    g is evaluated along the predicted rate, then along the f after each correction. In f itself, stiffness multiplies
+    the error of y. In g this error would spoil other components by the change of the Jacobian, times the square of the
+    step. Newton's method would then converge only from nearby, on Robertson's reaction from a basin below round-off.
 
-    If the error of the prediction is as large as the state, as at the end of a fast transient, the matrix there may be
-    so large that the second correction appears negligible far from any solution; it is not computed.
+    If the error of the prediction is as large as the state, as at the end of a fast transient, there is no second
+    correction. Otherwise, with a large matrix, it might appear negligible far from any solution.
 
     **Fields:** the `equation`; `size`: the norm of a correction in units of the tolerance; `tol`: the norm of the last
-    correction, which is not applied to y, and to f and g only through the current matrix, since stiffness would
-    multiply its error there and spoil predictions.
+    correction. It is not applied to y, and to f and g only through the current matrix, since stiffness would multiply
+    its error there and spoil predictions.
     """
 
     equation: StepEquation
@@ -232,15 +233,15 @@ class Newton(eqx.Module):
     ) -> Solved:
         """The end of the step, from the `predicted` y and rate, with the current matrix.
 
-        **Arguments:** `before`: the state before the step and its rate, where Newton's method restarts if the field was
-        not finite.
+        **Arguments:** `before`: the state before the step and its rate, from which Newton's method restarts if the
+        field was not finite.
         """
         equation, size, tol = self.equation, self.size, self.tol
         field, t = equation.field, equation.t
         shapes = eqx.filter_eval_shape(derivatives, field, t, predicted[0])
         blank = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else jnp.asarray(x)
-        nothing = jax.tree.map(blank, shapes)
-        none, one = jnp.zeros((), jnp.int32), jnp.ones((), equation.past.dtype)
+        blank_end = jax.tree.map(blank, shapes)
+        zero, one = jnp.zeros((), jnp.int32), jnp.ones((), equation.past.dtype)
 
         def iterate(matrix, inverses, carry: _Iterate) -> _Iterate:
             (y, f), push, rest = jax.linearize(field, t, carry.end.y - matrix.moved(carry.change), has_aux=True)
@@ -267,7 +268,7 @@ class Newton(eqx.Module):
             inverses = matrix.inverses(equation.a, equation.b, equation.free)
             matrix = matrix.observed(inverses, anew)
             first = _Iterate(
-                nothing._replace(y=start, f=rate), jnp.zeros(equation.free.size, one.dtype), one * jnp.inf, one, none
+                blank_end._replace(y=start, f=rate), jnp.zeros(equation.free.size, one.dtype), one * jnp.inf, one, zero
             )
             last = lax.while_loop(proceed, functools.partial(iterate, matrix, inverses), first)
             converged = last.size <= tol
@@ -275,7 +276,7 @@ class Newton(eqx.Module):
             renewals = jnp.maximum(matrix.renewals - 1, slow.astype(jnp.int32))
             renewals = jnp.where(converged, renewals, jnp.asarray(_DISTRUST, jnp.int32))
             matrix = eqx.tree_at(lambda m: m.renewals, matrix, renewals)
-            # A matrix is not computed for the same state again.
+            # A matrix is not computed twice for the same state.
             farther = jnp.where(anew, last.end.y, start)
             nearest = jnp.where(last.rate < 1, last.end.y - matrix.moved(last.change), farther)
             finite = jnp.isfinite(last.size)
@@ -284,7 +285,7 @@ class Newton(eqx.Module):
             return jnp.where(converged, _DONE, k + 1).astype(jnp.int32), place, matrix, inverses, last.end, work
 
         inverses = matrix.no_inverses(equation.a, equation.b, equation.free)
-        carry = none, predicted, matrix, inverses, nothing, jnp.zeros(2, jnp.int32)
+        carry = zero, predicted, matrix, inverses, blank_end, jnp.zeros(2, jnp.int32)
         k, _, matrix, inverses, end, work = lax.while_loop(lambda carry: carry[0] < _ATTEMPTS, attempt, carry)
         return Solved(end, k == _DONE, matrix, inverses, work)
 
@@ -294,15 +295,15 @@ def tangents_nearby(
     inverses: Any,
     equation: StepEquation,
     push: Callable[..., tuple[Array, Array, Array]],
-    own: tuple[Array, Array, Array],
+    by_numbers: tuple[Array, Array, Array],
     predicted: tuple[Float[Array, " n"], Float[Array, " n"]],
     size: Callable[[Array], Any],
     tol: float,
     begins: Bool[Array, ""],
 ) -> tuple[Array, Array, Array]:
-    """The tangents of `(y, f, g)` at the end of a step, by Newton's method with the matrix of the step itself.
+    """The tangents of `(y, f, g)` at the end of a step, by Newton's method with the step's matrix.
 
-    **Arguments:** `equation`: of the tangents, for its `past`, `a`, `b` and `free`; `push`, `own`: as of
+    **Arguments:** `equation`: of the tangents, for its `past`, `a`, `b` and `free`; `push`, `by_numbers`: as of
     `AbstractLinearization.tangents`; the `predicted` tangents of the state and of the rate; `size`, `tol`: as of
     `Newton`; `begins`: whether this is a start, whose state is the predicted one.
     """
@@ -313,7 +314,7 @@ def tangents_nearby(
 
     def iterate(carry):
         k, x, along, _, last, _ = carry
-        y, f, g = map(jnp.add, own, push(x, along))
+        y, f, g = map(jnp.add, by_numbers, push(x, along))
         change, without, *corrected = matrix.correction(inverses, equation, y, f, g, along)
         now = jnp.maximum(size(matrix.moved(change)), size(matrix.moved(without)))
         # At a start the rate is known after the first evaluation, and after the second g along it.
@@ -321,6 +322,6 @@ def tangents_nearby(
         f, g = (jnp.where(begins, *both) for both in zip((f, g), corrected, strict=True))
         return k + 1, jnp.where(begins, x, x - matrix.moved(change)), f, (y, f, g), now, last
 
-    infinite = jnp.full((), jnp.inf, own[0].dtype)
-    start = jnp.zeros((), jnp.int32), predicted[0] - own[0], predicted[1], own, infinite, infinite
+    infinite = jnp.full((), jnp.inf, by_numbers[0].dtype)
+    start = jnp.zeros((), jnp.int32), predicted[0] - by_numbers[0], predicted[1], by_numbers, infinite, infinite
     return lax.while_loop(proceed, iterate, start)[3]

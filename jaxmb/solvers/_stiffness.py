@@ -1,10 +1,10 @@
 """Whether stability, instead of accuracy, limits the steps of Adams' method.
 
-A step is counted as stiff if two conditions hold. The Jacobian, estimated from the corrector, is so large that the step
-is near the stability bound; and along the solution the vector field changes much less than that, relative to the state,
-or the state changes less than in the corrector: stability errors, not the motion, keep the step short. By measurement,
-this holds for fewer than one in ten steps of non-stiff motions, and for four in ten to all steps where stability limits
-them (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances 1e-4 to 1e-9).
+A step is counted as stiff under two conditions. First, the Jacobian, estimated from the corrector, is so large that the
+step is near the stability bound. Second, along the solution the vector field changes much less than that, relative to
+the state, or the state changes less than in the corrector. So stability errors, not the motion, keep the step short. By
+measurement, this holds for fewer than one in ten steps of non-stiff motions, and for four in ten to all steps if
+stability limits them (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances 1e-4 to 1e-9).
 
 Source of the first condition: E. Hairer, S. P. Nørsett and G. Wanner, Solving Ordinary Differential Equations I,
 Springer, 1993, for Runge-Kutta methods (DOPRI5's test).
@@ -23,12 +23,12 @@ from .stability import adams, spectral_radius
 
 # A step is stiff above these fractions of the stability bound and of the changes along the solution.
 _NEAR, _FASTER, _SMALLER = 0.3, 10.0, 3.0
-# The increment for a stiff step, the decrement for any other, and the sum from which on the motion is stiff.
+# The increment for a stiff step, the decrement for any other, and the sum from which the motion counts as stiff.
 _UP, _DOWN, _STIFF = 3, 1, 150
 
 
 class Stiffness(eqx.Module):
-    """**Fields:** `steps`: number of stiff steps; `level`: the evidence, which decreases with other steps."""
+    """**Fields:** `steps`: the number of stiff steps; `level`: the evidence, which other steps decrease."""
 
     steps: Int[Array, ""]
     level: Int[Array, ""]
@@ -52,9 +52,9 @@ def observed(
 ) -> Stiffness:
     """The evidence after one more step, from the changes of y and f by the corrector and by the step.
 
-    Sizes that are zero or not finite are no evidence.
+    Sizes that are zero or not finite do not count as evidence.
     """
-    # |df| / |dy| of the corrector compared with that along the solution, without division.
+    # |df| / |dy| of the corrector, compared with the ratio along the solution, without division.
     near = h * correction[1] > _NEAR * jnp.asarray(_bounds(), h.dtype)[order] * correction[0]
     faster = correction[1] * change[0] > _FASTER * change[1] * correction[0]
     smaller = change[0] < _SMALLER * correction[0]
@@ -67,7 +67,7 @@ def observed(
 
 @functools.cache
 def _bounds() -> NDArray[np.float64]:
-    """For each order the negative `h λ` up to which predictor and corrector are stable."""
+    """For each order, the size of `h λ` on the negative real axis up to which predictor and corrector are stable."""
     out = [0.0]
     sizes = np.geomspace(0.01, 4.0, 400)
     for order in range(1, HIGHEST_ORDER + 1):

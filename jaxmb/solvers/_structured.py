@@ -1,11 +1,10 @@
-"""Newton's method with a Jacobian that knows its structure, where a term on a manifold has one.
+"""Newton's method with a Jacobian that knows its structure, as some terms on a manifold do.
 
-All components of the state are unknowns, and each iterate is projected on the manifold: the solution is the projection
+All components of the state are unknowns, and each iterate is projected on the manifold. The solution is the projection
 of `past + a f + b g`. With `1 - a x - b x² = (1 - r x)(1 - r* x)` one factor of `1 - r J` for a complex number r solves
-for corrections; the eigenvalues of J near 1 / r, which decide what formulas and steps are stable, follow from Arnoldi's
-method with the same factor. The factor leaves out some terms of the exact derivative. Newton's method converges without
-them, linearly, and the derivative of its solution is found by iteration with the exact linear function, which the
-factor preconditions.
+for corrections. The eigenvalues of J near 1 / r decide which formulas and steps are stable; they follow from Arnoldi's
+method with the same factor. The factor leaves out some terms of the exact derivative, so Newton's method converges
+linearly. The derivative of its solution is found by iteration with the exact function, preconditioned by the factor.
 
 Sources: Y. Saad, "Numerical Methods for Large Eigenvalue Problems", SIAM, 2011 (shift-and-invert Arnoldi); S. C.
 Eisenstat, H. C. Elman and M. H. Schultz, SIAM J. Numer. Anal. 20(2), 1983 (generalized conjugate residuals).
@@ -31,13 +30,13 @@ from .manifold_term import AbstractFieldJacobian, AbstractResolvent
 _ARNOLDI = 16
 # Eigenvalues of the inverse below this belong to components that decay, or change, in much less than a step.
 _SMALL = 0.02
-# The part of a vector outside the space of those before it that is rounding errors.
+# The part of a vector outside the space of the preceding vectors, at most, that is rounding errors.
 _ROUNDING = 1e-10
-# A matrix is renewed after a step whose corrections shrank more slowly than by this factor, and in a step where more
-# than about this number of iterations would follow.
+# A matrix is renewed after a step whose corrections shrank more slowly than by the first factor, and in a step that
+# would need more than about the second number of further iterations.
 _SLOW, _PATIENCE = 0.35, 8
-# The largest number of iterations for derivatives; the relative residual at which they end, and the largest one of a
-# derivative that may be used, in rounding units.
+# The largest number of iterations for derivatives; in rounding units, the relative residual at which they end, and the
+# largest residual of a usable derivative.
 _ITERATIONS, _RESIDUAL, _LARGEST_RESIDUAL = 40, 50, 1e5
 
 
@@ -71,8 +70,8 @@ class StructuredInverses(eqx.Module):
 class StructuredLinearization(AbstractLinearization):
     """A matrix that knows its structure; the unknowns are all components of the state.
 
-    **Fields:** the `jacobian` J of the term; `direction` of time; `spectrum`: eigenvalues of J of the size of those
-    that formulas may amplify; `renewals`: the number of next steps that must compute their own matrix.
+    **Fields:** the `jacobian` J of the term; `direction` of time; `spectrum`: eigenvalues of J of the sizes that
+    formulas may amplify; `renewals`: the number of next steps that must compute a new matrix.
     """
 
     jacobian: AbstractFieldJacobian
@@ -107,7 +106,7 @@ class StructuredLinearization(AbstractLinearization):
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def observed(self, inverses: StructuredInverses, anew: Bool[Array, ""]) -> "StructuredLinearization":
-        """With the spectrum of a matrix that is new."""
+        """With the spectrum of a new matrix."""
         find = lambda old: _spectrum(inverses, self.jacobian.project)
         return eqx.tree_at(lambda m: m.spectrum, self, cond_of_any_lane(anew, find, lambda old: old, self.spectrum))
 
@@ -119,7 +118,7 @@ class StructuredLinearization(AbstractLinearization):
         mismatch, lag = y - equation.past - inverses.a * along - b * g, along - f
         mismatch, lag = lax.map(self.jacobian.project, jnp.stack([mismatch, lag]))
         change, rate = inverses.solve(mismatch, lag)
-        # f at y - change; with it y - change = past + a f + b g along the manifold.
+        # This is f at y - change, for which y - change = past + a f + b g along the manifold.
         corrected = f - rate
         g = g - (change - mismatch - inverses.a * (lag + rate)) / b
         return change, change, corrected, g
@@ -139,10 +138,12 @@ class StructuredLinearization(AbstractLinearization):
         project = matrix.jacobian.project
 
         def twice(change):
-            """Changes of y, f and g by that of y; a loop, so that the linear function is compiled once."""
+            """The changes of y, f and g by a change of y; a loop, so that the linear function is compiled once."""
             still = jnp.zeros_like(change)
-            _, found = lax.scan(lambda rate, _: (lambda out: (out[1], out))(push(change, rate)), still, None, length=2)
-            y, rate, acceleration = (x[1] for x in found)
+            _, changes = lax.scan(
+                lambda rate, _: (lambda out: (out[1], out))(push(change, rate)), still, None, length=2
+            )
+            y, rate, acceleration = (x[1] for x in changes)
             return y, rate, acceleration
 
         def apply(change):
@@ -157,34 +158,34 @@ class StructuredLinearization(AbstractLinearization):
             pull = jax.linear_transpose(project, x)
             return x + pull(inverses.transpose_solve(x) - x)[0]
 
-        def solve(own, load):
-            acceleration = own[2] + push(None, own[1])[2]
+        def solve(by_numbers, load):
+            acceleration = by_numbers[2] + push(None, by_numbers[1])[2]
             change = lax.custom_linear_solve(
                 apply,
-                load + a * own[1] + b * acceleration,
+                load + a * by_numbers[1] + b * acceleration,
                 lambda apply, x: _iterate(apply, precondition, x),
                 lambda apply, x: _iterate(apply, precondition_transpose, x),
             )
             y, rate, by_change = twice(change)
-            return own[0] + y, own[1] + rate, acceleration + by_change
+            return by_numbers[0] + y, by_numbers[1] + rate, acceleration + by_change
 
         return solve
 
 
 def structured(jacobian: Callable[[Float[Array, " n"]], Any], y: Float[Array, " n"]) -> StructuredLinearization | None:
     """The linearisation of a term that knows the structure of its Jacobian, without its spectrum; else None."""
-    known = jacobian(y)
-    if known is None:
+    given = jacobian(y)
+    if given is None:
         return None
-    own, direction = known
+    matrix, direction = given
     spectrum = lax.complex(*[jnp.zeros(_ARNOLDI, y.dtype)] * 2)
-    return freeze(StructuredLinearization(own, direction.astype(y.dtype), spectrum, jnp.array(0, jnp.int32)))
+    return freeze(StructuredLinearization(matrix, direction.astype(y.dtype), spectrum, jnp.array(0, jnp.int32)))
 
 
 def unknown_structure(
     jacobian: Callable[[Float[Array, " n"]], Any], y: Float[Array, " n"]
 ) -> StructuredLinearization | None:
-    """Zeros of a term that knows the structure of its Jacobian, and that the first step computes its own; else None."""
+    """Zeros for a term that knows the structure of its Jacobian, so that the first step computes it; else None."""
     shapes = eqx.filter_eval_shape(structured, jacobian, y)
     if shapes is None:
         return None
@@ -193,7 +194,7 @@ def unknown_structure(
 
 
 def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -> Complex[Array, " k"]:
-    """Eigenvalues of J near 1 / r, by Arnoldi's method for the inverse of `1 - r J`; zero for others."""
+    """Eigenvalues of J near 1 / r, by Arnoldi's method for the inverse of `1 - r J`; zero for the others."""
     weights = inverses.resolvent.weights()
     n, m = weights.size, _ARNOLDI
     # Any start that excites all components.
@@ -210,29 +211,29 @@ def _spectrum(inverses: StructuredInverses, project: Callable[[Array], Array]) -
     def extend(basis, k):
         x = scale * inverses.resolvent.solve(basis[k] / scale)
         column, whole = jnp.zeros(m + 1, x.dtype), size(x)
-        # Twice is enough.
+        # Two passes of Gram-Schmidt are enough.
         for _ in range(2):
             along = jnp.conj(basis) @ x
             column, x = column + along, x - along @ basis
-        # Small machines have fewer eigenvalues than there are steps. What is left of x then is rounding errors, whose
-        # direction is no part of a basis.
+        # Small machines have fewer eigenvalues than steps. The rest of x is then rounding errors, whose direction must
+        # not enter the basis.
         length = size(x)
-        found = length > _ROUNDING * whole
-        x = jnp.where(found, x / length.astype(x.dtype), jnp.zeros_like(x))
-        return basis.at[k + 1].set(x), column.at[k + 1].set(jnp.where(found, length, 0.0).astype(x.dtype))
+        new = length > _ROUNDING * whole
+        x = jnp.where(new, x / length.astype(x.dtype), jnp.zeros_like(x))
+        return basis.at[k + 1].set(x), column.at[k + 1].set(jnp.where(new, length, 0.0).astype(x.dtype))
 
     _, columns = lax.scan(extend, basis, jnp.arange(m))
-    found = eigenvalues(columns[:, :m].T)
-    magnitude = jnp.abs(found)
+    ritz_values = eigenvalues(columns[:, :m].T)
+    magnitude = jnp.abs(ritz_values)
     counts = magnitude > _SMALL * jnp.max(magnitude)
-    safe = jnp.where(counts, found, jnp.ones_like(found))
-    return jnp.where(counts & jnp.isfinite(magnitude), (1 - 1 / safe) / inverses.r, jnp.zeros_like(found))
+    safe = jnp.where(counts, ritz_values, jnp.ones_like(ritz_values))
+    return jnp.where(counts & jnp.isfinite(magnitude), (1 - 1 / safe) / inverses.r, jnp.zeros_like(ritz_values))
 
 
 def _iterate(
     apply: Callable[[Array], Array], precondition: Callable[[Array], Array], load: Float[Array, " n"]
 ) -> Array:
-    """The solution of a linear equation by generalized conjugate residuals; NaN where it is not found."""
+    """The solution of a linear equation by generalized conjugate residuals; NaN without convergence."""
     n, dtype = load.size, load.dtype
     size = lambda x: jnp.sqrt(jnp.sum(x**2))
     unit = jnp.finfo(dtype).eps * size(load)

@@ -37,8 +37,8 @@ from .tolerances import Tolerances, norm_of
 _TARGET = 0.2
 # Numbers of evaluations and matrices in a step.
 _WORK = np.array([2, 0], np.int32)
-# The local error of order k is proportional to the power k + 1 of the steps if all of them change, but to the power 1 +
-# sum_{m<=k} 1/m if only the last one does: it is a product of the spans h_n + ... + h_{n-m+1}.
+# The local error of order k is a product of the spans h_n + ... + h_{n-m+1}. So it is proportional to the power k + 1
+# of the steps if all of them change, but to the power 1 + sum_{m<=k} 1/m if only the last step does.
 _ORDERS = np.arange(1, LENGTH)
 _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
@@ -51,13 +51,13 @@ class AdamsState(AbstractMultistepState):
     - `history`: the mesh and the scaled divided differences of all components.
     - `order`: the order of the next step.
     - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
-        accepted steps of order `k`. The number of evaluations of the vector field, rejected steps included, is
-        `2 * solution.stats["num_steps"]`, with steps of given lengths `step_counts[0]` more.
+        accepted steps of order `k`. The number of evaluations of the vector field, rejected steps included, is `2 *
+        solution.stats["num_steps"]`, plus `step_counts[0]` for steps of given lengths.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `stiffness`: the evidence of stiffness in the accepted steps if it is counted, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
-    - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
-    - `found`: what an `AbstractManifoldTerm` has found at the last jump, for its derivatives, otherwise `None`.
+    - `tangents`: the tangents whose errors are controlled beside the state's error, otherwise `None`.
+    - `found`: the numbers of `AbstractManifoldTerm.found_at_jump` for derivatives of the last jump, or `None`.
     """
 
     history: History
@@ -82,9 +82,11 @@ class AdamsState(AbstractMultistepState):
 
 
 class _Step(AbstractAttempt):
-    """The numbers of a step: the state `after` it and the history there, the local `errors` of three formulas (of a
-    first step, which has one, the state before it and the change by its derivative beside that), the `mismatch` of
-    the corrector at the end, and the evaluations of the prediction and of the corrected state.
+    """The numbers of a step.
+
+    **Fields:** the state `after` it and the history there; the local `errors` of three formulas; the `mismatch` of the
+    corrector at the end; the evaluations of the prediction (`first`) and of the corrected state (`second`). A first
+    step has one error, and beside it the state before it and the change by its derivative.
     """
 
     after: Float[Array, " n"]
@@ -109,8 +111,7 @@ class Adams(AbstractMultistep):
     Runge-Kutta methods, so it pays when the vector field is expensive. The first step, of order one, evaluates at its
     start instead of at a prediction: it is Euler's.
 
-    Use it with `MultistepController`, which reads its error estimates and from which it takes the
-    tolerances:
+    Use it with `MultistepController`, which reads its error estimates and from which it takes the tolerances:
 
     ```python
     import diffrax
@@ -121,12 +122,11 @@ class Adams(AbstractMultistep):
     motion = jaxmb.simulate(system, state, t1=1.0, solver=Adams(max_order=8))
     ```
 
-    The term is a `diffrax.ODETerm` or an `AbstractManifoldTerm`. Every form of `diffrax.SaveAt`,
-    events, jumps, integration backward in time and every adjoint work as with other diffrax solvers. Derivatives are
-    those of the discrete solution with its mesh and orders frozen. After a jump
-    (`diffrax.ClipStepSizeController(jump_ts=...)`) the method restarts at order one. A solve continued with
-    `solver_state` must start at the state where the other ended, in the same direction of time; otherwise pass
-    `made_jump=True`.
+    The term is a `diffrax.ODETerm` or an `AbstractManifoldTerm`. Every form of `diffrax.SaveAt`, events, jumps,
+    integration backward in time and every adjoint work as with other diffrax solvers. Derivatives differentiate the
+    discrete solution with its mesh and orders frozen. After a jump (`diffrax.ClipStepSizeController(jump_ts=...)`) the
+    method restarts at order one. A solve continued with `solver_state` must start at the state where the other ended,
+    in the same direction of time; otherwise pass `made_jump=True`.
 
     **Reference:**
 
@@ -166,8 +166,7 @@ class Adams(AbstractMultistep):
 
         - `min_order`, `max_order`: bounds of the order; equal values fix it, after a start from order one.
         - `stiffness`: whether to count the steps that are limited by stability instead of accuracy, in
-            `AdamsState.stiffness`, and whether to stop, with `diffrax.RESULTS.nonlinear_divergence`, when a motion is
-            found stiff.
+            `AdamsState.stiffness`, and whether to stop at a stiff motion, with `diffrax.RESULTS.nonlinear_divergence`.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
             `diffrax.StepTo`): the tolerances by which the order is then chosen. Otherwise leave them out.
 
@@ -209,24 +208,24 @@ class Adams(AbstractMultistep):
         history = eqx.tree_at(lambda history: history.known, history, jnp.zeros_like(history.known))
         starts = jnp.zeros((), np.int32)
         if self.tolerances.fixed:
-            # No error is controlled, so that of Euler's method may be large in the first step.
+            # No error is controlled, so the error of Euler's method may be large in the first step.
             first = evaluate(terms, t0, flat, y0, next_chart(terms, t0, y0, chart, args), args)
             history, chart, starts = start(t0, first.f, t1 - t0), first.chart, starts + 1
         if before is None:
             step_counts, stiffness = jnp.zeros(LENGTH, np.int32), None if self.stiffness == "ignore" else none_found()
             sizes = None if self.tolerances.scales is None else self.tolerances.scales.none(flat.dtype)
-            found = eqx.filter_eval_shape(found_at_jump, terms, t0, y0, args)
-            found = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), found)
+            at_jump = eqx.filter_eval_shape(found_at_jump, terms, t0, y0, args)
+            at_jump = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), at_jump)
         else:
             step_counts, stiffness, sizes = before.step_counts, before.stiffness, before.sizes
-            found = before.found
+            at_jump = before.found
         tangents = None
         if self.tangent_control is not None:
             control = self.tangent_control
             ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
             tangents = tuple(Tangent(w, jnp.zeros_like(history.differences), control.largest(w)) for w in ws)
         order = jnp.asarray(1, np.int32)
-        return AdamsState(history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents, found)
+        return AdamsState(history, order, step_counts.at[0].add(starts), chart, stiffness, sizes, tangents, at_jump)
 
     def attempt(self, terms, t1, before, like, args, state: AdamsState) -> _Step:
         history, order, chart = state.history, state.order, state.chart
@@ -235,7 +234,7 @@ class Adams(AbstractMultistep):
         sums = of.sums(history.differences)
         predicted = before + of.h * sums[2]
         first = evaluate(terms, jnp.where(starts, history.mesh[0], t1), predicted, like, chart, args)
-        # At a start nothing has been known to predict from: this is the first point, and its derivative all of it.
+        # At a start there was no history to predict from: this is its first point, with the first derivative.
         f = jnp.where(starts, first.f, jnp.zeros((), before.dtype))
         partial_sums, neighbours, mean = of.with_first(sums, f)
         history = eqx.tree_at(lambda history: history.known, history, jnp.maximum(history.known, 1))
@@ -264,12 +263,12 @@ class Adams(AbstractMultistep):
         state = eqx.tree_at(lambda state: state.sizes, state, started, is_leaf=lambda x: x is None)
         scale = self.tolerances.of_step(before, after, h, state.sizes, self.finest)
         sizes = self._sizes(terms, y0, scale, step.errors, state.chart)
-        # In the first step the state changes at most by its own size, or by the tolerance.
+        # In the first step the state changes at most by its size, or by the tolerance.
         reached = sizes[2] / jnp.maximum(sizes[0], 1)
         sizes = jnp.where(starts, jnp.maximum(sizes, _TARGET * reached**2), sizes)
         tangents, scales = self.tangents_after(state.tangents, along)
-        for end, own in zip(along, scales, strict=True):
-            sizes = jnp.maximum(sizes, self._sizes(terms, y0, own, end.errors, state.chart))
+        for end, tolerated in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(terms, y0, tolerated, end.errors, state.chart))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         change, estimate = choose_order(
             sizes,
@@ -282,7 +281,7 @@ class Adams(AbstractMultistep):
             work=jnp.asarray(_WORK),
         )
         lost = starts & (step.first.failed | ~jnp.isfinite(reached))
-        # After one step the second order is known to be better, but not by how much: by more than steps may grow.
+        # After one step the second order is better by an unknown factor, larger than the steps may grow.
         growth = jnp.where(starts, jnp.asarray(jnp.inf, dtype), estimate.growth)
         retry = jnp.where(lost, jnp.asarray(-1.0, dtype), estimate.retry)
         estimate = eqx.tree_at(lambda e: (e.growth, e.retry), estimate, (growth, retry))
@@ -309,7 +308,7 @@ class Adams(AbstractMultistep):
         return y1, estimate, dense_info, new_state, failed
 
     def _started(self, sizes, before, f) -> Float[Array, " sizes"] | None:
-        """The sizes that the absolute tolerance is relative to, where there are none yet those of a first state."""
+        """The sizes that the absolute tolerance is relative to; from the first state, if there are none yet."""
         scales = self.tolerances.scales
         if scales is None:
             return None

@@ -1,9 +1,9 @@
 """The formulas of a step of Adams' method, and the step as a linear map.
 
 A step evaluates its field twice, at a prediction and at the corrected state, which differ by the local error. The
-tangent of a step uses one linearisation for both, at the corrected state, which is on its manifold and whose field is
-known: nothing is solved, and little of a step is stored. This is the same method, applied to the tangent equation on
-the mesh of the motion; it differs from the derivative of the step by less than the local error of the tangent.
+tangent of a step uses one linearisation for both, at the corrected state, which is on its manifold and has a known
+field. So nothing is solved, and little of a step is stored. It is the same method, applied to the tangent equation on
+the mesh of the motion. It differs from the derivative of the step by less than the local error of the tangent.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ class Coefficients(eqx.Module):
     """The coefficients of a step.
 
     **Fields:** its length `h` and its `end`; `products` with the divided differences, see `sums`; `last`: the integral
-    of what a new derivative contributes to the corrector; `differences` of such integrals for three orders.
+    that multiplies a new derivative in the corrector; `differences` of such integrals for three orders.
     """
 
     h: Float[Array, ""]
@@ -37,42 +37,44 @@ class Coefficients(eqx.Module):
     differences: Float[Array, "3"]
 
     def sums(self, differences: Float[Array, "length n"]) -> tuple[Array, Array, Array]:
-        """At the end of the step, the polynomials through the last 0, 1, 2, ... derivatives, and those through the last
-        k - 1, k and k + 1; and the mean over the step of that through the last k.
+        """Values at the end of the step of two sets of polynomials, and a mean over the step. The first set goes
+        through the last 0, 1, 2, ... derivatives, the second through the last k - 1, k and k + 1; the mean is of the
+        polynomial through the last k.
         """
         sums = self.products @ differences
         return sums[:LENGTH], sums[LENGTH:-1], sums[-1]
 
     def with_first(self, sums: tuple[Array, Array, Array], f: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """The same with a latest derivative that is larger by `f`."""
+        """The same for a latest derivative that is larger by `f`."""
         every, near, mean = (weights * f[None] for weights in jnp.split(self.products[:, :1], [LENGTH, LENGTH + 3]))
         return sums[0] + every, sums[1] + near, sums[2] + mean[0]
 
 
 def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, dtype: Any) -> Coefficients:
-    """Those of a step of an order from the latest point of a mesh to `t1`."""
+    """The coefficients of a step of an order from the latest point of a mesh to `t1`."""
     h = (t1 - mesh[0]).astype(dtype)
     end = step_end(mesh, t1)
     means, values = basis_means(mesh, mesh[0], end)
     means, values = means.astype(dtype), values.astype(dtype)
-    # Row by row, how many differences count: all polynomials, those of three orders, and the mean.
+    # For each row, how many differences count: all polynomials, the polynomials of three orders, and the mean.
     lengths = jnp.concatenate([jnp.asarray(INDEX), order + np.array([-1, 0, 1, 0], np.int32)])
     is_mean = np.arange(LENGTH + 4) == LENGTH + 3
     products = jnp.where(is_mean[:, None], means[None], values[None])
     products = jnp.where(lengths[:, None] > INDEX[None], products, jnp.zeros((), dtype))
     integrals = means / values
     padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
-    # Those of the terms k - 2 to k + 1, of which the term k is the new derivative's.
+    # The integrals of the terms k - 2 to k + 1; the term k belongs to the new derivative.
     integrals = lax.dynamic_slice_in_dim(padded, order - 1, 4)
     return Coefficients(h, end, products, integrals[2], jnp.diff(integrals))
 
 
 class AdamsRow(eqx.Module):
-    """What is stored of a step, or of the start of a run.
+    """The stored numbers of a step, or of the start of a run.
 
     **Fields:** its `end`; the `mesh`, the `order` and the number of `known` points at its start; state `y` and field
-    `f` at its end; what is `kept` of the chart there; `jump` at its start, None where steps have none. At the start of
-    a run the order is zero, nothing is known unless the memory is given, and y, f and the chart are those there.
+    `f` at its end; `kept`: the numbers kept of the chart there; `jump` at its start, None if steps have none. In the
+    row of a start the order is zero, and `known` is zero unless the memory is given. Then y, f and the chart belong to
+    the start.
     """
 
     end: Any
@@ -86,8 +88,10 @@ class AdamsRow(eqx.Module):
 
 
 class AdamsSteps(AbstractSteps):
-    """The steps of `Adams`; `jumps`: whether they may begin after a jump; whether the run itself `begins` with one;
-    whether the first step after a jump `evaluates` at its start, and at its end, only.
+    """The steps of `Adams`.
+
+    **Fields:** `jumps`: whether they may begin after a jump; `evaluates`: whether the first step after a jump evaluates
+    at its start, and at its end, only; `begins`: whether the run begins with a jump.
     """
 
     jumps: bool = eqx.field(static=True)
@@ -99,21 +103,21 @@ class AdamsSteps(AbstractSteps):
 
     def row(self, terms, before, after):
         old, new = before.solver_state, after.solver_state
-        mesh, order, known, jump = old.history.mesh, old.order, jnp.maximum(old.history.known, 1), None
+        mesh, order, count, jump = old.history.mesh, old.order, jnp.maximum(old.history.known, 1), None
         if self.jumps:
             made = jnp.asarray(before.made_jump)
             first = start(before.tprev, new.history.differences[0], before.tnext - before.tprev)
             of_start = first.mesh, jnp.ones_like(order), first.known
-            mesh, order, known = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, (mesh, order, known))
+            mesh, order, count = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, (mesh, order, count))
             last = jnp.where(old.history.known > 0, old.history.mesh[0], before.tprev)
             restart = self._restart(terms, new)
             jump = Jump(made, last, before.tprev, ravel(before.y), old.history.differences[0], old.chart, restart)
         kept = kept_of_chart(terms, new.chart)
-        return AdamsRow(before.tnext, mesh, order, known, ravel(after.y), new.history.differences[0], kept, jump)
+        return AdamsRow(before.tnext, mesh, order, count, ravel(after.y), new.history.differences[0], kept, jump)
 
     def _restart(self, terms, after):
-        """What is known after one step from a restart. Second derivatives, which there are none of through events,
-        would need the tangent of the field.
+        """The numbers known after one step from a restart. Second derivatives, which do not exist through events, would
+        need the tangent of the field.
         """
         if guards_of(terms) is None or not self.evaluates:
             return None
@@ -134,14 +138,14 @@ class AdamsSteps(AbstractSteps):
         return not self.begins
 
     def start(self, terms, before, after):
-        own, known = self.row(terms, before, after), before.solver_state.history.known
-        given = (known > 0) | jnp.asarray(before.made_jump)
-        if own.jump is not None:
-            own = eqx.tree_at(lambda row: row.jump.made, own, jnp.zeros_like(own.jump.made))
+        first_row, count = self.row(terms, before, after), before.solver_state.history.known
+        given = (count > 0) | jnp.asarray(before.made_jump)
+        if first_row.jump is not None:
+            first_row = eqx.tree_at(lambda row: row.jump.made, first_row, jnp.zeros_like(first_row.jump.made))
         f, kept = _at_start(terms, after.solver_state)
-        numbers = jnp.zeros_like(own.order), given.astype(known.dtype), ravel(before.y), f, kept
+        numbers = jnp.zeros_like(first_row.order), given.astype(count.dtype), ravel(before.y), f, kept
         return eqx.tree_at(
-            lambda row: (row.order, row.known, row.y, row.f, row.kept), own, numbers, is_leaf=lambda x: x is None
+            lambda row: (row.order, row.known, row.y, row.f, row.kept), first_row, numbers, is_leaf=lambda x: x is None
         )
 
     def linearised(self, of, moved, like, row):
@@ -172,7 +176,7 @@ class AdamsSteps(AbstractSteps):
                 corrected = predicted + h * formulas.last * (f - neighbours[1])
                 return (corrected, w, f), None
 
-            # A loop, so that there is one program for both evaluations, and one for their transposes.
+            # A loop, so that both evaluations share one program, and one transpose.
             none = jnp.zeros_like(predicted)
             (corrected, after, f), _ = lax.scan(evaluated, (predicted, none, none), length=2)
             of_start = jnp.where(row.known == 0, jnp.zeros_like(memory).at[0].set(f), memory)
@@ -202,7 +206,7 @@ class AdamsSteps(AbstractSteps):
 
 
 def _at_start(terms, after):
-    """The field at a start, and what is kept of the chart there, from the state of the solver after one step."""
-    # These are the derivative at its end, and how far it is from that at the start.
+    """The field at a start, and the numbers kept of the chart there, from the state of the solver after one step."""
+    # The derivative at its end, and this minus the derivative at its start.
     last, change, *_ = after.history.differences
     return last - change, kept_of_chart(terms, after.chart, at_start=True)

@@ -1,7 +1,7 @@
-"""Functions of the user's that close over traced values.
+"""Functions of the user that close over traced values.
 
-JAX sees such a value only where it is an argument: a derivative rule of one's own would treat it as a constant, and the
-derivative by it would be zero, without a word. `opened` makes it one.
+JAX differentiates by such a value only if it is an argument. A custom derivative rule would treat it as a constant, and
+the derivative by it would silently be zero. `opened` makes it an argument.
 """
 
 import functools
@@ -15,27 +15,27 @@ from jax.core import Tracer
 
 
 def opened(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A Python function that closes over traced values as a module with these for leaves; anything else as it is.
+    """A Python function that closes over traced values, as a module whose leaves they are; anything else unchanged.
 
-    Those in functions that it closes over, in defaults and in `functools.partial` count as well.
+    Traced values in functions that it closes over, in defaults and in `functools.partial` count as well.
     """
     return _opened(function, set())
 
 
 def _opened(x: Any, inside: set[int]) -> Any:
     if isinstance(x, functools.partial):
-        held = _open_all((x.func, x.args, x.keywords), inside)
-        return eqx.Partial(_calling, *held) if _has_traced(held) else x
-    # A function that refers to itself is met again inside.
+        contents = _open_all((x.func, x.args, x.keywords), inside)
+        return eqx.Partial(_calling, *contents) if _has_traced(contents) else x
+    # A function that refers to itself is visited again inside.
     if not isinstance(x, types.FunctionType) or id(x) in inside:
         return x
     inside = inside | {id(x)}
     cells = tuple(_contents(cell) for cell in x.__closure__ or ())
-    held = _open_all((cells, x.__defaults__, x.__kwdefaults__), inside)
-    if not _has_traced(held):
+    contents = _open_all((cells, x.__defaults__, x.__kwdefaults__), inside)
+    if not _has_traced(contents):
         return x
-    traced, rest = eqx.partition(held, lambda leaf: isinstance(leaf, Tracer))
-    return _Opened(traced, _Known(x, rest))
+    traced, rest = eqx.partition(contents, lambda leaf: isinstance(leaf, Tracer))
+    return _Opened(traced, _Code(x, rest))
 
 
 def _open_all(tree: Any, inside: set[int]) -> Any:
@@ -54,13 +54,15 @@ def _contents(cell: Any) -> Any:
         return None
 
 
-def _calling(func: Any, args: Any, keywords: Any, *more: Any, **others: Any) -> Any:
-    return func(*args, *more, **(keywords | others))
+def _calling(func: Any, args: Any, keywords: Any, *positional: Any, **named: Any) -> Any:
+    return func(*args, *positional, **(keywords | named))
 
 
-class _Known:
-    """What is known of a function: its code, and what it closes over without the traced values. Two are equal where
-    they compute the same from equal ones, so that a function that is written anew for each call is compiled once.
+class _Code:
+    """The code of a function, and the contents of its closure without the traced values.
+
+    Two are equal if they compute the same from equal traced values, so a function written anew for each call is
+    compiled once.
     """
 
     def __init__(self, function: types.FunctionType, rest: Any):
@@ -68,7 +70,7 @@ class _Known:
         self.rest = rest
         leaves, structure = jax.tree.flatten(rest)
         plain = (bool, int, float, complex, str, bytes)
-        # Other objects are told apart by where they are, and this one keeps them there.
+        # Other objects are distinguished by identity, and this object keeps them alive.
         of_leaves = tuple((type(x), x) if type(x) in plain else id(x) for x in leaves)
         self._key = self.code, id(self.globals), structure, of_leaves
 
@@ -81,12 +83,12 @@ class _Known:
 
 class _Opened(eqx.Module):
     traced: Any
-    known: _Known = eqx.field(static=True)
+    known: _Code = eqx.field(static=True)
 
     def __call__(self, *args: Any, **keywords: Any) -> Any:
-        known = self.known
-        cells, defaults, of_keywords = eqx.combine(self.traced, known.rest)
+        code = self.known
+        cells, defaults, of_keywords = eqx.combine(self.traced, code.rest)
         closure = tuple(types.CellType(x) for x in cells)
-        function = types.FunctionType(known.code, known.globals, known.name, defaults, closure)
+        function = types.FunctionType(code.code, code.globals, code.name, defaults, closure)
         function.__kwdefaults__ = of_keywords
         return function(*args, **keywords)

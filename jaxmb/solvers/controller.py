@@ -24,44 +24,44 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# After a step without a usable error estimate: the vector field is not finite, or a constraint was not solved.
+# The factor after a step without a usable error estimate: the field is not finite, or constraints are unsolved.
 _WITHOUT_ESTIMATE = 0.25
-# Repeated rejections mean that errors do not decrease according to the order, as at a kink or a jump: upper bounds of
-# the factor after the first, second, and every further rejection.
+# Upper bounds of the factor after the first, second, and every further rejection. Repeated rejections mean that errors
+# do not decrease according to the order, as at a kink or a jump.
 _REPEATED = (0.95, 0.5, 0.1)
 # The length of the trial before the first step, in units of the interval, and the factors from it to the first step.
 _TRIAL, _SHORTER, _LONGER = 1e-4, 1e-8, 100.0
 # The recovery from a step shortened by a wrapper is at most this factor, unless the step's own error allows a longer
-# one; beyond it differences are rounding errors.
+# one; beyond it, differences are rounding errors.
 _RECOVERY = 100.0
-# After a step without an estimate, this number of steps grow by at most this factor, so that steps that are too long to
-# be solved are not tried again and again.
+# After a step without an estimate, this number of steps grow by at most this factor, so that unsolvable long steps are
+# not tried again and again.
 _CAUTION, _CAUTIOUS = 4, 1.4
 
 
 class AbstractControllerState(eqx.Module):
     """The state of a step size controller that knows its next step.
 
-    **Fields:** `intended`: the last step size that was requested.
+    **Fields:** `intended`: the last requested step size.
     """
 
     intended: AbstractVar[Float[Array, ""]]
 
 
 def intended_step(controller_state: Any) -> Float[Array, ""] | None:
-    """The length of the next step, from the state of a controller that knows it, which others may be wrapped around."""
-    found = states_inside(controller_state, AbstractControllerState)
-    return found[0].intended if found else None
+    """The length of the next step, from the state of a controller that knows it or wraps one that does; else None."""
+    states = states_inside(controller_state, AbstractControllerState)
+    return states[0].intended if states else None
 
 
 def states_inside(controller_state: Any, kind: type) -> list[Any]:
-    """The states of a kind in that of a controller, which others may be wrapped around."""
+    """The states of a kind in a controller's state, which may be nested."""
     is_one = lambda x: isinstance(x, kind)
     return [x for x in jax.tree.leaves(controller_state, is_leaf=is_one) if is_one(x)]
 
 
 class AbstractControllerAround(diffrax.AbstractAdaptiveStepSizeController):
-    """A controller around another one, `controller`, with the tolerances of that."""
+    """A controller around another one, `controller`, with the latter's tolerances."""
 
     controller: AbstractVar[Any]
 
@@ -122,10 +122,9 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
     motion = jaxmb.simulate(system, state, t1=1.0, solver=jaxmb.solvers.Adams(), stepsize_controller=control)
     ```
 
-    The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm, so that
-    the error of the result is of the size of the tolerance; below more, up to one, where that would be rounding. For
-    `Adams` and `Hermite`; to step exactly to some times, or over jumps, wrap it in
-    `diffrax.ClipStepSizeController`.
+    The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm. The error
+    of the result is then of the size of the tolerance. Near rounding errors the bound is larger, up to one. For `Adams`
+    and `Hermite`; to step exactly to some times, or over jumps, wrap it in `diffrax.ClipStepSizeController`.
 
     Without a given `dt0` the first step is a trial of one ten-thousandth of the interval, whose error tells how long
     the first step may be. It is rejected and counted as that, unless it happens to be of about the right length.
@@ -257,7 +256,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         keep = (y_error.error < 1) & ~(trial & (safety * y_error.retry > scalar(self.factormax)))
         if self.force_dtmin:
             keep = keep | (intended <= jnp.asarray(self.dtmin, dtype))
-        # The first step has no others before it.
+        # No steps precede the first one.
         response = jnp.where(opening > 0, scalar(1.0), y_error.response)
         allowed = (safety * jnp.where(keep, y_error.growth, y_error.retry)) ** response
         growth = jnp.clip(allowed, scalar(0.5), jnp.minimum(scalar(self.factormax), y_error.limit))

@@ -29,7 +29,7 @@ from .packing import Layout
 
 
 class Evaluation(NamedTuple):
-    """A state, its derivative, the chart, whether the evaluation failed, and the evaluation by the manifold."""
+    """A state, its derivative, the chart, whether the evaluation failed, and the manifold's evaluation."""
 
     y: Array
     f: Array
@@ -76,7 +76,7 @@ def derivative(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]
 
 
 def first_chart(term: Any, t: Any, y: PyTree[Array], args: Args) -> Chart | None:
-    """A chart that `next_chart` makes one at `y`; None for a plain vector field."""
+    """A chart for `next_chart` at `y`; None for a plain vector field."""
     return freeze(_manifold(term).init_chart(t * direction_of(term), y, args))
 
 
@@ -86,31 +86,31 @@ def next_chart(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: A
 
 
 def chart_after_step(term: Any, t: Any, y: PyTree[Array], chart: Chart | None, args: Args) -> Chart | None:
-    """The chart at the end of a step to `y`, from which `refused` tells."""
+    """The chart at the end of a step to `y`, for `refused`."""
     return freeze(_manifold(term).after_step(t * direction_of(term), y, chart, args))
 
 
 def refused(term: Any, chart: Chart | None, before: Chart | None) -> Any:
-    """Whether the step from a chart `before` to this one must be retried with a smaller one."""
+    """Whether the step from a chart `before` to this one must be retried with a smaller step."""
     return _manifold(term).refuses(chart, before)
 
 
 def found_at_jump(term: Any, t: Any, y: PyTree[Array], args: Args) -> PyTree[Array]:
-    """The numbers of a jump by which `after_jump` knows the state after it, as few vectors; None without any."""
-    found = _manifold(term).found_at_jump(t * direction_of(term), y, args)
-    return None if found is None else Layout(found).packed(found)
+    """The numbers of a jump from which `after_jump` computes the state after it, as few vectors; None without any."""
+    numbers = _manifold(term).found_at_jump(t * direction_of(term), y, args)
+    return None if numbers is None else Layout(numbers).packed(numbers)
 
 
-def after_jump(term: Any, t: Any, y: PyTree[Array], found: PyTree[Array], args: Args) -> PyTree[Array]:
+def after_jump(term: Any, t: Any, y: PyTree[Array], numbers: PyTree[Array], args: Args) -> PyTree[Array]:
     """The state just after a jump."""
     manifold, t = _manifold(term), t * direction_of(term)
-    if found is not None:
-        found = Layout(eqx.filter_eval_shape(manifold.found_at_jump, t, y, args)).unpacked(found)
-    return manifold.after_jump(t, y, found, args)
+    if numbers is not None:
+        numbers = Layout(eqx.filter_eval_shape(manifold.found_at_jump, t, y, args)).unpacked(numbers)
+    return manifold.after_jump(t, y, numbers, args)
 
 
 def chart_after_jump(term: Any, chart: Chart | None) -> Chart | None:
-    """The chart just after a jump, which `next_chart` makes one."""
+    """The chart just after a jump, for `next_chart`."""
     return _manifold(term).chart_after_jump(chart)
 
 
@@ -120,7 +120,7 @@ def guards_of(term: Any) -> AbstractGuards | None:
 
 
 def gaps_of(term: Any) -> AbstractGaps | None:
-    """The gaps of the forces of a term; None of a term that knows none."""
+    """The gaps of the forces of a term; None without any."""
     return _manifold(term).gaps
 
 
@@ -133,15 +133,15 @@ def evaluate(term: Any, t: Any, flat: Array, like: PyTree[Array], chart: Chart |
 def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Evaluation, args: Args) -> Evaluation:
     """Project a corrected state on the manifold, and evaluate the vector field there.
 
-    `before` is the evaluation of the prediction, at the same time.
+    **Arguments:** `before`: the evaluation of the prediction, at the same time.
     """
     y = unravel_like(like, flat)
     return _raveled(term, _manifold(term).project_near(t * direction_of(term), y, before.of_manifold, args), flat.dtype)
 
 
 def jacobian_of(term: Any, t: Any, like: PyTree[Array], args: Args) -> Callable[[Array], Any]:
-    """`y -> (J, direction)` for raveled states, a pytree: the derivative of a vector field that knows its structure, in
-    the time of the term, and the direction of that time; None instead of both if the term knows none.
+    """`y -> (J, direction)` for raveled states, a pytree: the derivative, with known structure, of a vector field in
+    the time of the term, and the direction of that time; None for both if the term does not know the structure.
     """
     return eqx.Partial(_jacobian, term, t, like, args)
 
@@ -165,7 +165,7 @@ def field_of(term: Any, t: Any, like: PyTree[Array], chart: Chart | None, args: 
 
 
 def kept_of_chart(term: Any, chart: Chart | None, at_start: bool = False) -> PyTree[Array]:
-    """What `at_solution` needs of the chart at the end of a step; `at_start`: of a first step, for its start."""
+    """The part of the chart at the end of a step that `at_solution` needs; `at_start`: for the start of a run."""
     manifold = _manifold(term)
     return manifold.kept_at_start(chart) if at_start else manifold.kept(chart)
 
@@ -173,7 +173,7 @@ def kept_of_chart(term: Any, chart: Chart | None, at_start: bool = False) -> PyT
 def at_solution(
     term: Any, t: Any, flat: Array, f: Array, like: PyTree[Array], kept: PyTree[Array], args: Args
 ) -> tuple[Array, Array]:
-    """The state and the vector field at the end of a step, which are known, with their derivatives."""
+    """The known state and vector field at the end of a step, with their derivatives."""
     manifold, direction = _manifold(term), direction_of(term)
     sign = jnp.asarray(direction).astype(flat.dtype)
     y, f = manifold.at_solution(t * direction, unravel_like(like, flat), unravel_like(like, f * sign), kept, args)
@@ -182,7 +182,7 @@ def at_solution(
 
 def solution_of(term: Any, t: Any, like: PyTree[Array], kept: PyTree[Array], args: Args) -> Any:
     """`(t, y, f, along) -> (y, f, g)` for raveled states, a pytree: a known state, its vector field, and the rate of
-    that along a rate of the state, by default the field, with the derivatives that the equations give them.
+    the latter along a rate of the state (None: the field), with their derivatives by the equations.
     """
     direction = direction_of(term)
     manifold = _manifold(term).closed(t * direction, like, args)

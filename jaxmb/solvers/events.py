@@ -1,8 +1,8 @@
 """Events within an integration: steps end where a guard becomes negative, and the motion goes on from there.
 
-A guard is a function of time and state that is positive as long as the equations are those of the moment. A step that
-finds one negative at its end, or in between, is tried again up to the first zero of the step's own interpolant. A step
-that ends at a zero is followed by a restart, as after a jump; what changes there is left to the term, by `after_jump`.
+A guard is a function of time and state that is positive as long as the present equations hold. A step with a negative
+guard at its end, or in between, is tried again up to the first zero of the step's interpolant. A step that ends at a
+zero is followed by a restart, as after a jump; the term's `after_jump` makes the changes there.
 """
 
 from collections.abc import Callable
@@ -27,45 +27,42 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# A zero is found to this fraction of a step, or in this many evaluations, by bisection after the first ones.
+# A zero is found to this fraction of a step, or in this many evaluations, by bisection after the first few.
 _FRACTION, _EVALUATIONS, _SECANTS = 1e-13, 60, 12
 # A step ends at a zero that is this fraction of it from its end: its interpolant does not resolve a smaller one.
 _END = 1e-9
-# After an event that follows another one at once the next step is this fraction of the last one that was tried.
+# After an event that follows another one at once, the next step is this fraction of the last attempted step.
 _SHORTER = 1e-2
-# In the middle of a step gaps are those of a cubic polynomial, and forces the mean of those at its ends, up to these
-# fractions of them; otherwise it is halved, so many times at most, as they may jump. Where they are not up to a
-# hundredth of that, or a force varies, the next step is at most twice as long, or they could repeat themselves in it.
+# At the middle of a step, gaps must follow a cubic polynomial and forces the mean of both ends, up to these fractions.
+# Otherwise it is halved, so many times at most, since guards may jump. If the differences exceed a hundredth of that,
+# or if a force varies, the next step is at most twice as long: they could repeat themselves in a longer one.
 _COARSE, _BENT, _HALVED, _NOT_SMOOTH, _VARIES, _GROWTH = 0.25, 0.05, 4, 0.01, 0.4, 2.0
-# The share of the length that the error of a start allows which the next start has.
+# The next start has this share of the length that the error of the last start allows.
 _START_SAFETY = 0.92
-# Forces that are smaller than this, relative to the largest ones, are compared with it.
+# The least size of forces, relative to the largest.
 _FAINT = 1e-3
-# The result of a solve that ends since there is no state after an event.
+# The result of a solve that ends because an event leads to no state.
 NO_STATE: Any = diffrax.RESULTS.internal_error
-# A guard that is as negative as this at the start of a run, of a state that is as exact as its digits, and rises, may
-# take until the end of the step.
+# At the start of a run a guard may be this negative, by rounding of the given state, if it rises in the step.
 _OVERLAP = 1e-5
-# Where a guard is zero at the start of a step as well, its rise there is looked for down to this power of two.
+# If a guard is zero at the start of a step as well, its rise is searched down to this power of two.
 _HALVINGS = 30
 
 
 class AbstractErrorWithMore(eqx.Module):
-    """What a solver returns as its `y_error` that holds more than an `error` estimate."""
+    """The `y_error` of a solver that holds more than an `error` estimate."""
 
     error: AbstractVar[PyTree]
 
 
 class Crossing(AbstractErrorWithMore):
-    """What a solver tells an `EventController`, as its `y_error`.
+    """The `y_error` that a solver passes to an `EventController`; flags are 1 or 0, as diffrax expects.
 
-    **Fields:** the `error` for the controller inside; the `target`: the time of the first zero in the step; one where a
-    guard is negative `within` the step, and otherwise zero, since diffrax expects no truth values in an error; the
-    `lowest` guard at its end; one where a guard is `falling` through zero there; one where the term has `lost` the
-    motion at the start of the step: there was no state after an event, and it gave an infinite one; how `coarse` the
-    step is for guards that vary in it, more than one where it is too long; `touch` and `near` of the guards; the factor
-    by which a multistep method could `retry` the step, infinite for other methods, which do not start anew; one where
-    the step starts anew though an event has changed nothing: it is `idle`.
+    **Fields:** the `error` for the controller inside; `target`: the time of the first zero in the step; `within`: 1 if
+    a guard is negative within the step; the `lowest` guard at its end; `falling`: 1 if a guard falls through zero
+    there; `lost`: 1 if an event at its start led to no state, and the state is infinite; `coarse`: above 1 if the step
+    is too long for guards that vary in it; `touch` and `near` of the guards; `retry`: the factor by which a multistep
+    method could retry the step, infinite for methods without restarts; `idle`: 1 if the step restarts after no change.
     """
 
     error: PyTree
@@ -82,12 +79,12 @@ class Crossing(AbstractErrorWithMore):
 
 
 def error_of(y_error: Any) -> PyTree:
-    """The error estimate in what a solver returns as its error."""
+    """The error estimate in a solver's `y_error`."""
     return error_of(y_error.error) if isinstance(y_error, AbstractErrorWithMore) else y_error
 
 
 def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
-    """What a solver returns as its error, with a function of the error estimate in it."""
+    """A solver's `y_error`, with a function applied to the error estimate in it."""
     if not isinstance(y_error, AbstractErrorWithMore):
         return function(y_error)
     within = map_error(function, y_error.error)
@@ -95,21 +92,22 @@ def map_error(function: Callable[[PyTree], Any], y_error: Any) -> Any:
 
 
 def cond_of_jumps(guards: AbstractGuards | None) -> Callable:
-    """The `lax.cond` for what follows a jump: members of a batch jump together, and have events at their own times."""
+    """The `lax.cond` for a restart: members of a batch jump together, but have events at different times."""
     return cond_of_any_lane if guards is None else cond_of_lanes
 
 
-# What the search in a step looks for: a zero at its end or in its middle, where a force is least, where the rate of a
-# guard is zero, a point before a zero at which guards are positive, the zero; nothing more.
+# The phases of the search in a step, for: a zero at its end or middle; the least force; the zero of a guard's rate; a
+# point before a zero with positive guards; the zero; nothing.
 _LOOK, _LEAST, _DIP, _RISE, _ZERO, _DONE = range(6)
-# Where guards are evaluated first, all at once: an evaluation of one point takes nearly as long. Later looks, which
-# few steps have, are at one point three times.
+# Guards are evaluated first at these points, all at once: one point takes nearly as long. Later evaluations, which few
+# steps need, repeat one point three times.
 _POINTS = np.array([1.0, 0.5, 0.0])
 
 
 class Bracket(NamedTuple):
-    """An interval from `a` to `b` in which a function changes its sign, with its values there; which end was `moved`
-    last: -1 the first, 1 the second, 0 none.
+    """An interval from `a` to `b` in which a function changes its sign, with its values at both ends.
+
+    **Fields:** `moved`: the end that moved last: -1 the first, 1 the second, 0 none.
     """
 
     a: Any
@@ -122,10 +120,10 @@ class Bracket(NamedTuple):
 class _Search(NamedTuple):
     """The search for the first zero in a step, whose times are fractions of it.
 
-    **Fields:** the `phase`; `s`: where guards are evaluated next; the `bracket` of what changes its sign; which guards
-    are `looked_at`, and which are `waiting` for that; guards and their rates at the end of the step, guards and their
-    `slopes` at its `middle`, the rates at its `start`, and which guards begin there, see `AbstractGuards`; whether one
-    is negative within it, and how `coarse` it is; the number of evaluations in this `phase`.
+    **Fields:** the `phase`; `s`: the next point of evaluation; `bracket`: of the function that changes its sign; which
+    guards are `looked_at`, and which are `waiting`; the guards and their `rates` at the `end` of the step, the guards
+    and their `slopes` at its `middle`, the rates at its `start`; `begins`: see `AbstractGuards`; `dips`: whether a
+    guard is negative within the step; how `coarse` it is; `count`: evaluations in this phase.
     """
 
     phase: Any
@@ -154,16 +152,16 @@ def crossing(
     made_jump: Any,
     retry: Any = jnp.inf,
 ) -> Crossing:
-    """Look for zeros of guards in a step.
+    """Search for zeros of guards in a step.
 
-    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's; `ends`: the state before a
-    jump at its start, and those at its start and end; `at(t)`: a state in between; `made_jump`: whether there was one;
-    `retry`: see `Crossing`.
+    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's time; `ends`: the states before
+    a jump at its start, at its start, and at its end; `at(t)`: a state in between; `made_jump`: whether it starts with
+    a jump; `retry`: see `Crossing`.
     """
     (t0, t1), (before, y0, y1) = step, ends
     sign, forces = jnp.asarray(direction, t0.dtype), guards.forces(y0)
     none, one = jnp.zeros(forces.shape, ravel(y0).dtype), jnp.ones((), t0.dtype)
-    known = _Known(forces, (t1 - t0).astype(none.dtype), guards.touch, guards.near)
+    step_data = _StepData(forces, (t1 - t0).astype(none.dtype), guards.touch, guards.near)
 
     def guarded(s):
         t = t0 + s * (t1 - t0)
@@ -172,16 +170,16 @@ def crossing(
         return guards.values(t, y), guards.rates(t, y) * sign.astype(none.dtype), guards.begins(t, y)
 
     def advance(packed):
-        # One evaluation for all that is looked for, so that the guards are compiled once.
+        # One evaluation for all phases, so that the guards are compiled once.
         search = layout.unpacked(packed)
         points = jnp.where(search.phase == _LOOK, _POINTS.astype(t0.dtype), search.s)
         values, rates, begins = jax.vmap(guarded)(points)
         if begins is not None:
             begins = jnp.where(search.phase == _LOOK, begins[2], search.begins)
         search = search._replace(begins=begins, count=search.count + 1)
-        after = [_looked, _least_found, _dipped, _risen, _zero_found]
-        after = [lambda *given, own=own: layout.packed(own(*given)) for own in after]
-        return lax.switch(search.phase, after, search, values, rates, known)
+        phases = [_looked, _least_found, _dipped, _risen, _zero_found]
+        phases = [lambda *given, at_phase=at_phase: layout.packed(at_phase(*given)) for at_phase in phases]
+        return lax.switch(search.phase, phases, search, values, rates, step_data)
 
     zero, no = jnp.zeros((), none.dtype), jnp.array(False)
     bracket = Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0))
@@ -207,19 +205,21 @@ def crossing(
     # Each lane evaluates its guards at a few points; few of them have a zero to find.
     phase = lambda packed: layout.unpacked(packed).phase
     looks, goes = lambda packed: phase(packed) <= _LEAST, lambda packed: phase(packed) != _DONE
-    found = layout.unpacked(loop_of_lanes(looks, goes, advance, layout.packed(first)))
-    falling = jnp.any((jnp.abs(found.end) <= guards.touch) & (found.rates < 0))
+    last = layout.unpacked(loop_of_lanes(looks, goes, advance, layout.packed(first)))
+    falling = jnp.any((jnp.abs(last.end) <= guards.touch) & (last.rates < 0))
     lost = jnp.any(jnp.isinf(ravel(y0)))
     idle = made_jump & ~guards.changed(before, y0)
-    falling, lost, within, idle = (x.astype(none.dtype) for x in (falling, lost, found.dips, idle))
+    falling, lost, within, idle = (x.astype(none.dtype) for x in (falling, lost, last.dips, idle))
     touch, near, retry = (jnp.asarray(x, none.dtype) for x in (guards.touch, guards.near, retry))
-    target = t0 + found.bracket.b * (t1 - t0)
-    return Crossing(error, target, within, jnp.min(found.end), falling, lost, found.coarse, touch, near, retry, idle)
+    target = t0 + last.bracket.b * (t1 - t0)
+    return Crossing(error, target, within, jnp.min(last.end), falling, lost, last.coarse, touch, near, retry, idle)
 
 
-class _Known(NamedTuple):
-    """What a search knows of a step: which guards are forces, its length, what counts as zero, and what does at the end
-    of a step that was made to end there.
+class _StepData(NamedTuple):
+    """The data of a step for the search.
+
+    **Fields:** `forces`: which guards are forces; `length` of the step; `touch`: the size that counts as zero; `near`:
+    the same at the end of a step that was made to end at a zero.
     """
 
     forces: Any
@@ -228,62 +228,64 @@ class _Known(NamedTuple):
     near: Any
 
 
-def _looked(search: _Search, values, rates, known):
-    """At the end, the middle and the start of a step: guards that are negative in the middle, those that are least in
-    one of the halves, and those whose rate there is another than that of a cubic polynomial with what is known of them
-    at both ends and their value in the middle; forces that vary.
+def _looked(search: _Search, values, rates, step_data):
+    """The guards at the end, the middle and the start of a step.
+
+    Looks for guards that are negative in the middle and for guards that are least within one of the halves. The step is
+    coarse if forces vary, or if a guard's rate in the middle differs from a cubic polynomial. The polynomial follows
+    from the rates at both ends, the value at the end and the value in the middle.
     """
     (last, values, first), (ends, rates, start) = values, rates
     search = search._replace(s=0.5 * search.s, end=last, rates=ends, middle=values, slopes=rates, start=start)
     search = search._replace(count=jnp.zeros_like(search.count))
-    dips, risen = _negative_within(search, values, known)
+    dips, risen = _negative_within(search, values, step_data)
     watched = jnp.isfinite(start) & jnp.isfinite(ends)
-    at_start, at_end = known.length * start, known.length * ends
+    at_start, at_end = step_data.length * start, step_data.length * ends
     cubic = 4 * (0.125 * at_start + 0.375 * at_end - (search.end - values))
     expected = at_start + 0.5 * (at_end - at_start - 3 * cubic) + 0.75 * cubic
-    off = jnp.abs(expected - known.length * rates)
-    size = jnp.maximum(jnp.minimum(jnp.abs(values), jnp.abs(search.end)), known.touch)
-    # A guard that the step was made to end at has no size there.
-    counts = watched & (jnp.abs(search.end) > known.near)
+    off = jnp.abs(expected - step_data.length * rates)
+    size = jnp.maximum(jnp.minimum(jnp.abs(values), jnp.abs(search.end)), step_data.touch)
+    # A guard at whose zero the step was made to end has no size there.
+    counts = watched & (jnp.abs(search.end) > step_data.near)
     coarse = jnp.max(jnp.where(counts, off / (_COARSE * size), 0.0), initial=0.0)
     turns = jnp.where(rates > 0, start < 0, ends > 0)
-    waiting = turns & watched & jnp.isfinite(rates) & (search.end >= -known.touch)
+    waiting = turns & watched & jnp.isfinite(rates) & (search.end >= -step_data.touch)
     search = search._replace(coarse=coarse, waiting=waiting)
-    return _chosen(dips, risen, _next_force(search, first, known))
+    return _chosen(dips, risen, _next_force(search, first, step_data))
 
 
-def _next_force(search: _Search, first, known):
-    """Forces that vary by more than a parabola shows, and those that it shows to be next to zero, from the `first`
-    ones, those in the middle and those at the end.
+def _next_force(search: _Search, first, step_data):
+    """The step is coarse where forces vary by more than a parabola shows; a force with a parabola next to zero is
+    searched next. Its values are the `first` ones, in the middle, and at the end.
     """
     middle, last = search.middle, search.end
     bent, sloped = 2 * (first + last - 2 * middle), 4 * middle - 3 * first - last
     least_at = jnp.where(bent > 0, -sloped / jnp.where(bent > 0, 2 * bent, 1.0), 0.0)
-    inside = known.forces & (least_at > 0) & (least_at < 1)
+    inside = step_data.forces & (least_at > 0) & (least_at < 1)
     least = jnp.where(inside, first + 0.5 * sloped * least_at, jnp.inf)
-    own = jnp.argmin(least)
+    lowest = jnp.argmin(least)
     varies = jnp.maximum(jnp.abs(first - middle), jnp.abs(last - middle))
     size = jnp.maximum(jnp.max(jnp.abs(jnp.stack([first, middle, last])), axis=0), _FAINT)
     off = jnp.maximum(0.25 * jnp.abs(bent) / _BENT, _VARIES * varies) / size
-    # A step that was made to end at a zero may be as long as that one is away, whatever forces do.
-    counts = known.forces & jnp.all(jnp.abs(last) > known.near)
+    # A step that was made to end at a zero may be that long, whatever forces do.
+    counts = step_data.forces & jnp.all(jnp.abs(last) > step_data.near)
     search = search._replace(coarse=jnp.maximum(search.coarse, jnp.max(jnp.where(counts, off, 0.0), initial=0.0)))
     looks = search._replace(
-        phase=jnp.array(_LEAST), s=least_at[own].astype(search.s.dtype), looked_at=jnp.arange(least.size) == own
+        phase=jnp.array(_LEAST), s=least_at[lowest].astype(search.s.dtype), looked_at=jnp.arange(least.size) == lowest
     )
-    return _chosen(least[own] < _COARSE, looks, _next_dip(search, known))
+    return _chosen(least[lowest] < _COARSE, looks, _next_dip(search, step_data))
 
 
-def _least_found(search: _Search, values, rates, known):
-    """Where a force is about the least of the step."""
+def _least_found(search: _Search, values, rates, step_data):
+    """At the point where a force is about least in the step."""
     del rates
-    dips, risen = _negative_within(search, values[0], known)
-    return _chosen(dips, risen, _next_dip(search, known))._replace(count=jnp.zeros_like(search.count))
+    dips, risen = _negative_within(search, values[0], step_data)
+    return _chosen(dips, risen, _next_dip(search, step_data))._replace(count=jnp.zeros_like(search.count))
 
 
-def _negative_within(search: _Search, values, known):
-    """Whether guards are negative at a point within the step, and the search back from there if they are."""
-    below = values < -known.touch
+def _negative_within(search: _Search, values, step_data):
+    """Whether guards are negative at a point within the step, and if so, the search back from there."""
+    below = values < -step_data.touch
     if search.begins is not None:
         below = below & ~search.begins
     bracket = search.bracket._replace(b=search.s, of_b=jnp.min(jnp.where(below, values, jnp.inf)))
@@ -295,12 +297,12 @@ def _chosen(condition, one: _Search, other: _Search) -> _Search:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
 
 
-def _next_dip(search: _Search, known):
-    """Before the search for the zero of the rate of the next guard that waits for it, of several the one that is least
-    at the end of the step. Where none does, guards that are negative at the end are next; the search is done without.
+def _next_dip(search: _Search, step_data):
+    """The search for the zero of the rate of the next waiting guard: the guard that is lowest at the end of the step.
+    Without one, guards that are negative at the end are next, or else the search is done.
     """
     least = jnp.argmin(jnp.where(search.waiting, search.end, jnp.inf))
-    own, half = jnp.arange(search.start.size) == least, 0.5 * jnp.ones_like(search.s)
+    guard, half = jnp.arange(search.start.size) == least, 0.5 * jnp.ones_like(search.s)
     # In the first half where the guard rises at the middle.
     middle, first = search.slopes[least], search.slopes[least] > 0
     of_a, of_b = jnp.where(first, search.start[least], middle), jnp.where(first, middle, search.rates[least])
@@ -309,11 +311,11 @@ def _next_dip(search: _Search, known):
         phase=jnp.array(_DIP),
         s=0.5 * (turn.a + turn.b),
         bracket=turn,
-        looked_at=own,
-        waiting=search.waiting & ~own,
+        looked_at=guard,
+        waiting=search.waiting & ~guard,
         count=jnp.array(0),
     )
-    below = search.end < -known.touch
+    below = search.end < -step_data.touch
     of_end = Bracket(
         0 * half, 2 * half, jnp.zeros_like(of_a), jnp.min(jnp.where(below, search.end, jnp.inf)), dip.count
     )
@@ -323,32 +325,32 @@ def _next_dip(search: _Search, known):
     return _chosen(jnp.any(search.waiting), dip, back)
 
 
-def _dipped(search: _Search, values, rates, known):
-    """Towards the zero of a guard's rate, where it is least."""
-    (values, _, _), (rates, _, _), own = values, rates, jnp.argmax(search.looked_at)
-    again = _narrowed(search, rates[own])
+def _dipped(search: _Search, values, rates, step_data):
+    """Towards the zero of a guard's rate, where the guard is least."""
+    (values, _, _), (rates, _, _), guard = values, rates, jnp.argmax(search.looked_at)
+    again = _narrowed(search, rates[guard])
     ends = _is_short(again)
-    dips = ends & (values[own] < -known.touch)
+    dips = ends & (values[guard] < -step_data.touch)
     # From rates to values of the guard.
-    bracket = again.bracket._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=values[own])
+    bracket = again.bracket._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=values[guard])
     risen = again._replace(
         phase=jnp.array(_RISE), s=search.s / 2, bracket=bracket, dips=jnp.array(True), count=jnp.array(0)
     )
-    return _chosen(dips, risen, _chosen(ends, _next_dip(search, known), again))
+    return _chosen(dips, risen, _chosen(ends, _next_dip(search, step_data), again))
 
 
-def _risen(search: _Search, values, rates, known):
-    """Back from a point where guards are negative to one where they are positive; near the start there may be none."""
+def _risen(search: _Search, values, rates, step_data):
+    """Back from a point with negative guards to a point with positive ones, which may not exist near the start."""
     del rates
     values = values[0]
     least = jnp.min(jnp.where(search.looked_at, values, jnp.inf))
     positive, ends = least > 0, search.count >= _HALVINGS
     before = search.bracket
-    found = before._replace(a=search.s, of_a=least, moved=jnp.array(0))
+    forwards = before._replace(a=search.s, of_a=least, moved=jnp.array(0))
     back = before._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=least)
-    bracket = jax.tree.map(lambda found, back: jnp.where(positive, found, back), found, back)
-    # Those that have been negative all the time, and have risen, are not crossed here.
-    overlap = search.looked_at & (values < -known.touch) & (values >= -_OVERLAP)
+    bracket = jax.tree.map(lambda forwards, back: jnp.where(positive, forwards, back), forwards, back)
+    # Guards that were negative all the time, and have risen, have no zero here.
+    overlap = search.looked_at & (values < -step_data.touch) & (values >= -_OVERLAP)
     overlap = overlap & (search.start > 0) & (search.end >= values)
     eases = ends & ~positive & jnp.all(overlap | ~search.looked_at)
     return search._replace(
@@ -361,9 +363,9 @@ def _risen(search: _Search, values, rates, known):
     )
 
 
-def _zero_found(search: _Search, values, rates, known):
-    """Towards the first zero of guards, between a point where they are positive and one where one is negative."""
-    del rates, known
+def _zero_found(search: _Search, values, rates, step_data):
+    """Towards the first zero, between a point with positive guards and a point with a negative one."""
+    del rates, step_data
     again = _narrowed(search, jnp.min(jnp.where(search.looked_at, values[0], jnp.inf)))
     return again._replace(phase=jnp.where(_is_short(again), _DONE, _ZERO))
 
@@ -374,19 +376,19 @@ def _is_short(search: _Search):
 
 
 def _narrowed(search: _Search, value):
-    """The shorter interval with a value at `s` in it, and where the next one is asked for."""
+    """The shorter interval with a value at `s` in it, and the next point of evaluation."""
     bracket, s = narrowed(search.bracket, search.s, value, search.count >= _SECANTS, 0.5 * _FRACTION)
     return search._replace(bracket=bracket, s=s)
 
 
 def narrowed(bracket: Bracket, s: Any, value: Any, bisects: Any, least: float = 0.0) -> tuple[Bracket, Any]:
-    """An interval with a further value of the function in it, and where the next one is asked for.
+    """An interval shortened by a further value of the function in it, and the next point of evaluation.
 
     Source: M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11,
-    1971 (the Illinois method): where the same end moves twice, the value at the other one counts half.
+    1971 (the Illinois method). If the same end moves twice, the value at the other end counts half.
 
-    **Arguments:** `value` at `s`; `bisects`: whether the middle is next; `least`: how far the next point is from both
-    ends, so that the interval becomes as short as that once one end is at the zero.
+    **Arguments:** `value` at `s`; `bisects`: whether the middle is next; `least`: the distance of the next point from
+    both ends, so that the interval becomes that short once one end is at the zero.
     """
     a, b, of_a, of_b, moved = bracket
     same = jnp.sign(value) == jnp.sign(of_b)
@@ -403,11 +405,11 @@ def narrowed(bracket: Bracket, s: Any, value: Any, bisects: Any, least: float = 
 class EventState(AbstractControllerState):
     """The state of `EventController`.
 
-    **Fields:** that of the controller `inner`; the `target` of the step that is tried, infinite without one; the
-    `length` that it had before it was made to end there; the `count` of events, their `times` and the raveled `states`
-    before them, in buffers; `touch` of the guards; how many times in a row a step was `halved`; whether the method
-    `starts` anew with this step, and the length that the error of the last `start` allows; whether the last step
-    `ended` at an event.
+    **Fields:** `inner`: the state of the controller inside; `target`: the time at which the attempted step is made to
+    end, infinite without one; its `length` before that; the `count` of events, their `times` and the raveled `states`
+    before them, in buffers; `touch` of the guards; `halved`: how many times in a row a step was halved; `starts`:
+    whether the method restarts with this step; `start`: the length that the error of the last start allows; `ended`:
+    whether the last step ended at an event.
     """
 
     inner: Any
@@ -430,7 +432,7 @@ class EventState(AbstractControllerState):
 class EventController(AbstractControllerAround):
     """A controller around another one, whose steps end at events; at most `most` of them.
 
-    Too many events end the solve with `diffrax.RESULTS.dt_min_reached`, and one after which there is no state with
+    Too many events end the solve with `diffrax.RESULTS.dt_min_reached`, an event that leads to no state with
     `NO_STATE`.
     """
 
@@ -444,7 +446,7 @@ class EventController(AbstractControllerAround):
     def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         flat = ravel(y0)
-        # The last entry of the buffers is written where there is no event.
+        # Without an event, the last entry of the buffers is written.
         times = jnp.full(self.most + 1, jnp.inf, t0.dtype)
         states = jnp.zeros((self.most + 1, flat.size), flat.dtype)
         touch = jnp.zeros((), flat.dtype)
@@ -453,18 +455,18 @@ class EventController(AbstractControllerAround):
         return first, EventState(inner, *none, times, states, touch, jnp.array(0), *start)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        before, found = controller_state, y_error
+        before, crossing = controller_state, y_error
         keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, found.error, error_order, before.inner
+            t0, t1, y0, y1_candidate, args, crossing.error, error_order, before.inner
         )
         starts = jnp.asarray(made_jump), before.starts
-        step = _Tried(t0, t1, found.target, found.coarse, found.retry, before.halved, before.inner, starts)
+        step = _Tried(t0, t1, crossing.target, crossing.coarse, crossing.retry, before.halved, before.inner, starts)
         plan = _Plan(
             jnp.array(False),
             jnp.array(False),
             next_t0,
             next_t1,
-            # The controller inside does not learn of a step without a length, where one event follows another at once.
+            # The controller inside does not learn of a step without length, between events at the same time.
             jax.tree.map(lambda new, old: jnp.where(t1 <= t0, old, new), inner, before.inner),
             jnp.full_like(before.target, jnp.inf),
             jnp.where(jnp.isinf(before.target), t1 - t0, before.length),
@@ -473,11 +475,11 @@ class EventController(AbstractControllerAround):
             before.start,
             before.ended,
         )
-        # A branch, so that the compiler does not repeat the verdict wherever it matters.
-        verdict = _verdict(keep, (t0, t1), found, before)
+        # A branch, so that the compiler does not repeat the verdict at every use.
+        verdict = _verdict(keep, (t0, t1), crossing, before)
         plan = switch(verdict, [_refused, _crossed, _too_coarse, _passed, _ended], step, plan)
-        # A place at which nothing changed is that of the next event.
-        idle = plan.accepted & before.ended & (found.idle > 0)
+        # The next event overwrites an event that changed nothing.
+        idle = plan.accepted & before.ended & (crossing.idle > 0)
         count = before.count - idle.astype(before.count.dtype)
         place = jnp.where(plan.ends, jnp.minimum(count, self.most), self.most)
         state = EventState(
@@ -487,7 +489,7 @@ class EventController(AbstractControllerAround):
             count + plan.ends.astype(count.dtype),
             lax.dynamic_update_index_in_dim(before.times, t1, place, 0),
             lax.dynamic_update_index_in_dim(before.states, ravel(y1_candidate), place, 0),
-            found.touch,
+            crossing.touch,
             plan.halved,
             plan.starts,
             plan.start,
@@ -495,14 +497,16 @@ class EventController(AbstractControllerAround):
         )
         full = plan.ends & (count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)
-        lost = found.lost > 0
+        lost = crossing.lost > 0
         result = diffrax.RESULTS.where(lost, NO_STATE, result)
         return plan.accepted & ~lost, plan.next_t0, plan.next_t1, made_jump | plan.ends, state, result
 
 
 class _Tried(NamedTuple):
-    """A step that was tried from `t0` to `t1`, with what was found in it, see `Crossing`; of the state before it how
-    often a step was `halved`, and `inner`; whether the method `starts` anew after it, and did with it.
+    """A step from `t0` to `t1` that was tried.
+
+    **Fields:** `target`, `coarse`, `retry`: see `Crossing`; `halved`, `inner`: of the state before it, see
+    `EventState`; `starts`: whether the method restarts after the step, and did with it.
     """
 
     t0: Any
@@ -516,9 +520,7 @@ class _Tried(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """What follows a step: whether it is `accepted`, and `ends` at an event; the next one; for the other fields see
-    `EventState`.
-    """
+    """The next step: whether this one is `accepted`, and `ends` at an event; for the other fields see `EventState`."""
 
     accepted: Any
     ends: Any
@@ -533,21 +535,20 @@ class _Plan(NamedTuple):
     ended: Any
 
 
-# Steps that the controller inside refuses; that pass a zero; that are too coarse; that have no event, and that end at
-# one.
+# Steps that the controller inside refuses; that pass a zero; that are too coarse; without an event; that end at one.
 _REFUSED, _CROSSED, _TOO_COARSE, _PASSED, _ENDED = range(5)
 
 
-def _verdict(keep, step: tuple[Any, Any], found: Crossing, before: EventState):
-    """What a step is, if the controller inside would `keep` it."""
+def _verdict(keep, step: tuple[Any, Any], crossing: Crossing, before: EventState):
+    """The kind of a step, if the controller inside would `keep` it."""
     t0, t1 = step
-    # Compilers round what is computed in two places twice.
+    # Compilers may round a value that is computed in two places differently.
     meant = jnp.abs(t1 - before.target) <= 4 * jnp.finfo(before.target.dtype).eps * jnp.abs(t1)
-    close = (t1 - found.target) <= _END * (t1 - t0)
-    at_zero = jnp.where(meant, jnp.abs(found.lowest) <= found.near, found.falling > 0)
-    at_zero = at_zero | (close & (found.lowest < -found.touch))
-    crossed = (found.within > 0) | ((found.lowest < -found.touch) & ~at_zero)
-    coarse = (found.coarse > 1) & (before.halved < _HALVED)
+    close = (t1 - crossing.target) <= _END * (t1 - t0)
+    at_zero = jnp.where(meant, jnp.abs(crossing.lowest) <= crossing.near, crossing.falling > 0)
+    at_zero = at_zero | (close & (crossing.lowest < -crossing.touch))
+    crossed = (crossing.within > 0) | ((crossing.lowest < -crossing.touch) & ~at_zero)
+    coarse = (crossing.coarse > 1) & (before.halved < _HALVED)
     verdict = jnp.where(coarse, _TOO_COARSE, jnp.where(at_zero, _ENDED, _PASSED))
     return jnp.where(keep, jnp.where(crossed, _CROSSED, verdict), _REFUSED)
 
@@ -571,7 +572,7 @@ def _passed(step: _Tried, plan: _Plan) -> _Plan:
     growing = jnp.where(step.coarse > _NOT_SMOOTH, t1 + _GROWTH * (t1 - t0), jnp.inf)
     empty = t1 <= t0
     next_t1 = jnp.where(empty, t1 + _SHORTER * plan.length, jnp.minimum(plan.next_t1, growing))
-    # A method that starts anew, at order one, takes the longest step that it could take when it last did.
+    # A method that restarts, at order one, takes the longest step that its last start allowed.
     allowed = (t1 - t0) * _START_SAFETY * step.retry.astype(plan.start.dtype)
     start = jnp.where(started & ~empty, allowed, plan.start)
     yes, no = jnp.array(True), jnp.array(False)
@@ -585,6 +586,6 @@ def _ended(step: _Tried, plan: _Plan) -> _Plan:
 
 
 def events_found(controller_state: Any) -> EventState | None:
-    """What an `EventController` found, from the state of a controller that may be wrapped around it."""
-    found = states_inside(controller_state, EventState)
-    return found[0] if found else None
+    """The events that an `EventController` recorded, from the state of a controller that may be wrapped around it."""
+    states = states_inside(controller_state, EventState)
+    return states[0] if states else None

@@ -1,8 +1,8 @@
 """Steps that would pass over a force which sets in and ends within them.
 
-A method sees a force where it evaluates the equations, mostly at the ends of steps. A contact that closes and opens
-again between them would be missed. So the gaps in which forces act are followed along the interpolant of each step, and
-a step that hides one of them is tried again up to where it is most closed. All other steps stay as they are.
+A method sees a force where it evaluates the equations, mostly at the ends of steps. It would miss a contact that closes
+and opens again in between. So the gaps in which forces act are followed along the interpolant of each step. A step that
+hides a contact is tried again up to the time of least gap; all other steps are unchanged.
 """
 
 from typing import Any, NamedTuple
@@ -18,26 +18,26 @@ from .evaluation import gaps_of
 from .events import AbstractErrorWithMore
 from .manifold_term import AbstractGaps
 
-# A stretch of a step is looked at in so many pieces; stretches that hide nothing grow by a factor.
+# A stretch of a step is examined in this many pieces; stretches that hide nothing grow by this factor.
 _PIECES, _GROWTH = 8, 4.0
-# A contact is hidden where it is this many times deeper than at both ends of the step, or where its depth is off from a
-# cubic polynomial of what is known at the ends by this fraction.
+# A contact is hidden if it is this many times deeper than at both ends of the step. It is also hidden if its depth
+# differs by this fraction from the cubic polynomial through gaps and rates at both ends.
 _DEEPER, _OFF = 2.0, 0.2
-# Depths below this fraction of the width in which a force sets in do not count. (That of a ramp at a distance of 25 000
-# widths.) Those below the next fraction may differ from the polynomial: there is no contact yet.
+# Depths below this fraction of the width in which a force sets in do not count (a ramp has it at a distance of 25 000
+# widths). Depths below the next fraction may differ from the polynomial, since the contact is not closed yet.
 _FAINT, _NEAR = 1e-5, 0.25
-# Pieces that are this short, relative to the step, are not divided; after so many looks the step is shortened.
+# Pieces this short, relative to the step, are not divided; after this many looks the step is shortened.
 _SHORTEST, _LOOKS = 1e-9, 256
-# A gap is as uncertain as this many times what it differs from the integral of its rates. Where a contact may be hidden
-# in that, the step is halved: a method whose interpolant has more stages than its step may have seen a force in these.
+# The uncertainty of a gap is this many times its difference from the integral of its rates. A step that may hide a
+# contact within the uncertainty is halved: an interpolant with more stages than the step may have seen a force in them.
 _UNCERTAIN = 2.0
 
 
 class Hidden(AbstractErrorWithMore):
-    """What a solver tells a `GapController`, as its `y_error`.
+    """The `y_error` that a solver passes to a `GapController`.
 
-    **Fields:** the `error` for the controller inside; the `target`: the time up to which the step may go; one where the
-    step hides a force (`hides`), and otherwise zero, since diffrax expects no truth values in an error.
+    **Fields:** the `error` for the controller inside; the `target`: the time up to which the step may go; `hides`: 1 if
+    the step hides a force, else 0, since diffrax expects no truth values in an error.
     """
 
     error: PyTree
@@ -46,7 +46,7 @@ class Hidden(AbstractErrorWithMore):
 
 
 class _Ends(NamedTuple):
-    """Gaps and their rates, in units of the step, at its start and its end, and the widths in which forces set in."""
+    """Gaps and their rates, in units of the step, at both ends of the step, and the widths in which forces set in."""
 
     first: Any
     last: Any
@@ -56,11 +56,10 @@ class _Ends(NamedTuple):
 
 
 class _Walk(NamedTuple):
-    """The way along a step, whose times are fractions of it.
+    """The progress along a step, whose times are fractions of it.
 
-    **Fields:** the `start` and the `length` of the stretch that is looked at next; the `ends` of the step; by how much
-    gaps are `uncertain`; whether the step `hides` a force, and where its gap is most closed, `target`; the number of
-    `looks`.
+    **Fields:** the `start` and the `length` of the next stretch; the `ends` of the step; by how much gaps are
+    `uncertain`; whether the step `hides` a force; `target`: the time of its least gap; the number of `looks`.
     """
 
     start: Any
@@ -73,10 +72,10 @@ class _Walk(NamedTuple):
 
 
 def hidden(gaps: AbstractGaps, direction: Any, error: PyTree, step: tuple[Any, Any], y1: Any, at: Any) -> Hidden:
-    """Look for forces that a step hides.
+    """Search for forces that a step hides.
 
-    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's; `y1`: the state at its end;
-    `at(t)`: a state in between.
+    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's time; `y1`: the state at its
+    end; `at(t)`: a state in between.
     """
     t0, t1 = step
     sign = jnp.asarray(direction, t0.dtype)
@@ -86,39 +85,39 @@ def hidden(gaps: AbstractGaps, direction: Any, error: PyTree, step: tuple[Any, A
         y = jax.tree.map(lambda end, inside: jnp.where(s == 1, end, inside), y1, at(t))
         return gaps.seen(t * sign, y)
 
-    # By the way that is measured: in the direction of the solver, and in units of the step.
+    # Rates in the direction of the solver, and in units of the step.
     unit = (t1 - t0) * sign
 
     def advance(walk):
         s = jnp.minimum(walk.start + walk.length * jnp.linspace(0.0, 1.0, _PIECES + 1, dtype=t0.dtype), 1.0)
-        found = jax.vmap(seen)(s)
-        rates = found.rates * unit.astype(found.rates.dtype)
-        own = _Ends(found.gaps[0], found.gaps[-1], rates[0], rates[-1], found.widths[0])
-        ends = jax.tree.map(lambda new, old: jnp.where(walk.looks == 0, new, old), own, walk.ends)
-        pace = found.pace * (t1 - t0).astype(found.pace.dtype)
-        return _advanced(walk._replace(ends=ends), s, found.gaps, rates, pace, gaps.touch)
+        sight = jax.vmap(seen)(s)
+        rates = sight.rates * unit.astype(sight.rates.dtype)
+        seen_ends = _Ends(sight.gaps[0], sight.gaps[-1], rates[0], rates[-1], sight.widths[0])
+        ends = jax.tree.map(lambda new, old: jnp.where(walk.looks == 0, new, old), seen_ends, walk.ends)
+        pace = sight.pace * (t1 - t0).astype(sight.pace.dtype)
+        return _advanced(walk._replace(ends=ends), s, sight.gaps, rates, pace, gaps.touch)
 
     zero, one = jnp.zeros_like(t0), jnp.ones_like(t0)
     none = jax.eval_shape(seen, t0).gaps
     none = jnp.zeros(none.shape, none.dtype)
     first = _Walk(zero, one, _Ends(none, none, none, none, none), none, jnp.array(False), one, jnp.array(0))
     goes = lambda walk: (walk.start < 1) & ~walk.hides
-    # Most steps of most lanes are seen at once.
+    # Most steps of most lanes need one look.
     last = loop_of_lanes(lambda walk: goes(walk) & (walk.looks < 2), goes, advance, first)
     return Hidden(error, t0 + last.target * (t1 - t0), last.hides.astype(none.dtype))
 
 
 def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
-    """A stretch further, or into the first piece of this one in which something may be hidden.
+    """A stretch further, or into the first piece of this stretch that may hide a force.
 
-    **Arguments:** of times `s` in the step the `gaps`, their `rates` in units of the step, and the `pace`.
+    **Arguments:** at times `s` in the step the `gaps`, their `rates` in units of the step, and the `pace`.
     """
     ends, piece = walk.ends, walk.length / _PIECES
-    # A step in which a gap changes by less than the width in which its force sets in hides nothing. What still differs
-    # there is a jump of the gap itself, as of an angle that wraps.
+    # A gap that changes by less than the width in which its force sets in hides nothing in a step. A difference there
+    # is a jump of the gap itself, as of an angle that wraps.
     varies = (jnp.max(jnp.abs(rates), axis=0) > jnp.maximum(_NEAR * ends.widths, touch))[None]
     score = jnp.max(_score(ends, s, gaps, varies, touch), axis=1)
-    own = jnp.argmax(score)
+    deepest = jnp.argmax(score)
     width = piece.astype(gaps.dtype)
     least = _least(gaps, rates, width)
     fast = jnp.maximum(pace[:-1], pace[1:]) * width > 1
@@ -129,15 +128,15 @@ def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
     doubtful = jnp.any(_deeper(ends, least - _UNCERTAIN * uncertain[None], touch) & varies, axis=1)
     looks, start = walk.looks + 1, jnp.where(passed[-1], s[-1], s[jnp.argmax(divided)])
     length = jnp.minimum(jnp.where(passed[-1], _GROWTH * walk.length, piece), 1 - start)
-    hides, wrong, tired = score[own] > 0, jnp.any(doubtful & passed), (looks >= _LOOKS) & (start < 1)
+    hides, wrong, tired = score[deepest] > 0, jnp.any(doubtful & passed), (looks >= _LOOKS) & (start < 1)
     shorter = jnp.where(wrong, 0.5, jnp.where(tired, jnp.maximum(start, piece), 1.0))
-    target = jnp.where(hides, s[own], shorter)
+    target = jnp.where(hides, s[deepest], shorter)
     return _Walk(start, length, ends, uncertain, hides | wrong | tired, target, looks)
 
 
 def _score(ends: _Ends, s, gaps, varies, touch):
     """How much deeper contacts are than their ends show, at times of a step; zero where nothing is hidden. Contacts
-    that do not vary are hidden only where they are deeper than at the ends.
+    that do not vary are hidden only where they are deeper than at both ends.
     """
     s, widths = s.astype(gaps.dtype)[:, None], ends.widths[None]
     depth, first, last = (_depth(gap, widths) for gap in (gaps, ends.first[None], ends.last[None]))
@@ -150,14 +149,14 @@ def _score(ends: _Ends, s, gaps, varies, touch):
 
 
 def _deeper(ends: _Ends, gaps, touch):
-    """Where gaps are closed much further than at both ends of a step."""
+    """Where gaps are much further closed than at both ends of a step."""
     widths = ends.widths[None]
     most = jnp.maximum(_depth(ends.first[None], widths), _depth(ends.last[None], widths))
     return _depth(gaps, widths) > _DEEPER * jnp.maximum(most, _FAINT * widths + touch)
 
 
 def _depth(gaps, widths):
-    """The depth by which a gap is closed, a ramp that is as wide as that of the force; at a width of zero a kink."""
+    """The depth by which a gap is closed: a ramp as wide as the ramp of the force; a kink for a width of zero."""
     root = jnp.sqrt(gaps**2 + widths**2)
     outside = 0.5 * widths**2 / jnp.where(root > 0, root + jnp.abs(gaps), 1.0)
     return jnp.where(gaps < 0, 0.5 * (root - gaps), outside)
@@ -173,7 +172,7 @@ def _cubic(ends: _Ends, s):
 
 
 def _unlike(gaps, rates, piece):
-    """What gaps differ from the integral of their rates, by Simpson's rule, in pairs of pieces in which none turns."""
+    """The difference of gaps from the integral of their rates, by Simpson's rule, in pairs of pieces without a turn."""
     closes = rates < 0
     turns = (closes[:-2:2] != closes[1:-1:2]) | (closes[1:-1:2] != closes[2::2])
     integral = piece / 3 * (rates[:-2:2] + 4 * rates[1:-1:2] + rates[2::2])
@@ -181,8 +180,8 @@ def _unlike(gaps, rates, piece):
 
 
 def _least(gaps, rates, piece):
-    """Lower bounds of gaps in pieces between times, where those that close and open again are convex: of a distance
-    from a convex body along a straight way, the value where tangents at both ends meet.
+    """Lower bounds of gaps in pieces between times. Gaps that close and open again are convex, as the distance from a
+    convex body along a straight path. So the tangents at both ends meet at a lower bound.
     """
     (before, after), (closing, opening) = (gaps[:-1], gaps[1:]), (rates[:-1], rates[1:])
     turns = (closing < 0) & (opening > 0)
@@ -192,7 +191,7 @@ def _least(gaps, rates, piece):
 
 
 class AbstractWithoutJumps(AbstractControllerAround):
-    """A controller around another one that makes no jumps of its own."""
+    """A controller around another one that adds no jumps."""
 
 
 class GapController(AbstractWithoutJumps):
@@ -207,24 +206,24 @@ class GapController(AbstractWithoutJumps):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        before, found = controller_state, y_error
+        before, report = controller_state, y_error
         keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, found.error, error_order, before
+            t0, t1, y0, y1_candidate, args, report.error, error_order, before
         )
-        again = keep & (found.hides > 0)
-        # The controller inside does not learn of a step that was good but hid something.
+        again = keep & (report.hides > 0)
+        # The controller inside does not learn of a good step that hid a force.
         inner = jax.tree.map(lambda new, old: jnp.where(again, old, new), inner, before)
-        next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, found.target, next_t1)
+        next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, report.target, next_t1)
         return keep & ~again, next_t0, next_t1, made_jump, inner, result
 
 
 class GapSolver(WrappedSolver):
-    """A one-step solver that looks at the gaps in which the forces of its term act."""
+    """A one-step solver that examines the gaps in which the forces of its term act."""
 
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)
 
-    # Compiled inside the whole program, so that it is traced once.
+    # A nested program, so that the step is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         y1, error, dense_info, *rest = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)

@@ -59,11 +59,11 @@ class HermiteState(AbstractMultistepState):
     - `matrix`: the linearisation for Newton's method.
     - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
         accepted steps with k points.
-    - `work`: evaluations of f with g, and matrices computed, in accepted steps; the first evaluation after a start is
-        in `step_counts`, those of rejected steps are in `ControllerState`.
+    - `work`: evaluations of f with g, and matrices computed, in accepted steps. The first evaluation after a start is
+        in `step_counts`, the evaluations of rejected steps are in `ControllerState`.
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
-    - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
+    - `tangents`: the tangents whose errors are controlled beside the state's error, otherwise `None`.
     - `wrong_derivative`: whether differences of the vector field contradict its derivative at the first start.
     """
 
@@ -88,7 +88,7 @@ class HermiteState(AbstractMultistepState):
 
 
 class StepEnd(eqx.Module):
-    """A step as its end determines it.
+    """A step as a function of its end.
 
     **Fields:** the state `after` it, the history there and its `slope`; for interpolation the history with the last
     point `doubled`, and the `mismatch` of the formula at the end.
@@ -106,8 +106,10 @@ class StepEnd(eqx.Module):
 
 
 class _Step(AbstractAttempt):
-    """The numbers of a step: its `end`; the state there by every formula, for their errors (`ends`); the chart there,
-    whether the evaluation `broke` down, and the end of Newton's method.
+    """The numbers of a step.
+
+    **Fields:** its `end`; `ends`: the state there by every formula, for their errors; the `chart` there; whether the
+    evaluation `broke` down; the result of Newton's method.
     """
 
     end: StepEnd
@@ -126,9 +128,7 @@ class _Step(AbstractAttempt):
 
 
 class PushedTangent(NamedTuple):
-    """A tangent that is carried along, `before` a step, with its memory there, at its `end`, and there by every formula
-    (`ends`).
-    """
+    """A tangent that is carried along: `before` a step, at its `end`, and there by every formula (`ends`)."""
 
     before: Tangent
     end: StepEnd
@@ -136,9 +136,9 @@ class PushedTangent(NamedTuple):
 
 
 class Formula(NamedTuple):
-    """The formula of a step, for a mesh.
+    """The formula of a step on a mesh.
 
-    **Fields:** the `end` of the step in time, and its length `h`; `unit`: of the values that it integrates; its
+    **Fields:** the `end` of the step in time, and its length `h`; the `unit` of the values that it integrates; its
     `coefficients` for all numbers of nodes, and how many `nodes` it has; `values` of the basis at the end.
     """
 
@@ -163,41 +163,39 @@ class Hermite(AbstractMultistep):
     motion.stats["num_steps"]
     ```
 
-    A step interpolates, in the sense of Hermite, at the new point and at k points of the past. The second derivative
-    is exact, by one directional derivative of the vector field, which must be differentiable. Families:
+    A step interpolates, in the sense of Hermite, at the new point and at k points of the past. The second derivative is
+    exact: one directional derivative of the vector field, which must be differentiable. Families:
 
-    - `"E"` (Enright), order `k + 2`, `k ≤ 7`: integrates the polynomial through values of `f`. A-stable for
-        `k ≤ 2`, stiffly stable for all, and zero-stable for any sequence of steps. The default.
+    - `"E"` (Enright), order `k + 2`, `k ≤ 7`: integrates the polynomial through values of `f`. A-stable for `k ≤ 2`,
+        stiffly stable for all, and zero-stable for any sequence of steps. The default.
     - `"B"`, order `k + 1`, `k ≤ 8`: backward differentiation of `y` with the second derivative at the new point.
         A-stable for `k ≤ 3`; steps may only grow slowly at high orders.
-    - `"H"`, order `2k + 2`, `k ≤ 3`: as E, with `f′` at every point. A-stable, without damping at infinity, for
-        `k = 1`; unsuitable for stiff problems otherwise.
+    - `"H"`, order `2k + 2`, `k ≤ 3`: as E, with `f′` at every point. A-stable, without damping at infinity, for `k =
+        1`; unsuitable for stiff problems otherwise.
     - `"Y"`, order `2k + 1`, `k ≤ 3`: as B, with `y′` at every point. A-stable for `k = 1`.
 
     Formulas that are not A-stable amplify lightly damped vibrations when a step covers a few radians of them. They are
-    chosen only for steps at which no eigenvalue of the Jacobian (computed whenever Newton's method needs a new one)
-    causes that, unless `past_points` has no A-stable alternative. With large steps, implicit formulas damp components
-    that should grow: no step covers more than two e-foldings of them.
+    chosen only for steps at which no eigenvalue of the Jacobian causes amplification, unless `past_points` has no
+    A-stable alternative. The eigenvalues are computed whenever Newton's method needs a new Jacobian. With large steps,
+    implicit formulas damp components that should grow: no step covers more than two e-foldings of them.
 
-    A term that knows the structure of its Jacobian (`AbstractManifoldTerm.jacobian`) makes a step cost what solving
-    with that structure costs. Of its eigenvalues sixteen are known, by Arnoldi's method: those near the inverse of the
-    step, where lightly damped vibrations and growing components are found first. One such vibration among many
-    components that are damped well may be missed; the error estimate then keeps steps short.
+    A term may know the structure of its Jacobian (`AbstractManifoldTerm.jacobian`); a step then costs as much as
+    solving with that structure. Arnoldi's method finds sixteen of its eigenvalues near the inverse of the step, where
+    lightly damped vibrations and growing components appear first. A single vibration among many well damped components
+    may be missed; the error estimate then keeps steps short.
 
-    At the start the derivative of the vector field is compared with its differences. Where it contradicts them, as with
-    `stop_gradient`, rounding or integers in the vector field, results would be wrong: `jaxmb.simulate` warns, except
-    under `jit` and `vmap`, where `stats["wrong_derivative"]` says it. With `diffrax.diffeqsolve` the solver's
-    state does.
+    At the start the derivative of the vector field is compared with its differences. If it contradicts them, as with
+    `stop_gradient`, rounding or integers in the vector field, results would be wrong. `jaxmb.simulate` then warns,
+    except under `jit` and `vmap`: see `stats["wrong_derivative"]`, or with `diffrax.diffeqsolve` the solver's state.
 
-    Use it with `MultistepController`, as `Adams`; the term, `diffrax.SaveAt`,
-    events, jumps, backward time, adjoints and derivatives work in the same way. Steps are differentiated by the
-    implicit function theorem, with the exact Jacobian. Non-stiff problems are solved as accurately as by `Adams`, but
-    more slowly.
+    Use it with `MultistepController`, as `Adams`; the term, `diffrax.SaveAt`, events, jumps, backward time, adjoints
+    and derivatives work in the same way. Steps are differentiated by the implicit function theorem, with the exact
+    Jacobian. Non-stiff problems are solved as accurately as by `Adams`, but more slowly.
 
     If a solution jumps from one slow motion to another, as in relaxation oscillations, give reverse mode a checkpoint
-    for every step, `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`. With fewer it repeats steps, rounding
-    changes their lengths slightly, and jumps occur too early or too late (van der Pol's equation with μ = 100 over a
-    jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
+    for every step, `diffrax.RecursiveCheckpointAdjoint(checkpoints=max_steps)`. With fewer checkpoints it repeats
+    steps. Rounding then changes their lengths slightly, and jumps occur too early or too late (van der Pol's equation
+    with μ = 100 over a jump, at rtol 1e-9: 2e-4 of the derivative, instead of 3e-9).
 
     **Reference:**
 
@@ -232,12 +230,11 @@ class Hermite(AbstractMultistep):
         """**Arguments:**
 
         - `family`: the family of formulas.
-        - `past_points`: the numbers k of points of the past to choose from, increasing; default all useful ones. A
-            pair such as `(2, 4)` is a method that switches between two formulas by their errors; a single number fixes
-            the order. The method starts with k = 1.
+        - `past_points`: the numbers k of points of the past to choose from, increasing; default all useful ones. A pair
+            such as `(2, 4)` is a method that switches between two formulas by their errors; a single number fixes the
+            order. The method starts with k = 1.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
-            `diffrax.StepTo`): the tolerances by which the order is then chosen and Newton's method is ended. Otherwise
-            leave them out.
+            `diffrax.StepTo`). They then control the order and Newton's method. Otherwise leave them out.
 
         **Raises:** `ValueError` for an unknown family, for numbers of points that it does not have or that are not
         increasing, and if only one tolerance is given.
@@ -266,8 +263,8 @@ class Hermite(AbstractMultistep):
         return FAMILIES[self.family].order(self.past_points[-1])
 
     def statistics(self, solver_state: HermiteState, controller_state, stats):
-        own = states_inside(controller_state, ControllerState)
-        work = solver_state.work + sum(controller.wasted for controller in own)
+        controller_states = states_inside(controller_state, ControllerState)
+        work = solver_state.work + sum(controller.wasted for controller in controller_states)
         return {
             "num_evaluations": solver_state.step_counts[0] + work[0],
             "num_matrices": work[1],
@@ -283,8 +280,8 @@ class Hermite(AbstractMultistep):
             raise ValueError(
                 "`Hermite` has no equation to solve: constraints prescribe all components of the state. Use `Adams()`."
             )
-        known = unknown_structure(jacobian_of(terms, t0, y0, args), flat)
-        matrix = DenseLinearization.unknown(flat, free) if known is None else known
+        structured_matrix = unknown_structure(jacobian_of(terms, t0, y0, args), flat)
+        matrix = DenseLinearization.unknown(flat, free) if structured_matrix is None else structured_matrix
         field, at = freeze((field_of(terms, t0, y0, chart, args), flat))
         if before is None:
             size = None if scales is None else scales.expected(at)
@@ -294,14 +291,14 @@ class Hermite(AbstractMultistep):
             first, wrong = derivatives(field, t0, at), before.wrong_derivative
             step_counts, work = before.step_counts, before.work
         chart, failed = freeze(first.rest)
-        # The NaN reaches the error estimate, so the step is rejected.
+        # The NaN reaches the error estimate, so that the step is rejected.
         end = at, jnp.where(failed, jnp.full_like(first.f, jnp.nan), first.f), first.g
 
         solution = solution_of(terms, t0, y0, kept_of_chart(terms, chart), args)
         history, slope = self.begun(t0, t1 - t0, *at_start(end, solution, t0, flat))
         control, tangents = self.tangent_control, None
         if control is not None:
-            # The first step finds their memory.
+            # The first step computes their memory.
             ws = control.starts() if before is None else [tangent.w for tangent in before.tangents or ()]
             none = jax.tree.map(jnp.zeros_like, (history.differences, slope))
             tangents = tuple(Tangent(w, none, control.largest(w)) for w in ws)
@@ -325,8 +322,8 @@ class Hermite(AbstractMultistep):
 
         chart, broke = newton.end.rest
         solution = solution_of(terms, t1, like, kept_of_chart(terms, freeze(chart)), args)
-        known = KnownStep(solution, t1, past, a, b, free)
-        y, f, g = at_end(newton.end[:3], known, *freeze((newton.matrix, newton.inverses)))
+        step = KnownStep(solution, t1, past, a, b, free)
+        y, f, g = at_end(newton.end[:3], step, *freeze((newton.matrix, newton.inverses)))
         end = self.ended(formula, history, (past, a, b), (y, f, g))
         return _Step(end, self._ends(formula, history, f, g), chart, broke, newton)
 
@@ -334,36 +331,36 @@ class Hermite(AbstractMultistep):
         step, control = self.attempt(terms, t1, before, like, args, state), self.tangent_control
         if control is None:
             return step, []
-        # Tangents that are carried along have no derivatives themselves.
-        terms, own_step, state, before = freeze((terms, step, state, before))
-        along, newton, history = control.of_terms(terms), own_step.newton, state.history
-        used = jax.tree.map(lambda *own: any(x is not None for x in own), *along, is_leaf=lambda x: x is None)
-        numbers, rest = eqx.partition(terms, used)
+        # Tangents that are carried along have no derivatives.
+        terms, frozen_step, state, before = freeze((terms, step, state, before))
+        along, newton, history = control.of_terms(terms), frozen_step.newton, state.history
+        is_moved = jax.tree.map(lambda *parts: any(x is not None for x in parts), *along, is_leaf=lambda x: x is None)
+        numbers, rest = eqx.partition(terms, is_moved)
         formula = self.formula(history.mesh, state.order_index, t1, before.dtype)
         free = free_components(terms, before, state.chart)
         start = history.mesh[0], before, state.slope[-before.size :], state.chart
-        end = t1, own_step.after, newton.end.f, newton.end.rest[0]
+        end = t1, frozen_step.after, newton.end.f, newton.end.rest[0]
 
-        def pushed(x: Tangent, scale, own, by_state, begins):
-            of = History(x.memory[0], history.mesh, history.known)
-            past, a, b = self.equation(formula, x.w, of.differences)
+        def pushed(x: Tangent, scale, by_numbers, by_state, begins):
+            past_history = History(x.memory[0], history.mesh, history.known)
+            past, a, b = self.equation(formula, x.w, past_history.differences)
             equation = StepEquation(None, None, t1, formula.h, past, a, b, free)  # pyright: ignore[reportArgumentType]
             size = lambda change: self.weighted_norm(change, scale, like)
-            predicted = self._predicted(formula, of, before.size)
+            predicted = self._predicted(formula, past_history, before.size)
             predicted = jnp.where(begins, x.w, predicted[0]), predicted[1]
             solved = tangents_nearby(
-                newton.matrix, newton.inverses, equation, by_state, own, predicted, size, _NEWTON, begins
+                newton.matrix, newton.inverses, equation, by_state, by_numbers, predicted, size, _NEWTON, begins
             )
             first, slope = self.begun(*spacing_of(history), *solved)
             first = Tangent(solved[0], (first.differences, slope), control.largest(solved[0]))
-            ended = self.ended(formula, of, (past, a, b), solved)
-            found = PushedTangent(
+            ended = self.ended(formula, past_history, (past, a, b), solved)
+            out = PushedTangent(
                 jax.tree.map(lambda a, b: jnp.where(begins, a, b), first, x),
                 ended,
-                self._ends(formula, of, *solved[1:]),
+                self._ends(formula, past_history, *solved[1:]),
             )
-            # A derivative that is no number is taken as zero.
-            return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), found)
+            # A NaN derivative counts as zero.
+            return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.zeros_like(x), x), out)
 
         def advanced(carry):
             # In a first step the equations are linearised at its start, then at its end.
@@ -374,21 +371,21 @@ class Hermite(AbstractMultistep):
                 eqx.combine(numbers, rest), t, like, kept_of_chart(terms, chart), args
             )
             by_numbers, by_state = linearized(solution, numbers, t, y, f)
-            tangents = [own.before for own in last]
+            tangents = [x.before for x in last]
             scales = control.scales(self.tolerances.rtol, tangents, [x.w for x in tangents])
-            each = zip(tangents, scales, along, strict=True)
-            return k + 1, [pushed(x, scale, by_numbers(of, None), by_state, begins) for x, scale, of in each]
+            pairs = zip(tangents, scales, along, strict=True)
+            return k + 1, [pushed(x, scale, by_numbers(of, None), by_state, begins) for x, scale, of in pairs]
 
-        blank = jax.tree.map(jnp.zeros_like, (own_step.end, own_step.ends))
+        blank = jax.tree.map(jnp.zeros_like, (frozen_step.end, frozen_step.ends))
         carry = jnp.where(is_start(history), 0, 1), [PushedTangent(x, *blank) for x in state.tangents or ()]
         return step, lax.while_loop(lambda carry: carry[0] < 2, advanced, carry)[1]
 
     def _predicted(self, formula: Formula, history: History, n: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state and the rate at the end of a step, extrapolated.
 
-        The state is, and not f: the remaining error of stiff components is large in f. The prediction has the order of
-        the formula, if there are enough points, since Newton's method converges only from nearby. Its slope follows
-        from the logarithmic derivatives of the basis.
+        The state is extrapolated, not f, in which the remaining error of stiff components is large. The prediction has
+        the order of the formula, if there are enough points, since Newton's method converges only from nearby. Its
+        slope follows from the logarithmic derivatives of the basis.
         """
         dtype, states = history.differences.dtype, history.differences[:, -n:]
         used = np.arange(FAMILIES[self.family].length, dtype=np.int32) <= formula.nodes + 2
@@ -397,11 +394,11 @@ class Hermite(AbstractMultistep):
         return recent @ states, (recent * rates) @ states
 
     def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, begins: Any):
-        """The end of a step as a linear map of tangents: of numbers, of the state at its start, and of the history
-        there, on the mesh of the step.
+        """The end of a step as a linear map of the tangents of the numbers, and of the state and the history at its
+        start, on the mesh of the step.
 
-        **Arguments:** `equations`: the solution of the equations, a function of the numbers, and these; the `end`: its
-        time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there; `begins`:
+        **Arguments:** `equations`: the solution of the equations, a function of the numbers, and the numbers; `end`:
+        its time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there; `begins`:
         whether this is the start of the step instead, whose history follows from the state.
         """
         (solution, numbers), (t, y, f) = equations, end
@@ -423,7 +420,7 @@ class Hermite(AbstractMultistep):
         return push
 
     def begun(self, t, spacing, y, f, g) -> tuple[History, Float[Array, " m"]]:
-        """The history at a start, of one point, and its slope there."""
+        """The history at a start, with one point, and its slope there."""
         z, slope = self._recorded(y, f, g)
         return start(FAMILIES[self.family], t, z, slope, spacing), slope
 
@@ -438,9 +435,7 @@ class Hermite(AbstractMultistep):
     def equation(
         self, formula: Formula, before: Float[Array, " n"], differences: Float[Array, "length m"]
     ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, ""]]:
-        """`(past, a, b)` of the equation `y = past + a f + b g` of a step; `past` is linear in the state `before` and
-        in the differences.
-        """
+        """`(past, a, b)` of the equation `y = past + a f + b g` of a step; `past` is linear in the arguments."""
         base = before if FAMILIES[self.family].integrated else jnp.zeros_like(before)
         of, nodes = formula.coefficients, formula.nodes
         past = base + formula.unit * (of.past[nodes] @ differences[:, : before.size])
@@ -492,9 +487,9 @@ class Hermite(AbstractMultistep):
         stable = a_stable(self.family, self.past_points)
         candidates = jnp.append(around, stable or 1)
         sizes = self._sizes(step.ends, candidates, family, newton, free, scale, y0)
-        tangents, scales = self.tangents_after(tuple(own.before for own in along), [own.end for own in along])
-        for own, scale in zip(along, scales, strict=True):
-            sizes = jnp.maximum(sizes, self._sizes(own.ends, candidates, family, newton, free, scale, y0))
+        tangents, scales = self.tangents_after(tuple(x.before for x in along), [x.end for x in along])
+        for x, scale in zip(along, scales, strict=True):
+            sizes = jnp.maximum(sizes, self._sizes(x.ends, candidates, family, newton, free, scale, y0))
         sizes = jnp.where(failed, jnp.asarray(jnp.inf, dtype), sizes)
         bounded = None
         if stable is not None:
@@ -513,7 +508,7 @@ class Hermite(AbstractMultistep):
         )
         order_index = around[1 + change]
         if stable is not None:
-            # For this step length the formulas in between may be unstable.
+            # At this step length the formulas in between may be unstable.
             growth = LOWER * growth_factors(sizes[3], family.order(candidates[3]) + 1, _TARGET)
             better = (k > stable) & (growth > estimate.growth)
             order_index = jnp.where(better, candidates[3], order_index)
@@ -541,7 +536,7 @@ class Hermite(AbstractMultistep):
         return y1, estimate, self.dense_info(step.end, y0, k), new_state, failed
 
     def _tolerated(self, t1, before, state: HermiteState) -> Float[Array, " n"]:
-        """The errors tolerated in the step, by the state that it starts from: those of its iterations as well."""
+        """The errors tolerated in the step, also of its iterations, by the state at its start."""
         h = step_end(state.history.mesh, t1) - state.history.mesh[0]
         return self.tolerances.of_step(before, before, h, state.sizes, self.finest)
 
@@ -549,9 +544,9 @@ class Hermite(AbstractMultistep):
         """Weighted norms of the errors of the formulas with these numbers of points.
 
         The error of a formula is the change by the next formula; Newton's matrix converts this residual to an error of
-        y. Where constraints determine the others from few free components, whose error passes through zero now and
-        then, the change of the others counts as well that does not follow from that of the free ones. (A four-bar with
-        the same evaluations: errors of a half to a fifth, in proportion to the tolerance.)
+        y. If constraints determine the other components from few free ones, the error of the free ones passes through
+        zero now and then. So the part of the others' change counts as well that does not follow from the free ones. (A
+        four-bar with the same evaluations: errors of a half to a fifth, in proportion to the tolerance.)
         """
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]
@@ -560,7 +555,7 @@ class Hermite(AbstractMultistep):
         return jnp.stack([self.weighted_norm(error, scale, like) for error in errors])
 
     def _recorded(self, y, f, g):
-        """The values that the history holds, and their time derivatives."""
+        """The values in the history, and their time derivatives."""
         if not FAMILIES[self.family].integrated:
             return y, f
         return jnp.concatenate([f, y]), jnp.concatenate([g, f])

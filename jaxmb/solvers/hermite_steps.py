@@ -1,8 +1,7 @@
 """A step of `Hermite` as a linear map.
 
-A step solves `y = past + a f + b g` at its end, which is known when it is differentiated: its tangent is the solution
-of the linearised equation, and nothing else is solved. So little of a step is stored, and none of what Newton's method
-did.
+The end of a step, known when the step is differentiated, solves `y = past + a f + b g`. So the tangent solves the
+linearised equation, and nothing else is solved. Little of a step is stored, and nothing of Newton's method.
 """
 
 import dataclasses
@@ -24,11 +23,11 @@ from .steps import AbstractSteps, LinearStep
 
 
 class HermiteRow(eqx.Module):
-    """What is stored of a step, or of the start of a run: then nothing is `known`, and y and f are of the start.
+    """The stored numbers of a step, or of the start of a run.
 
     **Fields:** its `end`; the `mesh`, the number of `known` points and the `order_index` at its start; state `y` and
-    field `f` at its end; what is `kept` of the chart there, and its `free` components; `jump` at its start, None where
-    steps have none.
+    field `f` at its end; `kept`: the numbers kept of the chart there; its `free` components; `jump` at its start, None
+    if steps have none. In the row of a start `known` is zero, and y and f belong to the start.
     """
 
     end: Any
@@ -43,8 +42,10 @@ class HermiteRow(eqx.Module):
 
 
 class HermiteSteps(AbstractSteps):
-    """The steps of `Hermite`; `jumps`: whether they may begin after a jump; its `family` of formulas; whether a run
-    begins with a state alone (`anew`).
+    """The steps of `Hermite`.
+
+    **Fields:** `jumps`: whether they may begin after a jump; the `family` of formulas; `anew`: whether a run begins
+    with a state and without a memory.
     """
 
     jumps: bool = eqx.field(static=True)
@@ -71,16 +72,16 @@ class HermiteSteps(AbstractSteps):
 
     def row(self, terms, before, after):
         old, new, n = before.solver_state, after.solver_state, ravel(after.y).size
-        mesh, known, order_index, jump = old.history.mesh, old.history.known, old.order_index, None
+        mesh, count, order_index, jump = old.history.mesh, old.history.known, old.order_index, None
         if self.jumps:
             made, f = jnp.asarray(before.made_jump), old.slope[-n:]
             first = start(FAMILIES[self.family], before.tprev, f, f, before.tnext - before.tprev)
             of_start = first.mesh, first.known, jnp.ones_like(order_index)
-            here = mesh, known, order_index
-            mesh, known, order_index = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, here)
+            here = mesh, count, order_index
+            mesh, count, order_index = jax.tree.map(lambda a, b: jnp.where(made, a, b), of_start, here)
             jump = Jump(made, old.history.mesh[0], before.tprev, ravel(before.y), f, old.chart, None)
         kept, free = kept_of_chart(terms, new.chart), free_components(terms, ravel(after.y), new.chart)
-        return HermiteRow(before.tnext, mesh, known, order_index, ravel(after.y), new.slope[-n:], kept, free, jump)
+        return HermiteRow(before.tnext, mesh, count, order_index, ravel(after.y), new.slope[-n:], kept, free, jump)
 
     def alone(self, solver_state):
         return solver_state.alone()
@@ -101,8 +102,8 @@ class HermiteSteps(AbstractSteps):
         time = jnp.where(begins, row.mesh[0], row.end)
 
         def solution(numbers):
-            own, args, _ = of(numbers)
-            return solution_of(own, time, like, row.kept, args)
+            new_terms, args, _ = of(numbers)
+            return solution_of(new_terms, time, like, row.kept, args)
 
         matrix = structured(jacobian_of(*freeze((terms, time, like, args))), freeze(row.y))
         if matrix is None:
@@ -111,7 +112,7 @@ class HermiteSteps(AbstractSteps):
 
         def push(dmoved, w, memory):
             differences, slope = memory
-            # At a start the memory follows from the state.
+            # At a start, the memory follows from the state.
             differences = jnp.where(begins, 0.0, differences)
             if jump is not None and restart is not None:
                 new, f, g = restart(dmoved, w, slope[-w.size :])

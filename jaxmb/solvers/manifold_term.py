@@ -1,9 +1,9 @@
 """The interface between the multistep solvers and a term on a manifold.
 
-A plain `diffrax.ODETerm` is an equation `y' = f(t, y)`. An `AbstractManifoldTerm` is the same equation together with
-invariants that every solution satisfies (a constraint manifold) and a local choice of coordinates on it (a chart). The
-solver keeps its history for *all* components of `y`; the chart only says which of them are integrated and which are
-solved for (`project_near`), so a change of chart preserves history and order.
+A plain `diffrax.ODETerm` is an equation `y' = f(t, y)`. An `AbstractManifoldTerm` adds invariants that every solution
+satisfies (a constraint manifold) and a local choice of coordinates on it (a chart). The solver keeps its history for
+*all* components of `y`. The chart only says which components are integrated and which follow from the constraints
+(`project_near`), so a change of chart preserves history and order.
 """
 
 import abc
@@ -32,11 +32,10 @@ class ManifoldEvaluation(NamedTuple):
 
     - `y`: the state, on the manifold if a projection was requested.
     - `f`: the vector field there.
-    - `chart`: the chart with the same index sets; it may carry counters, and data that make the next evaluation
+    - `chart`: the chart with the same index sets, which may carry counters, and data that make the next evaluation
         cheaper.
-    - `failed`: true where the state could not be evaluated or projected; the step is then retried with a smaller one.
-    - `factors`: data that make the projection of a nearby state at the same time cheaper; any pytree of arrays, or
-        None.
+    - `failed`: true if the state could not be evaluated or projected; a smaller step is then tried.
+    - `factors`: data for a cheaper projection of a nearby state at the same time; any pytree of arrays, or None.
     """
 
     y: Y
@@ -63,9 +62,9 @@ class AbstractResolvent(eqx.Module):
 
 
 class AbstractFieldJacobian(eqx.Module):
-    """The derivative J of a vector field along its manifold at a state, in a form that knows its structure.
+    """The derivative J of a vector field along its manifold at a state, with a known structure.
 
-    It may leave out terms that are small with the change of the state in a step: implicit solvers correct for them.
+    J may leave out terms that are small with the change of the state in a step: implicit solvers correct for them.
     """
 
     @abc.abstractmethod
@@ -78,10 +77,10 @@ class AbstractFieldJacobian(eqx.Module):
 
 
 class AbstractGuards(eqx.Module):
-    """The guards of a term, functions of time and state, both in the term's own time.
+    """The guards of a term, functions of time and state, both in the term's time.
 
     **Fields:** `touch`: values down to minus this count as zero; `near`: a step that was meant to end at an event does
-    so where a guard is at most this.
+    so if a guard is at most this.
     """
 
     touch: AbstractVar[Float[Array, ""]]
@@ -93,22 +92,22 @@ class AbstractGuards(eqx.Module):
 
     @abc.abstractmethod
     def rates(self, t: Any, y: PyTree[Array]) -> Float[Array, "guards"]:
-        """The rates of those guards that may be negative in the middle of a step alone, and of those whose zeros are
-        passed in one direction only; infinite for others.
+        """The rates of guards that may be negative in the middle of a step alone, and of guards whose zeros are passed
+        in one direction only; infinite for others.
         """
 
     @abc.abstractmethod
     def forces(self, y: PyTree[Array]) -> Bool[Array, "guards"]:
-        """Which guards are forces, of the size of one at most: the motion does not show how they vary in a step."""
+        """Which guards are forces, of size one at most: the motion does not show how they vary in a step."""
 
     @abc.abstractmethod
     def changed(self, before: PyTree[Array], after: PyTree[Array]) -> Bool[Array, ""]:
         """Whether something changed in an event, from the states before and after it."""
 
     def begins(self, t: Any, y: PyTree[Array]) -> Bool[Array, "guards"] | None:
-        """Which guards begin to grow from zero at the start of a step; None where no guard does.
+        """Which guards begin to grow from zero at the start of a step; None if no guard does.
 
-        Such a guard may be smaller than the error of the step between its ends, so it counts only at its end.
+        Such a guard may be smaller than the error of the step between its ends, so it counts only at the step's end.
         """
         del t, y
         return None
@@ -117,9 +116,9 @@ class AbstractGuards(eqx.Module):
 class GapsSeen(NamedTuple):
     """The gaps of forces at a time.
 
-    **Fields:** the `gaps`, negative where a force acts; their `rates`; the `widths` in which forces set in, which are
-    as large as the gaps where these close; the `pace` [1/s]: in an interval of 1/pace no gap closes and opens unless
-    its rates at both ends say so.
+    **Fields:** the `gaps`, negative where a force acts; their `rates`; the `widths` in which forces set in, as large as
+    the gaps where these close; the `pace` [1/s]: in an interval of 1/pace no gap closes and opens unless its rates at
+    both ends say so.
     """
 
     gaps: Float[Array, " gaps"]
@@ -129,7 +128,7 @@ class GapsSeen(NamedTuple):
 
 
 class AbstractGaps(eqx.Module):
-    """The gaps in which the forces of a term act, functions of time and state, in the term's own time.
+    """The gaps in which the forces of a term act, functions of time and state, in the term's time.
 
     **Fields:** `touch`: depths down to this count as zero.
     """
@@ -166,58 +165,59 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
     @abc.abstractmethod
     def init_chart(self, t: Any, y: Y, args: Args) -> Chart:
-        """A chart to begin with at a state, any pytree of arrays, of a structure and shape that never change.
+        """A first chart at a state: any pytree of arrays, whose structure and shapes never change.
 
-        `update_chart` follows at the same state before anything is evaluated, and may do the choosing.
+        `update_chart` follows at the same state before anything is evaluated, and may make the choice.
         """
 
     @abc.abstractmethod
     def evaluate(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
-        """Evaluate the vector field at a state on the manifold or near it, a prediction; it need not be projected."""
+        """Evaluate the vector field at a state on the manifold or near it, a prediction; projection is optional."""
 
     @abc.abstractmethod
     def project_near(self, t: Any, y: Y, linearized_at: ManifoldEvaluation, args: Args) -> ManifoldEvaluation:
         """Project a state on the manifold, and evaluate the vector field there.
 
         The independent components of `y` are kept; the others are a first guess and are solved for. `linearized_at` is
-        an evaluation nearby, of the prediction that `y` corrects, at the same time, or in a first step of the state
-        before it; its `factors` may make this one cheap.
+        an evaluation at the same time, of the prediction that `y` corrects, or in a first step of the state before it.
+        Its `factors` may make this evaluation cheap.
         """
 
     def project_cold(self, t: Any, y: Y, chart: Chart, args: Args) -> ManifoldEvaluation:
-        """`project_near` where no state nearby has been evaluated yet; `y` is a first guess.
+        """`project_near` without an evaluation nearby; `y` is a first guess.
 
         A manifold that needs only one evaluation, at the projected state, overrides this method.
         """
-        # The state that is linearised at does not matter to the derivative.
+        # The point of linearisation does not affect the derivative.
         manifold, *at = jax.tree.map(stop, (self, t, y, args))
         linearized_at = manifold.evaluate(at[0], at[1], chart, at[2])
         out = self.project_near(t, y, linearized_at, args)
         return out._replace(failed=out.failed | linearized_at.failed)
 
     def kept(self, chart: Chart) -> PyTree[Array]:
-        """What `at_solution` needs of the chart at the end of a step, stored for each step; by default all of it."""
+        """The part of the chart at the end of a step for `at_solution`, stored for each step; by default all of it."""
         return chart
 
     def kept_at_start(self, chart: Chart) -> PyTree[Array]:
-        """The same for the start of a run, from the chart at the end of its first step, whose prediction is the start.
+        """The same for the start of a run, from the chart at the end of the first step, whose prediction is the start.
 
-        The index sets are those that `update_chart` chose at the start.
+        `update_chart` chose the index sets at the start.
         """
         return self.kept(chart)
 
     def at_solution(self, t: Any, y: Y, f: Y, kept: PyTree[Array], args: Args) -> tuple[Y, Y]:
-        """A state on the manifold and the vector field there, both known, with the derivatives that the equations give
-        them; `kept` is of a chart that is good there.
+        """A known state on the manifold and the known vector field there, with their derivatives by the equations.
 
         A manifold that need not solve its equations for this overrides this method.
+
+        **Arguments:** `kept`: of a chart that is good there.
         """
         del f
         out = self.project_cold(t, y, kept, args)
         return out.y, out.f
 
     def along_solution(self, t: Any, y: Y, f: Y, along: Y | None, kept: PyTree[Array], args: Args) -> tuple[Y, Y, Y]:
-        """The same with the rate of the vector field, for a rate `along` of the state; None for the vector field.
+        """The same with the rate of the vector field, for a rate `along` of the state, by default the vector field.
 
         A manifold that knows the rate of its equations overrides this method.
         """
@@ -226,9 +226,9 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return y, f, jax.jvp(at, (t, y), (jnp.ones_like(t), f if along is None else along))[1]
 
     def found_at_jump(self, t: Any, y: Y, args: Args) -> PyTree[Array]:
-        """The numbers of a jump that take long to find, without derivatives; by default None.
+        """The numbers of a jump that take long to compute, without derivatives; by default None.
 
-        They are found once, and stored for the derivatives of `after_jump`.
+        They are computed once, and stored for the derivatives of `after_jump`.
         """
         del t, y, args
         return None
@@ -244,12 +244,12 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return y
 
     def chart_after_jump(self, chart: Chart) -> Chart:
-        """The chart just after a jump, which `update_chart` makes one there; by default the one before it."""
+        """The chart just after a jump, for `update_chart`; by default the chart before the jump."""
         return chart
 
     @property
     def guards(self) -> AbstractGuards | None:
-        """The functions at whose zeros `after_jump` is asked for the state after them; by default None."""
+        """The functions at whose zeros `after_jump` gives the state after them; by default None."""
         return None
 
     @property
@@ -258,9 +258,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return None
 
     def controlled(self, chart: Chart) -> PyTree[Bool[Array, "..."]]:
-        """A mask with the structure of `y`: true for the components that the local error is measured on; by default
-        None, all.
-        """
+        """A mask like `y`: true for the components whose local error is measured; by default None, all."""
         del chart
         return None
 
@@ -273,29 +271,29 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         """Keep the chart or choose a better one at a state on the manifold, from which a step begins."""
 
     def jacobian(self, t: Any, y: Y, args: Args) -> AbstractFieldJacobian | None:
-        """The derivative of the vector field at a state on the manifold, if the term knows its structure; by default
-        None, and implicit solvers compute a full matrix for the independent components.
+        """The derivative of the vector field at a state on the manifold, if the term knows its structure.
 
-        A term that overrides this method projects states instead of singling out components: all of them are `free`.
+        By default None: implicit solvers then compute a full matrix for the independent components. A term that
+        overrides this method projects states and does not single out components: all of them are `free`.
         """
         del t, y, args
         return None
 
     def closed(self, t: Any, y: Y, args: Args) -> "AbstractManifoldTerm":
-        """The same term as a pytree of all numbers that it depends on; by default it is one.
+        """The same term as a pytree of all numbers that it depends on; by default the term itself.
 
-        **Arguments:** as those of `vf`, an example.
+        **Arguments:** as of `vf`, an example.
         """
         del t, y, args
         return self
 
     def after_step(self, t: Any, y: Y, chart: Chart, args: Args) -> Chart:
-        """The chart at the end of a step, with what `refuses` needs to know of the state there; by default the same."""
+        """The chart at the end of a step, with the data there that `refuses` needs; by default the same chart."""
         del t, y, args
         return chart
 
     def refuses(self, chart: Chart, before: Chart) -> Bool[Array, ""] | bool:
-        """Whether a step that began with the chart `before` must not end with this one; it is then retried, shorter."""
+        """Whether a step must not lead from the chart `before` to this one; a shorter step is then tried."""
         del chart, before
         return False
 

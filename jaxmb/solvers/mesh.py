@@ -1,10 +1,10 @@
 """Derivatives of a solve on its mesh.
 
-A solve that is differentiated is integrated once, without derivatives, and leaves a row of numbers for each accepted
-step. Its derivatives go over these rows: forward mode pushes a tangent through them from the first to the last, reverse
-mode pulls a cotangent back from the last to the first, one linear step at a time. There is no step size control, no
-rejected step and no second solution of the equations in them, all modes share one mesh, and since the linear map over
-the rows comes with its transpose, modes can be combined and batched.
+A differentiated solve is integrated once, without derivatives, and leaves a row of numbers for each accepted step.
+Forward mode pushes a tangent through the rows from first to last, one linear step at a time. Reverse mode pulls a
+cotangent back from last to first. The derivatives contain no step size control, no rejected step and no second solution
+of the equations, and all modes share one mesh. The linear map over the rows comes with its transpose, so modes can be
+combined and batched.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from .events import events_found
 from .linear_map import filled, linear_map
 from .packing import Layout
 from .segments import Row, Segments, choice_of, first_of, remainder, row_of, start_of
-from .stepping import ended, known_in_steps, stepped
+from .stepping import constant_fields, ended, stepped
 from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
@@ -36,9 +36,9 @@ _TOO_LONG = (
 class Saved(eqx.Module):
     """A series of saved states.
 
-    **Fields:** whether it begins with the `start`; its `times`, or None; after how many `steps` each a state is saved,
-    or 0; whether it is saved before each of the `events`; its `length`; how many states, and how many of the times,
-    were `passed`; of events the second is one where the next step has found that the last event is none.
+    **Fields:** `start`: whether it begins with the start; its `times`, or None; `steps`: it saves every so many steps,
+    0 for none; `events`: whether it saves the state before each event; its `length`; `passed`: how many states and how
+    many of the times were passed. Of events the second number is 1 if the next step found the last one void.
     """
 
     start: bool = eqx.field(static=True)
@@ -49,7 +49,7 @@ class Saved(eqx.Module):
     passed: Any
 
     def takes(self, k: Any, row: Row) -> Any:
-        """Whether the state at the end of the step k is saved; False of a series without such states."""
+        """Whether the state at the end of the step k is saved; False for a series without such states."""
         if self.events:
             return row.at_event.here
         return ((k + 1) % self.steps == 0) & (k >= 0) if self.steps else False
@@ -58,8 +58,8 @@ class Saved(eqx.Module):
 class Tangents(NamedTuple):
     """Tangents, or cotangents, of a run.
 
-    **Fields:** those of the raveled state and of the memory at its `end`; of `saved` states; of the `rows`; of the
-    `dense` output of all steps, or None; of that of the `last` step, or None.
+    **Fields:** `end`: of the raveled state and the memory at the end; of the `saved` states; of the `rows`; `dense`: of
+    the dense output of all steps, or None; `last`: of the dense output of the last step, or None.
     """
 
     end: tuple[Array, PyTree]
@@ -73,9 +73,9 @@ class Mesh(eqx.Module):
     """The steps of a run.
 
     **Fields:** `moved`: the numbers that have tangents; `still`: the rest of the terms, their arguments and the solver;
-    `steps`; `rows`: buffers of packed rows, behind them that of the start if there is one; `layout` of a row; their
-    `count`; the `saved` series; `like`: a state; `memory` of the solver at the start; `dense`: of how many steps dense
-    output is kept; whether the run ends at an `event`; its `segments`, None where there is one only.
+    `steps`; `rows`: buffers of packed rows, then the row of the start if there is one; `layout` of a row; their
+    `count`; the `saved` series; `like`: a state; `memory` of the solver at the start; `dense`: the number of steps with
+    dense output; `event`: whether the run ends at an event; its `segments`, None for a single one.
     """
 
     moved: Moving
@@ -96,21 +96,21 @@ class Mesh(eqx.Module):
         return self.rows[0].shape[0] - self.steps.starts
 
     def row(self, rows: list[Array], k: Any) -> Row:
-        """The row of a step, from those of its segment."""
+        """The row of a step, from the rows of its segment."""
         place = self._place(k)
         return self.layout.unpacked([buffer[place] for buffer in rows])
 
     @property
     def _begin(self) -> Any:
-        """The index of the first row: that of the start is -1, where there are steps."""
+        """The index of the first row: -1 for the row of the start, if steps follow it."""
         return -(self.count > 0).astype(self.count.dtype) if self.steps.starts else jnp.zeros_like(self.count)
 
     def _is_step(self, k: Any) -> Any:
-        """Whether a row is of a step, and not of the start."""
+        """Whether a row belongs to a step, and not to the start."""
         return k >= 0 if self.steps.starts else True
 
     def _place(self, k: Any) -> Any:
-        """The index of the row of a step, among those of its segment."""
+        """The index of the row of a step among the rows of its segment."""
         place = k if self.segments is None else remainder(k, self.size)
         return jnp.where(k < 0, self.size, place) if self.steps.starts else place
 
@@ -139,8 +139,8 @@ class Mesh(eqx.Module):
         return eqx.filter_eval_shape(run, self.moved, self.memory)
 
     def push(self, x: PyTree, used: Tangents) -> Tangents:
-        """The tangents that one of the terms, one of the first state and one of its memory cause; those of the rows are
-        zeros unless they are `used`.
+        """The tangents caused by `x`: tangents of the terms, of the first state and of its memory. The tangents of the
+        rows are zeros unless they are `used`.
         """
         blank, (w, memory) = self.blank(), x[1]
         first = self._first(w, memory, blank if any(used.rows) else blank._replace(rows=[]))
@@ -164,14 +164,14 @@ class Mesh(eqx.Module):
         return self._out(carry[1], blank)
 
     def of_one_segment(self) -> "Mesh":
-        """The same, whose maps can be differentiated by the rows; of a run that has more than them, an error."""
+        """The same mesh, whose maps can be differentiated by the rows; an error for a run with more steps than rows."""
         if self.segments is None:
             return self
         rows = eqx.error_if(self.rows, self.count > self.size, _TOO_LONG.format(self.size))
         return dataclasses.replace(self, rows=rows, segments=None)
 
     def _rows_again(self, segment: Any, rows: list[Array], lost: Any) -> list[Array]:
-        """The rows of a segment of the run, found again in these buffers where they are `lost`."""
+        """The rows of a segment of the run, recomputed in these buffers where they are `lost`."""
         segments: Any = self.segments
         equations = freeze(eqx.combine(self.moved.terms, self.still))
         return segments.rows(self.steps, equations, segment, self.count, rows, lost)
@@ -198,21 +198,21 @@ class Mesh(eqx.Module):
             w, memory, ddense = step.push(dmoved, *before)
             after = w, memory
             if rows:
-                own = self.steps.row_tangent(row.own, self.like, before, after)
+                row_tangent = self.steps.row_tangent(row.own, self.like, before, after)
                 none = jax.tree.map(lambda _: None, row)
-                along = self.layout.packed_tangent(row, none._replace(own=own))
+                along = self.layout.packed_tangent(row, none._replace(own=row_tangent))
                 rows = [buffer_set(buffer, self._place(k), x) for buffer, x in zip(rows, along, strict=True)]
             if self.dense:
                 dense = jax.tree.map(lambda x, buffer: buffer_set(buffer, k, x, self._is_step(k)), ddense, dense)
-            each = zip(self.saved, saved, places, strict=True)
-            new = [_saved(series, table, place, k, row, after[0], ddense, step.at) for series, table, place in each]
+            parts = zip(self.saved, saved, places, strict=True)
+            new = [_saved(series, table, place, k, row, after[0], ddense, step.at) for series, table, place in parts]
             saved, places = tuple(x[0] for x in new), tuple(x[1] for x in new)
             return k + 1, after, saved, places, rows, dense, ddense if self.event else None
 
         return while_loop(lambda carry: carry[0] < count, body, carry, max_steps=None, buffers=_tables, kind="lax")
 
     def pull(self, cotangents: Tangents) -> PyTree:
-        """The transpose of `push`; cotangents that are None are zero."""
+        """The transpose of `push`; None stands for a zero cotangent."""
         end = filled((ravel(self.like), self.memory), cotangents.end)
         places = tuple(series.passed for series in self.saved)
         carry = self.count, *end, places, jax.tree.map(jnp.zeros_like, self.moved)
@@ -248,19 +248,19 @@ class Mesh(eqx.Module):
             shapes = eqx.filter_eval_shape(step.push, nothing, lw, lmemory)[2]
             ldense = zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
             if cotangents.dense is not None:
-                own = lambda z, c: z if c is None else z + jnp.where(self._is_step(k), c[k], 0)
-                ldense = jax.tree.map(own, zeros, cotangents.dense)
+                with_cotangent = lambda z, c: z if c is None else z + jnp.where(self._is_step(k), c[k], 0)
+                ldense = jax.tree.map(with_cotangent, zeros, cotangents.dense)
             if cotangents.last is not None:
                 is_last = k + 1 == self.count
                 ldense = jax.tree.map(
                     lambda z, c: z if c is None else z + jnp.where(is_last, c, 0), ldense, cotangents.last
                 )
-            left = []
+            places_before = []
             for series, table, place in zip(self.saved, cotangents.saved, places, strict=True):
                 lw, ldense, place = _unsaved(series, table, place, k, row, lw, ldense, step.at)
-                left.append(place)
+                places_before.append(place)
             dmoved, lw, lmemory = jax.linear_transpose(step.push, nothing, lw, lmemory)((lw, lmemory, ldense))
-            return k, lw, lmemory, tuple(left), jax.tree.map(jnp.add, total, dmoved)
+            return k, lw, lmemory, tuple(places_before), jax.tree.map(jnp.add, total, dmoved)
 
         return while_loop(lambda carry: carry[0] > first, body, carry, max_steps=None, buffers=None, kind="lax")
 
@@ -272,11 +272,11 @@ def _tables(carry):
 
 
 def _saved(series: Saved, table, place, k, row, w, dense, at):
-    """The table of a series of saved states with those of a step, and where the series is after it."""
+    """The table of a series with the states of a step, and the place of the series after it."""
     if series.times is not None:
         times = series.times
 
-        def more(carry):
+        def is_due(carry):
             _, place = carry
             return (place[1] < times.size) & (times[jnp.minimum(place[1], times.size - 1)] <= row.end)
 
@@ -285,10 +285,10 @@ def _saved(series: Saved, table, place, k, row, w, dense, at):
             return buffer_set(table, place[0], at(dense, times[place[1]])), place + 1
 
         carry = table, place
-        table, place = while_loop(more, save, carry, max_steps=None, buffers=lambda carry: carry[0], kind="lax")
+        table, place = while_loop(is_due, save, carry, max_steps=None, buffers=lambda carry: carry[0], kind="lax")
     here = series.takes(k, row)
     if series.events:
-        # The next event takes the place of one that is none.
+        # The next event takes the place of a void one.
         place = place.at[0].add(-row.at_event.void.astype(place.dtype))
     if here is not False:
         table = buffer_set(table, place[0], w, here)
@@ -297,8 +297,8 @@ def _saved(series: Saved, table, place, k, row, w, dense, at):
 
 
 def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
-    """The transpose: cotangents of the end of a step and of its dense output with those of the states that were saved
-    in it, and where the series is before it.
+    """The transpose of `_saved`: the cotangents of a step's end and dense output, including the states saved in the
+    step, and the place of the series before it.
     """
     here = series.takes(k, row)
     if here is not False:
@@ -311,7 +311,7 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
     if series.times is not None:
         times = series.times
 
-        def more(carry):
+        def is_due(carry):
             _, place = carry
             return (place[1] > 0) & (times[jnp.maximum(place[1] - 1, 0)] > row.since)
 
@@ -319,27 +319,27 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
             ldense, place = carry
             place = place - 1
             if table is not None:
-                (own,) = jax.linear_transpose(lambda x: at(x, times[place[1]]), ldense)(table[place[0]])
-                ldense = jax.tree.map(jnp.add, ldense, own)
+                (by_state,) = jax.linear_transpose(lambda x: at(x, times[place[1]]), ldense)(table[place[0]])
+                ldense = jax.tree.map(jnp.add, ldense, by_state)
             return ldense, place
 
         carry = ldense, place
-        ldense, place = while_loop(more, unsave, carry, max_steps=None, buffers=None, kind="lax")
+        ldense, place = while_loop(is_due, unsave, carry, max_steps=None, buffers=None, kind="lax")
     return lw, ldense, place
 
 
 class MeshAdjoint(diffrax.AbstractAdjoint):
     """Derivatives of a solve on its mesh, in every mode.
 
-    **Arguments:** `most`: the number of steps that are kept; whether the run `begins` with a jump, so that there is
-    nothing before its first step.
+    **Arguments:** `most`: the number of steps whose rows are kept; `begins`: whether the run begins with a jump, so
+    that nothing precedes its first step.
     """
 
     most: int = eqx.field(static=True)
     begins: bool = eqx.field(static=True, default=False)
 
     def loop(self, *, terms, event, max_steps, **options):
-        # What a function closes over is an argument of the rule below, or its derivative would be zero.
+        # Values that a function closes over are arguments of the rule below; otherwise their derivatives would be zero.
         terms, event = jax.tree.map(opened, (terms, event))
         return self.run(max_steps, max_steps, terms=terms, event=event, **options)
 
@@ -358,9 +358,9 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         passed_controller_state,
         **options,
     ):
-        """diffrax's loop with room for `max_steps` steps, of which `limit` are taken at most."""
+        """diffrax's loop with buffers for `max_steps` steps, of which at most `limit` are taken."""
         del throw, passed_controller_state
-        steps, own = steps_of(solver, options["stepsize_controller"])
+        steps, untracked = steps_of(solver, options["stepsize_controller"])
         steps = steps.after_first_jump() if self.begins else steps
         steps = steps if passed_solver_state else steps.from_start()
         jumps = jump_times(options["stepsize_controller"])
@@ -368,18 +368,19 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
         fixed = given, steps = freeze((given, steps))
         still = freeze({"terms": terms, "args": args})
         first = freeze(init_state)
-        known = known_in_steps(first, **still, **given)
-        found = _recorded(still, first, fixed, known, freeze(limit), self.most)
-        final, *_ = _with_derivatives(found, (terms, args, own), jumps, init_state, fixed)
+        constants = constant_fields(first, **still, **given)
+        recorded = _recorded(still, first, fixed, constants, freeze(limit), self.most)
+        final, *_ = _with_derivatives(recorded, (terms, args, untracked), jumps, init_state, fixed)
         # The time of an event depends on its function, after the steps are taken.
         given = given | {"event": options["event"]}
-        return ended(final, known, terms=terms, args=args, **given), {}
+        return ended(final, constants, terms=terms, args=args, **given), {}
 
 
-def _recorded(equations, init_state, fixed, known, limit, most):
-    """The last state of diffrax's loop; the rows of the last segment of steps, of which each has `most`, and behind
-    them that of the start if there is one; the starts of all segments and the choices of all steps, None where there is
-    one segment only. All but the first are packed.
+def _recorded(equations, init_state, fixed, constants, limit, most):
+    """The last state of diffrax's loop, the rows of the last segment, and the starts of all segments with the choices
+    of all steps, None for a single segment. All but the first are packed.
+
+    The segment has at most `most` steps; behind its rows follows the row of the start if there is one.
     """
     (given, steps), terms = fixed, equations["terms"]
     size = min(most, given["max_steps"])
@@ -398,7 +399,7 @@ def _recorded(equations, init_state, fixed, known, limit, most):
             if steps.starts:
                 first = _written(first, 0, layout.packed(first_of(steps, terms, old, new)), kept & (k == 0))
             if starts is not None:
-                # In the middle of a segment what is written comes to lie behind the last start.
+                # In the middle of a segment the row goes behind the last start.
                 place = jnp.where(remainder(k, size) == 0, k // size, segments)
                 starts = _written(starts, place, of_starts.packed(start_of(steps, since, old)), True)
                 choices = _written(choices, k, of_choices.packed(choice_of(steps, old, new)), kept)
@@ -413,7 +414,7 @@ def _recorded(equations, init_state, fixed, known, limit, most):
         several = segments > 1
         starts = of_starts.blank(segments + 1) if several else None
         choices = of_choices.blank(segments * size) if several else None
-        # A place for the start where it is no row as well: XLA loses the types of calls beside arrays without entries.
+        # A place for the start even without its row: XLA loses the types of calls beside empty arrays.
         last, _, first, rows, starts, choices = while_loop(
             lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < limit),
             body,
@@ -423,11 +424,11 @@ def _recorded(equations, init_state, fixed, known, limit, most):
             kind="lax",
         )
         if steps.starts:
-            # Not in the loop, where two rows that are written make a copy of all.
+            # Outside the loop: two rows written in it would copy the whole buffer.
             rows = _written(rows, size, [table[0] for table in first], True)
         return last, rows, None if starts is None else (starts, choices)
 
-    return stepped(init_state, outer, known, **equations, **given)
+    return stepped(init_state, outer, constants, **equations, **given)
 
 
 def _written(tables, index, row, kept):
@@ -443,25 +444,25 @@ def _layouts_again(steps, old, new):
 
 
 @eqx.filter_custom_jvp
-def _with_derivatives(found, equations, jumps, init_state, fixed):
-    """What was `_recorded` without derivatives, with those by the rest.
+def _with_derivatives(recorded, equations, jumps, init_state, fixed):
+    """The `recorded` run, with derivatives by the other arguments.
 
-    **Arguments:** `equations`: terms, their arguments and the solver without tangents; the times of `jumps`, which the
-    step size controller knows as well, and the solver stand here for their tangents.
+    **Arguments:** `equations`: terms, their arguments and the solver without tangents; `jumps`: the times of jumps,
+    which the step size controller knows as well. The solver and these times are here for their tangents.
     """
     del jumps, fixed
-    # In a batch what comes out is batched where its tangents are, and tangents are where anything is: JAX gives the
-    # outputs of a rule that is applied inside of `jit` the axes of those of its function.
-    numbers = [x for x in jax.tree.leaves((found, equations, init_state)) if eqx.is_array(x) and x.size]
+    # In a batch all outputs must be batched if their tangents are, and tangents are batched if any input is. Under
+    # `jit`, JAX gives the outputs of a rule the batch axes of the outputs of its function.
+    numbers = [x for x in jax.tree.leaves((recorded, equations, init_state)) if eqx.is_array(x) and x.size]
     same = jnp.any(jnp.stack([jnp.ravel(x)[0] != jnp.ravel(x)[0] for x in numbers]))
-    return jax.tree.map(lambda x: jnp.where(same, x, x) if eqx.is_array(x) else x, found)
+    return jax.tree.map(lambda x: jnp.where(same, x, x) if eqx.is_array(x) else x, recorded)
 
 
 @_with_derivatives.def_jvp
 def _with_derivatives_jvp(primals, tangents):
     _, equations, jumps, init_state, fixed = primals
     _, dequations, djumps, dinit, *_ = tangents
-    # Second derivatives see those of the rows.
+    # Second derivatives need the derivatives of the rows.
     out = _with_derivatives(*primals)
     final, rows, again = out
     given, steps = fixed
@@ -512,13 +513,13 @@ def _segments(again, layout, steps, old, new):
 def _of_loop(final, along: Tangents, like):
     """The tangent of the last state of diffrax's loop."""
     state = lambda flat: unravel_like(like, flat)
-    none, found = jax.tree.map(lambda _: None, final), lambda final: events_found(final.controller_state)
+    none, event_state = jax.tree.map(lambda _: None, final), lambda final: events_found(final.controller_state)
     parts = lambda final: (
         final.y,
         final.dense_infos,
         final.event_dense_info,
         *(saved.ys for saved in save_states(final)),
-        *(() if (events := found(final)) is None else (events.states,)),
+        *(() if (events := event_state(final)) is None else (events.states,)),
     )
     series = len(save_states(final))
     tables, events = along.saved[:series], along.saved[series:]
@@ -527,8 +528,8 @@ def _of_loop(final, along: Tangents, like):
 
 
 def _of_rows(rows, along):
-    left = iter(along)
-    return [next(left) if jnp.issubdtype(x.dtype, jnp.floating) else None for x in rows]
+    tangents = iter(along)
+    return [next(tangents) if jnp.issubdtype(x.dtype, jnp.floating) else None for x in rows]
 
 
 def _is_none(x):

@@ -38,19 +38,19 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# Result of a step whose constraints or implicit equation were not solved; it matters only for fixed steps, otherwise
-# the error is infinite.
+# The result of a step whose constraints or implicit equation were not solved. It matters only for fixed steps;
+# otherwise the error is infinite.
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
 
 
 class AbstractMultistepState(eqx.Module):
-    """What a multistep method keeps between steps; `diffrax.SaveAt(solver_state=True)` returns it.
+    """The memory of a multistep method between steps; `diffrax.SaveAt(solver_state=True)` returns it.
 
     **Fields:**
 
     - `chart`: the chart of an `AbstractManifoldTerm`, otherwise `None`.
     - `sizes`: the sizes that the absolute tolerance is relative to, with the controller's `scales`; otherwise `None`.
-    - `tangents`: those whose errors are controlled beside that of the state, otherwise `None`.
+    - `tangents`: the tangents whose errors are controlled beside the state's error, otherwise `None`.
     """
 
     chart: AbstractVar[Chart | None]
@@ -65,14 +65,10 @@ class AbstractMultistepState(eqx.Module):
     @property
     @abc.abstractmethod
     def chosen(self) -> PyTree[Array]:
-        """What the error estimate of the last step chose for the next one, such as its order: fields, or parts of them;
-        None without any.
-        """
+        """The choices of the last step for the next, such as its order: fields, or parts of them; None without any."""
 
     def with_found(self, found: PyTree[Array]) -> Self:
-        """The same after a jump, with what was found there if the method keeps it; see
-        `AbstractManifoldTerm.found_at_jump`.
-        """
+        """The same after a jump, with the numbers of `AbstractManifoldTerm.found_at_jump` if the method keeps them."""
         del found
         return self
 
@@ -98,19 +94,19 @@ class AbstractAttempt(eqx.Module):
 class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     """A multistep method under a `MultistepController`.
 
-    A method of one's own is a subclass with diffrax's `term_structure`, `interpolation_cls` and `order`, with the
-    fields below, and with the four methods `initial_state`, `attempt`, `advance` and `statistics`; the base calls them
-    at starts, after jumps and in every step. States are raveled, one vector of all components; `evaluate` is the vector
-    field of any term at such a vector, and `next_chart` follows the charts of a manifold.
+    A new method is a subclass with diffrax's `term_structure`, `interpolation_cls` and `order`, the fields below, and
+    the four methods `initial_state`, `attempt`, `advance` and `statistics`. The base calls them at starts, after jumps
+    and in every step. States are raveled, one vector of all components; `evaluate` is the vector field of any term at
+    such a vector, and `next_chart` follows the charts of a manifold.
 
     **Fields:**
 
     - `tolerances`: from `tolerances_of`, filled in from the controller before the solver is asked for anything.
-    - `tangent_control`: None; set where a tangent's error is controlled.
-    - `solves_implicitly`: whether a step solves an equation for the independent components of the state, which an
-        `AbstractManifoldTerm` then has to name (`free`).
+    - `tangent_control`: None; set if a tangent's error is controlled.
+    - `solves_implicitly`: whether a step solves an equation for the independent components of the state; an
+        `AbstractManifoldTerm` must then name them (`free`).
     - `finest`: the smallest relative tolerance of a step that the method resolves, in units of the machine precision;
-        default zero.
+        default 0.
     """
 
     tolerances: AbstractVar[Tolerances]
@@ -118,7 +114,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     solves_implicitly: AbstractVar[bool]
     finest: ClassVar[float] = 0.0
 
-    # diffrax fills in the tolerances of a step size controller here; there is no root finder.
+    # diffrax fills in the tolerances of a step size controller here; it is not a root finder.
     @property
     def root_finder(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.tolerances
@@ -136,7 +132,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         check_real(y0)
         return self.initial_state(terms, t0, t1, y0, args, first_chart(terms, t0, y0, args), None)
 
-    # Nested jit: a step is traced once, and not for each loop and transformation around it.
+    # Nested jit: a step is traced once, and not again for each loop and transformation around it.
     @eqx.filter_jit
     def step(
         self,
@@ -172,26 +168,26 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         return y1, estimate, dense_info, state, result
 
     def restarted(self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any) -> tuple[Y, Any]:
-        """The state, and that of the solver, restarted after a jump and otherwise unchanged."""
+        """The state and the solver state, restarted after a jump and otherwise unchanged."""
         if made_jump is False:
             return y0, solver_state
 
-        # In few vectors, since those of most steps are copied.
+        # Packed in few vectors, since most steps copy them.
         layout = Layout((y0, solver_state))
 
         def restarted(before):
             y0, solver_state = layout.unpacked(before)
-            found = found_at_jump(terms, t0, y0, args)
-            after = after_jump(terms, t0, y0, found, args)
+            numbers = found_at_jump(terms, t0, y0, args)
+            after = after_jump(terms, t0, y0, numbers, args)
             chart = chart_after_jump(terms, solver_state.chart)
-            state = self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(found)
+            state = self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(numbers)
             return layout.packed((after, state))
 
         cond = cond_of_jumps(guards_of(terms))
         return layout.unpacked(cond(made_jump, restarted, lambda before: before, layout.packed((y0, solver_state))))
 
     def linear_steps(self, jumps: bool) -> AbstractSteps | None:
-        """The steps of the method as linear maps of tangents, if it knows a cheaper form than their derivatives.
+        """The steps of the method as linear maps of tangents, if the method has a form cheaper than their derivatives.
 
         **Arguments:** `jumps`: whether steps may begin after a jump.
         """
@@ -200,9 +196,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
     @abc.abstractmethod
     def statistics(self, solver_state: Any, controller_state: Any, stats: dict[str, Any]) -> dict[str, Any]:
-        """Counts of an integration, from the final states and diffrax's own `stats`.
+        """Counts of an integration, from the final states and diffrax's `stats`.
 
-        Among them is `num_evaluations` of the vector field; with `SaveAt(solver_state=True, controller_state=True)`.
+        They include `num_evaluations` of the vector field; with `SaveAt(solver_state=True, controller_state=True)`.
         """
 
     @abc.abstractmethod
@@ -219,11 +215,11 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         """The solver state at a start.
 
         A method that evaluates here takes two fields from `first_sizes` and `first_tangents`, and its chart from
-        `next_chart`. The vector field and the choice of a chart are then compiled once more for each start, which
-        `Adams` leaves to the first step.
+        `next_chart`. The vector field and the choice of a chart are then compiled once more for each start; `Adams`
+        leaves both to the first step.
 
-        **Arguments:** `t1`: the end of the first step that is tried; `chart`: one that `next_chart` makes one at `y0`;
-        `before`: the state before a jump, None at the first start.
+        **Arguments:** `t1`: the end of the first attempted step; `chart`: a chart for `next_chart` at `y0`; `before`:
+        the state before a jump, None at the first start.
 
         **Returns:** a state whose numbers are arrays of JAX.
         """
@@ -243,9 +239,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     ) -> tuple[Y, StepEstimate, dict[str, Any], Any, Any]:
         """A step from y0 to `t1`: `(y1, estimate, dense_info, state, failed)`.
 
-        `attempted` makes the attempt, `tolerances.of_step` and `weighted_norm` measure its error, `choose_order` makes
-        the estimate; `tangents_after`, `grown_sizes` and `next_chart` give fields of the new state. `dense_info` are
-        the arguments of the interpolation; `failed`: whether a constraint or an implicit equation was not solved.
+        `attempted` makes the attempt, `tolerances.of_step` and `weighted_norm` measure its error, and `choose_order`
+        makes the estimate. `tangents_after`, `grown_sizes` and `next_chart` give fields of the new state. `dense_info`
+        contains the arguments of the interpolation; `failed`: whether an equation was not solved.
         """
 
     def first_tangents(
@@ -264,7 +260,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         return tuple(Tangent(w, memory, control.largest(w)) for w, memory in pushes)
 
     def attempted(self, terms, t1, before: Float[Array, " n"], like: Y, args, state: Any) -> tuple[Any, list[Any]]:
-        """The numbers of a step, and their derivatives along the tangents whose error is controlled."""
+        """The numbers of a step, and their derivatives along the tangents whose errors are controlled."""
         if self.tangent_control is None:
             return self.attempt(terms, t1, before, like, args, state), []
         step = eqx.Partial(_step_from, self, t1, like, args, state)
@@ -311,7 +307,7 @@ def _step_from(solver, t1, like, args, state, terms, before, memory):
 def tolerances_of(
     solver: str, rtol: Any = None, atol: Any = None, norm: Callable[[PyTree], Any] = optx.rms_norm
 ) -> Tolerances:
-    """The tolerances of a solver, by default those of the step size controller.
+    """The tolerances of a solver, by default from the step size controller.
 
     **Raises:** `ValueError` for one tolerance without the other.
     """

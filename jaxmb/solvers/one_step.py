@@ -26,7 +26,7 @@ class WithTangents(WrappedSolver):
 
     control: TangentControl
     rtol: Any
-    # What `solver` is wrapped in, if anything: diffrax looks for Runge–Kutta methods in one wrapper only.
+    # The wrapper around `solver`, if any: diffrax looks for Runge–Kutta methods in one wrapper only.
     outer: diffrax.AbstractWrappedSolver | None = None
 
     @property
@@ -45,7 +45,7 @@ class WithTangents(WrappedSolver):
             tangents.append(Tangent(w, memory, self.control.largest(w)))
         return start(terms, y0), tangents
 
-    # Compiled inside the whole program, so that it is traced once.
+    # A nested program, so that the step is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         state, before = solver_state
@@ -70,12 +70,12 @@ def _step_from(solver, t0, t1, args, made_jump, terms, y0, state):
 
 
 def with_counted(controller: Any, counted: tuple[int, ...] | None) -> Any:
-    """A controller that measures the errors of some components only, those with these indices in the raveled state, all
-    of them where this is None; one that measures no errors stays as it is.
+    """A controller that measures the errors of some components only, with the indices `counted` in the raveled state
+    (None: all). A controller that measures no errors is unchanged.
     """
     if counted is None:
         return controller
-    # A controller may be wrapped in others that diffrax has.
+    # A controller may be wrapped in others of diffrax.
     norms = {
         MultistepController: lambda x: (x.norm.norm,),
         OneStepController: lambda x: (x.norm, x.controller.norm),
@@ -84,17 +84,17 @@ def with_counted(controller: Any, counted: tuple[int, ...] | None) -> Any:
     is_known = lambda x: isinstance(x, tuple(norms))
 
     def of_counted(x):
-        where = next((own for kind, own in norms.items() if isinstance(x, kind)), None)
+        where = next((select for kind, select in norms.items() if isinstance(x, kind)), None)
         return x if where is None else eqx.tree_at(where, x, replace_fn=lambda norm: NormOfCounted(norm, counted))
 
     return jax.tree.map(of_counted, controller, is_leaf=is_known)
 
 
 def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tuple[Any, Any, Callable[[Any], Any]]:
-    """A solver and its step size controller, with the errors of tangents controlled as well, and a function that
-    removes the tangents from the solver's state.
+    """A solver and its step size controller that also control the errors of tangents, and a function that removes the
+    tangents from the solver's state.
 
-    A controller that measures no error stays as it is, and so does the solver.
+    A controller that measures no error is unchanged, and so is its solver.
     """
     if isinstance(solver, AbstractMultistep):
         if solver.tolerances.fixed:
@@ -102,33 +102,35 @@ def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tupl
         solver = eqx.tree_at(lambda s: s.tangent_control, solver, control, is_leaf=lambda x: x is None)
         return solver, controller, lambda state: eqx.tree_at(lambda s: s.tangents, state, None)
     kinds = (diffrax.PIDController, OneStepController)
-    # A concrete class, since a controller may be wrapped in others that diffrax has.
+    # Concrete classes, since a controller may be wrapped in others of diffrax.
     is_known = lambda x: isinstance(x, kinds)
-    found = [x for x in jax.tree.leaves(controller, is_leaf=is_known) if is_known(x)]
-    if not found:
+    controllers = [x for x in jax.tree.leaves(controller, is_leaf=is_known) if is_known(x)]
+    if not controllers:
         return solver, controller, lambda state: state
 
     def watched(x):
         if not is_known(x):
             return x
-        own = OneStepController.around(x) if isinstance(x, diffrax.PIDController) else x
-        return dataclasses.replace(own, tangents=True)
+        with_scales = OneStepController.around(x) if isinstance(x, diffrax.PIDController) else x
+        return dataclasses.replace(with_scales, tangents=True)
 
     controller = jax.tree.map(watched, controller, is_leaf=is_known)
     inner, outer = (solver.solver, solver) if isinstance(solver, diffrax.AbstractWrappedSolver) else (solver, None)
-    return WithTangents(inner, control, found[0].rtol, outer), controller, lambda state: state[0]
+    return WithTangents(inner, control, controllers[0].rtol, outer), controller, lambda state: state[0]
 
 
 class ErrorWithTangents(NamedTuple):
-    """The error estimate of a state, and those of tangents in units of the tolerance."""
+    """The error estimate of a state, and the errors of tangents in units of the tolerance."""
 
     error: PyTree
     of_tangents: list[Float[Array, " n"]]
 
 
 class OneStepState(AbstractControllerState):
-    """The state of `OneStepController`: that of the controller inside, the running sizes, the least step that is tried,
-    and the `intended` length of the next step.
+    """The state of `OneStepController`.
+
+    **Fields:** `inner`: the state of the controller inside; the running `sizes`; `least`: the least step that is tried;
+    `intended`: the length of the next step.
     """
 
     inner: Any
@@ -138,8 +140,8 @@ class OneStepState(AbstractControllerState):
 
 
 class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
-    """A PID controller of the error of a state in units of tolerances that may be relative to running `scales`, and of
-    the errors of `tangents` where the solver carries them along. `rtol`, `atol` and `norm` are those of `controller`.
+    """A PID controller of the error of a state, and of `tangents` if the solver carries them along. Errors are in units
+    of tolerances, which may be relative to running `scales`. `rtol`, `atol` and `norm` are taken from `controller`.
     """
 
     rtol: Any
@@ -151,7 +153,7 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
 
     @classmethod
     def around(cls, controller: Any, scales: RunningScales | None = None) -> "OneStepController":
-        """With the tolerances of a PID controller."""
+        """A controller with the tolerances of a PID controller."""
         return cls(controller.rtol, controller.atol, controller.norm, controller, scales)
 
     def wrap(self, direction):
@@ -168,8 +170,8 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
             return first, OneStepState(state, None, least, first - t0)
         flat = ravel(y0)
         sizes = self.scales.start(flat, ravel(func(terms, t0, y0, args)))
-        # The first step is chosen in units of these sizes, and of the time that they change in: it then depends on no
-        # others, and the absolute tolerance is the same for all components.
+        # The first step is chosen in units of these sizes, and of the time in which they change. It then does not
+        # depend on other units, and the absolute tolerance is the same for all components.
         unit, rate = self.scales.of_components(sizes), self.scales.rate(sizes).astype(t0.dtype)
 
         def field(terms, t, y, args):
@@ -191,14 +193,14 @@ class OneStepController(diffrax.AbstractAdaptiveStepSizeController):
             ravel(y0), ravel(y1_candidate), t1 - t0, sizes
         )
         errors = [self.norm(unravel_like(y0, error)) for error in (ravel(of_state) / scale, *of_tangents)]
-        # What is left to the controller is one number in units of the tolerance.
+        # The PID controller sees one number in units of the tolerance.
         unit = eqx.tree_at(lambda c: (c.rtol, c.atol, c.norm), self.controller, (0.0, 1.0, jnp.abs))
         zero = jnp.zeros_like(errors[0])
         error = functools.reduce(jnp.maximum, errors)
         keep, *times, made_jump, state, result = unit.adapt_step_size(
             t0, t1, zero, zero, args, error, error_order, state
         )
-        # Where errors are not finite, ever smaller steps would be tried.
+        # With errors that are not finite, ever smaller steps would be tried.
         stuck = jnp.logical_not(keep) & (times[1] - times[0] <= least)
         result = diffrax.RESULTS.where(stuck, diffrax.RESULTS.dt_min_reached, result)
         if self.scales is not None and sizes is not None:

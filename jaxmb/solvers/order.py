@@ -11,10 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 # The constants were chosen by measuring evaluations against true error on Kepler's problem, the Pleiades and
 # Arenstorf's orbit. Results are insensitive to them; a strong preference for low orders or for an unchanged step costs
-# 10-20%.
-# Weights of the steps of the lower and of the higher order relative to that of the present order.
+# 10-20%. Weights of the steps of the lower and of the higher order, relative to the present order.
 LOWER, _UPPER = 0.98, 0.95
-# After a step that is refused, the step changes by this factor, times the controller's safety.
+# After a refused step, the step changes by this factor, times the controller's safety.
 _REFUSED = 0.75
 # The fraction of the deviation from the target that the next step corrects.
 GAIN = 0.85
@@ -27,12 +26,11 @@ class StepEstimate(eqx.Module):
 
     - `error`: the weighted norm of the local error; below one the step is good.
     - `growth`: the factor by which all steps may grow, with the order chosen for the next step.
-    - `retry`: the same for the order just used; zero if there is no usable estimate, negative if no step from here can
-        have one.
+    - `retry`: the same for the order just used; zero without a usable estimate, negative if no step from this state can
+        have an estimate.
     - `response`: the power of these factors by which to change the next step alone, with the earlier steps given.
     - `limit`: the largest factor by which the next step may grow.
-    - `work`: evaluations of the vector field, and matrices computed. Not integers, which diffrax does not expect in an
-        error.
+    - `work`: evaluations of the vector field, and matrices computed. Not integers, unexpected by diffrax in an error.
     """
 
     error: Float[Array, ""]
@@ -44,7 +42,7 @@ class StepEstimate(eqx.Module):
 
 
 def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
-    """The estimate of a step that must not be accepted, where `off`."""
+    """The estimate of a step, which must not be accepted where `off`."""
     parts = lambda e: (e.error, e.growth, e.retry, e.response)
     values = zip(parts(estimate), (jnp.inf, 0.0, _REFUSED, 1.0), strict=True)
     changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]
@@ -70,19 +68,19 @@ def choose_order(
     limit: Any = np.inf,
     bounded: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None,
 ) -> tuple[Int[Array, ""], StepEstimate]:
-    """Choose, among the present formula and its neighbours in order, the one that allows the longest next step.
+    """Choose the formula that allows the longest next step, among the present formula and its neighbours in order.
 
     **Arguments:**
 
     - `errors`: weighted norms of the local errors of the lower, the present and the higher formula in the step,
-        infinite or NaN if the step failed. Those of formulas that are not allowed are ignored.
+        infinite or NaN if the step failed. The errors of formulas that are not allowed are ignored.
     - `powers`: the powers of the step that these errors are proportional to.
     - `response`: as in `StepEstimate`.
     - `may_fall`, `may_rise`: whether the lower and the higher formula are allowed.
     - `known`: whether there are enough points for the error of the higher formula.
     - `target`: the error to aim at, in units of the tolerance.
     - `work`, `limit`: as in `StepEstimate`.
-    - `bounded`: limits the growth factors of the three formulas to those that stability allows.
+    - `bounded`: limits the growth factors of the three formulas for stability.
 
     **Returns:** `(-1, 0 or 1, StepEstimate)`.
     """
@@ -95,7 +93,7 @@ def choose_order(
     lower = jnp.where(may_fall, LOWER * factors[0], zero)
     same = factors[1]
     higher = jnp.where(may_rise & known, _UPPER * factors[2], zero)
-    # While every point since the start is in use there is no estimate for the next order, but it is usually better.
+    # While every point since the start is in use, the next order has no estimate, but is usually better.
     opening = may_rise & ~known & (lower <= same)
     rise = opening | ((higher > same) & (higher > lower))
     fall = ~rise & (lower > same)

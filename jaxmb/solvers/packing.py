@@ -31,7 +31,7 @@ class Layout:
         return [self._joined(leaves, dtype) for dtype in self.types]
 
     def packed_tangent(self, row: PyTree[Array], tangent: PyTree[Array]) -> list[Array]:
-        """The tangent of a row, or parts of it, as those of its vectors that are floating-point numbers."""
+        """The tangent of a row, or of parts of it, as tangents of its floating-point vectors."""
         arrays = eqx.filter(row, eqx.is_array)
         leaves = jax.tree.leaves(filled(arrays, tangent))
         return [self._joined(leaves, dtype) for dtype in self.types if jnp.issubdtype(dtype, jnp.floating)]
@@ -50,7 +50,7 @@ class Layout:
 
 
 def switch(index: Array, branches: Sequence[Callable[..., PyTree]], *operands: PyTree) -> PyTree:
-    """`lax.switch` with a result in few vectors: XLA copies each array that a branch returns as it is."""
+    """`lax.switch` with a result in few vectors: XLA copies each array that a branch returns unchanged."""
     layout = Layout(eqx.filter_eval_shape(branches[0], *operands))
-    packed = [lambda *given, own=own: layout.packed(own(*given)) for own in branches]
+    packed = [lambda *given, branch=branch: layout.packed(branch(*given)) for branch in branches]
     return layout.unpacked(lax.switch(index, packed, *operands))

@@ -25,13 +25,15 @@ from .evaluation import (
 )
 from .times import twice_differentiable
 
-# Of more numbers than this, states and fields among them, tangents after a jump are computed one at a time.
+# With more numbers than this, states and fields among them, tangents after a jump are computed one at a time.
 _MOST_COLUMNS = 256
 
 
 class AtRestart(eqx.Module):
-    """What is stored of a restart after a jump: what the term has `found` there; the field `f` after it; what is `kept`
-    of the chart there.
+    """The stored numbers of a restart after a jump.
+
+    **Fields:** `found`: the term's numbers of the jump (`AbstractManifoldTerm.found_at_jump`); `f`: the field after it;
+    `kept`: the numbers kept of the chart there.
     """
 
     found: PyTree[Array]
@@ -40,8 +42,10 @@ class AtRestart(eqx.Module):
 
 
 class Jump(eqx.Module):
-    """What is stored of a start: whether there was a jump, the times `before` and after it, the state, the field and
-    the chart before it; what is known `after` it, None where derivatives find that again.
+    """The stored numbers of a start.
+
+    **Fields:** `made`: whether there was a jump; the times `before` and after it (`time`); the state `y`, the field `f`
+    and the `chart` before it; `after` it, None if derivatives find these numbers again.
     """
 
     made: Any
@@ -56,8 +60,8 @@ class Jump(eqx.Module):
 def restarts(
     of, moved, like, jump: Jump, numbers: Callable[..., tuple[Array, ...]]
 ) -> Callable[..., tuple[Array, ...]]:
-    """The tangents of the numbers after a jump, where there was one, from those of the run's numbers, of the state and
-    of the field before it, in which they are linear.
+    """The tangents of the numbers after a jump, if there was a jump, as a linear function. Its arguments are the
+    tangents of the run's numbers, and of the state and the field before the jump.
 
     **Arguments:** `numbers(field, t, y)`: the raveled state that a method starts from, and its derivatives there.
     """
@@ -71,8 +75,7 @@ def restarts(
     def restarted(*along):
         if moved.jumps is None or guards is None:
             return tangents(moved.jumps is not None, *along)
-        # A run starts, and goes on after an impact, at a time that is none of the jumps, and at the start there is
-        # nothing before it.
+        # The start of a run, or of the motion after an impact, is not at a jump, and nothing precedes the start.
         is_jump = any_of_batch(_is_jump(moved.jumps, jump))
         return lax.cond(is_jump, lambda: tangents(True, *along), lambda: tangents(False, *along))
 
@@ -87,7 +90,7 @@ def restarts(
         return push
     raveled = jax.numpy_dtype_promotion("standard")(ravel_pytree)
     _, unraveled = raveled((moved, jump.y, jump.f))
-    # The transpose of a program that finds an event would be a second one, and as long; a matrix is transposed at once.
+    # The transpose of a program that finds an event would be a second one of its size; a matrix is transposed at once.
     column = lambda unit: jnp.concatenate(restarted(*unraveled(unit)))
     every = lambda: jax.vmap(column)(jnp.eye(columns, dtype=jump.y.dtype))
     none = jnp.zeros((columns, n * len(blank)), jump.y.dtype)
@@ -101,30 +104,31 @@ def restarts(
 
 
 def _restart(of, like, jump, numbers, at_jump, moved, flat, f):
-    """The numbers after a restart, from the state and the field before it; `at_jump`: whether it may be at a jump whose
-    time has derivatives.
+    """The numbers after a restart, from the state and the field before it.
+
+    **Arguments:** `at_jump`: whether the restart may be at a jump whose time has derivatives.
     """
     terms, args, _ = of(moved.terms)
     if not at_jump:
-        late = at = None
+        delay = delayed = None
     else:
-        # The jump comes later by this time, which is zero: the state moves on before it, and back after it.
+        # The jump is later by this time, which is zero: the state moves on before the jump, and back after it.
         time = moved.jumps[jnp.argmin(jnp.abs(moved.jumps - jump.time))]
-        late = twice_differentiable(time - lax.stop_gradient(time))
-        late = jnp.where(_is_jump(lax.stop_gradient(moved.jumps), jump), late, 0.0)
+        delay = twice_differentiable(time - lax.stop_gradient(time))
+        delay = jnp.where(_is_jump(lax.stop_gradient(moved.jumps), jump), delay, 0.0)
         field = field_of(terms, jump.before, unravel_like(like, flat), jump.chart, args)
-        flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, late)
-        at = jump.time + late
-    known, y, time = jump.after, unravel_like(like, flat), jump.time if at is None else at
-    y = after_jump(terms, time, y, found_at_jump(terms, time, y, args) if known is None else known.found, args)
-    if late is None and known is not None:
-        return at_solution(terms, jump.time, ravel(y), known.f, like, known.kept, args)
+        flat = _moved_on(lambda t, y: field(t, y)[0][1], jump.before, flat, f, delay)
+        delayed = jump.time + delay
+    stored, y, time = jump.after, unravel_like(like, flat), jump.time if delayed is None else delayed
+    y = after_jump(terms, time, y, found_at_jump(terms, time, y, args) if stored is None else stored.found, args)
+    if delay is None and stored is not None:
+        return at_solution(terms, jump.time, ravel(y), stored.f, like, stored.kept, args)
     chart = next_chart(terms, jump.time, y, chart_after_jump(terms, jump.chart), args)
     field = field_of(terms, jump.time, y, chart, args)
-    if late is None:
+    if delay is None:
         return numbers(field, jump.time, ravel(y))
-    (flat, f), _ = field(at, ravel(y))
-    flat = _moved_on(lambda t, y: field(t, y)[0][1], at, flat, f, -late)
+    (flat, f), _ = field(delayed, ravel(y))
+    flat = _moved_on(lambda t, y: field(t, y)[0][1], delayed, flat, f, -delay)
     return numbers(field, jump.time, flat)
 
 
@@ -134,6 +138,6 @@ def _is_jump(jumps, jump):
 
 
 def _moved_on(field, t, flat, f, time):
-    """A state after a time of zero, right to the second derivative by it; `f`: the field at the state."""
+    """A state moved on by a `time` of zero, right to the second derivative by it; `f`: the field at the state."""
     step = time.astype(flat.dtype)
     return flat + step / 2 * (f + field(t + time, flat + step * f))

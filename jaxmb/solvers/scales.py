@@ -11,23 +11,23 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-# What a block counts as at least, in its natural units, as a power of eps: 1e-4 in double precision. Much more hides a
-# small motion that starts at zero; much less asks for the digits of rounding errors.
+# The least size of a block, in its natural units, as a power of eps: 1e-4 in double precision. A much larger one hides
+# a small motion that starts at zero; a much smaller one resolves rounding errors.
 _LEAST = 0.25
-# What a step at rest moves by at most, in natural units, as a power of eps: 2e-14 in double precision. Rounding errors
-# of a chain of many bodies add up to nearly that; much more hides slow motions.
+# The largest motion of a step at rest, in natural units, as a power of eps: 2e-14 in double precision. Rounding errors
+# of a chain of many bodies add up to nearly that; a much larger bound hides slow motions.
 _REST = 0.875
-# What rates count as at least at the start of a motion, in units of what is expected of them, as a power of eps: 1e-6
-# in double precision. Steps of an explicit method beyond its stability enlarge rounding errors to nearly the tolerance.
+# The least size of rates at the start of a motion, in units of their expected size, as a power of eps: 1e-6 in double
+# precision. Steps of an explicit method beyond its stability enlarge rounding errors to nearly the tolerance.
 _LEAST_RATE = 0.375
 
 
 class Block(eqx.Module):
-    """A block of components of a state that are measured by the largest one among them.
+    """A block of components of a state, measured by its largest component.
 
-    **Fields:** its `name`; `size`: the number of its components; `initial`: what is expected of the block at the start
-    of a motion, in natural units of its components, where it is zero but for rounding errors, and None for a block that
-    counts as 1e-4 at least; `rate_of`: the name of the block before it whose rate of change it is, or None.
+    **Fields:** its `name`; `size`: the number of its components; `initial`: the expected size at the start of a motion,
+    in natural units, for a block that is zero but for rounding errors; None for a block with a least size of 1e-4;
+    `rate_of`: the name of the preceding block whose rate of change it is, or None.
     """
 
     name: str = eqx.field(static=True)
@@ -37,18 +37,18 @@ class Block(eqx.Module):
 
 
 def ends_of(sizes: Iterable[int]) -> tuple[tuple[int, int], ...]:
-    """The first index of each block in the raveled state, and that after its last."""
+    """The first index of each block in the raveled state, and the index after its last."""
     return tuple(itertools.pairwise(itertools.accumulate(sizes, initial=0)))
 
 
 class RunningScales(eqx.Module):
-    """Sizes of the components of a state: the largest in each block that a motion has shown so far, in natural units of
-    each component; and the largest rate that it really had, which at a start from rest is zero.
+    """Sizes of the components of a state: the largest of each block in the motion so far, in natural units; and the
+    largest actual rate, which is zero at a start from rest.
 
     With them an absolute tolerance is a pure number, and a component that never moves may be zero.
 
-    **Fields:** `units`: the natural sizes of the components of the raveled state, those of rates for one unit of time;
-    `blocks` of it, in order; the indices of the components that are `counted`, None for all.
+    **Fields:** `units`: the natural sizes of the components of the raveled state, of rates for one unit of time;
+    `blocks` of it, in order; `counted`: the indices of the components that count, None for all.
     """
 
     units: Float[Array, " n"]
@@ -56,7 +56,7 @@ class RunningScales(eqx.Module):
     counted: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     def none(self, dtype: Any) -> Float[Array, " sizes"]:
-        """Zeros, for sizes that are not known yet."""
+        """Zeros, for unknown sizes."""
         return jnp.zeros(len(self.blocks) + 1, dtype)
 
     def start(self, y: Float[Array, " n"], f: Float[Array, " n"]) -> Float[Array, " sizes"]:
@@ -66,7 +66,7 @@ class RunningScales(eqx.Module):
             if block.rate_of is None:
                 sizes[block.name] = _expected(block, size)
             else:
-                # From rest, a rate causes a motion of the size of the other block with this one.
+                # From rest, the acceleration reaches this velocity when the other block has moved by its size.
                 ahead = jnp.sqrt(sizes[block.rate_of] * rate)
                 size = jnp.maximum(size, jnp.where(jnp.isfinite(ahead), ahead, 0.0))
                 # Less where the motion itself is small.
@@ -75,7 +75,7 @@ class RunningScales(eqx.Module):
         return lax.stop_gradient(jnp.stack([*sizes.values(), self._largest_rate(self._largest(y))]))
 
     def expected(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The size of each component of a motion that starts at y, with what is expected of those that are zero."""
+        """The size of each component of a motion that starts at y, with the expected size for zero components."""
         sizes = [_expected(block, size) for block, size in zip(self.blocks, self._largest(y), strict=True)]
         return lax.stop_gradient(self.of_components(jnp.stack(sizes)))
 
@@ -89,12 +89,12 @@ class RunningScales(eqx.Module):
         return self.units * jnp.concatenate([jnp.full(block.size, sizes[k]) for k, block in enumerate(self.blocks)])
 
     def at_rest(self, sizes: Float[Array, " sizes"], y: Float[Array, " n"], h: Any) -> Float[Array, " n"]:
-        """The errors of rates that move nothing in a step of length h to y, where nothing has moved faster so far; zero
-        for all else.
+        """Errors of rates that move nothing in a step of length h to y, where nothing has moved faster so far; zero for
+        other components.
 
-        Where forces balance, accelerations are the rounding errors of these forces, and no step is so short that its
-        error estimate is not made of them. What rates are there does not matter as long as nothing moves. The errors
-        fall with the square of what the step would move, to far below those of any tolerance.
+        Where forces balance, accelerations are the rounding errors of these forces, and dominate the error estimate of
+        any step, however short. Such rates do not matter as long as nothing moves. The errors fall with the square of
+        the motion in the step, to far below any tolerance.
         """
         least = float(jnp.finfo(y.dtype).eps) ** _REST
         moved = jnp.abs(h) * jnp.maximum(sizes[-1], self._largest_rate(self._largest(y)))
@@ -104,7 +104,7 @@ class RunningScales(eqx.Module):
         return lax.stop_gradient(self.of_components(errors))
 
     def rate(self, sizes: Float[Array, " sizes"]) -> Float[Array, ""]:
-        """The size of the first block of rates over that of the block whose rates they are [1/s]."""
+        """The size of the first block of rates over the size of the block whose rates they are [1/s]."""
         names = [block.name for block in self.blocks]
         k, of = next((k, names.index(block.rate_of)) for k, block in enumerate(self.blocks) if block.rate_of)
         return sizes[k] / sizes[of]
@@ -124,6 +124,6 @@ def _expected(block, size):
     eps = jnp.finfo(size.dtype).eps
     if block.initial is None:
         return jnp.maximum(size, eps**_LEAST)
-    # Rounding errors of what constraints hold at rest are no size.
+    # Rounding errors of components that constraints hold at rest are not a size.
     initial = jnp.asarray(block.initial, size.dtype)
     return jnp.where(size > eps * initial, size, initial)

@@ -1,8 +1,8 @@
-"""Runs of more steps than rows are kept of, whose steps are taken again.
+"""Runs with more steps than kept rows, whose steps are repeated.
 
-Of every step is kept what the step size controller and the error estimates chose, a few numbers, and at the start of
-every segment of a run the whole state. The steps of a segment follow from these, without error estimates and without
-the tangents whose errors were controlled.
+Every step keeps a few numbers: the choices of the step size controller and of the error estimates. Every segment keeps
+its whole first state. The steps of a segment follow from these, without error estimates and without the tangents whose
+errors were controlled.
 """
 
 from typing import Any, NamedTuple
@@ -20,18 +20,18 @@ from .steps import AbstractSteps
 
 
 class AtEvent(NamedTuple):
-    """Whether a step ends at an event (`here`), and whether the one at which it starts is `void`: nothing changed."""
+    """**Fields:** `here`: whether a step ends at an event; `void`: whether the event at its start changed nothing."""
 
     here: Any
     void: Any
 
 
 class Row(NamedTuple):
-    """What is stored of a step, or of the start of a run, in which no time lies.
+    """The row of a step, or of the start of a run, which has no duration.
 
-    **Fields:** the end of the last step, which is the start of this one unless there was a jump, and minus infinity
-    before the first; the `end` of this one; what is known of events there, None in a run that
-    looks for none (`AbstractGuards`); what its linearisation needs, its `own`.
+    **Fields:** `since`: the end of the last step, which is the start of this step unless there was a jump, and minus
+    infinity before the first; its `end`; `at_event`: the events there, None for a run without them (`AbstractGuards`);
+    `own`: the numbers for its linearisation.
     """
 
     since: Any
@@ -41,11 +41,11 @@ class Row(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What was chosen for a step.
+    """The choices made for a step.
 
-    **Fields:** its end `tnext`, its start `tprev`, and whether it `made_jump`, as in the states of diffrax's loop;
-    where steps have no jumps, the last two are None, since it starts where the last one ended; `at_event` of its row;
-    what its error estimate has `chosen` for the next step.
+    **Fields:** its end `tnext`, its start `tprev`, and whether it `made_jump`, as in the states of diffrax's loop.
+    Without jumps the last two are None: a step starts at the end of the last. `at_event` of its row; `chosen`: the
+    choices of its error estimate for the next step.
     """
 
     tnext: Any
@@ -56,7 +56,7 @@ class Choice(NamedTuple):
 
 
 class Between(NamedTuple):
-    """The parts of a state of diffrax's loop that steps are made of."""
+    """The parts of a state of diffrax's loop that determine a step."""
 
     tprev: Any
     tnext: Any
@@ -66,25 +66,25 @@ class Between(NamedTuple):
 
 
 def row_of(steps: AbstractSteps, terms: PyTree, since: Any, old: Any, new: Any) -> Row:
-    """The row of the step between two states of diffrax's loop; `since`: the end of the last step before it."""
+    """The row of the step between two states of diffrax's loop; `since`: the end of the step before it."""
     return Row(since, old.tnext, _at_event(old, new), steps.row(terms, old, new))
 
 
 def first_of(steps: AbstractSteps, terms: PyTree, old: Any, new: Any) -> Row:
-    """The row of the start of a run, in which no time lies, from the states before and after its first step."""
+    """The row of the start of a run, without duration, from the states before and after the first step."""
     ever, nothing = jnp.full_like(old.tprev, jnp.inf), jax.tree.map(jnp.zeros_like, _at_event(old, new))
     return Row(ever, -ever, nothing, steps.start(terms, old, new))
 
 
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
-    """What was chosen for the same step."""
+    """The choices made for the same step."""
     jump = (old.tprev, jnp.asarray(old.made_jump)) if steps.jumps else (None, None)
     chosen = steps.chosen(steps.alone(new.solver_state))
     return Choice(old.tnext, *jump, _at_event(old, new), chosen)
 
 
 def start_of(steps: AbstractSteps, since: Any, state: Any) -> tuple[Any, Any, PyTree[Array], PyTree[Array]]:
-    """What a segment starts with: `since` of its first row, its time, the state, and that of the solver itself."""
+    """The start of a segment: `since` of its first row, its time, the state, and the solver's plain state."""
     return since, state.tprev, state.y, steps.alone(state.solver_state)
 
 
@@ -96,8 +96,8 @@ def _at_event(old, new):
 
 
 def remainder(k: Any, size: int) -> Any:
-    """The remainder of a number of steps, which is not negative: for any number it is ten operations, by a power of two
-    one, and each kernel repeats them that uses it as an index.
+    """The remainder of a nonnegative number of steps. It is one operation for a power of two, else ten, and every
+    kernel that uses it as an index repeats them.
     """
     k = jnp.asarray(k)
     return k & (size - 1) if size & (size - 1) == 0 else lax.rem(k, jnp.asarray(size, k.dtype))
@@ -118,7 +118,7 @@ class Segments(eqx.Module):
     def rows(
         self, steps: AbstractSteps, equations: PyTree, segment: Any, count: Any, rows: list[Array], lost: Any
     ) -> list[Array]:
-        """The rows of a segment of a run of `count` steps, in these buffers; where they are not `lost`, the same.
+        """The rows of a segment of a run of `count` steps, in these buffers; unchanged where they are not `lost`.
 
         **Arguments:** `equations`: the terms, their arguments and the solver without tangents.
         """
@@ -136,8 +136,8 @@ class Segments(eqx.Module):
             y, _, _, after, _ = solver.step(terms, old.tprev, old.tnext, y, args, solver_state, made_jump)
             if choice.chosen is not None:
                 after = eqx.tree_at(steps.chosen, after, choice.chosen)
-            own = steps.row(terms, old, Between(old.tnext, old.tnext, y, made_jump, after))
-            packed = self.layout.packed(Row(since, old.tnext, choice.at_event, own))
+            row_numbers = steps.row(terms, old, Between(old.tnext, old.tnext, y, made_jump, after))
+            packed = self.layout.packed(Row(since, old.tnext, choice.at_event, row_numbers))
             place = remainder(k, size)
             rows = [buffer_set(buffer, place, x) for buffer, x in zip(rows, packed, strict=True)]
             return k + 1, old.tnext, old.tnext, y, after, rows

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 Rationals: TypeAlias = tuple[Fraction, ...]
 
-# Tolerances: roots this far outside the unit circle count as on it, and points of the locus this near the imaginary
-# axis, relative to their size, as on the axis.
+# Tolerances: roots this far outside the unit circle count as on it. Points of the locus this near the imaginary axis,
+# relative to their size, count as on the axis.
 _OUTSIDE = 1e-7
 _LEFT = 1e-9
 
@@ -98,8 +98,8 @@ def formula(family: str, k: int) -> Formula:
 def adams(k: int) -> Formula:
     """Adams' predictor and corrector of order k with local extrapolation (PECE), on the test equation.
 
-    The formula of Adams and Bashforth of order k predicts, that of Adams and Moulton of order k + 1 corrects, and the
-    derivative is evaluated after both. With the coefficients `p_j` and `q_j` of the two,
+    The formula of Adams and Bashforth of order k predicts, the formula of Adams and Moulton of order k + 1 corrects,
+    and the derivative is evaluated after both. With the coefficients `p_j` and `q_j` of the two,
 
         y_{n+1} = y_n + h q_0 λ (y_n + h sum_j p_j f_{n+1-j}) + h sum_j q_j f_{n+1-j},  j = 1 ... k,
 
@@ -159,7 +159,7 @@ def boundary_locus(formula: Formula, theta: ArrayLike) -> NDArray[np.complex128]
 
     **Arguments:** `theta`: angles [rad], of any shape.
 
-    **Returns:** complex, of shape `(2, *theta.shape)`: the root of smaller and that of larger modulus of the quadratic
+    **Returns:** complex, of shape `(2, *theta.shape)`: the roots of smaller and of larger modulus of the quadratic
     equation `Π(ζ, μ) = 0`. The latter is infinite where the equation is linear.
     """
     powers = np.exp(-1j * np.asarray(theta, float)[..., None] * np.arange(len(formula.a)))
@@ -176,7 +176,7 @@ def stability_angle(formula: Formula) -> float:
 
     Computed from the sector without points of the boundary locus; roots are then tested on rays in it.
 
-    **Returns:** α [degrees] to 1e-3, 90 for an A-stable formula and 0 for one that is stable in no sector.
+    **Returns:** α [degrees] to 1e-3, 90 for an A-stable formula and 0 for a formula that is stable in no sector.
     """
 
     mu = boundary_locus(formula, _THETA)
@@ -206,7 +206,7 @@ def damping_at_infinity(formula: Formula) -> float:
 
 
 def is_zero_stable(formula: Formula) -> bool:
-    """Whether the formula is stable for `μ = 0`: all roots in the unit circle, and those on it simple."""
+    """Whether the formula is stable for `μ = 0`: all roots in the unit circle, and roots on it simple."""
     roots = characteristic_roots(formula, 0.0)
     on_circle = roots[np.abs(roots) > 1 - _OUTSIDE]
     distances = np.abs(on_circle[:, None] - on_circle) + np.eye(len(on_circle))
@@ -216,13 +216,13 @@ def is_zero_stable(formula: Formula) -> bool:
 def largest_growth(family: str, k: int) -> float:
     """The largest constant ratio of neighbouring steps for which a formula of variable step remains zero-stable.
 
-    With steps in a constant ratio the coefficients are constant too. Those of y are the same for all steps in the
-    families E and H, and in the one-step formulas.
+    With steps in a constant ratio the coefficients are constant too. The coefficients of y are the same for all steps
+    in the families E and H, and in the one-step formulas.
 
     **Arguments:** `family`, `k`: as for `formula`.
 
-    **Returns:** the ratio of a step and the one before, to 1e-5; infinite if every ratio is stable. It is below one for
-    a formula that is not zero-stable when the steps are equal.
+    **Returns:** the ratio of a step and its predecessor, to 1e-5; infinite if every ratio is stable. It is below one
+    for a formula that is not zero-stable when the steps are equal.
 
     **Raises:** `ValueError` for another family or `k < 1`.
     """
@@ -233,7 +233,7 @@ def largest_growth(family: str, k: int) -> float:
     def unstable(n):
         ratio = Fraction(n, _PARTS)
         nodes = [Fraction(0), *itertools.accumulate(-(ratio**-j) for j in range(k))]
-        # Sums of the coefficients are those of the polynomial divided by ζ - 1.
+        # Sums of the coefficients are the coefficients of the polynomial divided by ζ - 1.
         return _largest(np.roots(np.cumsum(np.array(_coefficients(family, nodes)[0], float))[:-1])) > 1
 
     tenth = _PARTS // 10
@@ -244,7 +244,7 @@ def largest_growth(family: str, k: int) -> float:
 def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figure":
     """Draw the regions of stability of some formulas in the plane of μ, shaded.
 
-    **Arguments:** `formulas`: the formulas; `ax`: the matplotlib axes, default those of a new figure.
+    **Arguments:** `formulas`: the formulas; `ax`: the matplotlib axes, default in a new figure.
 
     **Returns:** the matplotlib `Figure`.
 
@@ -260,8 +260,8 @@ def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figu
     axes = figure.add_subplot() if ax is None else ax
     re, im = _window(formulas)
     upper = re + 1j * im[:, None]
-    for n, each in enumerate(formulas):
-        radius = spectral_radius(each, upper)
+    for n, rule in enumerate(formulas):
+        radius = spectral_radius(rule, upper)
         mirrored = np.concatenate([radius[:0:-1], radius])
         plane = re, np.concatenate([-im[:0:-1], im]), mirrored
         axes.contourf(*plane, levels=[0.0, 1.0], colors=[f"C{n % 10}"], alpha=0.1)
@@ -271,7 +271,7 @@ def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figu
     axes.set_aspect("equal")
     axes.set_xlabel("Re μ")
     axes.set_ylabel("Im μ")
-    handles = [Line2D([], [], color=f"C{n % 10}", label=each.name) for n, each in enumerate(formulas)]
+    handles = [Line2D([], [], color=f"C{n % 10}", label=rule.name) for n, rule in enumerate(formulas)]
     axes.legend(handles=handles, fontsize="small")
     return figure
 
@@ -279,10 +279,10 @@ def plot_regions(formulas: Sequence[Formula], ax: "Axes | None" = None) -> "Figu
 def _window(formulas: Sequence[Formula], points: int = 161) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Real and nonnegative imaginary parts of a grid around the boundaries of the regions."""
     extents = []
-    for each in formulas:
-        locus = boundary_locus(each, np.linspace(1e-3, np.pi, 500)).ravel()
+    for rule in formulas:
+        locus = boundary_locus(rule, np.linspace(1e-3, np.pi, 500)).ravel()
         locus = locus[np.isfinite(locus)]
-        boundary = locus[spectral_radius(each, locus) <= 1 + _OUTSIDE]
+        boundary = locus[spectral_radius(rule, locus) <= 1 + _OUTSIDE]
         locus = boundary if len(boundary) else locus
         # Some boundaries extend to infinity.
         extents.append(locus[np.abs(locus) <= 3 * np.median(np.abs(locus))])
@@ -303,15 +303,15 @@ def _coefficients(family: str, nodes: Sequence[Fraction]) -> tuple[Rationals, Ra
     """`a`, `b`, `c` for the times `(t_{n+1-j} - t_{n+1}) / h` of the points, newest first."""
     integrated, multiplicity = FAMILIES[family].integrated, FAMILIES[family].multiplicity
     points = range(len(nodes))
-    given = {(0, 0): Fraction(1), (0, 1): Fraction(-1)} if integrated else {(0, 0): Fraction(1)}
+    fixed = {(0, 0): Fraction(1), (0, 1): Fraction(-1)} if integrated else {(0, 0): Fraction(1)}
     # Coefficients are named by the derivative that they multiply, and by the point.
     lowest = 1 if integrated else 0
     unknown = [(1, 0), (2, 0), *((d, j) for d in range(lowest, lowest + multiplicity) for j in points[1:])]
-    # A given a sums to zero, so constants are solutions already.
+    # The fixed a sum to zero, so constants are solutions already.
     degrees = range(lowest, lowest + len(unknown))
     matrix = [[_residual(nodes[j], d, q) for d, j in unknown] for q in degrees]
-    right = [sum((-x * _residual(nodes[j], d, q) for (d, j), x in given.items()), Fraction(0)) for q in degrees]
-    solved = given | dict(zip(unknown, _solve(matrix, right), strict=True))
+    right = [sum((-x * _residual(nodes[j], d, q) for (d, j), x in fixed.items()), Fraction(0)) for q in degrees]
+    solved = fixed | dict(zip(unknown, _solve(matrix, right), strict=True))
     a, b, c = (tuple(solved.get((d, j), Fraction(0)) for j in points) for d in range(3))
     return a, b, c
 

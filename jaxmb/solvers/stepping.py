@@ -1,10 +1,9 @@
-"""The loop over the steps of a solve, in the place of diffrax's own.
+"""The loop over the steps of a solve, in place of diffrax's loop.
 
-It does the same with the same state, for `diffrax.diffeqsolve` and the adjoints of this package. The time from which on
-a step ends with the run, a hundred rounding errors before its end, is found in one operation: diffrax takes fifteen
-hundred for it, a tenth of what it takes to trace and to compile a small mechanism. Where a run fails no event happens,
-and the search for the time of an event is that of the members of a batch that have one, so that a member that fails
-does not stop the others.
+It computes the same from the same state, for `diffrax.diffeqsolve` and the adjoints of this package. A step that would
+end within a hundred rounding errors of the end of the run ends there. One operation finds that time: diffrax takes
+fifteen hundred, a tenth of the time to trace and compile a small mechanism. A run that fails has no event. The time of
+an event is searched only in members of a batch that have an event, so a failed member does not stop the others.
 """
 
 import dataclasses
@@ -23,12 +22,12 @@ from jaxtyping import PyTree
 from .._compat import any_of_batch, buffer_set, save_states, while_loop
 
 _RESULTS = diffrax.RESULTS
-# A step that would end so many rounding errors before the end ends there.
+# A step that would end within this many rounding errors of the end of the run ends there.
 _LAST = 100
 
 
 class _Solve(NamedTuple):
-    """What `diffrax.diffeqsolve` gives to the loop and does not change in it."""
+    """The arguments of `diffrax.diffeqsolve` that the loop does not change."""
 
     terms: PyTree
     args: PyTree
@@ -42,8 +41,8 @@ class _Solve(NamedTuple):
     max_steps: int | None
     progress_meter: Any
 
-    def each(self, function: Callable[[diffrax.SubSaveAt, Any], Any], saved: PyTree) -> PyTree:
-        """A function of each series of saved states, and of what is saved of it."""
+    def on_series(self, function: Callable[[diffrax.SubSaveAt, Any], Any], saved: PyTree) -> PyTree:
+        """Map a function of `(series, saved)` over the series of saved states."""
         return jax.tree.map(function, self.saveat.subs, saved, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
 
     def guard(self, function: Callable[..., Any], t: Any, y: PyTree) -> Any:
@@ -53,45 +52,46 @@ class _Solve(NamedTuple):
 
 
 def loop(*, init_state: Any, outer_while_loop: Callable[..., Any], **given: Any) -> tuple[Any, dict[str, Any]]:
-    """The last state of the loop, and statistics, of which there are none, for an adjoint.
+    """The last state of the loop, and its statistics (none), for an adjoint.
 
-    **Arguments:** those of diffrax's loop; `outer_while_loop(proceed, advance, state, max_steps=, buffers=)`: the loop
-    over steps.
+    **Arguments:** as of diffrax's loop; `outer_while_loop(proceed, advance, state, max_steps=, buffers=)`: over steps.
     """
-    known = known_in_steps(init_state, **given)
-    return ended(stepped(init_state, outer_while_loop, known, **given), known, **given), {}
+    constants = constant_fields(init_state, **given)
+    return ended(stepped(init_state, outer_while_loop, constants, **given), constants, **given), {}
 
 
-def known_in_steps(state: Any, **given: Any) -> dict[str, Any]:
-    """What is the same in all steps and so known to the compiler, by the names of fields of the state: that there are
-    no jumps, that nothing fails.
+def constant_fields(state: Any, **given: Any) -> dict[str, Any]:
+    """The fields of the state that are the same constants in all steps, by name: for example, that nothing fails and
+    that there are no jumps. The compiler then knows them.
 
     **Arguments:** as of `loop`.
     """
-    solve, known = _Solve(**given), _known(state)
+    solve, constants = _Solve(**given), _concrete_fields(state)
     while True:
-        # What is found of one may change the other.
-        at = lambda state, known=known: _known(_advanced(solve, dataclasses.replace(state, **known)))
-        after = eqx.filter_eval_shape(at, state)
-        same = {name: value for name, value in known.items() if name in after and after[name] == value}
-        if len(same) == len(known):
-            return known
-        known = same
+        # A constant that turns out to vary may make others vary.
+        fields_after = lambda state, constants=constants: _concrete_fields(
+            _advanced(solve, dataclasses.replace(state, **constants))
+        )
+        shapes = eqx.filter_eval_shape(fields_after, state)
+        same = {name: value for name, value in constants.items() if name in shapes and shapes[name] == value}
+        if len(same) == len(constants):
+            return constants
+        constants = same
 
 
-def stepped(state: Any, outer_while_loop: Callable[..., Any], known: dict[str, Any], **given: Any) -> Any:
-    """The state after the last step, of what is `known_in_steps`."""
+def stepped(state: Any, outer_while_loop: Callable[..., Any], constants: dict[str, Any], **given: Any) -> Any:
+    """The state after the last step, with the constants of `constant_fields`."""
     solve = _Solve(**given)
     if solve.saveat.dense:
         state = dataclasses.replace(state, dense_ts=state.dense_ts.at[0].set(solve.t0))
     at_start = lambda sub, saved: _saved(solve, sub, saved, solve.t0, state.y) if sub.t0 else saved
-    state = dataclasses.replace(state, save_state=solve.each(at_start, state.save_state))
-    proceed = lambda state: _proceeds(solve, dataclasses.replace(state, **known))
-    advance = lambda state: _advanced(solve, dataclasses.replace(state, **known))
+    state = dataclasses.replace(state, save_state=solve.on_series(at_start, state.save_state))
+    proceed = lambda state: _proceeds(solve, dataclasses.replace(state, **constants))
+    advance = lambda state: _advanced(solve, dataclasses.replace(state, **constants))
     return outer_while_loop(proceed, advance, state, max_steps=solve.max_steps, buffers=_buffers)
 
 
-def ended(last: Any, known: dict[str, Any], **given: Any) -> Any:
+def ended(last: Any, constants: dict[str, Any], **given: Any) -> Any:
     """The last state with its result, the end of the run among the saved states, and an event at its time."""
     solve = _Solve(**given)
     t, y, result, saved = last.tprev, last.y, last.result, last.save_state
@@ -100,10 +100,12 @@ def ended(last: Any, known: dict[str, Any], **given: Any) -> Any:
         happened = jnp.any(jnp.stack(jax.tree.leaves(last.event_mask)))
         find = lambda: _time_of_event(solve, last, happened)
         t, y, result = lax.cond(any_of_batch(happened), find, lambda: (t, y, result))
-        saved = solve.each(lambda _, saved: _until(saved, t), saved)
-    saved = solve.each(lambda sub, saved: _without_steps(solve, sub, saved, y), saved)
-    saved = solve.each(lambda sub, saved: _with_end(solve, sub, saved, last.num_accepted_steps, (t, y), finds), saved)
-    last = dataclasses.replace(last, **known | {"save_state": saved})
+        saved = solve.on_series(lambda _, saved: _until(saved, t), saved)
+    saved = solve.on_series(lambda sub, saved: _without_steps(solve, sub, saved, y), saved)
+    saved = solve.on_series(
+        lambda sub, saved: _with_end(solve, sub, saved, last.num_accepted_steps, (t, y), finds), saved
+    )
+    last = dataclasses.replace(last, **constants | {"save_state": saved})
     result = _RESULTS.where(_proceeds(solve, last), _RESULTS.max_steps_reached, result)
     return dataclasses.replace(last, result=result)
 
@@ -111,16 +113,16 @@ def ended(last: Any, known: dict[str, Any], **given: Any) -> Any:
 def _proceeds(solve: _Solve, state: Any) -> Any:
     """Whether another step is tried."""
     if isinstance(solve.stepsize_controller, diffrax.StepTo):
-        more = state.num_steps < len(solve.stepsize_controller.ts) - 1
+        before_end = state.num_steps < len(solve.stepsize_controller.ts) - 1
     else:
-        more = state.tprev < solve.t1
-    return more & diffrax.is_successful(state.result)
+        before_end = state.tprev < solve.t1
+    return before_end & diffrax.is_successful(state.result)
 
 
-def _known(state):
-    """What of a state is known before the program runs."""
-    found = {"made_jump": state.made_jump} if isinstance(state.made_jump, bool) else {}
-    return found if state.result.is_traced() else found | {"result": state.result}
+def _concrete_fields(state):
+    """The fields of a state whose values the compiler knows."""
+    fields = {"made_jump": state.made_jump} if isinstance(state.made_jump, bool) else {}
+    return fields if state.result.is_traced() else fields | {"result": state.result}
 
 
 def _buffers(state):
@@ -130,12 +132,12 @@ def _buffers(state):
 
 
 def _advanced(solve: _Solve, state: Any) -> Any:
-    """The state after one step that is tried."""
+    """The state after one attempted step."""
     start, end = state.tprev, state.tnext
     y, error, dense, solver_state, of_solver = solve.solver.step(
         solve.terms, start, end, state.y, solve.args, state.solver_state, state.made_jump
     )
-    # A step that leads to no number is too long.
+    # A step whose error is NaN is too long.
     error = jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
     order = solve.solver.error_order(solve.terms)
     keep, tprev, tnext, made_jump, controller_state, of_controller = solve.stepsize_controller.adapt_step_size(
@@ -168,8 +170,8 @@ def _advanced(solve: _Solve, state: Any) -> Any:
         num_rejected_steps=state.num_rejected_steps + jnp.where(keep, 0, 1),
     )
     within = solve.solver.interpolation_cls(t0=start, t1=end, **dense)
-    saved = solve.each(lambda sub, saved: _with_times(solve, sub, saved, within, end, keep), state.save_state)
-    saved = solve.each(lambda sub, saved: _with_step(solve, sub, saved, accepted, (tprev, y), keep), saved)
+    saved = solve.on_series(lambda sub, saved: _with_times(solve, sub, saved, within, end, keep), state.save_state)
+    saved = solve.on_series(lambda sub, saved: _with_step(solve, sub, saved, accepted, (tprev, y), keep), saved)
     new = dataclasses.replace(new, save_state=saved)
     if solve.saveat.dense:
         place = state.dense_save_index
@@ -195,20 +197,20 @@ def _advanced(solve: _Solve, state: Any) -> Any:
 
 
 def _chosen(keep, new, old):
-    """One of two truth values, known before the program runs where `keep` is, or both are the same."""
+    """One of two truth values; a Python one if `keep` is, or if both are the same."""
     if isinstance(keep, bool | np.bool_):
         return new if keep else old
     return new if new is old else lax.select(keep, new, old)
 
 
 def _share(t0, t, t1):
-    """How far a time is from the start to the end, 0 to 1; 0 where they are the same."""
+    """The fraction of the run that lies before `t`, from 0 to 1; 0 for a run without length."""
     same = t0 == t1
     return jnp.where(same, 0.0, t - t0) / jnp.where(same, 1.0, t1 - t0)
 
 
 def _saved(solve: _Solve, sub: diffrax.SubSaveAt, saved: Any, t: Any, y: PyTree, times: int = 1) -> Any:
-    """A series with a further state, written so many `times`."""
+    """A series with a further state, written `times` times."""
     write = lambda table, x: lax.dynamic_update_slice_in_dim(
         table, jnp.broadcast_to(x, (times, *jnp.shape(x))), saved.save_index, axis=0
     )
@@ -217,12 +219,12 @@ def _saved(solve: _Solve, sub: diffrax.SubSaveAt, saved: Any, t: Any, y: PyTree,
 
 
 def _with_times(solve, sub, saved, within, end, keep):
-    """A series with the states at those of its times that a step passes, if it is kept."""
+    """A series with the states at its times in a step, if the step is kept."""
     if sub.ts is None:
         return saved
     count = len(sub.ts)
 
-    def more(saved):
+    def is_due(saved):
         return keep & (sub.ts[saved.saveat_ts_index] <= end) & (saved.saveat_ts_index < count)
 
     def save(saved):
@@ -234,7 +236,7 @@ def _with_times(solve, sub, saved, within, end, keep):
         return dataclasses.replace(saved, ts=ts, ys=ys, save_index=place + 1, saveat_ts_index=saved.saveat_ts_index + 1)
 
     tables = lambda saved: (saved.ts, saved.ys)
-    return while_loop(more, save, saved, max_steps=count, buffers=tables, kind="lax")
+    return while_loop(is_due, save, saved, max_steps=count, buffers=tables, kind="lax")
 
 
 def _with_step(solve, sub, saved, accepted, at, keep):
@@ -242,12 +244,12 @@ def _with_step(solve, sub, saved, accepted, at, keep):
     if sub.steps == 0:
         return saved
     here = keep & (accepted % sub.steps == 0)
-    find = lambda: sub.fn(*at, solve.args)
+    value = lambda: sub.fn(*at, solve.args)
     if sub.steps == 1:
-        y = find()
+        y = value()
     else:
-        none = lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(find))
-        y = lax.cond(any_of_batch(here), find, none)
+        zeros = lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(value))
+        y = lax.cond(any_of_batch(here), value, zeros)
     place = saved.save_index
     ys = jax.tree.map(lambda x, table: buffer_set(table, place, x, pred=here), y, saved.ys)
     ts = buffer_set(saved.ts, place, at[0], pred=here)
@@ -255,22 +257,20 @@ def _with_step(solve, sub, saved, accepted, at, keep):
 
 
 def _without_steps(solve, sub, saved, y):
-    """A series of a run without a step, since it ends where it starts: its times are all that."""
+    """A series of a run without steps, which ends where it starts: all its times are the start."""
     if sub.ts is None:
         return saved
-    none = solve.t0 == solve.t1
+    is_empty = solve.t0 == solve.t1
 
     def fill():
         filled = _saved(solve, sub, saved, solve.t0, y, len(sub.ts))
-        return jax.tree.map(lambda new, old: jnp.where(none, new, old), filled, saved)
+        return jax.tree.map(lambda new, old: jnp.where(is_empty, new, old), filled, saved)
 
-    return lax.cond(any_of_batch(none), fill, lambda: saved)
+    return lax.cond(any_of_batch(is_empty), fill, lambda: saved)
 
 
 def _with_end(solve, sub, saved, accepted, at, finds):
-    """A series with the end of the run, unless it was saved as that of a step; where an event is looked for, what was
-    saved behind it is gone.
-    """
+    """A series with the end of the run, unless the last step saved it, and without states after an event."""
     by_step = sub.steps == 1 if sub.steps < 2 else accepted % sub.steps == 0
     if finds:
         here = sub.t1 | by_step
@@ -286,7 +286,7 @@ def _with_end(solve, sub, saved, accepted, at, finds):
 
 
 def _until(saved, t):
-    """A series without what was saved after a time."""
+    """A series without the states saved after a time."""
     after = saved.ts > t
     count = jnp.sum(after & (saved.ts < jnp.inf))
     drop = lambda x: jnp.where(after.reshape(-1, *[1] * (x.ndim - 1)), jnp.inf, x)
@@ -304,9 +304,7 @@ def _is_finite(y: PyTree) -> Any:
 
 
 def _changes(event: diffrax.Event, before: PyTree, values: PyTree, finite: Any) -> PyTree:
-    """Which functions of an event say that it happened in a step to a state that is `finite`: a truth value, or a
-    number that changes its sign or is none any more.
-    """
+    """Which events happened in a step to a `finite` state: a true value, a change of sign, or a new NaN."""
 
     def changes(_, old, new, upwards):
         if jnp.issubdtype(jnp.result_type(new), jnp.bool_):
@@ -322,7 +320,7 @@ def _changes(event: diffrax.Event, before: PyTree, values: PyTree, finite: Any) 
 
 
 def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
-    """The first of several that happened, and whether one did."""
+    """The first of several events that happened, and whether any did."""
     leaves, structure = jax.tree.flatten(mask)
     happened, first = False, []
     for leaf in leaves:
@@ -332,9 +330,7 @@ def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
 
 
 def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree, Any]:
-    """The time of the event in the last step, the state there and the result; those of the end of the run if none
-    happened.
-    """
+    """The time of the event in the last step, the state there, and the result; without an event, at the end."""
     event: Any = solve.event
     finite = jnp.isfinite(last.event_tnext)
     end = jnp.where(finite, last.event_tnext, solve.t1)
@@ -344,23 +340,23 @@ def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree
         """Zero at the event."""
 
         def of(guard, mask):
-            def found():
+            def guard_value():
                 value = solve.guard(guard, t, within.evaluate(t))
                 return value if jnp.issubdtype(jnp.result_type(value), jnp.floating) else end - t
 
-            # What did not happen is not evaluated, since its derivatives need not exist.
-            own = eqx.filter_eval_shape(found)
-            value = lax.cond(mask, found, lambda: jnp.zeros(own.shape, own.dtype))
+            # A guard without an event is not evaluated, since its derivatives need not exist.
+            shape = eqx.filter_eval_shape(guard_value)
+            value = lax.cond(mask, guard_value, lambda: jnp.zeros(shape.shape, shape.dtype))
             return jnp.where(happened & finite, value, (end - t).astype(value.dtype))
 
         return jax.tree.map(of, event.cond_fn, last.event_mask, is_leaf=callable)
 
     limits = {"lower": jnp.where(finite, last.event_tprev, solve.t0), "upper": end}
-    found = optx.root_find(left, event.root_finder, y0=end, options=limits, throw=False)
-    # A derivative that is not a number, as in a failed member of a batch, does not come to the search.
-    t = jnp.where(happened, found.value, last.tprev)
+    root = optx.root_find(left, event.root_finder, y0=end, options=limits, throw=False)
+    # A NaN derivative, as of a failed member of a batch, does not reach the search.
+    t = jnp.where(happened, root.value, last.tprev)
     moved = happened & (last.num_steps > 0)
     y = lax.cond(any_of_batch(moved), lambda: within.evaluate(t), lambda: last.y)
     y = jax.tree.map(lambda inside, y: jnp.where(moved, inside, y), y, last.y)
-    lost = happened & (found.result != optx.RESULTS.successful)
-    return t, y, _RESULTS.where(lost, _RESULTS.promote(found.result), last.result)
+    lost = happened & (root.result != optx.RESULTS.successful)
+    return t, y, _RESULTS.where(lost, _RESULTS.promote(root.result), last.result)

@@ -14,8 +14,10 @@ else:
 
 
 class Moving(NamedTuple):
-    """The numbers of a run that have tangents, or their tangents: those of the `terms`, their arguments and the solver,
-    and the times of `jumps`, in the solver's time, None where they have none.
+    """The numbers of a run that have tangents, or their tangents.
+
+    **Fields:** `terms`: the terms, their arguments and the solver; `jumps`: the times of jumps in the solver's time,
+    None if they have no tangents.
     """
 
     terms: PyTree
@@ -25,9 +27,8 @@ class Moving(NamedTuple):
 class LinearStep(NamedTuple):
     """A step as linear maps of tangents.
 
-    **Fields:** `push(dmoved, w, memory)`: the tangent of the raveled state at the end, that of the solver's memory, and
-    that of the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time in the step, from the
-    latter.
+    **Fields:** `push(dmoved, w, memory)`: the tangents of the raveled state at the end, of the solver's memory, and of
+    the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time, from the latter.
     """
 
     push: Callable[..., tuple[Array, PyTree, PyTree]]
@@ -35,7 +36,7 @@ class LinearStep(NamedTuple):
 
 
 class AbstractSteps(eqx.Module):
-    """How a solver's steps are stored, and linearised from what is stored.
+    """How a solver's steps are stored, and linearised from their rows.
 
     **Fields:** `jumps`: whether steps may begin after a jump.
     """
@@ -44,25 +45,23 @@ class AbstractSteps(eqx.Module):
 
     @property
     def starts(self) -> bool:
-        """Whether the start of a run is a row, before that of its first step."""
+        """Whether the start of a run has a row before the row of its first step."""
         return False
 
     @abc.abstractmethod
     def row(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
-        """What is stored of an accepted step, from the states of diffrax's loop before and after it."""
+        """The row that is stored of an accepted step, from the states of diffrax's loop before and after the step."""
 
     @abc.abstractmethod
     def alone(self, solver_state: Any) -> Any:
-        """The state of the solver itself, without the tangents that it carries along."""
+        """The state of the solver, without the tangents that it carries along."""
 
     @abc.abstractmethod
     def chosen(self, solver_state: Any) -> PyTree[Array]:
-        """The parts of the state of the solver itself that the error estimate of a step chose for the next one; None
-        without any.
-        """
+        """The parts of the solver's state that the error estimate chose for the next step; None without any."""
 
     def of_solver_alone(self) -> Self:
-        """The same for runs of the solver itself."""
+        """The same for runs of the solver without tangents."""
         return self
 
     def after_first_jump(self) -> Self:
@@ -70,7 +69,7 @@ class AbstractSteps(eqx.Module):
         return self
 
     def from_start(self) -> Self:
-        """The same for runs that begin with a state alone, and not with the memory of another run."""
+        """The same for runs that begin with a state, and not with the memory of another run."""
         return self
 
     @abc.abstractmethod
@@ -78,9 +77,7 @@ class AbstractSteps(eqx.Module):
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""
 
     def start(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
-        """The row of the start of a run, if it `starts` with one, from the states of diffrax's loop before and after
-        its first accepted step.
-        """
+        """The row of the start of a run (`starts`), from the states around the first accepted step."""
         raise NotImplementedError
 
     @abc.abstractmethod
@@ -94,9 +91,7 @@ class AbstractSteps(eqx.Module):
     def row_tangent(
         self, row: PyTree[Array], like: PyTree[Array], before: tuple[Array, PyTree], after: tuple[Array, PyTree]
     ) -> PyTree[Array]:
-        """The tangent of a row, from those of the state and the memory before and after its step; None for numbers that
-        have none.
-        """
+        """The tangent of a row, from the tangents around its step; None for numbers without one."""
 
 
 def refuse_moving_jumps(moved: Moving, solver: Any) -> None:

@@ -1,14 +1,15 @@
 """Error control of tangents beside the state.
 
 Steps that follow a motion may lie far outside the stability region of a mode that is not excited. The motion does not
-show it, but its derivatives do: they grow from step to step without bound. A solve that is differentiated therefore
-carries a tangent w of the state along, `w' = J(t, y) w`, from a start that excites every mode, and keeps its local
-error small as well. Nor does a motion show a force of strength zero, whose derivative by the strength is none the less
-a function of time that steps have to resolve: where derivatives by parameters are taken, a tangent that these cause is
-watched, `d' = J d + f_p`. Tangents that are carried along have no derivatives themselves.
+show it, but its derivatives grow from step to step without bound. A differentiated solve therefore carries a tangent w
+of the state along, `w' = J(t, y) w`, and keeps its local error small as well. Its start excites every mode.
 
-They are those of the numerical solution: each step is differentiated along the tangents of the state and of the
-solver's memory. The derivative of the error estimate is then the error estimate of the tangent.
+Nor does a motion show a force of strength zero, but its derivative by the strength is a function of time that steps
+must resolve. With derivatives by parameters, the solve also carries a tangent that parameters cause, `d' = J d + f_p`.
+
+Tangents that are carried along have no derivatives. They differentiate the numerical solution: each step is
+differentiated along the tangents of the state and of the solver's memory. The derivative of the error estimate is then
+the error estimate of the tangent.
 """
 
 import dataclasses
@@ -25,30 +26,30 @@ from .._compat import with_inner
 from .evaluation import freeze, ravel, unravel_like
 from .scales import ends_of
 
-# The tolerance of a tangent, in units of that of the state; and its absolute part, as a fraction of the largest entry.
+# The tolerance of a tangent, in units of the state's tolerance; and its absolute part, relative to the largest entry.
 _LOOSER, _FLOOR = 5.0, 0.01
-# The start of a tangent that parameters cause, which would be zero, in units of the other start. So steps do not begin
-# at no length, and a mode that is excited late has been followed until then. The effect of parameters is resolved
-# relative to it where that is fainter still. (From 1e-12 the first steps are so short that modes of derivatives differ
-# by 1e-10 of rounding errors.)
+# The start of a tangent that parameters cause, instead of zero, in units of the other start. So the first step has a
+# length, and a mode that is excited late is followed until then. Fainter effects of parameters are resolved relative to
+# this start. (From 1e-12 the first steps are so short that rounding makes derivatives of different modes differ by
+# 1e-10.)
 _FAINT = 1e-4
-# The rounding errors of a tangent, at most, in units of its largest entry so far and of eps. Of the tangents of a body
-# that constraints hold or drive nothing else is left.
+# The largest rounding errors of a tangent, in units of its largest entry so far and of eps. The tangents of a body that
+# constraints hold or drive consist of nothing else.
 _ROUNDING = 100.0
 
 
 class TangentControl(eqx.Module):
-    """What a solver is told of the tangents whose error it controls.
+    """The tangents whose error a solver controls.
 
     **Fields:**
 
     - `units`: the natural sizes of the components of the raveled state.
-    - `blocks`: sizes of the blocks of components that are measured by the largest one among them.
-    - `direction`: a tangent of the term, None where derivatives by its numbers are not taken. The tangent of the state
-        that it causes is carried along.
-    - `excites`: whether the tangent from a start that excites every mode is, beside that.
+    - `blocks`: sizes of the blocks of components that are measured by their largest component.
+    - `direction`: a tangent of the term, None without derivatives by its numbers. The tangent of the state that it
+        causes is carried along.
+    - `excites`: whether the tangent from a start that excites every mode is carried along as well.
     - `counted`: the indices of the components that the starts excite, None for all.
-    - `restored`: the starts on constraints (`on_constraints`); None where those of `starts` need not be on any.
+    - `restored`: the starts on constraints (`on_constraints`); None if `starts` need not satisfy constraints.
     """
 
     units: Float[Array, " n"]
@@ -59,13 +60,15 @@ class TangentControl(eqx.Module):
     restored: tuple[Float[Array, " n"], ...] | None = None
 
     def starts(self) -> tuple[Float[Array, " n"], ...]:
-        """A start with entries of random signs, between one half and one unit, always the same one; and a faint one."""
+        """A start with entries of random signs between one half and one unit, always the same; and a faint one."""
         if self.restored is not None:
             return self.restored
         random = np.random.default_rng(0)
-        own = np.arange(self.units.size) if self.counted is None else np.array(self.counted, int)
+        excited_indices = np.arange(self.units.size) if self.counted is None else np.array(self.counted, int)
         entries = np.zeros(self.units.size)
-        entries[own] = random.choice([-1.0, 1.0], own.size) * random.uniform(0.5, 1.0, own.size)
+        entries[excited_indices] = random.choice([-1.0, 1.0], excited_indices.size) * random.uniform(
+            0.5, 1.0, excited_indices.size
+        )
         excited = self.units * jnp.asarray(entries, self.units.dtype)
         return tuple(size * excited for size in self.start_sizes)
 
@@ -78,27 +81,27 @@ class TangentControl(eqx.Module):
 
     @property
     def directions(self) -> tuple[PyTree, ...]:
-        """The tangent of the term that each start goes with, None for that which excites every mode."""
+        """The tangent of the term for each start; None for the start that excites every mode."""
         if self.direction is None:
             return (None,)
         return (None, self.direction) if self.excites else (self.direction,)
 
     def on_constraints(self, restore: Any, term: PyTree, y0: PyTree) -> "TangentControl":
-        """The same with starts that are tangents of states that `restore(term, y)` returns, of a term.
+        """The same with starts that are tangents of the states returned by `restore(term, y)`, for a term.
 
-        A solver that returns its steps to constraints would have the first one end at another tangent, however short.
+        Otherwise a solver that projects its steps would end the first one, however short, at another tangent.
         """
         none = jax.tree.map(lambda _: None, term)
         starts = [
-            ravel(pushed_only(restore, (term, y0), (none if own is None else own, unravel_like(y0, w))))
-            for own, w in zip(self.directions, self.starts(), strict=True)
+            ravel(pushed_only(restore, (term, y0), (none if direction is None else direction, unravel_like(y0, w))))
+            for direction, w in zip(self.directions, self.starts(), strict=True)
         ]
         return dataclasses.replace(self, restored=tuple(starts))
 
     def of_terms(self, terms: PyTree) -> tuple[PyTree, ...]:
         """The tangents of a solver's terms, which diffrax has wrapped."""
         none = jax.tree.map(lambda _: None, terms)
-        return tuple(none if own is None else with_inner(terms, own, None) for own in self.directions)
+        return tuple(none if direction is None else with_inner(terms, direction, None) for direction in self.directions)
 
     def largest(self, w: Float[Array, " n"]) -> Float[Array, " n"]:
         """The largest entry of the group of each component, in its unit."""
@@ -110,7 +113,7 @@ class TangentControl(eqx.Module):
         self, rtol: Any, tangents: Sequence["Tangent"], afters: Sequence[Float[Array, " n"]]
     ) -> list[Float[Array, " n"]]:
         """The errors tolerated in the components of tangents in a step that ends with `afters`."""
-        return [self._scale(rtol, *own) for own in zip(tangents, afters, self.start_sizes, strict=True)]
+        return [self._scale(rtol, *data) for data in zip(tangents, afters, self.start_sizes, strict=True)]
 
     def _scale(self, rtol, tangent, after, start_size):
         after = jnp.where(jnp.isnan(after), 0.0, jnp.abs(after))
@@ -123,8 +126,8 @@ class TangentControl(eqx.Module):
 class Tangent(eqx.Module):
     """A tangent between steps.
 
-    **Fields:** `w`, of the raveled state; `memory`, of the solver's memory; `peak`: the largest entries of
-    the groups so far.
+    **Fields:** `w`, of the raveled state; `memory`, of the solver's memory; `peak`: the largest entries of the groups
+    so far.
     """
 
     w: Float[Array, " n"]
@@ -133,10 +136,10 @@ class Tangent(eqx.Module):
 
 
 def pushed(function: Any, at: PyTree, along: tuple[PyTree, ...], differentiable: Any = None) -> tuple[PyTree, list]:
-    """`function(*at)` and its derivatives `along` tangents, which have no derivatives themselves.
+    """`function(*at)` and its derivatives `along` tangents, which have no derivatives.
 
-    **Arguments:** `function`: a pytree, since it has derivatives as well; `differentiable`: the same function in a form
-    that adjoints can differentiate, if that is another.
+    **Arguments:** `function`: a pytree, since it has derivatives as well; `differentiable`: another form of the same
+    function that adjoints can differentiate, if needed.
     """
     out, tangents = _pushed(function, at, along, differentiable)
     return out, [_filled(tangent, out) for tangent in tangents]
@@ -149,7 +152,7 @@ def pushed_only(function: Any, at: PyTree, along: PyTree) -> PyTree:
 
 
 def _filled(tangent, out):
-    """A tangent with zeros where it has no entries, as constants have none, and where a derivative is no number."""
+    """A tangent with zeros where it has no entries, as for constants, and where it is NaN."""
 
     def fill(t, x):
         if t is None:
@@ -177,9 +180,9 @@ def _pushed_jvp(primals, tangents):
         return (out, pushes), (dout, jax.tree.map(lambda _: None, pushes))
     # One linearisation serves all directions.
     none = jax.tree.map(lambda _: None, function)
-    own = [(none, tangent) for tangent in along]
+    directions = [(none, tangent) for tangent in along]
     used = lambda *tangents: any(t is not None for t in tangents)
-    moving, still = eqx.partition((function, at), jax.tree.map(used, (dfunction, dat), *own, is_leaf=_is_none))
+    moving, still = eqx.partition((function, at), jax.tree.map(used, (dfunction, dat), *directions, is_leaf=_is_none))
 
     def run(moving):
         function, at = eqx.combine(moving, still)
@@ -188,8 +191,8 @@ def _pushed_jvp(primals, tangents):
     out, push, rest = jax.linearize(run, moving, has_aux=True)
     zeros = jax.tree.map(jnp.zeros_like, moving)
     dout = push(eqx.combine((dfunction, dat), zeros))
-    # As a derivative of the linear function, each leaves out what its direction does not change.
-    pushes = [eqx.filter_jvp(push, (zeros,), (tangent,))[1] for tangent in own]
+    # Each is a derivative of the linear function, and so omits parts that its direction does not change.
+    pushes = [eqx.filter_jvp(push, (zeros,), (tangent,))[1] for tangent in directions]
     return (eqx.combine(out, rest), pushes), (dout, jax.tree.map(lambda _: None, pushes))
 
 

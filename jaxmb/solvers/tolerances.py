@@ -12,21 +12,22 @@ from jaxtyping import Array, PyTree
 from .evaluation import unravel_like
 from .scales import RunningScales, ends_of
 
-# The part of the tolerance that the error of one step may take. A method of variable order settles at the order where
-# the estimates of neighbouring orders are equal: the step taken with local extrapolation is hardly better than its
-# estimate, and the errors of a hundred steps add up. The steps of a Runge–Kutta method of high order are fewer and much
-# better than its estimate. With one twentieth both mean the same error of the result by a tolerance.
+# The part of the tolerance for the error of one step. A method of variable order settles where the estimates of
+# neighbouring orders are equal. The extrapolated step is hardly better than its estimate, and the errors of a hundred
+# steps add up. A Runge–Kutta method of high order takes fewer steps, much better than their estimates. With one
+# twentieth a tolerance means the same error of the result for both.
 _SHARE = 1 / 20
 
 
 def closer_tolerance(rtol: Any, finest: float, dtype: Any) -> Any:
-    """The relative tolerance whose steps may err a hundredth as much; near rounding, a tenth. `finest` as in
-    `Tolerances.of_step`.
+    """The relative tolerance whose steps may err a hundredth as much; near rounding, a tenth.
+
+    **Arguments:** `finest`: as in `Tolerances.of_step`.
     """
     with jax.numpy_dtype_promotion("standard"):
         whole, least = _part_of_step(rtol, finest, dtype), finest * float(jnp.finfo(dtype).eps)
         part = jnp.minimum(jnp.maximum(whole / 100, least / 10), whole / 10)
-        # The tolerance of which a step has this part: below the finest, a step has all of it.
+        # The tolerance of which a step may use this part; below the finest, a step may use all of it.
         return jnp.where(part < least, part, part / _SHARE)
 
 
@@ -45,9 +46,9 @@ def absolute_tolerance(atol: Any, scales: RunningScales | None, sizes: Array | N
 
 
 class NormOfCounted(eqx.Module):
-    """The norm of some components of a state alone, those with the indices `counted` in the raveled state.
+    """The norm of some components of a state alone, with the indices `counted` in the raveled state.
 
-    A norm that is a mean would be the less, the more components there are that have no error.
+    A mean over all components would shrink with the number of components without error.
     """
 
     norm: Callable[[PyTree], Any]
@@ -56,8 +57,8 @@ class NormOfCounted(eqx.Module):
     def __call__(self, x: PyTree) -> Any:
         leaves, structure = jax.tree.flatten(x)
         ends = ends_of(leaf.size for leaf in leaves)
-        own = [[k - first for k in self.counted if first <= k < end] for first, end in ends]
-        taken = [leaf[np.array(k, int)] for leaf, k in zip(leaves, own, strict=True)]
+        indices = [[k - first for k in self.counted if first <= k < end] for first, end in ends]
+        taken = [leaf[np.array(k, int)] for leaf, k in zip(leaves, indices, strict=True)]
         return self.norm(structure.unflatten(taken))
 
 
@@ -76,8 +77,8 @@ class MultistepNorm(eqx.Module):
 class Tolerances(eqx.Module):
     """Tolerances and norm of a multistep method, from `tolerances_of`.
 
-    They are filled in from the step size controller, in the only way that diffrax has to tell a solver of it (see
-    `from_controller` of `jaxmb._compat`); otherwise they are `fixed`, for steps that no error estimate controls.
+    They are filled in from the step size controller (see `from_controller` of `jaxmb._compat`: diffrax has no other way
+    to tell a solver of it); otherwise they are `fixed`, for steps that no error estimate controls.
     """
 
     rtol: Any
@@ -97,20 +98,21 @@ class Tolerances(eqx.Module):
 
     @property
     def scales(self) -> RunningScales | None:
-        """What the absolute tolerance is relative to."""
+        """The scales that the absolute tolerance is relative to."""
         return self.norm.scales
 
     def scale(self, y0: Array, y1: Array, h: Any, sizes: Array | None) -> Array:
-        """The tolerance of each component over a step of length h from `y0` to `y1`; `sizes` are those of the running
-        scales so far. With these, a machine at rest is not resolved into its rounding errors.
+        """The tolerance of each component over a step of length h from `y0` to `y1`; `sizes`: the running scales so
+        far. With them, the rounding errors of a machine at rest are not resolved.
         """
         return self._scale(1.0, self.rtol, self.atol, y0, y1, h, sizes)
 
     def of_step(self, y0: Array, y1: Array, h: Any, sizes: Array | None, finest: float = 0.0) -> Array:
         """The error tolerated in each component in one step of a multistep method, from `y0` to `y1` in a time h.
 
-        `finest`: the smallest relative one, in units of the machine precision, where rounding dominates the estimates.
-        All `rtol` of one to twenty times it have the same steps, to the last bit, for the same `atol / rtol`.
+        **Arguments:** `finest`: the smallest relative tolerance, in units of the machine precision, where rounding
+        dominates the estimates. Every `rtol` of one to twenty times `finest` has the same steps, to the last bit, for
+        equal `atol / rtol`.
         """
         with jax.numpy_dtype_promotion("standard"):
             whole = jnp.maximum(self.rtol, float(jnp.finfo(y0.dtype).eps))

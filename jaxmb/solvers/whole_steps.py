@@ -18,11 +18,11 @@ from .steps import AbstractSteps, LinearStep, refuse_moving_jumps
 
 
 class WholeSteps(AbstractSteps):
-    """The steps of any solver, differentiated as they are, also by the numbers of the solver itself.
+    """The steps of any solver, differentiated as they are, also by the numbers of the solver.
 
     **Fields:** `multistep`: whether the solver is a multistep method, which names the numbers that a step depends on
-    smoothly; whether the solver of the run is `watched`: the first parts of its states are then those of this one;
-    `jumps`: whether steps may begin after a jump.
+    smoothly; `watched`: whether the solver of the run carries tangents (`WithTangents`), so that the plain solver's
+    state is the first part of its states; `jumps`: whether steps may begin after a jump.
     """
 
     multistep: bool = eqx.field(static=True)
@@ -83,20 +83,20 @@ class WholeSteps(AbstractSteps):
 
 
 def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
-    """The steps of a solver, and the solver itself, without the tangents that it carries along."""
-    still = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
-    # Concrete classes, since nothing else tells that a controller knows no jumps.
+    """The steps of a solver, and the solver without the tangents that it carries along."""
+    jumpless = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
+    # Concrete classes, since no attribute tells that a controller knows no jumps.
     if isinstance(controller, diffrax.ClipStepSizeController) and controller.jump_ts is None:
         controller = controller.controller
     if isinstance(controller, AbstractWithoutJumps):
         controller = controller.controller
-    jumps = not isinstance(controller, still)
+    jumps = not isinstance(controller, jumpless)
     if isinstance(solver, AbstractMultistep):
         # A multistep method has no numbers but its tolerances.
-        own = freeze(eqx.tree_at(lambda s: s.tangent_control, solver, None, is_leaf=_is_none))
-        steps = own.linear_steps(jumps)
-        return WholeSteps(True, False, jumps) if steps is None else steps, own
-    # A concrete class, which alone holds another solver beside tangents.
+        untracked = freeze(eqx.tree_at(lambda s: s.tangent_control, solver, None, is_leaf=_is_none))
+        steps = untracked.linear_steps(jumps)
+        return WholeSteps(True, False, jumps) if steps is None else steps, untracked
+    # A concrete class: only this one holds another solver beside tangents.
     watched = isinstance(solver, WithTangents)
     # Loops over stages in the form that both modes can differentiate.
     return WholeSteps(False, watched, jumps), with_loops(solver.inner if watched else solver, "bounded")
@@ -104,7 +104,7 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
 
 def jump_times(controller: Any) -> Any:
     """The times of jumps that a step size controller knows, or None."""
-    # A concrete class, which alone has such times.
+    # A concrete class: no other has such times.
     return controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
 
 
