@@ -40,7 +40,17 @@ _FOR_SPEED = _QUICKLY | {
     "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**20}",
     "xla_disable_hlo_passes": ",".join((*_PASSES, "dot-library-rewriter")),
 }
-_OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, None: {}}
+# For batches whole blocks of members become one kernel, in whose inner loops members stand side by side in the registers
+# of a processor. XLA computes a value of several uses once, where it would compute it for each use, and LLVM does not
+# unroll the loops over members, which it would no longer vectorise then.
+_VECTORS = f"{_KERNEL_LOOPS}={2**27},xla_cpu_use_multi_output_fusion=true,xla_cpu_disable_loop_unrolling=true"
+_FOR_BATCHES = _FOR_SPEED | {
+    "xla_backend_optimization_level": "3",
+    "xla_backend_extra_options": _VECTORS,
+    "xla_disable_hlo_passes": f"{_FOR_SPEED['xla_disable_hlo_passes']},cpu-parallel-task-assigner",
+    "xla_cpu_prefer_vector_width": "512",
+}
+_OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, "for batches": _FOR_BATCHES, None: {}}
 # Python looks for garbage after so many more new objects than have gone. A program is traced into a million of them,
 # among which there is little, and the search takes a sixth of that time when it comes after 700, as by default.
 _NEW_OBJECTS = 50_000
@@ -58,7 +68,7 @@ SETTINGS = {
 def setup(
     *,
     x64: bool = True,
-    compile: Literal["quickly", "for speed"] | None = "quickly",
+    compile: Literal["quickly", "for speed", "for batches"] | None = "quickly",
     keep: bool | str | os.PathLike[str] = True,
     max_bytes: int = MAX_BYTES,
 ) -> None:
@@ -90,7 +100,7 @@ def setup(
     that has computed something already, after which options of XLA have no effect.
     """
     if compile not in _OPTIONS:
-        raise ValueError(f'compile must be "quickly", "for speed" or None, got {compile!r}.')
+        raise ValueError(f'compile must be "quickly", "for speed", "for batches" or None, got {compile!r}.')
     if not isinstance(keep, bool | str | os.PathLike):
         raise ValueError(f"keep must be True, False or the folder to keep compiled programs in, got {keep!r}.")
     if not max_bytes > 0:
@@ -133,6 +143,11 @@ def _tell(flags: dict[str, str]) -> None:
     _told.clear()
     _told.update({name: flags[name] for name in names})
     os.environ["XLA_FLAGS"] = " ".join([*kept, *told])
+
+
+def computes_side_by_side() -> bool:
+    """Whether XLA was told to compile batches whose members stand side by side."""
+    return _VECTORS in os.environ.get("XLA_FLAGS", "")
 
 
 def bytes_of_kernel_loops() -> int:

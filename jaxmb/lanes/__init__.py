@@ -7,3 +7,4 @@ processor. A program is traced for one member, and its equations are evaluated a
 
 from . import control as control, indexing as indexing, shapes as shapes, sums as sums
 from .evaluate import in_lanes as in_lanes
+from .together import together as together

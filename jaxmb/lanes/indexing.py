@@ -1,5 +1,6 @@
 """Rules of slices, gathers and scatters at indices that may differ between members."""
 
+import functools
 import math
 from typing import Any
 
@@ -56,13 +57,31 @@ def _dynamic_update_slice(lanes, equation, values):
     shape, sizes = (atom.aval.shape for atom in equation.invars[:2])
     rows = all(k in (1, n) for n, k in zip(shape, sizes, strict=True))
     if not rows or math.prod(shape) > 64 * _SELECTED:
-        return _by_vmap(lanes, equation, values)
+        places = [_in_range(index.array, n - k) for index, n, k in zip(indices, shape, sizes, strict=True)]
+        return _written(lanes, lanes.spread(table), lanes.spread(part), places)
     at = {
         axis: _in_range(index.array, n - 1)
         for axis, (index, n, k) in enumerate(zip(indices, shape, sizes, strict=True))
         if n != k
     }
     return jnp.where(_at(at, (*shape, lanes.size)), lanes.spread(part), lanes.spread(table))
+
+
+def _written(lanes, table, part, places):
+    """A large table with the part of each member written at its place, if that is in the table. The loop writes into
+    the table, which is not copied.
+    """
+    largest = [n - k for n, k in zip(table.shape[:-1], part.shape[:-1], strict=True)]
+
+    def write(member, table):
+        start = [lax.dynamic_index_in_dim(place, member, keepdims=False) if place.ndim else place for place in places]
+        inside = functools.reduce(jnp.logical_and, [(at >= 0) & (at <= n) for at, n in zip(start, largest, strict=True)])
+        start = [*start, member.astype(start[0].dtype)]
+        new = lax.dynamic_slice_in_dim(part, member, 1, -1)
+        old = lax.dynamic_slice(table, start, new.shape)
+        return lax.dynamic_update_slice(table, jnp.where(inside, new, old), start)
+
+    return lax.fori_loop(0, lanes.size, write, table)
 
 
 def _at(places: dict[int, Any], shape: tuple[int, ...]) -> Any:
@@ -153,8 +172,16 @@ def _scatter(lanes, equation, values):
         and not numbers.operand_batching_dims
         and sorted(map(int, numbers.inserted_window_dims)) == sorted(axes)
     )
-    if not one_row or math.prod(np.array(shape)[axes]) > 4 * _SELECTED:
+    if not one_row:
         return _by_vmap(lanes, equation, values)
+    if math.prod(np.array(shape)[axes]) > 4 * _SELECTED:
+        if name != "scatter":
+            return _by_vmap(lanes, equation, values)
+        zero = jnp.zeros((), index.array.dtype)
+        places = [index.array[axes.index(axis)] if axis in axes else zero for axis in range(len(shape))]
+        if params["mode"] == _MODE.CLIP:
+            places = [_in_range(place, n - 1) for place, n in zip(places, shape, strict=True)]
+        return _written(lanes, lanes.spread(table), jnp.expand_dims(lanes.spread(update), axes), places)
     places = {axis: index.array[k] for k, axis in enumerate(axes)}
     if params["mode"] == _MODE.CLIP:
         places = {axis: _in_range(place, shape[axis] - 1) for axis, place in places.items()}

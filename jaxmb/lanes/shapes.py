@@ -147,10 +147,20 @@ def _concatenate(lanes, equation, values):
     return lax.concatenate([lanes.spread(value) for value in values], equation.params["dimension"])
 
 
+@rule("stack")
+def _stack(lanes, equation, values):
+    return jnp.stack([lanes.spread(value) for value in values], equation.params["axis"])
+
+
 @rule("split")
 def _split(lanes, equation, values):
     parts = lax.split(values[0].array, equation.params["sizes"], equation.params["axis"])
     return [Value(part, True) for part in parts]
+
+
+@rule("unstack")
+def _unstack(lanes, equation, values):
+    return [Value(part, True) for part in equation.primitive.bind(values[0].array, **equation.params)]
 
 
 @rule("slice")
