@@ -43,7 +43,7 @@ def _where_small(x, of_small, of_any):
 
 
 def _sin_cos(x):
-    """By Taylor's series of the rest beside the nearest multiple of π/2; errors are below two units in the last place."""
+    """By Taylor's series of the rest beside the nearest multiple of π/2, to three units in the last place."""
     quarter = lax.round(x * float(1 / _HALF_PI), lax.RoundingMethod.TO_NEAREST_EVEN)
     rest = x
     for part in _PARTS:

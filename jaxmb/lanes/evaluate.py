@@ -22,7 +22,7 @@ class Value(NamedTuple):
     varies: bool
 
 
-# `rule(lanes, equation, values)` gives the array of the only output, whose members differ, or the values of all outputs.
+# `rule(lanes, equation, values)` gives the array of the only output, which varies, or the values of all outputs.
 Rule = Callable[["Lanes", Any, list[Value]], Any]
 RULES: dict[str, Rule] = {}
 

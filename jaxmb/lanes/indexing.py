@@ -1,6 +1,5 @@
 """Rules of slices, gathers and scatters at indices that may differ between members."""
 
-import functools
 import math
 from typing import Any
 
@@ -75,11 +74,11 @@ def _written(lanes, table, part, places):
 
     def write(member, table):
         start = [lax.dynamic_index_in_dim(place, member, keepdims=False) if place.ndim else place for place in places]
-        inside = functools.reduce(jnp.logical_and, [(at >= 0) & (at <= n) for at, n in zip(start, largest, strict=True)])
+        fits = [(place >= 0) & (place <= n) for place, n in zip(start, largest, strict=True)]
         start = [*start, member.astype(start[0].dtype)]
         new = lax.dynamic_slice_in_dim(part, member, 1, -1)
-        old = lax.dynamic_slice(table, start, new.shape)
-        return lax.dynamic_update_slice(table, jnp.where(inside, new, old), start)
+        new = jnp.where(jnp.all(jnp.stack(fits)), new, lax.dynamic_slice(table, start, new.shape))
+        return lax.dynamic_update_slice(table, new, start)
 
     return lax.fori_loop(0, lanes.size, write, table)
 
@@ -88,6 +87,7 @@ def _at(places: dict[int, Any], shape: tuple[int, ...]) -> Any:
     """Where an array has the indices of each member along some axes."""
     mask = jnp.ones(shape, bool)
     for axis, place in places.items():
+        place = lax.broadcast_in_dim(place, shape, (len(shape) - 1,) * place.ndim)
         mask = mask & (lax.broadcasted_iota(place.dtype, shape, axis) == place)
     return mask
 
@@ -151,7 +151,7 @@ def _filling(given, dtype):
         return jnp.asarray(given, dtype)
     if jnp.issubdtype(dtype, jnp.inexact):
         return jnp.asarray(jnp.nan, dtype)
-    if dtype == bool:
+    if jnp.issubdtype(dtype, jnp.bool_):
         return jnp.asarray(True)
     limits = jnp.iinfo(dtype)
     return jnp.asarray(limits.min if jnp.issubdtype(dtype, jnp.signedinteger) else limits.max, dtype)

@@ -107,7 +107,7 @@ def _dot_general(lanes, equation, values):
 
 
 def _ordered(lanes, value, shape, inner, batch, dtype):
-    """A factor with batched axes first, then one contracted axis, then the free ones; the sizes of the first and last."""
+    """A factor with batched axes first, then one contracted axis, then free ones; the sizes of the first and last."""
     array = jnp.asarray(value.array) if dtype is None else jnp.asarray(value.array, dtype)
     free = [axis for axis in range(len(shape)) if axis not in inner and axis not in batch]
     array = lax.transpose(array, [*batch, *inner, *free, *([len(shape)] if value.varies else [])])
