@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._compat import Literal, bound, is_of_jax, not_inlined
+from .._compat import Literal, bound, is_of_jax, like_of, not_inlined
 from .calls import called
 
 
@@ -91,7 +91,7 @@ _LOOPS = ("while", "scan", "cond")
 def _by_vmap(lanes, equation, values):
     """An equation without a rule: a primitive of ours by its equations, one of JAX by its rule for batches."""
     if not is_of_jax(equation.primitive):
-        like = [jax.ShapeDtypeStruct(atom.aval.shape, atom.aval.dtype) for atom in equation.invars]
+        like = [like_of(atom.aval) for atom in equation.invars]
         return lanes.run(jax.make_jaxpr(lambda *x: equation.primitive.impl(*x, **equation.params))(*like), values)
     axes = [-1 if value.varies else None for value in values]
     together = jax.vmap(lambda *arrays: bound(equation, arrays), in_axes=axes, out_axes=-1)
