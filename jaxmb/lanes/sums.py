@@ -89,21 +89,20 @@ def _dot_general(lanes, equation, values):
     axes_a = [*range(len(batch) + len(free_a)), *([last] if values[0].varies else [])]
     axes_b = [*range(len(batch)), *range(len(batch) + len(free_a), last), *([last] if values[1].varies else [])]
 
-    def added(a, b, *total):
+    def added(total, a, b):
         for x, y in zip(_entries(a, len(batch)), _entries(b, len(batch)), strict=True):
             product = lax.broadcast_in_dim(x, shape, axes_a) * lax.broadcast_in_dim(y, shape, axes_b)
-            total = (product if not total else total[0] + product,)
-        return total[0]
+            total = product if total is None else total + product
+        return total
 
     # Entries of the factors are read many times.
     if k > 1 and math.prod(free_a) * math.prod(free_b) > 1:
         added = apart(added)
-    parts, total = -(-k // _TERMS), ()
+    parts, total = -(-k // _TERMS), None
     for part in range(parts):
         first, end = part * k // parts, (part + 1) * k // parts
-        cut = [lax.slice_in_dim(x, first, end, axis=len(batch)) for x in (a, b)]
-        total = (added(*cut, *total),)
-    return total[0]
+        total = added(total, *[lax.slice_in_dim(x, first, end, axis=len(batch)) for x in (a, b)])
+    return total
 
 
 def _ordered(lanes, value, shape, inner, batch, dtype):

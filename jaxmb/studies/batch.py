@@ -51,7 +51,8 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
         which the numbers that the largest loop of the function carries from step to step stay in the cache of a core;
         1 where that loop becomes one kernel, by `setup(compile="for speed")`, which is as fast and waits for no other
-        member; all members, where it has no loop, and on other devices than a CPU.
+        member; 8 by `setup(compile="for batches")`, with members side by side in the registers of a processor; all
+        members, where it has no loop, and on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array, compiled at its first call,
     whose results have them there as well. Values that are no arrays, such as names, are the same for all members, and
