@@ -28,6 +28,7 @@ from jax._src import compilation_cache, xla_bridge
 from jax._src.compilation_cache_interface import CacheInterface
 from jax._src.interpreters.partial_eval import partial_eval_jaxpr_nounits
 from jax.core import ShapedArray
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval
@@ -55,6 +56,31 @@ REVERSE = "bwd"
 RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
 # A closed jaxpr as a function of its operands. (jax.extend.core.jaxpr_as_fun, 0.9 and 0.10.)
 jaxpr_as_function = core.jaxpr_as_fun
+
+
+def bound(equation: Any, operands: Any) -> Any:
+    """The outputs of an equation of a traced program.
+
+    (Primitive.get_bind_params, 0.9 to 0.12.)
+    """
+    return equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
+
+
+def is_of_jax(primitive: Primitive) -> bool:
+    """Whether an operation is one of JAX, and not one that is made of others.
+
+    (Primitive.impl, a function of the package that made it, 0.9 to 0.12.)
+    """
+    module = getattr(getattr(primitive, "impl", None), "__module__", None) or "jax"
+    return module.split(".")[0] in ("jax", "functools")
+
+
+def not_inlined() -> Any:
+    """A context in which calls of compiled functions stay calls in the program that XLA makes.
+
+    (jax.experimental.xla_metadata.set_xla_metadata, 0.9 to 0.12; `inlineable` is an attribute of XLA.)
+    """
+    return set_xla_metadata(inlineable="false")
 
 
 def current_trace() -> Any:

@@ -40,7 +40,17 @@ _FOR_SPEED = _QUICKLY | {
     "xla_backend_extra_options": f"{_KERNEL_LOOPS}={2**20}",
     "xla_disable_hlo_passes": ",".join((*_PASSES, "dot-library-rewriter")),
 }
-_OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, None: {}}
+# For batches a whole block of members becomes one kernel. Its inner loops run over members, which stand side by side in
+# the registers of a processor. With multi-output fusion XLA computes a value once, and not once for each use. LLVM must
+# not unroll the loops over members, since it would no longer vectorise them.
+_VECTORS = f"{_KERNEL_LOOPS}={2**27},xla_cpu_use_multi_output_fusion=true,xla_cpu_disable_loop_unrolling=true"
+_FOR_BATCHES = _FOR_SPEED | {
+    "xla_backend_optimization_level": "3",
+    "xla_backend_extra_options": _VECTORS,
+    "xla_disable_hlo_passes": f"{_FOR_SPEED['xla_disable_hlo_passes']},cpu-parallel-task-assigner",
+    "xla_cpu_prefer_vector_width": "512",
+}
+_OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, "for batches": _FOR_BATCHES, None: {}}
 # Python collects garbage after so many more new than deleted objects. Tracing a program makes a million objects with
 # little garbage, and with the default of 700 the collection takes a sixth of the time.
 _NEW_OBJECTS = 50_000
@@ -58,7 +68,7 @@ SETTINGS = {
 def setup(
     *,
     x64: bool = True,
-    compile: Literal["quickly", "for speed"] | None = "quickly",
+    compile: Literal["quickly", "for speed", "for batches"] | None = "quickly",
     keep: bool | str | os.PathLike[str] = True,
     max_bytes: int = MAX_BYTES,
 ) -> None:
@@ -77,9 +87,10 @@ def setup(
 
     - `x64`: whether JAX computes in double precision; False leaves its precision as it is.
     - `compile`: with `"quickly"` programs compile in about six tenths of the time, with `"for speed"` programs of small
-        machines run in a third to three quarters of the time. Results differ in rounding. Both set options of XLA for
-        processors in the environment variable `XLA_FLAGS`; options that are set there already stay. None sets none, and
-        if JAX has an accelerator none are set.
+        machines run in a third to three quarters of the time. With `"for batches"` members of `jaxmb.batch` and `sweep`
+        are computed side by side. Results differ in rounding. All three set options of XLA for processors in the
+        environment variable `XLA_FLAGS`; options that are set there already stay. None sets none, and if JAX has an
+        accelerator none are set.
     - `keep`: whether compiled programs are kept on disk, for this and later processes; or the folder to keep them in,
         by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME`, in `~/.cache`, on macOS `~/Library/Caches`,
         on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes precedence: another folder, or `off`.
@@ -90,7 +101,7 @@ def setup(
     that has computed something already, after which options of XLA have no effect.
     """
     if compile not in _OPTIONS:
-        raise ValueError(f'compile must be "quickly", "for speed" or None, got {compile!r}.')
+        raise ValueError(f'compile must be "quickly", "for speed", "for batches" or None, got {compile!r}.')
     if not isinstance(keep, bool | str | os.PathLike):
         raise ValueError(f"keep must be True, False or the folder to keep compiled programs in, got {keep!r}.")
     if not max_bytes > 0:
@@ -133,6 +144,11 @@ def _tell(flags: dict[str, str]) -> None:
     _told.clear()
     _told.update({name: flags[name] for name in names})
     os.environ["XLA_FLAGS"] = " ".join([*kept, *told])
+
+
+def computes_side_by_side() -> bool:
+    """Whether XLA was told to compile batches whose members stand side by side."""
+    return _VECTORS in os.environ.get("XLA_FLAGS", "")
 
 
 def bytes_of_kernel_loops() -> int:

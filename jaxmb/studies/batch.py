@@ -12,8 +12,9 @@ from jaxtyping import PyTree
 
 from .._arguments import whole_number
 from .._compat import ClosedJaxpr, Jaxpr
-from .._setup import bytes_of_kernel_loops
+from .._setup import bytes_of_kernel_loops, computes_side_by_side
 from .._traced_functions import NEED_NUMBERS
+from ..lanes import together as side_by_side
 from ..linalg.arrays import ARRAYS
 from ..linalg.members import in_blocks
 from ..parts.names import names_arguments
@@ -22,6 +23,8 @@ from ..parts.names import names_arguments
 _CARRIED, _MOST = 2**20, 64
 # What the equations of a loop give in a turn is so many times what the kernels that XLA makes of them read and write.
 _FUSED = 3
+# Members that stand side by side fill a vector register with their double precision numbers.
+_SIDE_BY_SIDE = 8
 # Rows from which an array of several axes is a table that a step writes one row of.
 _LONG = 1024
 
@@ -48,7 +51,8 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
         which the numbers that the largest loop of the function carries from step to step stay in the cache of a core;
         1 where that loop becomes one kernel, by `setup(compile="for speed")`, which is as fast and waits for no other
-        member; all members, where it has no loop, and on other devices than a CPU.
+        member; 8 by `setup(compile="for batches")`, with members side by side in the registers of a processor; all
+        members, where it has no loop, and on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array, compiled at its first call,
     whose results have them there as well. Values that are no arrays, such as names, are the same for all members, and
@@ -85,9 +89,9 @@ class Member:
 
     def __init__(self, function: Callable[..., Any], example: PyTree):
         self._function = jax.jit(function)
-        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), example)
+        self._like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), example)
         try:
-            self._program = self._function.trace(like).jaxpr
+            self._program = self._function.trace(self._like).jaxpr
         except NEED_NUMBERS as error:
             raise ValueError(
                 f"The function cannot be batched: it needs the number of an argument, of which there is one for each "
@@ -100,6 +104,8 @@ class Member:
         carried = max((own for own, _ in loops), default=0)
         if carried == 0 or jax.default_backend() != "cpu":
             return members
+        if computes_side_by_side():
+            return min(_SIDE_BY_SIDE, members)
         if max(given for _, given in loops) < _FUSED * bytes_of_kernel_loops():
             return 1
         return min(2 ** int(math.log2(max(_CARRIED / carried, 1))), _MOST)
@@ -109,6 +115,10 @@ class Member:
         if size == 1:
             alone = lambda x: jax.tree.map(lambda x: x[0], x)
             return lambda own: jax.tree.map(lambda x: x[None], self._function(alone(own)))
+        if computes_side_by_side():
+            program, like = jax.make_jaxpr(self._function, return_shape=True)(self._like)
+            evaluated, structure = side_by_side(program), jax.tree.structure(like)
+            return lambda own: jax.tree.unflatten(structure, evaluated(*jax.tree.leaves(own)))
 
         def together(own):
             try:

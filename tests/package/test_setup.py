@@ -65,7 +65,7 @@ def options_of(code, flags=""):
     return process(f'import os\n{code}\nprint(repr(os.environ["XLA_FLAGS"]))', XLA_FLAGS=flags)
 
 
-@pytest.mark.parametrize("way", ["quickly", "for speed"])
+@pytest.mark.parametrize("way", ["quickly", "for speed", "for batches"])
 def test_options_of_the_compiler_are_set_before_jax_starts(way):
     flags = {option: value for option, value in _setup._OPTIONS[way].items() if takes_option(option)}
     call = f"mb.setup(compile={way!r}, keep=False)"
@@ -122,7 +122,7 @@ def test_what_is_asked_for_alone_is_set():
     assert (pi, flags, said) == (np.pi, "", "")
     code = "jax.config.update('jax_enable_x64', False)\nmb.setup(compile=None)\nprint(repr(str(jnp.ones(1).dtype)))"
     assert process(code, JAXMB_CACHE="off") == ("float64", "")
-    with pytest.raises(ValueError, match='compile must be "quickly", "for speed" or None, got \'fast\''):
+    with pytest.raises(ValueError, match='compile must be "quickly", "for speed", "for batches" or None, got \'fast\''):
         mb.setup(compile="fast")  # pyright: ignore[reportArgumentType]
     for keep in (None, 3):
         with pytest.raises(ValueError, match=f"keep must be True, False or the folder .* got {keep}"):

@@ -1,0 +1,27 @@
+"""Equations of a program that only call another one."""
+
+from typing import Any
+
+from .._compat import ClosedJaxpr
+
+# The parameter that holds the called program, by the names of the equations. (JAX 0.9 to 0.12.)
+_PROGRAMS = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "checkpoint": "jaxpr",
+    # Functions with a rule for batches of their own.
+    "custom_vmap_call": "call",
+}
+
+
+def called(equation: Any) -> Any:
+    """The closed program that an equation calls; None for any other equation."""
+    place = _PROGRAMS.get(equation.primitive.name)
+    if place is None:
+        return None
+    program = equation.params[place]
+    return program if hasattr(program, "consts") else ClosedJaxpr(program, ())

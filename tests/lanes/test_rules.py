@@ -1,0 +1,120 @@
+"""Each rule of an operation gives what `jax.vmap` gives, with members on the last axis."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from jaxmb.lanes import in_lanes
+
+MEMBERS = 5
+RANDOM = np.random.default_rng(0)
+MATRICES = RANDOM.standard_normal((MEMBERS, 4, 3))
+OTHERS = RANDOM.standard_normal((MEMBERS, 3, 6))
+LARGE = RANDOM.standard_normal((MEMBERS, 40, 20))
+LONG = RANDOM.standard_normal((MEMBERS, 600, 20))
+VECTORS = RANDOM.standard_normal((MEMBERS, 4))
+PLACES = np.array([0, 3, 1, 2, 7])
+
+
+def counted(x, k):
+    return lax.while_loop(lambda carry: carry[0] < k, lambda carry: (carry[0] + 1, carry[1] * 1.5 + 1), (0, x))
+
+
+def rare(x):
+    """A condition with a rule for batches, as those of events have."""
+    taken = jax.custom_batching.custom_vmap(lambda x: lax.cond(x[0] > 0, lambda x: jnp.sort(2 * x), lambda x: x, x))
+    taken.def_vmap(lambda size, batched, x: (jax.vmap(lambda x: jnp.where(x[0] > 0, jnp.sort(2 * x), x))(x), True))
+    return taken(x)
+
+
+CASES = {
+    "products": (lambda a, b: (a @ b, a * 2, jnp.einsum("ij,ij->i", a, a)), MATRICES, OTHERS),
+    "long products": (lambda a: (a @ a.T, a @ LARGE[0].T), LARGE),
+    "no rows": (lambda a: a[:, :0] @ a[:, :0].T, MATRICES),
+    "functions": (lambda x: (jnp.sin(x), jnp.cos(1e3 * x), jnp.abs(x) ** 1.7, x**3, jnp.exp(x), jnp.tanh(x)), VECTORS),
+    "sums": (lambda a: (a.sum(0), a.max(1), jnp.prod(a), jnp.any(a > 1, axis=1), jnp.cumsum(a, 1)), MATRICES),
+    "cumulative": (lambda a: (lax.cumsum(a, 0, reverse=True), lax.cummax(a, 1), jnp.cumsum(a[:, 0])), LONG[:, :100]),
+    "places": (lambda a: (jnp.argmax(a, 0), jnp.argmin(a.at[1].set(jnp.nan), 0), jnp.argmax(a[:, 0])), MATRICES),
+    "long sums": (lambda a: (a.sum(0), a.max(), jnp.argmax(a, 0)), LONG),
+    "moved": (lambda a: (a[::-1], a.T, a.reshape(6, 2), a[1:3, ::2], jnp.stack([a, 2 * a], 1), a[None]), MATRICES),
+    "joined": (lambda a: (jnp.concatenate([a, jnp.ones((2, 3))]), jnp.split(a, 2), jnp.sort(a, 0)), MATRICES),
+    "padded": (lambda a: (jnp.pad(a, ((1, 2), (0, 1))), lax.pad(a, a[0, 0], ((1, 0, 1), (0, 0, 0)))), MATRICES),
+    "selected": (lambda a, k: (jnp.where(a > a[k % 3], a, 0.0), jnp.clip(a, -(a[3] ** 2), 1.0)), VECTORS, PLACES),
+    "shared places": (lambda a: (a[jnp.array([2, 0])], a.at[1].set(5.0), a.at[:, 1].add(a[:, 0])), MATRICES),
+    "rows": (lambda a, k: (a[k], a[:, jnp.clip(k, 0, 2)], a.at[k].get(mode="fill", fill_value=3.0)), MATRICES, PLACES),
+    "slices": (lambda a, k: lax.dynamic_slice(a, (k, 0), (2, 3)), MATRICES, PLACES),
+    "set": (lambda a, k: (a.at[k].set(1.0), a.at[k].add(a[0]), a.at[k, 1].set(5.0)), MATRICES, PLACES),
+    "updated": (lambda a, k: lax.dynamic_update_slice(a, a[:1], (k, 0)), MATRICES, PLACES),
+    "large rows": (lambda a, k: (a[k], a[k, k], lax.dynamic_slice(a, (k, 0), (2, 3)), a[9 * k]), LARGE, PLACES),
+    "large set": (lambda a, k: (a.at[k].set(1.0), a.at[9 * k].set(a[0]), a.at[k, 2].set(5.0)), LARGE, PLACES),
+    "large mode": (
+        lambda a, k: (a.at[100 * k].set(a[0], mode="drop"), a.at[100 * k].set(0.0, mode="clip")),
+        LONG,
+        PLACES,
+    ),
+    "large updated": (lambda a, k: lax.dynamic_update_slice(a, a[:1], (90 * k, 0)), LONG, PLACES),
+    "small integers": (lambda k: (k // 2, k % 3, k.astype(np.float32), k > 1), PLACES),
+    "switch": (lambda x, k: lax.switch(jnp.clip(k, 0, 2), [lambda x: x, lambda x: 2 * x, jnp.sin], x), VECTORS, PLACES),
+    "shared switch": (lambda x: lax.cond(jnp.array(1) > 0, lambda x: 2 * x, lambda x: jnp.ones(4), x), VECTORS),
+    "cond": (lambda x: lax.cond(x[0] > 0, lambda x: x, lambda x: -x, x), VECTORS),
+    "rare": (rare, VECTORS),
+    "while": (counted, VECTORS, PLACES),
+    "shared while": (lambda x: counted(x, 3), VECTORS),
+    "scan": (lambda a: lax.scan(lambda c, row: (c + row, jnp.outer(row, c)), jnp.zeros(3), a), MATRICES),
+    "backward": (lambda a: lax.scan(lambda c, row: (c * row, None), jnp.ones(3), a, reverse=True), MATRICES),
+    "loop": (lambda x: lax.fori_loop(0, 4, lambda k, c: c.at[k].add(x[k]), jnp.zeros(4)), VECTORS),
+    "constants": (lambda x: (jnp.full(3, 2.0) * x[0], jnp.arange(3), jnp.ones(2)), VECTORS),
+}
+
+
+def both(function, *members):
+    """The results in lanes and by `jax.vmap`."""
+    program = jax.make_jaxpr(function)(*[x[0] for x in members])
+    found = jax.jit(in_lanes(program, len(members[0])))(*[jnp.moveaxis(jnp.asarray(x), 0, -1) for x in members])
+    return [np.moveaxis(np.asarray(x), -1, 0) for x in found], jax.tree.leaves(jax.vmap(function)(*members))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rules_give_what_vmap_gives(name):
+    for found, expected in zip(*both(*CASES[name]), strict=True):
+        assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
+        np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
+
+
+def test_an_operation_without_a_rule_has_that_of_batches():
+    solved = lambda a: jnp.linalg.solve(a @ a.T + jnp.eye(4), a[:, 0])
+    for found, expected in zip(*both(solved, MATRICES), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "exp", "log"])
+def test_functions_by_operations_are_exact_to_three_units(name):
+    from jaxmb.lanes import elementary
+
+    x = np.concatenate([np.linspace(-300.0, 300.0, 20_001), RANDOM.uniform(-9e4, 9e4, 20_000)])
+    if name == "exp":
+        x = np.concatenate([x[np.abs(x) < 650], [-np.inf, -1e4, 0.0, 1e4, np.inf]])
+    if name == "log":
+        x = np.concatenate([np.exp(x[np.abs(x) < 300]), [0.0, np.inf, 1.0]])
+    with np.errstate(all="ignore"):
+        exact = getattr(np, name)(x.astype(np.longdouble))
+        nearest = exact.astype(float)
+    found = np.asarray(getattr(elementary, name)(jnp.asarray(x)))
+    differs = found != nearest
+    # Sine and cosine are small by cancellation near multiples of half a turn.
+    size = np.maximum(np.abs(nearest[differs]), 2.0**-30 if name in ("sin", "cos") else 0.0)
+    assert np.all(np.abs(found[differs] - exact[differs]) <= 3 * np.spacing(size))
+
+
+def test_large_angles_are_left_to_the_library():
+    x = jnp.array([[1.0, 1e9, 1e15], [2.0, -1e12, 0.5]])
+    for found, expected in zip(*both(lambda x: (jnp.sin(x), jnp.cos(x)), x), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-15)
+
+
+def test_powers_are_those_of_the_library_where_they_are_not_plain():
+    x, y = jnp.array([[2.0, -2.0, 0.0], [0.5, 3.0, jnp.inf]]), jnp.array([[0.0, 3.0, 0.0], [-1.5, jnp.inf, 2.0]])
+    for found, expected in zip(*both(lambda x, y: x**y, x, y), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-14)

@@ -1,0 +1,83 @@
+"""Motions of several members side by side."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb
+from jaxmb.lanes import together
+
+MASSES = jnp.linspace(0.9, 1.1, 3)
+
+
+def machine(make, **options):
+    found = make()
+    system, state = found.system, jaxmb.assemble(found.system, fix=found.fix, rates=found.rates)
+    (name, *_) = [key for key in jaxmb.parameters(system) if key.endswith(".mass")]
+    start = jaxmb.parameters(system)[name]
+
+    def end(share):
+        motion = jaxmb.simulate(jaxmb.with_parameters(system, {name: start * share}), state, **options)
+        return motion.ys.q[-1], motion.stats["num_steps"]
+
+    return end
+
+
+def side_by_side(function, *members):
+    like = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in members]
+    return together(jax.make_jaxpr(jax.jit(function))(*like))(*members)
+
+
+def test_members_end_where_each_alone_does():
+    end = machine(jaxmb.mechanisms.four_bar, t1=0.3, rtol=1e-9)
+    found, steps = jax.jit(lambda masses: side_by_side(end, masses))(MASSES)
+    alone = [jax.jit(end)(mass) for mass in MASSES]
+    np.testing.assert_allclose(found, [q for q, _ in alone], rtol=1e-8, atol=1e-8)
+    assert np.all(np.abs(steps - np.array([count for _, count in alone])) <= 2)
+
+
+def test_derivatives_are_those_of_vmap():
+    end = machine(jaxmb.mechanisms.four_bar, t1=0.1, rtol=1e-9)
+
+    def total(scale, masses, at_once):
+        alone = lambda mass: end(scale * mass)[0]
+        found = side_by_side(alone, masses)[0] if at_once else jax.vmap(alone)(masses)
+        return jnp.sum(found**2)
+
+    for derivative in (jax.grad, jax.jacfwd):
+        slope = jax.jit(derivative(total, (0, 1)), static_argnums=2)
+        both = [slope(1.0, MASSES, at_once) for at_once in (True, False)]
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), *both)
+
+
+@pytest.mark.long
+def test_gradients_of_members_are_those_of_each_alone():
+    end = machine(jaxmb.mechanisms.four_bar, t1=0.3, rtol=1e-9)
+    slope = jax.value_and_grad(lambda mass: jnp.sum(end(mass)[0]))
+    found = jax.jit(lambda masses: side_by_side(slope, masses))(MASSES)
+    alone = [jax.jit(slope)(mass) for mass in MASSES]
+    np.testing.assert_allclose(found, np.transpose(alone), rtol=1e-7)
+
+
+@pytest.mark.long
+def test_members_bounce_at_their_own_times():
+    ball = jaxmb.planar.Body("ball", mass=1.0, inertia=0.004, position=(0.0, 1.0))
+    floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
+    system = jaxmb.Scene([ball], joints=[floor], forces=[jaxmb.Gravity((0.0, -9.81))]).compile()
+    start = jaxmb.assemble(system)
+
+    def height(lifted):
+        state = jaxmb.assemble(system, start, fix={"ball.y": lifted})
+        return jaxmb.simulate(system, state, t1=1.5, rtol=1e-9, max_events=16)["ball"].position[-1, 1]
+
+    heights = jnp.array([0.6, 1.0, 1.7])
+    found = jax.jit(lambda heights: side_by_side(height, heights)[0])(heights)
+    np.testing.assert_allclose(found, [height(x) for x in heights], rtol=1e-8)
+
+
+def test_a_member_that_fails_spoils_no_other():
+    end = machine(jaxmb.mechanisms.four_bar, t1=0.1, rtol=1e-9)
+    masses = jnp.array([1.0, jnp.nan, 1.05])
+    found, _ = jax.jit(lambda masses: side_by_side(end, masses))(masses)
+    assert np.all(np.isnan(found[1])) and np.all(np.isfinite(found[np.array([0, 2])]))
