@@ -121,7 +121,7 @@ else:
     }
     _SOURCES = {name: source for source, names in _NAMES.items() for name in names.split()}
     # Modules that Python puts here when it imports them, and which are no part of the interface.
-    _INNER = {"TYPE_CHECKING", "bodies", "contacts", "linalg", "states"}
+    _INNER = {"TYPE_CHECKING", "bodies", "contacts", "lanes", "linalg", "states"}
     __all__ = sorted(name for name in {*globals(), *_MODULES, *_SOURCES} - _INNER if not name.startswith("_"))
 
     def __getattr__(name: str) -> object:

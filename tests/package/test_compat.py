@@ -1,6 +1,7 @@
 """Names and habits of other libraries that `jaxmb._compat` relies on; a test of each says what an update took away."""
 
 import ast
+import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
@@ -18,6 +19,8 @@ import numpy as np
 import pytest
 from jax import lax
 from precision import single_precision
+
+from jaxmb.linalg.sums import unchecked_take
 
 ROOT = Path(__file__).parents[2] / "jaxmb"
 COMPAT = ROOT / "_compat.py"
@@ -170,6 +173,32 @@ def test_programs_can_be_read(compat):
         x for own in program.jaxpr.eqns for x in jax.tree.leaves(own.params, is_leaf=lambda x: isinstance(x, kinds))
     ]
     assert any(isinstance(x, kinds) for x in inner), "branches of `cond` are no programs in the parameters of `cond`"
+
+
+def test_equations_are_evaluated_again(compat):
+    x = jnp.array([3.0, 1.0, 2.0])
+    program = jax.make_jaxpr(lambda x: jnp.sort(jax.jit(jnp.sin)(x))[::-1])(x)
+    values = {program.jaxpr.invars[0]: x}
+    for equation in program.jaxpr.eqns:
+        out = compat.bound(equation, [values[atom] for atom in equation.invars])
+        values |= zip(equation.outvars, out if equation.primitive.multiple_results else [out], strict=True)
+        assert compat.is_of_jax(equation.primitive)
+    np.testing.assert_array_equal(values[program.jaxpr.outvars[0]], np.sort(np.sin(x))[::-1])
+    (equation,) = jax.make_jaxpr(lambda x: unchecked_take(x, np.array([2, 0])))(x).jaxpr.eqns
+    assert not compat.is_of_jax(equation.primitive)
+
+
+def test_calls_that_are_not_inlined(compat):
+    def program(separate):
+        called = jax.jit(lambda x: jnp.cos(x) + 1)
+
+        def of(x):
+            with compat.not_inlined() if separate else contextlib.nullcontext():
+                return called(x) * 2
+
+        return jax.jit(of).lower(jnp.ones(3)).compile().as_text()
+
+    assert " call(" in program(True) and " call(" not in program(False)
 
 
 def test_rules_of_derivatives_in_programs(compat):
