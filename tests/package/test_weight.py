@@ -16,7 +16,7 @@ OPTIONAL = re.compile(
     r"\bcontacts\b|\bideal\w*|\belimination\b|\bdrops_rows\b|\.z\b|\bnz\b|split\.coordinate is|"
     r"\b\w+_(rows|rank) (==|>|!=) 0|\bfriction_rows\b"
 )
-MOST_CONDITIONS = 180
+MOST_CONDITIONS = 145
 MOST_MEMBERS = 52
 
 
