@@ -29,17 +29,18 @@ class Digest(NamedTuple):
     unknown: tuple[Any, ...]
 
 
-def digest_of_program(program: Any, *, rules: bool) -> Digest:
-    """The hash of a closed jaxpr: its equations with all their parameters, the programs within, literals and constants.
+def digest_of(value: Any, *, rules: bool) -> Digest:
+    """The hash of a closed jaxpr: its equations with all their parameters, the programs within, literals and constants;
+    or of nested dictionaries and tuples of arrays.
 
     **Arguments:** `rules`: whether derivative rules of functions count, `custom_jvp` and `custom_vjp`. A program that
     is not differentiated has no use for them.
     """
     own = _Digest()
-    value = own.of(program)
+    found = own.of(value)
     if rules and own.rules:
-        value = _joined("rules", [value, own.of_derivative(program)])
-    return Digest(value, tuple(own.unknown))
+        found = _joined("rules", [found, own.of_derivative(value)])
+    return Digest(found, tuple(own.unknown))
 
 
 class _Digest:
