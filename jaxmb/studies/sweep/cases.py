@@ -92,7 +92,7 @@ def table(columns: Any = None, /, **more: ArrayLike) -> Cases:
         return columns
     if hasattr(columns, "to_dataset") and not hasattr(columns, "data_vars"):
         if columns.name is None:
-            raise ValueError("The DataArray of cases has no name; array.rename(name) gives it that of the parameter.")
+            raise ValueError("The DataArray of cases has no name; array.rename(name) gives it the parameter's name.")
         columns = columns.to_dataset()
     if hasattr(columns, "data_vars"):
         return _of_dataset(columns)
