@@ -117,7 +117,7 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # What files that were changed raise is up to zarr and xarray.
-        reason = f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
+        reason = f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}".rstrip(". ")
         raise ValueError(
             f"The store {path} is damaged: {reason}. The same sweep with overwrite=True computes all of it again."
         ) from error

@@ -151,6 +151,8 @@ def _marks(cases: Cases, variables: Mapping[str, Variable], program: bytes, vers
     """The marks by which a store knows a sweep."""
     digest = lambda value: digest_of(value, rules=False).value.hex()
     columns = {name: own for name, own in variables.items() if name in cases.columns}
+    # Without the number of members, which the cases tell.
+    others = {name: own._replace(shape=own.shape[1:]) for name, own in variables.items() if name not in columns}
     return {
         "jaxmb_version": __version__,
         "jax_version": jax.__version__,
@@ -158,7 +160,7 @@ def _marks(cases: Cases, variables: Mapping[str, Variable], program: bytes, vers
         "version": "" if version is None else str(version),
         "function": program.hex(),
         "cases": digest((cases.grid, columns)),
-        "outputs": digest({name: own for name, own in variables.items() if name not in columns}),
+        "outputs": digest(others),
     }
 
 

@@ -117,7 +117,7 @@ ALONE = r"without the file status/c/7 these alone are computed again.*overwrite=
         (lambda s: (s / "wave/c/7/0").write_bytes(b""), f"'wave' of the members 70 to 79 .*{ALONE}", 1),
         (lambda s: shutil.rmtree(s / "more.square"), "there is no 'more.square' of the members 0 to 9", 2),
         (lambda s: shutil.rmtree(s / "a" / "c"), "there is no 'a'.*overwrite=True", 2),
-        (lambda s: _flip(s / "status/c/7"), "damaged.*overwrite=True", 2),
+        (lambda s: _flip(s / "status/c/7"), "checksum.*overwrite=True", 2),
     ],
 )
 def test_files_that_are_lost_or_damaged_are_an_error(undisturbed, copied, change, message, readers):
@@ -290,7 +290,7 @@ def test_steps_and_their_limit_are_told():
         """As a simulation of n steps."""
         taken = jax.lax.while_loop(lambda k: k < jnp.minimum(n, max_steps), lambda k: k + 1, 0)
         result = diffrax.RESULTS.where(n > max_steps, diffrax.RESULTS.max_steps_reached, diffrax.RESULTS.successful)
-        return {"n": n, "result": _Solution(result, {"num_steps": taken})}
+        return {"twice": 2 * n, "result": _Solution(result, {"num_steps": taken})}
 
     found = mb.sweep(function, mb.cases.table(n=[10, 100, 300]), progress=False)
     words = np.array(found["status"].attrs["flag_meanings"].split())[found["status"]]
