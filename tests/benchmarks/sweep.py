@@ -22,7 +22,7 @@ import numpy as np
 from sweep_four_bar import four_bar
 
 import jaxmb as mb
-from jaxmb.studies.sweep import engine
+from jaxmb.studies.sweep.chunk import Job, Task, Work
 from jaxmb.studies.sweep.outputs import declared
 
 # Members of a chunk, and how often a time is taken.
@@ -49,7 +49,7 @@ def timed(run):
 def work_of(function, columns, store=None):
     """Chunks of members, as a sweep computes and keeps them."""
     outputs, _ = declared(function, {name: column[0] for name, column in columns.items()})
-    return engine.Work(engine.Job(function, outputs, CHUNK, store), engine.Task(0, columns))
+    return Work(Job(function, outputs, CHUNK, store), Task(0, columns))
 
 
 def overhead(chunks=4):
@@ -63,7 +63,7 @@ def overhead(chunks=4):
     mb.sweep(four_bar, cases, store, chunk=CHUNK, progress=False)
     print(f"the whole sweep with compiling: {time.perf_counter() - begin:.1f} s")
     work = work_of(four_bar, parts[0], store)
-    swept = lambda: [work(engine.Task(k, part)) for k, part in enumerate(parts)] and None
+    swept = lambda: [work(Task(k, part)) for k, part in enumerate(parts)] and None
     plain = lambda: [np.asarray(bare(**part)["angle"]) for part in parts]
     swept(), plain()
     times = fastest(swept, plain)
@@ -103,7 +103,7 @@ def cores():
 
         def in_threads(count, run=run, columns=columns):
             os.environ["NPROC"] = str(count)
-            return run(engine.Task(0, columns))["q"]
+            return run(Task(0, columns))["q"]
 
         forms = [
             (in_threads, 1),

@@ -102,11 +102,6 @@ def _along(name: str, given: Any, sizes: Mapping[str, int]) -> np.ndarray:
     return values
 
 
-def attributes(cases: Cases, study: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes of a result: those of the study, its grid, and which variables are coordinates."""
-    return {**study, "grid": json.dumps(cases.grid), "coordinates": " ".join(cases.columns)}
-
-
 def in_memory(described: Mapping[str, Variable], attrs: Mapping[str, Any], computed: Mapping[str, np.ndarray]) -> Any:
     """The result, from arrays in memory."""
     (xarray,) = packages("xarray")

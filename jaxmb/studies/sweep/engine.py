@@ -5,9 +5,8 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,10 +14,8 @@ import numpy as np
 from ..._compat import processes_of
 from ..._machine import cores, limit_of_threads
 from ..._setup import SETTINGS
-from .batch import Program
+from .chunk import Job, Task, Work
 from .dataset import packages
-from .outputs import Outputs, statuses
-from .store import Store
 
 # Settings that a worker takes over from the session that started the sweep.
 _SETTINGS = (
@@ -35,48 +32,7 @@ _BREAKS = 3
 _IN_FLIGHT, _PER_WORKER = 256, 2
 
 
-class Task(NamedTuple):
-    """One chunk: its place, and the parameters of its members."""
-
-    place: int
-    columns: dict[str, np.ndarray]
-
-
-class Job(NamedTuple):
-    """What a process needs to compute chunks: the same everywhere, so that the bits are the same.
-
-    **Fields:** the `function` and its `outputs`; members of a `chunk`; the folder of the `store`, if there is one;
-    `on_cores`: whether a process computes blocks on all its cores. Workers of a user's executor do not, since there may
-    be a worker for each core.
-    """
-
-    function: Callable[..., Any]
-    outputs: Outputs
-    chunk: int
-    store: Path | None
-    on_cores: bool = True
-
-
-class Work:
-    """Computes and keeps chunks, in one process; compiled once, for members like those of the first chunk."""
-
-    def __init__(self, job: Job, first: Task):
-        self._program = Program(job.function, job.outputs, job.chunk, first.columns)
-        self._on_cores = job.on_cores
-        self._store = None if job.store is None else Store(job.store, job.chunk)
-
-    def __call__(self, task: Task, tell: Callable[[int], object] = lambda members: None) -> dict[str, np.ndarray]:
-        """The outputs of a chunk, or only its status if they are in the store; `tell` as of `Program`."""
-        found = self._program(task.columns, self._on_cores, tell)
-        steps = {} if found.steps is None else {"num_steps": np.asarray(found.steps, np.int64)}
-        # The status is written last, as the mark that a chunk is done.
-        values = {**found.values, **steps, "status": statuses(found)}
-        if self._store is None:
-            return values
-        self._store.write(task.place, values)
-        return {"status": values["status"]}
-
-
+# The place of each chunk, and its outputs, or only its status if they are in the store.
 Chunks = Iterator[tuple[int, dict[str, np.ndarray]]]
 
 
@@ -90,7 +46,7 @@ def here(job: Job, tasks: list[Task], tell: Callable[[int], object]) -> Chunks:
         yield task.place, work(task, tell)
 
 
-def on_executor(job: Job, tasks: Iterable[Task], executor: futures.Executor, in_flight: int = _IN_FLIGHT) -> Chunks:
+def on_executor(job: Job, tasks: list[Task], executor: futures.Executor, in_flight: int = _IN_FLIGHT) -> Chunks:
     """Compute chunks on an executor, in the order in which they are done."""
     (cloudpickle,) = packages("cloudpickle")
     settings = {name: getattr(jax.config, name) for name in _SETTINGS}

@@ -1,6 +1,7 @@
 """A function of named parameters over many cases."""
 
 import contextlib
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -17,8 +18,9 @@ from ..._version import __version__
 from ...parts.names import names_arguments
 from . import dataset, store as stores
 from .cases import Cases, table
+from .chunk import Job, Task
 from .dataset import Variable
-from .engine import Job, Task, here, on_executor, on_processes
+from .engine import here, on_executor, on_processes
 from .load import load_sweep, opened
 from .outputs import OK, PENDING, RESERVED, check_parameters, declared
 
@@ -125,7 +127,7 @@ def sweep(
         chunk = before["chunk"]
     size = _chunk(chunk, len(cases), processes)
     job = Job(function, outputs, size, path, on_cores=executor is None)
-    attrs = dataset.attributes(cases, {**known, "chunk": size})
+    attrs = {**known, "chunk": size, "grid": json.dumps(cases.grid), "coordinates": " ".join(cases.columns)}
     run = lambda status: _computed(job, cases, status, progress, processes, executor)
     if path is None:
         computed = {name: np.zeros(own.shape, own.values) for name, own in variables.items() if own.is_output}

@@ -21,7 +21,8 @@ from sweeping import CASES, CHUNKS, files, forked, marks, run, spring, wait_for
 
 import jaxmb as mb
 from jaxmb.cli import main
-from jaxmb.studies.sweep import batch as sweep_batch, engine, store as stores
+from jaxmb.studies.sweep import store as stores
+from jaxmb.studies.sweep.chunk import Work
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +81,9 @@ def copied(undisturbed, tmp_path):
 
 
 def test_a_sweep_that_is_done_computes_nothing_and_one_that_is_not_what_is_missing(undisturbed, copied, monkeypatch):
-    before, computed, own = files(copied), [], engine.Work.__call__
+    before, computed, own = files(copied), [], Work.__call__
     counted = lambda work, task, tell: (computed.append(task.place), own(work, task, tell))[1]
-    monkeypatch.setattr(engine.Work, "__call__", counted)
+    monkeypatch.setattr(Work, "__call__", counted)
     xr.testing.assert_identical(run(copied).load(), undisturbed[1].load())
     assert computed == []
     # A chunk that lacks its mark, and a leftover of a killed writer.
@@ -316,14 +317,8 @@ def test_motions_that_fail_have_a_status():
     np.testing.assert_allclose(found["q"][0], found["q"][2], rtol=1e-12)
 
 
-def test_a_thread_pool_is_an_executor(undisturbed, tmp_path):
-    with ThreadPoolExecutor(1) as executor:
-        run(tmp_path / "runs.zarr", executor=executor)
-    assert files(tmp_path / "runs.zarr") == files(undisturbed[0])
-
-
 def test_an_interruption_keeps_what_is_done(undisturbed, tmp_path, monkeypatch):
-    store, own = tmp_path / "runs.zarr", engine.Work.__call__
+    store, own = tmp_path / "runs.zarr", Work.__call__
 
     def interrupted(work, task, tell):
         if task.place == 5:
@@ -331,7 +326,7 @@ def test_an_interruption_keeps_what_is_done(undisturbed, tmp_path, monkeypatch):
         return own(work, task, tell)
 
     with monkeypatch.context() as patch:
-        patch.setattr(engine.Work, "__call__", interrupted)
+        patch.setattr(Work, "__call__", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(store)
     assert marks(store) == 5
@@ -348,7 +343,7 @@ def halved(a, b):
 def test_blocks_of_a_chunk_take_turns_on_all_cores(monkeypatch, capsys):
     """Two blocks are computed at a time, with the same bits as one after the other."""
     cases = mb.cases.grid(a=np.linspace(1.5, 7.0, 12), b=[1.0, 3.0])
-    own = sweep_batch.Program._computed
+    own = Work._computed
     monkeypatch.setattr("jaxmb.studies.batch._MOST", 4)
     together = threading.Barrier(2)
 
@@ -358,7 +353,7 @@ def test_blocks_of_a_chunk_take_turns_on_all_cores(monkeypatch, capsys):
 
     with monkeypatch.context() as patch:
         patch.setenv("NPROC", "2")
-        patch.setattr(sweep_batch.Program, "_computed", both)
+        patch.setattr(Work, "_computed", both)
         found = mb.sweep(halved, cases)
     shown = capsys.readouterr().err.strip().split("\r")[-1]
     assert "24/24" in shown and f"{int(np.sum(found.status != 1))} failed" in shown
@@ -367,7 +362,7 @@ def test_blocks_of_a_chunk_take_turns_on_all_cores(monkeypatch, capsys):
 
 def test_a_sweep_is_interrupted_between_blocks(monkeypatch):
     """Blocks that have not begun are not computed then."""
-    computed, own = [], sweep_batch.Program._computed
+    computed, own = [], Work._computed
     monkeypatch.setattr("jaxmb.studies.batch._MOST", 4)
 
     def interrupted(program, block):
@@ -379,7 +374,7 @@ def test_a_sweep_is_interrupted_between_blocks(monkeypatch):
         return own(program, block)
 
     monkeypatch.setenv("NPROC", "1")
-    monkeypatch.setattr(sweep_batch.Program, "_computed", interrupted)
+    monkeypatch.setattr(Work, "_computed", interrupted)
     with pytest.raises(KeyboardInterrupt):
         mb.sweep(halved, mb.cases.grid(a=np.linspace(1.5, 7.0, 40), b=[1.0, 3.0]), progress=False)
     assert len(computed) < 5
