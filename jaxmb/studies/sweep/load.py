@@ -25,6 +25,7 @@ def load_sweep(store: str | Path) -> Any:
     **Raises:** `ValueError` for a folder that holds no sweep, and for a store that cannot be read or has lost files of
     computed members; `ImportError` without the packages of `jaxmb[studies]`.
     """
+    packages("xarray", "zarr")
     path = Path(store)
     if stores.study_of(path) is None:
         raise ValueError(f"{store} holds no sweep; the folder is not there.")
@@ -34,7 +35,7 @@ def load_sweep(store: str | Path) -> Any:
 
 def opened(path: Path, read: bool = False) -> Any:
     """A store as a dataset along the dimension `member`, after a check of its files, which are `read` for that."""
-    (xarray,) = packages("xarray", "zarr")[:1]
+    (xarray,) = packages("xarray")
     dataset = xarray.open_zarr(path, chunks=None)
     stores.check_files(path, dataset["status"].to_numpy(), read)
     return dataset

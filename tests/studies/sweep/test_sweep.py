@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import signal
+import sys
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -133,6 +134,14 @@ def test_files_that_are_lost_or_damaged_are_an_error(undisturbed, copied, change
     else:
         run(copied, overwrite=True)
     assert files(copied) == files(undisturbed[0])
+
+
+@pytest.mark.parametrize("name", ["xarray", "zarr"])
+def test_a_package_that_is_not_installed_is_named(copied, monkeypatch, name):
+    monkeypatch.setitem(sys.modules, name, None)
+    for read in (run, mb.load_sweep):
+        with pytest.raises(ImportError, match=rf"A sweep needs the package '{name}': pip install jaxmb\[studies\]"):
+            read(copied)
 
 
 def _of(name, **changes):
