@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ._compat import ClosedJaxpr, canonical, default_float, is_weakly_typed, jaxpr_as_function
-from ._jaxpr_digest import digest_of_program
+from ._jaxpr_digest import digest_of
 from .linalg.arrays import ARRAYS
 from .solvers.closures import opened
 
@@ -161,7 +161,7 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
     if any(isinstance(constant, Tracer) for constant in closed.consts):
         return None
     tree, rest = results
-    digest = digest_of_program(closed, rules=True)
+    digest = digest_of(closed, rules=True)
     constants = [_own(v, constant) for v, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True)]
     key = digest.value, tuple(map(id, digest.unknown)), tree, rest
     return _Program(jaxpr_as_function(ClosedJaxpr(closed.jaxpr, constants)), tree, rest, key, digest.unknown)

@@ -29,17 +29,18 @@ class Digest(NamedTuple):
     unknown: tuple[Any, ...]
 
 
-def digest_of_program(program: Any, *, rules: bool) -> Digest:
-    """The hash of a closed jaxpr: its equations with all their parameters, the programs within, literals and constants.
+def digest_of(value: Any, *, rules: bool) -> Digest:
+    """The hash of a closed jaxpr: its equations with all their parameters, the programs within, literals and constants;
+    or of nested dictionaries and tuples of arrays.
 
     **Arguments:** `rules`: whether derivative rules of functions count, `custom_jvp` and `custom_vjp`. A program that
     is not differentiated does not use them.
     """
     digest = _Digest()
-    value = digest.of(program)
+    text = digest.of(value)
     if rules and digest.rules:
-        value = _joined("rules", [value, digest.of_derivative(program)])
-    return Digest(value, tuple(digest.unknown))
+        text = _joined("rules", [text, digest.of_derivative(value)])
+    return Digest(text, tuple(digest.unknown))
 
 
 class _Digest:

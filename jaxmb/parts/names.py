@@ -8,6 +8,12 @@ from typing import ParamSpec, TypeVar
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
+# Arguments that earlier versions took, by the name of the function or class: what to do now.
+_GONE = {
+    ("sweep", "budget"): "leave it out; members of a block do not wait for slow ones after "
+    'jaxmb.setup(compile="for speed").',
+    ("sweep", "devices"): "give executor= an executor with one worker for each device.",
+}
 
 
 class UnknownNameError(ValueError, KeyError):
@@ -57,6 +63,8 @@ def check_arguments(what: str, signature: inspect.Signature, positional: int, na
     kinds = {own.kind for own in taken.values()}
     if inspect.Parameter.VAR_KEYWORD not in kinds:
         for name in names:
+            if (what, name) in _GONE:
+                raise TypeError(f"{what} has no argument {name!r} any more: {_GONE[what, name]}")
             if name not in taken:
                 near = difflib.get_close_matches(name, taken, n=2, cutoff=0.5)
                 hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it takes {', '.join(taken)}."

@@ -1,4 +1,4 @@
-"""Batches in blocks: functions of many members, as many at once as the cache of a core holds."""
+"""Batches in blocks: a function of many members, for as many at once as the cache of a core holds."""
 
 import functools
 import math
@@ -19,13 +19,14 @@ from ..linalg.arrays import ARRAYS
 from ..linalg.members import in_blocks
 from ..parts.names import names_arguments
 
-# What the loops of the members of a block may carry [bytes], and the most members of a block.
+# The bytes that the loops of a block of members may carry from step to step, and the most members of a block.
 _CARRIED, _MOST = 2**20, 64
-# What the equations of a loop give in a turn is so many times what the kernels that XLA makes of them read and write.
+# Ratio of the bytes that the equations of a loop body write to the bytes that its fused kernels read and write (rule of
+# thumb).
 _FUSED = 3
-# Members that stand side by side fill a vector register with their double precision numbers.
+# Members that stand side by side fill a vector register with their numbers in double precision.
 _SIDE_BY_SIDE = 8
-# Rows from which an array of several axes is a table that a step writes one row of.
+# An array of several axes with at least so many rows is a table; a step writes one row of it.
 _LONG = 1024
 
 
@@ -38,30 +39,30 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     slopes = mb.batch(jax.grad(angle_at_end))(lengths, masses)
     ```
 
-    The members of a block go through the loop of a simulation together, as long as its slowest member needs, and each
-    operation is one of all their numbers. For a few hundred simulations at once these are more than the caches hold,
-    except of small machines, and members wait for the slowest of all: `jax.vmap` then takes longer than blocks, or even
-    than one run after the other. Use `jax.vmap` itself for functions without loops, and on a GPU, where it pays from
-    some hundred members on: a step of a four-bar takes 0.2 ms there, and one of 65 536 four-bars 2 ms (H100; on a core
-    one takes 0.01 ms).
+    The members of a block go through the loop of a simulation together, until the slowest member has ended. Each
+    operation acts on the numbers of all members. The caches hold the numbers of some tens of simulations. So
+    `jax.vmap` of a few hundred takes longer than blocks, or even than one run after the other. Use `jax.vmap` for
+    functions without loops. Use it on a GPU as well, where it pays from some hundred members on: a step of a four-bar
+    takes 0.2 ms there, and a step of 65 536 four-bars 2 ms (H100; on a core, a step of a four-bar takes 0.01 ms).
 
     **Arguments:**
 
     - `function`: of any arguments by position, pytrees of arrays, to a pytree of arrays; it is traced by JAX.
     - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
-        which the numbers that the largest loop of the function carries from step to step stay in the cache of a core;
-        1 where that loop becomes one kernel, by `setup(compile="for speed")`, which is as fast and waits for no other
-        member; 8 by `setup(compile="for batches")`, with members side by side in the registers of a processor; all
-        members, where it has no loop, and on other devices than a CPU.
+        which the numbers that the largest loop of the function carries from step to step stay in the cache of a core.
+        It is 1 if that loop becomes one kernel, by `setup(compile="for speed")`: this is as fast, and no member waits
+        for another. It is 8 by `setup(compile="for batches")`, with members side by side in the registers of a
+        processor. A function without loops has one block, and so have all functions on other devices than a CPU.
 
-    **Returns:** a function of the same arguments with members along axis 0 of each array, compiled at its first call,
-    whose results have them there as well. Values that are no arrays, such as names, are the same for all members, and
-    so is what the function refers to. The last block is filled up with the last member, which takes time and changes
-    nothing. The function has its derivatives in all modes; reverse mode keeps what it needs of all blocks at once.
+    **Returns:** a function of the same arguments with members along axis 0 of each array. Its results have members
+    along axis 0 as well. It is compiled at its first call. Values that are no arrays, such as names, are the same for
+    all members, and so are values that the function refers to. The last block is filled up with the last member, which
+    takes time and changes nothing. The function has derivatives in all modes; reverse mode keeps the values that it
+    needs of all blocks at once.
 
-    **Raises:** `ValueError` for a size that is no integer of at least 1, for arguments without members or of different
-    numbers of them, and for a function that cannot be batched: one that needs numbers where there are only traced
-    arrays, or with an operation that has no rule for batches, which `size=1` does not need.
+    **Raises:** `ValueError` for a size that is no integer of at least 1; for arguments without members or of different
+    numbers of members; for a function that needs an argument as a number; and for an operation without a rule for
+    batches, which `size=1` does not need.
     """
     if not callable(function):
         raise ValueError(f"batch needs a function, got {function!r}.")
@@ -82,7 +83,7 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
 
 
 class Member:
-    """A function of one member, traced once, for an example of its arguments, which may be traced itself.
+    """A function of one member, traced once for an example of its arguments. The example may be traced itself.
 
     **Raises:** `ValueError` for a function that needs the number of an argument.
     """
@@ -94,8 +95,8 @@ class Member:
             self._program = self._function.trace(self._like).jaxpr
         except NEED_NUMBERS as error:
             raise ValueError(
-                f"The function cannot be batched: it needs the number of an argument, of which there is one for each "
-                f"member. Use jnp.where or jax.lax.cond for `if`, and jax.numpy for NumPy. ({error})"
+                "The function cannot be batched: it needs the number of an argument, and each member has another one. "
+                f"Use jnp.where or jax.lax.cond for `if`, and jax.numpy for NumPy. ({error})"
             ) from error
 
     def block_size(self, members: int) -> int:
@@ -106,7 +107,7 @@ class Member:
             return members
         if computes_side_by_side():
             return min(_SIDE_BY_SIDE, members)
-        if max(given for _, given in loops) < _FUSED * bytes_of_kernel_loops():
+        if max(written for _, written in loops) < _FUSED * bytes_of_kernel_loops():
             return 1
         return min(2 ** int(math.log2(max(_CARRIED / carried, 1))), _MOST)
 
@@ -132,20 +133,20 @@ class Member:
 
 
 def _loops(program: Any) -> Iterator[tuple[int, int]]:
-    """The bytes that each loop of a program carries from step to step, and those that its equations give in a step."""
+    """The bytes that each loop of a program carries from step to step, and the bytes that its equations write."""
     for equation in getattr(program, "jaxpr", program).eqns:
         inner = _inner(equation)
         if equation.primitive.name in ("while", "scan"):
-            # What a scan makes of each step is not carried.
-            yield _bytes(equation.outvars[: equation.params.get("num_carry")]), sum(map(_given, inner))
+            # A scan does not carry the results of single steps.
+            yield _bytes(equation.outvars[: equation.params.get("num_carry")]), sum(map(_written, inner))
         for own in inner:
             yield from _loops(own)
 
 
-def _given(program: Any) -> int:
-    """The bytes that the equations of a program give, those in a loop once."""
+def _written(program: Any) -> int:
+    """The bytes that the equations of a program write, with one turn of each loop."""
     found = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
-    return sum(sum(map(_given, inner)) if inner else _bytes(equation.outvars) for equation, inner in found)
+    return sum(sum(map(_written, inner)) if inner else _bytes(equation.outvars) for equation, inner in found)
 
 
 def _inner(equation: Any) -> list[Any]:
@@ -158,7 +159,7 @@ def _bytes(variables: list[Any]) -> int:
 
 
 def _touched(shape: tuple[int, ...]) -> int:
-    """How many numbers of an array a step touches: of a long table, such as the rows of all steps, those of one row."""
+    """The numbers of an array that a step touches: one row of a long table, such as the states of all steps."""
     return math.prod(shape[1:] if len(shape) > 1 and shape[0] >= _LONG else shape)
 
 
@@ -173,8 +174,8 @@ def _count(members: tuple[Any, ...]) -> int:
         name = f"Argument {jax.tree_util.keystr(path)}"
         if isinstance(x, bool | int | float | complex) or (isinstance(x, ARRAYS) and not np.shape(x)):
             raise ValueError(
-                f"{name} is a single number, {x!r}: members are along axis 0. Those that are given one by one are "
-                "stacked by jax.tree.map(lambda *x: jnp.stack(x), *members), if they have one structure."
+                f"{name} is a single number, {x!r}: members are along axis 0. A list of members of one structure is "
+                "stacked by jax.tree.map(lambda *x: jnp.stack(x), *members)."
             )
         if isinstance(x, ARRAYS):
             counts[name] = np.shape(x)[0]

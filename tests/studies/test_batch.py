@@ -140,7 +140,7 @@ def test_a_size_that_is_none_is_refused(size):
         ((2.0,), r"Argument \[0\] is a single number, 2.0: members are along axis 0"),
         ((np.ones(3), {"a": np.ones(4)}), r"Argument \[0\] has 3 members, but Argument \[1\]\['a'\] has 4."),
         ((np.ones((0, 2)),), r"A batch needs at least one member, and Argument \[0\] has none."),
-        (([{"a": 1.0}, {"a": 2.0, "b": 1.0}],), "stacked by jax.tree.map.* if they have one structure"),
+        (([{"a": 1.0}, {"a": 2.0, "b": 1.0}],), "of one structure is stacked by jax.tree.map"),
     ],
 )
 def test_arguments_that_are_no_members_are_refused(arguments, message):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..._jaxpr_digest import Digest, digest_of_program
+from ..._jaxpr_digest import Digest, digest_of
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 from ...system.quantities import component_names
@@ -90,7 +90,7 @@ class Told:
 def told_apart(function: Callable[..., Any], space: Space | FreeParameters) -> Told:
     """A function of named parameters as one that is told apart by what it computes now."""
     traced = jax.make_jaxpr(lambda z: function(space(z)))(jnp.zeros(space.size))
-    return Told(function, digest_of_program(traced, rules=False))
+    return Told(function, digest_of(traced, rules=False))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ from ...system import AbstractSystem, parameters
 from ...system.design import Bounds, design_bounds
 from ...system.quantities import component_names
 from ..ranges import FreeParameters, range_between
+from ..sobol import sobol_points
 
 # A parameter is at a bound if it is closer than this, relative to its scale.
 _NEAR = 1e-6
@@ -90,17 +91,11 @@ class Space(eqx.Module):
 
         **Raises:** `ValueError` for a parameter without both bounds.
         """
-        try:
-            from scipy.stats import qmc
-        except ImportError:
-            raise ImportError("Several starts are spread by SciPy: install it, or jaxmb[studies].") from None
-
         low, high = self.box
         for name, a, b in zip(self.components(), low, high, strict=True):
             if not np.isfinite(a) or not np.isfinite(b):
                 raise ValueError(f"Several starts are spread between bounds: give {name!r} both of them.")
-        points = qmc.Sobol(self.size, rng=np.random.default_rng(seed)).random_base2(max(count - 1, 1).bit_length())
-        return jnp.asarray(low + (high - low) * points[:count])
+        return jnp.asarray(low + (high - low) * sobol_points(count, self.size, seed))
 
 
 def space(

@@ -17,6 +17,7 @@ from jaxtyping import ArrayLike
 
 from ..._arguments import whole_number
 from ...parts.names import unknown
+from ..sobol import sobol_points
 
 MEMBER = "member"
 
@@ -91,7 +92,7 @@ def table(columns: Any = None, /, **more: ArrayLike) -> Cases:
         return columns
     if hasattr(columns, "to_dataset") and not hasattr(columns, "data_vars"):
         if columns.name is None:
-            raise ValueError("The DataArray of cases has no name; array.rename(name) gives it that of the parameter.")
+            raise ValueError("The DataArray of cases has no name; array.rename(name) gives it the parameter's name.")
         columns = columns.to_dataset()
     if hasattr(columns, "data_vars"):
         return _of_dataset(columns)
@@ -117,8 +118,6 @@ def sobol(
 
     **Raises:** `ValueError` that names the parameter, for ranges that are empty or not finite.
     """
-    from scipy.stats import qmc
-
     members = whole_number("members", members)
     box, log = {name: _range(name, given) for name, given in _named(ranges, more).items()}, tuple(log)
     for name in log:
@@ -126,10 +125,7 @@ def sobol(
             raise unknown("parameter in log", name, box)
         if np.any(box[name] <= 0):
             raise ValueError(f"The range of {name!r} must be positive, since its logarithm is sampled.")
-    size = sum(ends[0].size for ends in box.values())
-    # The first points of a power of two are those of any other number, of which SciPy would warn in every process.
-    sequence = qmc.Sobol(size, rng=np.random.default_rng(seed))
-    points, columns = sequence.random_base2((members - 1).bit_length())[:members], {}
+    points, columns = sobol_points(members, sum(ends[0].size for ends in box.values()), seed), {}
     for name, ends in box.items():
         own, points = points[:, : ends[0].size].reshape(members, *ends[0].shape), points[:, ends[0].size :]
         low, high = np.log(ends) if name in log else ends

@@ -1,93 +1,134 @@
 """Results of a sweep as an xarray Dataset, with a dimension for each parameter of a grid."""
 
+import importlib
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...parts.names import unknown
 from .cases import MEMBER, Cases
 from .outputs import Outputs
 
 
+class Variable(NamedTuple):
+    """A variable of the result; `values`: those of a coordinate, and the type of an output, which is computed."""
+
+    dims: tuple[str, ...]
+    values: np.ndarray | np.dtype
+    shape: tuple[int, ...]
+    attributes: dict[str, Any]
+
+    @property
+    def is_output(self) -> bool:
+        return isinstance(self.values, np.dtype)
+
+
 def packages(*names: str) -> list[Any]:
     """Optional packages, imported at first use."""
-    import importlib
-
     try:
         return [importlib.import_module(name) for name in names]
     except ImportError as error:
         raise ImportError(f"A sweep needs the package {error.name!r}: pip install jaxmb[studies]") from None
 
 
-def variables(
-    cases: Cases,
-    outputs: Outputs,
-    dims: Mapping[str, tuple[str, ...]],
-    coords: Mapping[str, np.ndarray],
-    units: Mapping[str, str],
-) -> dict[str, tuple[tuple[str, ...], np.ndarray | np.dtype, tuple[int, ...], dict[str, Any]]]:
-    """Every variable of the result by name: its dimensions, its values, or the type of those to compute, its shape and
-    its attributes.
+def variables(cases: Cases, outputs: Outputs, dims: Any, coords: Any, units: Any) -> dict[str, Variable]:
+    """Every variable of the result by name.
+
+    **Raises:** `ValueError` for names of dimensions, values along them and units that do not fit.
     """
+    for what, given in (("dims", dims), ("coords", coords), ("units", units)):
+        if not isinstance(given, Mapping):
+            raise ValueError(f"{what} must be a dictionary by name, got {given!r}.")
+    sizes = _sizes(cases, outputs, dims)
+    values = {name: _along(name, given, sizes) for name, given in coords.items()}
+    for name in units:
+        known = (*cases.columns, *outputs.shapes, *sizes, *cases.labels)
+        if name not in known:
+            raise unknown("name in units", name, known)
     units = {**cases.units, **units}
     attributes = lambda name: {"units": units[name]} if name in units else {}
-    of_column = lambda name, column: (MEMBER, *(f"{name}_{k}" for k in range(column.ndim - 1)))
-    found: dict[str, Any] = {}
+    own_dims = lambda name, shape: tuple(f"{name}_{k}" for k in range(len(shape)))
+    found: dict[str, Variable] = {}
     for name, column in cases.columns.items():
-        found[name] = (of_column(name, column), column, column.shape, attributes(name))
-    for name, values in (cases.labels | dict(coords)).items():
-        found[name] = ((name,), values, values.shape, attributes(name))
+        found[name] = Variable((MEMBER, *own_dims(name, column.shape[1:])), column, column.shape, attributes(name))
+    for name, along in (cases.labels | values).items():
+        found[name] = Variable((name,), along, along.shape, attributes(name))
     for name, (shape, dtype) in outputs.shapes.items():
-        own = dims.get(name, tuple(f"{name}_{k}" for k in range(len(shape))))
-        found[name] = ((MEMBER, *own), dtype, (len(cases), *shape), attributes(name))
+        own = (MEMBER, *dims.get(name, own_dims(name, shape)))
+        found[name] = Variable(own, dtype, (len(cases), *shape), attributes(name))
     if outputs.steps:
-        found["num_steps"] = ((MEMBER,), np.dtype(np.int64), (len(cases),), {"long_name": "steps of the integration"})
+        steps = {"long_name": "steps of the integration"}
+        found["num_steps"] = Variable((MEMBER,), np.dtype(np.int64), (len(cases),), steps)
     # The words that the conventions for climate and forecast metadata have for a status.
     status = {
         "flag_values": list(range(len(outputs.statuses))),
         "flag_meanings": " ".join(name for name, _ in outputs.statuses),
         "messages": json.dumps([message for _, message in outputs.statuses]),
     }
-    found["status"] = ((MEMBER,), np.dtype(np.int16), (len(cases),), status)
+    found["status"] = Variable((MEMBER,), np.dtype(np.int16), (len(cases),), status)
     return found
 
 
-def attributes(cases: Cases, study: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes of a result: those of the study, its grid, and which variables are coordinates."""
-    return {**study, "grid": json.dumps(cases.grid), "coordinates": " ".join(cases.columns)}
+def _sizes(cases: Cases, outputs: Outputs, dims: Mapping[str, Any]) -> dict[str, int]:
+    """The lengths of the dimensions that the user names."""
+    sizes: dict[str, int] = {}
+    for name, own in dims.items():
+        if name not in outputs.shapes:
+            raise unknown("output in dims", name, outputs.shapes)
+        shape = outputs.shapes[name][0]
+        if isinstance(own, str) or len(own) != len(shape):
+            raise ValueError(
+                f"dims[{name!r}] must be a list of {len(shape)} names, for the shape {shape}; got {own!r}."
+            )
+        for dim, size in zip(own, shape, strict=True):
+            if dim in (MEMBER, *cases.columns, *outputs.shapes, *(axis for axis, _ in cases.grid)):
+                raise ValueError(f"The dimension {dim!r} of {name!r} has the name of something else; rename it.")
+            if sizes.setdefault(dim, size) != size:
+                raise ValueError(f"The dimension {dim!r} has the length {sizes[dim]}, but in {name!r} {size}.")
+        if len(set(own)) < len(own):
+            raise ValueError(f"dims[{name!r}] names a dimension twice, got {own!r}.")
+    return sizes
 
 
-def in_memory(described: Mapping[str, Any], attrs: Mapping[str, Any], computed: Mapping[str, np.ndarray]) -> Any:
+def _along(name: str, given: Any, sizes: Mapping[str, int]) -> np.ndarray:
+    """The values along a dimension."""
+    if name not in sizes:
+        raise unknown("dimension in coords", name, sizes)
+    values = np.asarray(given)
+    if values.shape != (sizes[name],) or values.dtype.kind not in "biuf":
+        raise ValueError(f"coords[{name!r}] must be {sizes[name]} numbers, got shape {values.shape} of {values.dtype}.")
+    return values
+
+
+def in_memory(described: Mapping[str, Variable], attrs: Mapping[str, Any], computed: Mapping[str, np.ndarray]) -> Any:
     """The result, from arrays in memory."""
     (xarray,) = packages("xarray")
-    made = {name: (dims, computed.get(name, values), attrs) for name, (dims, values, _, attrs) in described.items()}
+    made = {name: (own.dims, computed.get(name, own.values), own.attributes) for name, own in described.items()}
     return unstacked(xarray.Dataset(made, attrs=dict(attrs)).set_coords(attrs["coordinates"].split()))
 
 
 def unstacked(dataset: Any) -> Any:
-    """A result with the messages of its members, and with the dimensions of its grid instead of that of members."""
+    """A result with the messages of its members, and with the dimensions of its grid instead of `member`."""
     (xarray,) = packages("xarray")
     messages = json.loads(dataset["status"].attrs.pop("messages"))
     # As long as the longest message that occurs, not the longest one there is.
     dataset["message"] = (MEMBER, np.array([messages[code] for code in dataset["status"].to_numpy()]))
     dataset.attrs.pop("coordinates", None)
-    grid = json.loads(dataset.attrs.pop("grid"))
+    grid = dict(json.loads(dataset.attrs.pop("grid")))
     if not grid:
         return dataset
-    axes, sizes = [name for name, _ in grid], [size for _, size in grid]
     # A coordinate of more than one dimension cannot have the name of one of them.
-    several = {name for name in axes if name in dataset.coords and dataset[name].ndim > 1}
-    names = [f"{name}_index" if name in several else name for name in axes]
-    made, coords = {}, {}
+    several = {name for name in grid if name in dataset.coords and dataset[name].ndim > 1}
+    axes = {name: f"{name}_index" if name in several else name for name in grid}
+    sizes = {axes[name]: size for name, size in grid.items()}
+    made = {}
     for name, variable in dataset.variables.items():
-        dims, values = variable.dims, variable.to_numpy()
-        if MEMBER in dims:
-            dims, values = (*names, *dims[1:]), values.reshape(*sizes, *values.shape[1:])
+        if MEMBER in variable.dims:
+            variable = variable.unstack({MEMBER: sizes}).transpose(*sizes, ...)
             if name in axes and name in dataset.coords:
                 # A parameter of the grid varies along its own dimension only.
-                place = axes.index(name)
-                values = values[tuple(slice(None) if k == place else 0 for k in range(len(axes)))]
-                dims = (names[place], *dims[len(axes) :])
-        (coords if name in dataset.coords else made)[name] = xarray.Variable(dims, values, variable.attrs)
-    return xarray.Dataset(made, coords, dataset.attrs)
+                variable = variable.isel({axis: 0 for axis in sizes if axis != axes[name]})
+        made[name] = variable
+    return xarray.Dataset(made, attrs=dataset.attrs).set_coords(list(dataset.coords))

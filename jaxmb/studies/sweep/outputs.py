@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._arguments import whole_number
 from ..._compat import canonical, codes_of, is_enumerated, messages_of
-from ..._jaxpr_digest import Digest, digest_of_program
+from ..._jaxpr_digest import Digest, digest_of
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 
@@ -19,7 +18,7 @@ RESERVED = ("member", "status", "message", "num_steps", "result")
 
 
 class Returned(NamedTuple):
-    """What one member returned: outputs by name, and from its `result`, if it gave one, how it ended and its steps."""
+    """Outputs of one member by name; and the code and the steps of its `result`, None without one."""
 
     values: dict[str, Any]
     result: Any
@@ -27,24 +26,19 @@ class Returned(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """What is known of the outputs before anything is computed: shapes and types by name, whether steps are counted,
-    and the name and message of each status.
+    """The outputs before anything is computed: shapes and types by name, whether steps are counted, and the name and
+    message of each status.
     """
 
     shapes: dict[str, tuple[tuple[int, ...], np.dtype]]
     steps: bool
     statuses: tuple[tuple[str, str], ...]
 
-    @property
-    def can_be_cut_off(self) -> bool:
-        """Whether a member tells that it has used up its steps."""
-        return self.steps and any(name == "max_steps_reached" for name, _ in self.statuses)
 
-
-def returned(function: Callable[..., Any], parameters: Mapping[str, Any], **fixed: Any) -> Returned:
-    """Call the function for one member, and sort what it returns."""
+def returned(function: Callable[..., Any], parameters: Mapping[str, Any]) -> Returned:
+    """Call the function for one member, and sort its outputs."""
     with traced_by_jax("the function of a sweep", "a parameter"):
-        given = function(**parameters, **fixed)
+        given = function(**parameters)
     if not isinstance(given, Mapping):
         raise ValueError(
             f"The function of a sweep must return a dictionary of outputs by name, got {type(given).__name__}."
@@ -93,37 +87,24 @@ def check_parameters(function: Callable[..., Any], names: Any) -> None:
                 raise unknown("argument of the function", name, named, "The cases")
     for name, argument in arguments.items():
         needed = argument.default is kinds.empty and argument.kind not in (kinds.VAR_KEYWORD, kinds.VAR_POSITIONAL)
-        if needed and name not in names and name != "max_steps":
+        if needed and name not in names:
             raise ValueError(f"The function needs the parameter {name!r}, of which the cases give no values.")
 
 
-def step_limit(function: Callable[..., Any], names: Any) -> int | None:
-    """The default of the function's argument `max_steps`; None if it has no such argument or the cases give it."""
-    try:
-        argument = inspect.signature(function).parameters.get("max_steps")
-    except (TypeError, ValueError):
-        return None
-    if argument is None or "max_steps" in names:
-        return None
-    default = 65536 if argument.default is argument.empty else argument.default
-    return whole_number("The default of the function's argument max_steps", default)
+def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray]) -> tuple[Outputs, Digest]:
+    """Trace the function twice with the parameters of one member: its outputs, and the hash of its program.
 
-
-def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray], **fixed: Any) -> tuple[Outputs, Digest]:
-    """Trace the function twice, with the parameters of one member: what it returns, which must be the same, and the
-    hash of its program.
-
-    **Raises:** `ValueError` for what is no dictionary of arrays, and for a function that is not pure: one that gives
-    other names, shapes or numbers when it is traced again.
+    **Raises:** `ValueError` for a result that is no dictionary of arrays, and for a function that is not pure: traced
+    again, it has another program.
     """
     abstract = {k: jax.ShapeDtypeStruct(np.shape(v), canonical(v.dtype)) for k, v in example.items()}
     # A new lambda each time, since JAX remembers what it has traced.
-    trace = lambda: jax.make_jaxpr(lambda p: returned(function, p, **fixed), return_shape=True)(abstract)
+    trace = lambda: jax.make_jaxpr(lambda p: returned(function, p), return_shape=True)(abstract)
     (program, found), (again, found_again) = trace(), trace()
-    first, second = outputs_of(found), outputs_of(found_again)
-    check_same(first, second)
-    digest = digest_of_program(program, rules=False)
-    if digest.value != digest_of_program(again, rules=False).value:
+    first = outputs_of(found)
+    check_same(first, outputs_of(found_again))
+    digest = digest_of(program, rules=False)
+    if digest.value != digest_of(again, rules=False).value:
         raise ValueError(
             "The function is not pure: traced twice, it has other numbers in it, as from numpy.random or from "
             "something that it changes. Make such numbers parameters of the cases."
@@ -141,14 +122,14 @@ def outputs_of(found: Returned) -> Outputs:
 
 
 def check_same(first: Outputs, other: Outputs) -> None:
-    """Raise a `ValueError` if the function returned something else than at first."""
+    """Raise a `ValueError` if the function returned other outputs than at first."""
     if first == other:
         return
     names = sorted(set(first.shapes) ^ set(other.shapes))
     differing = names or [name for name in first.shapes if first.shapes[name] != other.shapes[name]] or ["result"]
     raise ValueError(
-        "The function is not pure, or its outputs depend on max_steps: traced again, it returned other names, shapes "
-        f"or types of {', '.join(map(repr, differing))}."
+        "The function is not pure: traced again, it returned other names, shapes or types of "
+        f"{', '.join(map(repr, differing))}."
     )
 
 
@@ -158,13 +139,13 @@ def statuses(found: Returned) -> np.ndarray:
     finite = np.ones(members, bool)
     for value in found.values.values():
         if value.dtype.kind in "fc":
-            # Times of contacts' events hold infinity after the last one; a result tells of failures.
+            # Times of events hold infinity after the last event; a result tells of failures.
             sound = np.isfinite(value) if found.result is None else ~np.isnan(value)
             finite &= sound.reshape(members, -1).all(axis=1)
     ended = np.where(finite, OK, NOT_FINITE)
     if found.result is not None:
         names, code = list(messages_of(found.result)), codes_of(found.result)
-        # After an event the saved times that are left hold infinity, as in diffrax, of which anything may come.
+        # After an event the saved times that are left are infinite, and outputs that depend on them may be anything.
         by_event = code == (names.index("event_occurred") if "event_occurred" in names else -1)
         ended = np.where(code == 0, ended, np.where(by_event, OK, code + NOT_FINITE))
     return ended.astype(np.int16)

@@ -6,7 +6,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -23,7 +22,8 @@ from sweeping import CASES, CHUNKS, files, forked, marks, run, spring, wait_for
 
 import jaxmb as mb
 from jaxmb.cli import main
-from jaxmb.studies.sweep import batch as sweep_batch
+from jaxmb.studies.sweep import store as stores
+from jaxmb.studies.sweep.chunk import Work
 
 
 @pytest.fixture(scope="module")
@@ -76,94 +76,100 @@ def test_values_equal_a_bare_vmap_and_failures_cost_nothing_to_others(undisturbe
     assert found["message"].to_numpy()[0] == "An output is not finite." and found["more.count"].dtype == np.int32
 
 
-def test_a_sweep_that_is_done_computes_nothing_and_one_that_is_damaged_only_what_is(undisturbed, tmp_path, monkeypatch):
-    store = tmp_path / "runs.zarr"
-    shutil.copytree(undisturbed[0], store)
-    before = files(store)
-    computed = []
-    engine = sys.modules["jaxmb.studies.sweep.engine"]
-    own = engine.Work.__call__
-    monkeypatch.setattr(
-        engine.Work, "__call__", lambda work, task, tell: (computed.append(task.place), own(work, task, tell))[1]
-    )
-    xr.testing.assert_identical(run(store).load(), undisturbed[1].load())
+@pytest.fixture
+def copied(undisturbed, tmp_path):
+    return shutil.copytree(undisturbed[0], tmp_path / "runs.zarr")
+
+
+def test_a_sweep_that_is_done_computes_nothing_and_one_that_is_not_what_is_missing(undisturbed, copied, monkeypatch):
+    before, computed, own = files(copied), [], Work.__call__
+    counted = lambda work, task, tell: (computed.append(task.place), own(work, task, tell))[1]
+    monkeypatch.setattr(Work, "__call__", counted)
+    xr.testing.assert_identical(run(copied).load(), undisturbed[1].load())
     assert computed == []
-    # A flipped bit, an empty file, a file that is gone, a mark that is gone, a leftover of a killed writer.
-    wave = store / "wave" / "c"
-    flipped = bytearray((wave / "3" / "0").read_bytes())
-    flipped[20] ^= 4
-    (wave / "3" / "0").write_bytes(flipped)
-    (wave / "5" / "0").write_bytes(b"")
-    (wave / "7" / "0").unlink()
-    (store / "status" / "c" / "9").unlink()
-    (store / "status" / "c" / "9.0123.partial").write_bytes(b"half")
-    with pytest.warns(UserWarning, match="damaged") as warned:
-        run(store)
-    assert len(warned) == 3 and computed == [3, 5, 7, 9] and files(store) == before
+    # A chunk that lacks its mark, and a leftover of a killed writer.
+    (copied / "status" / "c" / "9").unlink()
+    (copied / "status" / "c" / "9.0123.partial").write_bytes(b"half")
+    run(copied)
+    assert computed == [9] and files(copied) == before
 
 
-def test_a_store_can_be_read_while_it_is_written(undisturbed, tmp_path):
-    store = tmp_path / "runs.zarr"
-    shutil.copytree(undisturbed[0], store)
+def test_a_store_can_be_read_while_it_is_written(copied):
     for place in ("status/c/4", "wave/c/4/0", "more.count/c/4", "more.square/c/4"):
-        (store / place).unlink()
-    found = mb.load_sweep(store)
+        (copied / place).unlink()
+    found = mb.load_sweep(copied)
     assert np.all(found["status"][40:50] == 0) and np.all(np.isnan(found["wave"][40:50]))
     assert np.all(found["message"][40:50] == "Not computed yet.") and np.all(found["status"][50:] != 0)
 
 
-def test_a_store_that_lost_files_says_so_and_is_mended(undisturbed, tmp_path):
-    """A chunk, a variable with its metadata, a coordinate."""
-    store = tmp_path / "runs.zarr"
-    shutil.copytree(undisturbed[0], store)
-    before = files(store)
-    (store / "wave" / "c" / "7" / "0").unlink()
-    with pytest.raises(ValueError, match=r"has lost 'wave' of the members 70 to 79, which.*computes what is lost"):
-        mb.load_sweep(store)
-    shutil.rmtree(store / "more.square")
-    with pytest.raises(ValueError, match=r"has lost .* and 81 other chunks"):
-        mb.load_sweep(store)
-    shutil.rmtree(store / "a" / "c")
-    with pytest.raises(ValueError, match=r"has lost .* and 82 other chunks"):
-        mb.load_sweep(store)
-    with pytest.warns(UserWarning, match="damaged"):
-        xr.testing.assert_identical(run(store).load(), undisturbed[1].load())
-    assert files(store) == before
+def _flip(file):
+    flipped = bytearray(file.read_bytes())
+    flipped[20] ^= 4
+    file.write_bytes(flipped)
 
 
-def test_metadata_that_were_changed_are_an_error_that_names_the_store(undisturbed, tmp_path):
-    def changed(place, change):
-        file = store / place / "zarr.json"
-        data = json.loads(file.read_text())
-        change(data)
-        file.write_text(json.dumps(data))
+ALONE = r"without the file status/c/7 these alone are computed again.*overwrite=True"
 
-    def of(name):
-        return lambda data: data["consolidated_metadata"]["metadata"][name]
 
-    for place, change, message in (
-        ("", lambda data: data.pop("attributes"), r"damaged.*zarr.json cannot be used \(KeyError"),
-        ("", lambda data: data["attributes"].update(chunk="ten"), "damaged.*chunk is 'ten'"),
-        ("", lambda data: data["attributes"].update(grid="["), "damaged"),
-        ("", lambda data: of("wave")(data).update(shape=[3, 4]), "damaged"),
-        ("", lambda data: of("wave")(data).update(codecs=[]), "damaged"),
-        ("", lambda data: of("status")(data)["attributes"].pop("messages"), "damaged"),
-        ("", lambda data: data["consolidated_metadata"]["metadata"].pop("status"), "damaged"),
-    ):
-        store = tmp_path / "runs.zarr"
-        shutil.copytree(undisturbed[0], store, dirs_exist_ok=True)
-        changed(place, change)
-        with pytest.raises(ValueError, match=message):
-            mb.load_sweep(store)
-    for change in (lambda data: data.update(shape=[3, 4]), lambda data: data.pop("data_type")):
-        shutil.copytree(undisturbed[0], store, dirs_exist_ok=True)
-        changed("wave", change)
-        with pytest.raises(ValueError, match=r"damaged: the metadata of 'wave' cannot be used.*overwrite=True"):
-            run(store)
-    (store / "zarr.json").write_text("{")
+@pytest.mark.parametrize(
+    ("change", "message", "readers"),
+    [
+        (lambda s: (s / "wave/c/7/0").unlink(), f"there is no 'wave' of the members 70 to 79 .*{ALONE}", 2),
+        (lambda s: _flip(s / "wave/c/7/0"), f"'wave' of the members 70 to 79 .*{ALONE}", 1),
+        (lambda s: (s / "wave/c/7/0").write_bytes(b""), f"'wave' of the members 70 to 79 .*{ALONE}", 1),
+        (lambda s: shutil.rmtree(s / "more.square"), "there is no 'more.square' of the members 0 to 9", 2),
+        (lambda s: shutil.rmtree(s / "a" / "c"), "there is no 'a'.*overwrite=True", 2),
+        (lambda s: _flip(s / "status/c/7"), "checksum.*overwrite=True", 2),
+    ],
+)
+def test_files_that_are_lost_or_damaged_are_an_error(undisturbed, copied, change, message, readers):
+    """In reading what is not looked at, damage shows later."""
+    change(copied)
+    for read in (run, mb.load_sweep)[:readers]:
+        with pytest.raises(ValueError, match=f"The store .*runs.zarr is damaged: .*{message}"):
+            read(copied)
+    (copied / "status/c/7").unlink()
+    if "alone" in message:
+        run(copied)
+    else:
+        run(copied, overwrite=True)
+    assert files(copied) == files(undisturbed[0])
+
+
+@pytest.mark.parametrize("name", ["xarray", "zarr"])
+def test_a_package_that_is_not_installed_is_named(copied, monkeypatch, name):
+    monkeypatch.setitem(sys.modules, name, None)
+    for read in (run, mb.load_sweep):
+        with pytest.raises(ImportError, match=rf"A sweep needs the package '{name}': pip install jaxmb\[studies\]"):
+            read(copied)
+
+
+def _of(name, **changes):
+    return lambda data: data["consolidated_metadata"]["metadata"][name].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data.pop("attributes"), r"zarr.json cannot be used \(KeyError"),
+        (lambda data: data["attributes"].update(chunk="ten"), "chunk is 'ten'"),
+        (lambda data: data["attributes"].update(grid="["), "overwrite=True"),
+        (_of("wave", shape=[3, 4]), "overwrite=True"),
+        (_of("wave", codecs=[]), "overwrite=True"),
+        (_of("status", attributes={}), "overwrite=True"),
+        (lambda data: data["consolidated_metadata"]["metadata"].pop("status"), "overwrite=True"),
+    ],
+)
+def test_metadata_that_were_changed_are_an_error_that_names_the_store(copied, change, message):
+    data = json.loads((copied / "zarr.json").read_text())
+    change(data)
+    (copied / "zarr.json").write_text(json.dumps(data))
+    with pytest.raises(ValueError, match=f"The store .*runs.zarr is damaged: .*{message}"):
+        mb.load_sweep(copied)
+    (copied / "zarr.json").write_text("{")
     for read in (mb.load_sweep, run):
         with pytest.raises(ValueError, match=r"damaged: zarr\.json cannot be used"):
-            read(store)
+            read(copied)
 
 
 def test_a_second_sweep_does_not_write_a_store_at_the_same_time(tmp_path):
@@ -186,16 +192,13 @@ def test_a_second_sweep_does_not_write_a_store_at_the_same_time(tmp_path):
     np.testing.assert_array_equal(found["x"], [2.0, 4.0])
     assert refused == [False, True] and mb.sweep(function, cases, store, progress=False).identical(found)
     before = files(store)
-    stores = sys.modules["jaxmb.studies.sweep.store"]
     with pytest.raises(RuntimeError, match="Another process is writing the store"):
         stores.create(store, {}, {}, 2)
     assert files(store) == before and [p.name for p in tmp_path.iterdir()] == ["runs.zarr"]
 
 
-def test_the_store_of_another_study_is_refused(undisturbed, tmp_path):
-    store = tmp_path / "runs.zarr"
-    shutil.copytree(undisturbed[0], store)
-    before = files(store)
+def test_the_store_of_another_study_is_refused(copied, tmp_path):
+    store, before = copied, files(copied)
     factor = 2.0
     other = lambda a, b: {"wave": a * b * factor}
     with pytest.raises(ValueError, match=r"another sweep: the function and outputs differ.*overwrite=True"):
@@ -266,24 +269,14 @@ def _random():
         (lambda a: {"x": a}, {"chunk": 0}, "chunk must be"),
         (lambda a: {"x": a}, {"processes": 0}, "processes must be"),
         (lambda a: {"x": a}, {"executor": 3}, "executor must be a concurrent"),
-        (lambda a: {"x": a}, {"devices": 99}, "devices must be between 1"),
-        (lambda a: {"x": a}, {"devices": 1, "processes": 2}, "Give one of"),
-        (lambda a: {"x": a}, {"budget": 5}, "needs a function with an argument max_steps"),
+        (lambda a: {"x": a}, {"executor": ThreadPoolExecutor(1), "processes": 2}, "Give either processes or an"),
+        (lambda a: {"x": a}, {"devices": 2}, "no argument 'devices' any more: give executor="),
+        (lambda a: {"x": a}, {"budget": 5}, "no argument 'budget' any more: leave it out"),
     ],
 )
 def test_what_does_not_fit_is_named(function, options, message):
     with pytest.raises((ValueError, TypeError), match=message):
         mb.sweep(function, mb.cases.table(a=[1.0, 2.0]), progress=False, **options)
-
-
-def _steps(n, budget, max_steps=100):
-    """As a simulation that takes n steps: what is cut off is not a number."""
-    del budget
-    done = n <= max_steps
-    taken = jax.lax.while_loop(lambda k: (k < n) & (k < max_steps), lambda k: k + 1, 0)
-    result = diffrax.RESULTS.where(done, diffrax.RESULTS.successful, diffrax.RESULTS.max_steps_reached)
-    result = diffrax.RESULTS.where(n == 3, diffrax.RESULTS.singular, result)
-    return {"n2": jnp.where(done, n * n, -1), "result": _Solution(result, {"num_steps": taken})}
 
 
 class _Solution:
@@ -302,47 +295,17 @@ def test_times_after_the_last_event_are_no_failure():
     assert list(words) == ["ok", "ok", "not_finite", "singular"]
 
 
-def test_members_beyond_the_budget_are_computed_anew():
-    n = np.full(200, 10)
-    n[[5, 50, 120]], n[[7, 9]], n[77] = 90, 300, 3
-    function = lambda n, max_steps=100: _steps(n, None, max_steps)
-    found = mb.sweep(function, mb.cases.table(n=n), progress=False, chunk=64, budget=11)
-    assert found.attrs["budget"] == 11
-    np.testing.assert_array_equal(found["n2"], np.where(n <= 100, n * n, -1))
-    np.testing.assert_array_equal(found["num_steps"], np.minimum(n, 100))
+def test_steps_and_their_limit_are_told():
+    def function(n, max_steps=100):
+        """As a simulation of n steps."""
+        taken = jax.lax.while_loop(lambda k: k < jnp.minimum(n, max_steps), lambda k: k + 1, 0)
+        result = diffrax.RESULTS.where(n > max_steps, diffrax.RESULTS.max_steps_reached, diffrax.RESULTS.successful)
+        return {"twice": 2 * n, "result": _Solution(result, {"num_steps": taken})}
+
+    found = mb.sweep(function, mb.cases.table(n=[10, 100, 300]), progress=False)
     words = np.array(found["status"].attrs["flag_meanings"].split())[found["status"]]
-    assert list(np.flatnonzero(words == "max_steps_reached")) == [7, 9] and words[77] == "singular"
-    assert np.sum(words == "ok") == 197 and "maximum number of solver steps" in str(found["message"][7].item())
-    for budget in ("auto", None, 50, 1000):
-        other = mb.sweep(function, mb.cases.table(n=n), progress=False, budget=budget)
-        assert other.drop_attrs().identical(found.drop_attrs()), budget
-
-
-@pytest.mark.parametrize(("pays", "programs"), [(2.0, 1), (-1.0, 2)])
-def test_a_budget_is_chosen_only_where_it_pays(monkeypatch, pays, programs):
-    """Short motions in a few chunks are worth no second program; if it costs nothing, members have the same outputs."""
-    batches = sys.modules["jaxmb.studies.sweep.batch"]
-    monkeypatch.setattr(batches, "_PAYS", pays)
-    made, own = [], batches.Chunks.__init__
-    monkeypatch.setattr(batches.Chunks, "__init__", lambda chunks, batch: (made.append(chunks), own(chunks, batch))[1])
-    n = np.full(400, 10)
-    n[::50], n[[7, 309]], n[77] = 90, 300, 3
-    function = lambda n, max_steps=100: _steps(n, None, max_steps)
-    found = mb.sweep(function, mb.cases.table(n=n), progress=False, chunk=100)
-    assert made[0].programs == programs and found.attrs["budget"] is None
-    np.testing.assert_array_equal(found["n2"], np.where(n <= 100, n * n, -1))
-    np.testing.assert_array_equal(found["num_steps"], np.minimum(n, 100))
-
-
-def test_the_cheapest_budget():
-    batches = sys.modules["jaxmb.studies.sweep.batch"]
-    steps = np.full(64, 100)
-    # All alike: nothing is saved.
-    assert batches.cheapest_budget(steps, 8)[1] == 0.0
-    steps[[3, 20]] = 1000
-    # Two of eight blocks wait for 1000 steps; with a budget they end at 111, and one block of both takes 1000.
-    budget, share = batches.cheapest_budget(steps, 8)
-    assert budget == 111 and share == pytest.approx(1 - (6 * 100 + 2 * 111 + 1000) / (6 * 100 + 2 * 1000))
+    assert list(words) == ["ok", "ok", "max_steps_reached"] and list(found["num_steps"]) == [10, 100, 100]
+    assert "maximum number of solver steps" in str(found["message"][2].item())
 
 
 @pytest.mark.long
@@ -363,15 +326,8 @@ def test_motions_that_fail_have_a_status():
     np.testing.assert_allclose(found["q"][0], found["q"][2], rtol=1e-12)
 
 
-def test_a_thread_pool_is_an_executor(undisturbed, tmp_path):
-    with ThreadPoolExecutor(1) as executor:
-        run(tmp_path / "runs.zarr", executor=executor)
-    assert files(tmp_path / "runs.zarr") == files(undisturbed[0])
-
-
 def test_an_interruption_keeps_what_is_done(undisturbed, tmp_path, monkeypatch):
-    engine, store = sys.modules["jaxmb.studies.sweep.engine"], tmp_path / "runs.zarr"
-    own = engine.Work.__call__
+    store, own = tmp_path / "runs.zarr", Work.__call__
 
     def interrupted(work, task, tell):
         if task.place == 5:
@@ -379,7 +335,7 @@ def test_an_interruption_keeps_what_is_done(undisturbed, tmp_path, monkeypatch):
         return own(work, task, tell)
 
     with monkeypatch.context() as patch:
-        patch.setattr(engine.Work, "__call__", interrupted)
+        patch.setattr(Work, "__call__", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(store)
     assert marks(store) == 5
@@ -396,7 +352,7 @@ def halved(a, b):
 def test_blocks_of_a_chunk_take_turns_on_all_cores(monkeypatch, capsys):
     """Two blocks are computed at a time, with the same bits as one after the other."""
     cases = mb.cases.grid(a=np.linspace(1.5, 7.0, 12), b=[1.0, 3.0])
-    own = sweep_batch._Program._computed
+    own = Work._computed
     monkeypatch.setattr("jaxmb.studies.batch._MOST", 4)
     together = threading.Barrier(2)
 
@@ -406,7 +362,7 @@ def test_blocks_of_a_chunk_take_turns_on_all_cores(monkeypatch, capsys):
 
     with monkeypatch.context() as patch:
         patch.setenv("NPROC", "2")
-        patch.setattr(sweep_batch._Program, "_computed", both)
+        patch.setattr(Work, "_computed", both)
         found = mb.sweep(halved, cases)
     shown = capsys.readouterr().err.strip().split("\r")[-1]
     assert "24/24" in shown and f"{int(np.sum(found.status != 1))} failed" in shown
@@ -415,7 +371,7 @@ def test_blocks_of_a_chunk_take_turns_on_all_cores(monkeypatch, capsys):
 
 def test_a_sweep_is_interrupted_between_blocks(monkeypatch):
     """Blocks that have not begun are not computed then."""
-    computed, own = [], sweep_batch._Program._computed
+    computed, own = [], Work._computed
     monkeypatch.setattr("jaxmb.studies.batch._MOST", 4)
 
     def interrupted(program, block):
@@ -427,16 +383,18 @@ def test_a_sweep_is_interrupted_between_blocks(monkeypatch):
         return own(program, block)
 
     monkeypatch.setenv("NPROC", "1")
-    monkeypatch.setattr(sweep_batch._Program, "_computed", interrupted)
+    monkeypatch.setattr(Work, "_computed", interrupted)
     with pytest.raises(KeyboardInterrupt):
         mb.sweep(halved, mb.cases.grid(a=np.linspace(1.5, 7.0, 40), b=[1.0, 3.0]), progress=False)
     assert len(computed) < 5
 
 
-def test_progress_tells_the_time_left_and_failures(capsys):
+def test_progress_tells_of_compiling_the_time_left_and_failures(capsys):
     mb.sweep(lambda a: {"x": jnp.sqrt(a)}, mb.cases.table(a=[-1.0, 1.0]))
-    shown = capsys.readouterr().err.strip().split("\r")[-1]
-    assert "2/2" in shown and "00:00" in shown and "1 failed" in shown and "\n" not in shown
+    shown = capsys.readouterr().err.strip()
+    first, *_, last = shown.split("\r")
+    assert first.startswith("compiling:   0%") and "0/2" in first and "\n" not in shown
+    assert last.startswith("100%") and "2/2" in last and "00:00" in last and "1 failed" in last
 
 
 def test_the_command_line(capsys, tmp_path):
@@ -563,44 +521,3 @@ def test_a_lambda_and_a_closure_go_to_processes(tmp_path):
     lock = threading.Lock()
     with pytest.raises(ValueError, match="cannot be sent to other processes"):
         mb.sweep(lambda a: {"x": a + float(lock.locked())}, mb.cases.grid(a=[1.0, 2.0]), processes=2, progress=False)
-
-
-def test_two_devices_give_the_result_of_one():
-    """In a process of its own: devices are made when JAX starts. Without threads for them they are refused."""
-    code = """
-import os, sys
-import jax, numpy as np
-import jaxmb as mb
-from jaxmb.lagrangian import LagrangianSystem
-
-spring = LagrangianSystem(
-    kinetic=lambda t, q, v, p: 0.5 * v[0] ** 2,
-    potential=lambda t, q, p: 0.5 * p["k"] * q[0] ** 2,
-    q=(1.0,),
-    parameters={"k": 1.0},
-)
-
-def place(k, max_steps=4096):
-    sol = mb.simulate(mb.with_parameters(spring, {"k": k}), spring.guess, t1=1.0, throw=False, max_steps=max_steps)
-    return {"x": sol.ys.q[-1, 0], "result": sol}
-
-cases = mb.cases.grid(k=np.linspace(1.0, 4.0, 16))
-one, two = (mb.sweep(place, cases, devices=count, progress=False) for count in (1, 2))
-np.testing.assert_allclose(two["x"], one["x"], rtol=1e-13)
-np.testing.assert_allclose(two["x"], np.cos(np.sqrt(cases.columns["k"])), atol=1e-6)
-os.environ["NPROC"] = "3"
-try:
-    mb.sweep(place, cases, devices=2, progress=False)
-except ValueError as error:
-    sys.exit("need 4 threads" not in str(error))
-sys.exit(1)
-"""
-    flags = {"JAX_ENABLE_X64": "1", "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "NPROC": "4"}
-    done = subprocess.run([sys.executable, "-c", code], env=os.environ | flags, timeout=300, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode()
-
-
-def test_the_line_of_progress_says_that_it_compiles(capsys):
-    mb.sweep(lambda a: {"b": 2 * a}, mb.cases.table(a=np.arange(3.0)))
-    first, *_, last = capsys.readouterr().err.replace("\n", "\r").strip().split("\r")
-    assert first.startswith("compiling:   0%") and "0/3" in first and last.startswith("100%") and "3/3" in last
