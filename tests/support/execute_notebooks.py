@@ -27,7 +27,13 @@ FOLDER = Path(__file__).parents[2] / "notebooks"
 # The rounding errors of two machines have nothing in common, and errors of solutions their size.
 ROUNDING, OF_ERRORS, OF_VALUES = 1e-9, 20.0, 0.05
 # Mechanisms that the README shows: the end of the motion [s], and the number of poses.
-GALLERY = {"andrews": (0.03, 4), "tracked_vehicle": (2.0, 3), "bricard": (2.0, 4), "double_wishbone": (0.5, 3)}
+GALLERY = {
+    "andrews": (0.03, 4),
+    "bricard": (2.0, 4),
+    "double_wishbone": (0.5, 3),
+    "net": (1.0, 3),
+    "tracked_vehicle": (2.0, 3),
+}
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w])", re.IGNORECASE)
 
 
