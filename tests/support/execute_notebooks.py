@@ -19,7 +19,7 @@ import jax
 import nbformat
 import numpy as np
 from nbclient import NotebookClient
-from PIL import Image
+from PIL import Image, ImageOps
 
 import jaxmb
 
@@ -30,7 +30,7 @@ ROUNDING, OF_ERRORS, OF_VALUES = 1e-9, 20.0, 0.05
 GALLERY = {
     "andrews": (0.03, 4),
     "bricard": (2.0, 4),
-    "double_wishbone": (0.5, 3),
+    "n_four_bar": (1.0, 4),
     "net": (1.0, 3),
     "tracked_vehicle": (2.0, 3),
 }
@@ -141,7 +141,9 @@ def picture(name: str, path: Path) -> None:
     _bare(figure, 4.0, 3.0)
     file = io.BytesIO()
     figure.savefig(file, dpi=100)
-    Image.open(file).convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(path, optimize=True)
+    shown = Image.open(file).convert("RGB")
+    shown = shown.crop(ImageOps.invert(shown).getbbox())
+    shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(path, optimize=True)
 
 
 def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
