@@ -5,12 +5,13 @@ and example.
 import json
 import os
 import re
+from pathlib import Path
 
 import nbformat
 import numpy as np
 import pytest
 from compiling import QUICKLY
-from execute_notebooks import FOLDER, difference, digest, executed, printed
+from execute_notebooks import FOLDER, GALLERY, difference, digest, executed, printed, readme_examples
 from PIL import Image
 
 import jaxmb as mb
@@ -107,13 +108,14 @@ def test_the_figure_of_the_readme_shows_what_is_computed():
 
 @pytest.mark.always
 def test_readme_example(capsys):
-    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert code is not None
-    exec(code.group(1), {})
-    promised = [float(number) for number in code.group(1).rsplit("#", 1)[1].split()]
-    printed = [float(number) for number in capsys.readouterr().out.split()]
-    np.testing.assert_allclose(printed, promised, rtol=0, atol=1e-6)
-    # The moving picture is of the same motion.
+    examples = readme_examples()
+    assert len(examples) == 2
+    for code in examples:
+        exec(code, {})
+        promised = [float(number) for number in code.rsplit("#", 1)[1].split()]
+        printed = [float(number) for number in capsys.readouterr().out.split()]
+        np.testing.assert_allclose(printed, promised, rtol=0, atol=1e-6)
+    # The moving picture is of the second one.
     with Image.open(FOLDER / "four_bar.gif") as image:
         shown = json.loads(image.info["comment"])
     assert shown["jaxmb"] == mb.__version__
@@ -122,5 +124,9 @@ def test_readme_example(capsys):
 
 def test_the_readme_is_short():
     text = (ROOT / "README.md").read_text()
-    assert len(text.splitlines()) <= 150 and len(text.split()) <= 1500
+    assert len(text.splitlines()) <= 120 and len(text.split()) <= 1500
     assert (FOLDER / "four_bar.gif").stat().st_size < 1e6
+    assert all((FOLDER / f"{name}.png").stat().st_size < 6e4 for name in GALLERY)
+    linked = re.findall(r"notebooks/[\w.]+", text)
+    assert {path.name for path in NOTEBOOKS} < {Path(name).name for name in linked}
+    assert all((ROOT / name).is_file() for name in linked)

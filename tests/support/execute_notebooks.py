@@ -1,9 +1,9 @@
 """Execute notebooks, and record in them what was executed: `python tests/support/execute_notebooks.py [name …]`.
 
-Without names all notebooks are executed, and the figures `work_precision` and `four_bar` of the README are made. A
-notebook keeps the version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py` compares
-them with the package and with the cells, and in its long tests what is printed with what a new execution prints. Cells
-with the tag `varies` print what differs between machines and runs, such as times, and are not compared.
+Without names all notebooks are executed, and the README's pictures are made: `work_precision`, `four_bar` and those of
+`GALLERY`. A notebook keeps the version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py`
+compares them with the package and with the cells, and in its long tests what is printed with what a new execution
+prints. Cells with the tag `varies` print what differs between machines and runs, such as times, and are not compared.
 """
 
 import hashlib
@@ -17,14 +17,23 @@ from typing import Any
 import equinox as eqx
 import jax
 import nbformat
+import numpy as np
 from nbclient import NotebookClient
-from PIL import Image
+from PIL import Image, ImageOps
 
 import jaxmb
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 # The rounding errors of two machines have nothing in common, and errors of solutions their size.
 ROUNDING, OF_ERRORS, OF_VALUES = 1e-9, 20.0, 0.05
+# Mechanisms that the README shows: the end of the motion [s], and the number of poses.
+GALLERY = {
+    "andrews": (0.03, 4),
+    "bricard": (2.0, 4),
+    "n_four_bar": (1.0, 4),
+    "net": (1.0, 3),
+    "tracked_vehicle": (2.0, 3),
+}
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w])", re.IGNORECASE)
 
 
@@ -97,13 +106,44 @@ def _agree(a: str, b: str) -> bool:
     return abs(x - y) <= OF_VALUES * size
 
 
-def readme_example() -> dict[str, Any]:
-    """The names of the README's first block of code."""
-    code = re.search(r"```python\n(.*?)```", (FOLDER.parent / "README.md").read_text(), re.DOTALL)
-    assert code is not None
+def readme_examples() -> list[str]:
+    """The README's blocks of code."""
+    return re.findall(r"```python\n(.*?)```", (FOLDER.parent / "README.md").read_text(), re.DOTALL)
+
+
+def readme_machine() -> dict[str, Any]:
+    """The names of the README's last block of code."""
     scope: dict[str, Any] = {}
-    exec(code.group(1).rsplit("print(", 1)[0], scope)
+    exec(readme_examples()[-1].rsplit("print(", 1)[0], scope)
     return scope
+
+
+def _bare(figure, width, height):
+    """Its axes, without anything beside the machine, and as large as the figure [inches]."""
+    (axes,) = figure.axes
+    axes.set(title="")
+    for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
+        legend.remove()
+    axes.axis("off")
+    figure.set_size_inches(width, height)
+    figure.set_layout_engine("none")
+    axes.set_position((0.0, 0.0, 1.0, 1.0))
+    return axes
+
+
+def picture(name: str, path: Path) -> None:
+    """A PNG of a mechanism of `GALLERY`."""
+    t1, frames = GALLERY[name]
+    machine = jaxmb.mechanisms.get(name)
+    saveat = np.linspace(0.0, t1, 101)
+    motion = jaxmb.simulate(machine.system, machine.state, t1=t1, saveat=saveat, rtol=1e-6)
+    figure = jaxmb.viz.plot_mechanism(motion, frames=frames)
+    _bare(figure, 4.0, 3.0)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=100)
+    shown = Image.open(file).convert("RGB")
+    shown = shown.crop(ImageOps.invert(shown).getbbox())
+    shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(path, optimize=True)
 
 
 def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
@@ -113,14 +153,7 @@ def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
         until = lambda x, k=k: x[max(k - 12, 0) : k + 1]
         shown = eqx.tree_at(lambda t: (t.ts, t.ys), trajectory, jax.tree.map(until, (trajectory.ts, trajectory.ys)))
         figure = jaxmb.viz.plot_mechanism(shown, frames=3)
-        (axes,) = figure.axes
-        axes.set(xlim=(-1.2, 3.2), ylim=(-1.3, 2.1), title="")
-        for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
-            legend.remove()
-        axes.axis("off")
-        figure.set_size_inches(5.2, 4.0)
-        figure.set_layout_engine("none")
-        axes.set_position((0.0, 0.0, 1.0, 1.0))
+        _bare(figure, 5.2, 4.0).set(xlim=(-1.2, 3.2), ylim=(-1.3, 2.1))
         file = io.BytesIO()
         figure.savefig(file, dpi=70)
         frames.append(Image.open(file).convert("P", palette=Image.Palette.ADAPTIVE, colors=64))
@@ -132,12 +165,14 @@ def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
 
 def main(names: list[str]) -> None:
     known = {path.stem: path for path in sorted(FOLDER.glob("*.ipynb"))}
-    for name in names or [*known, "work_precision", "four_bar"]:
+    for name in names or [*known, "work_precision", "four_bar", *GALLERY]:
         print(name, flush=True)
         if name == "work_precision":
             jaxmb.report.work_precision(jaxmb.mechanisms.get("andrews")).figure(FOLDER / f"{name}.png")
         elif name == "four_bar":
-            moving_picture(readme_example()["motion"](2.0), FOLDER / f"{name}.gif")
+            moving_picture(readme_machine()["motion"](2.0), FOLDER / f"{name}.gif")
+        elif name in GALLERY:
+            picture(name, FOLDER / f"{name}.png")
         else:
             nbformat.write(executed(known[name]), known[name])
 
