@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, Velocities
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 
 

@@ -6,7 +6,7 @@ import diffrax
 
 from ..formulations import AbstractFormulation
 from ..solvers import AbstractMultistep
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from .manifold import AbstractManifold, VectorField
 from .orthogonal_projection import project_normalized
 from .partition import Partition

@@ -35,7 +35,7 @@ from ..linalg.jacobian import DenseJacobian
 from ..linalg.newton import chord
 from ..linalg.sums import unchecked_take
 from ..solvers import AbstractMultistep
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant, drops_rows
 from .constraints import (
     AbstractConstraints,

@@ -13,19 +13,13 @@ from compiling import jit_to_run_long
 from every_formulation import FORMULATIONS
 
 import jaxmb as mb
-from jaxmb.formulations import (
-    AbstractFormulation,
-    Multipliers,
-    Partitioned,
-    Poincare,
-    UdwadiaKalaba,
-    gauss_function,
-    pivoted_jacobian,
-)
+from jaxmb.formulations import AbstractFormulation, Multipliers, Partitioned, Poincare, UdwadiaKalaba, gauss_function
+from jaxmb.formulations.formulation import pivoted_jacobian
 from jaxmb.formulations.laws import laws_of
 from jaxmb.linalg.elimination import full_pivot
+from jaxmb.linalg.inertia import BlockInertia
 from jaxmb.linalg.jacobian import DenseJacobian
-from jaxmb.system import BlockInertia, DenseInertia, DiagonalInertia
+from jaxmb.system import DenseInertia, DiagonalInertia
 from jaxmb.system.instant import Instant
 
 WITHOUT_INVERSE_OF_MASS = {name: FORMULATIONS[name] for name in ("partitioned", "null_space", "singular_mass")}

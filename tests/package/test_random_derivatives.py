@@ -27,17 +27,10 @@ from sprung_pendulums import HANGING, double_pendulum, pendulum as sprung_pendul
 import jaxmb as mb
 from jaxmb import formulations, lagrangian, manifold, mechanisms, planar, solvers, spatial
 from jaxmb.formulations import Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from jaxmb.parts import (
-    AbstractForce,
-    AbstractFrictionLaw,
-    AbstractNonIdeal,
-    AbstractNormalLaw,
-    AbstractTerrain,
-    contact,
-    fields,
-    terrain,
-)
-from jaxmb.system import Solved
+from jaxmb.parts import AbstractForce, AbstractNonIdeal, contact, fields, terrain
+from jaxmb.parts.contact import AbstractFrictionLaw, AbstractNormalLaw
+from jaxmb.parts.terrain import AbstractTerrain
+from jaxmb.system.quantities import Solved
 
 TIMES = np.array([0.06, 0.1])
 MOTION = ("position", "velocity", "angle", "orientation", "angular_velocity")

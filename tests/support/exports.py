@@ -4,7 +4,6 @@ import inspect
 
 import jaxmb as mb
 from jaxmb.parts import (
-    AbstractBody,
     AbstractCompound,
     AbstractConstraint,
     AbstractForce,
@@ -12,6 +11,7 @@ from jaxmb.parts import (
     AbstractTendon,
     AbstractVelocityConstraint,
 )
+from jaxmb.parts.base import AbstractBody
 
 PARTS = (
     AbstractBody,

@@ -18,6 +18,8 @@ from jaxtyping import ArrayLike
 from ..._arguments import whole_number
 from ...parts.names import unknown
 
+__all__ = ["Cases", "grid", "sobol", "table"]
+
 MEMBER = "member"
 
 
