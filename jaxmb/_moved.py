@@ -18,14 +18,15 @@ def tell_of_moved(package: str, **now: str) -> None:
         text = f"module {package!r} has no attribute {name!r}"
         if name in now:
             text = f"{package}.{name} is now {now[name]}."
-        elif "." in package and not name.startswith("_") and (home := _home(name)):
+        elif "." in package and not name.startswith("_") and (home := _home(package, name)):
             text = f"{package} does not export {name!r}; it stands in {home}."
         raise AttributeError(text, name=name, obj=module)
 
     vars(module)["__getattr__"] = missing
 
 
-def _home(name: str) -> str | None:
-    """The module that defines a class or function."""
-    modules = (own for own in sorted(sys.modules) if own.split(".")[0] == __package__)
+def _home(package: str, name: str) -> str | None:
+    """The module that defines a class or function, of a package if it is there."""
+    modules = [own for own in sys.modules if own.split(".")[0] == __package__]
+    modules.sort(key=lambda own: (not own.startswith(package), own))
     return next((own for own in modules if getattr(vars(sys.modules[own]).get(name), "__module__", "") == own), None)

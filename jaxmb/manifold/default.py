@@ -16,10 +16,6 @@ from .projection import Projection
 class Unconstrained(AbstractManifold):
     """Integrate all coordinates, and constraints on the level of accelerations only.
 
-    ```python
-    motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Unconstrained())
-    ```
-
     The policy of systems without constraints. With constraints the integration drifts off them by its error, which is
     for comparison only: states that are saved are the nearest ones on the constraints. Euler parameters are normalised
     where they are used, so their length does not matter.

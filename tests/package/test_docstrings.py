@@ -231,18 +231,8 @@ RESULTS_OF = {
     "cases.Cases": "cases",
     "mechanisms.Mechanism": "mechanisms",
     "mechanisms.References": "mechanisms",
-    "report.FormulationCost": "report.formulation_costs",
-    "report.FormulationCosts": "report.formulation_costs",
-    "report.LeftOut": "report.left_out",
-    "report.Measured": "report.left_out",
-    "report.MethodCost": "report.method_costs",
-    "report.MethodCosts": "report.method_costs",
-    "report.Case": "report.stress_test",
-    "report.StressTest": "report.stress_test",
-    "report.Run": "report.work_precision",
-    "report.WorkPrecision": "report.work_precision",
+    "report.Table": "report.work_precision",
     "parts.Module": "parts.module",
-    "trajectory.PartMotion": "Trajectory",
 }
 # Modules that hold what a new method or a new kind of system is made of.
 MACHINERY = ("formulations", "manifold", "solvers", "system")

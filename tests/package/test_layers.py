@@ -16,6 +16,7 @@ LAYERS = [
         "_faulty_versions",
         "_kept_programs",
         "_machine",
+        "_moved",
         "_printed",
         "_setup",
         "_types",

@@ -14,10 +14,16 @@ from laws import FRICTION, LAWS, TERRAINS
 
 import jaxmb as mb
 from jaxmb import formulations, manifold, planar, solvers, spatial
-from jaxmb.parts import AbstractConstraint, AbstractForce, contact, terrain
-from jaxmb.parts.base import AbstractBody
-from jaxmb.parts.contact import AbstractFrictionLaw, AbstractNormalLaw
-from jaxmb.parts.terrain import AbstractTerrain
+from jaxmb.parts import (
+    AbstractBody,
+    AbstractConstraint,
+    AbstractForce,
+    AbstractFrictionLaw,
+    AbstractNormalLaw,
+    AbstractTerrain,
+    contact,
+    terrain,
+)
 
 CHOICES = [choice for options in METHODS.values() for choice in options.values()]
 

@@ -131,7 +131,7 @@ def test_what_is_asked_for_alone_is_set():
 
 @pytest.mark.parametrize("name", ["compile_quickly", "run_quickly", "keep_compiled"])
 def test_names_of_the_last_release_tell_the_new_one(name):
-    with pytest.raises(AttributeError, match=rf"jaxmb\.{name} is jaxmb\.setup\(.* now"):
+    with pytest.raises(AttributeError, match=rf"jaxmb\.{name} is now jaxmb\.setup\("):
         getattr(mb, name)
 
 

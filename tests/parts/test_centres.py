@@ -12,8 +12,8 @@ from every_part import EXAMPLES
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.formulations import Partitioned, accelerations
-from jaxmb.parts import AbstractCompound, AbstractForce, AbstractPotentialForce, fields
-from jaxmb.parts.base import AbstractBody, AbstractLink, AbstractVelocityConstraint
+from jaxmb.parts import AbstractBody, AbstractCompound, AbstractForce, AbstractPotentialForce, fields
+from jaxmb.parts.base import AbstractLink, AbstractVelocityConstraint
 from jaxmb.parts.frames import LinkFrame
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE

@@ -14,7 +14,11 @@ from every_part import EXAMPLES, METHOD, METHODS, compiled
 
 import jaxmb as mb
 from jaxmb.formulations import Multipliers, accelerations
-from jaxmb.parts import AbstractCompound, AbstractConstraint, AbstractVelocityConstraint
+from jaxmb.parts import (
+    AbstractCompound,
+    AbstractConstraint,
+    AbstractVelocityConstraint,
+)
 from jaxmb.parts.base import AbstractInertialConstraint
 
 CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)

@@ -15,7 +15,13 @@ import numpy as np
 
 import jaxmb as mb
 from jaxmb import planar
-from jaxmb.lagrangian import Holonomic, LagrangianSystem, NonIdealForce, Pfaffian, QuasiVelocityFrame
+from jaxmb.lagrangian import (
+    Holonomic,
+    LagrangianSystem,
+    NonIdealForce,
+    Pfaffian,
+    QuasiVelocityFrame,
+)
 from jaxmb.lagrangian.constraints import AbstractCoordinateConstraint
 from jaxmb.lagrangian.kinematics import AbstractKinematics
 

@@ -4,6 +4,7 @@ import inspect
 
 import jaxmb as mb
 from jaxmb.parts import (
+    AbstractBody,
     AbstractCompound,
     AbstractConstraint,
     AbstractForce,
@@ -11,7 +12,6 @@ from jaxmb.parts import (
     AbstractTendon,
     AbstractVelocityConstraint,
 )
-from jaxmb.parts.base import AbstractBody
 
 PARTS = (
     AbstractBody,
