@@ -14,7 +14,7 @@ Assembly, simulation, identification and derivatives work as with scenes of bodi
 
 Accelerations are computed by any of `jaxmb.formulations`: `Partitioned`, `Multipliers`, `NullSpace`, `Poincare`, or
 `UdwadiaKalaba` in three forms. They agree to 1e-10 on every mechanism of the library, with and without redundant
-joints. `gauss_function` is what the true accelerations make least.
+joints.
 """
 
 from .._moved import tell_of_moved as _tell_of_moved

@@ -10,7 +10,7 @@ rotations.unrotate(p, x), rotations.rotate(rotations.conjugate(p), x)  # Both (0
 rotations.from_matrix(R), rotations.from_xyzw(rotations.to_xyzw(p)), rotations.normalize(2.0 * p)  # All p.
 omega = jnp.array([0.0, 0.0, 2.0])
 rotations.angular_velocity(p, rotations.rates(p, omega))  # omega.
-rotations.rotate_2d(np.pi / 2, x[:2]), rotations.norm(rotations.cross(x, omega))  # (0, 1), and 2.
+rotations.norm(rotations.cross(x, omega))  # 2.
 rotations.dot(x, R @ x)  # 0.
 # The moment of a potential V(p), in the body frame, is minus the gradient, pulled back.
 V = lambda p: 9.81 * rotations.rotation_matrix(p)[2, 0]
@@ -51,7 +51,6 @@ __all__ = [
     "pull_back",
     "rates",
     "rotate",
-    "rotate_2d",
     "rotation_matrix",
     "to_xyzw",
     "unrotate",
