@@ -7,6 +7,11 @@ where rows are redundant) `simulate` chooses `Projection` with `Adams`, and from
 eliminates bodies on stiff springs along with the joints; `print(system)` reports this choice and the order of
 elimination. Joint friction costs O(n³) in the number n of constraint rows with friction. `Hermite` needs dense
 matrices for friction, servos and internal states.
+
+```python
+motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Partition())
+on_constraints = jaxmb.manifold.project(system, 0.0, jaxmb.State(motion.ys.q[-1] + 1e-3, motion.ys.u[-1]))
+```
 """
 
 from .._moved import tell_of_moved as _tell_of_moved
