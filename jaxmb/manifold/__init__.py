@@ -9,8 +9,7 @@ elimination. Joint friction costs O(n³) in the number n of constraint rows with
 matrices for friction, servos and internal states.
 
 ```python
-motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Partition())
-on_constraints = jaxmb.manifold.project(system, 0.0, jaxmb.State(motion.ys.q[-1] + 1e-3, motion.ys.u[-1]))
+on_constraints = jaxmb.manifold.project(system, 0.0, jaxmb.State(state.q + 1e-3, state.u))
 ```
 """
 

@@ -1,26 +1,28 @@
 """Multistep methods as diffrax solvers, with variable order and step, on vector fields and on manifolds.
 
-```python
-jaxmb.simulate(system, state, t1=0.1, solver=jaxmb.solvers.Adams(), adjoint=jaxmb.solvers.MeshAdjoint())
-```
-
-Any solver of diffrax is one for `simulate`. A multistep method of one's own derives from `AbstractMultistep`, where it
-states its order and tolerances, and is made of evaluations at predicted and at corrected states:
+Any solver of diffrax is one for `simulate`, as these are for `diffrax.diffeqsolve`, with a `MultistepController`. A
+multistep method of one's own derives from `AbstractMultistep`, with a field for its tolerances. Its steps are made of
+evaluations of the term that diffrax gives it, at predicted and at corrected states:
 
 ```python
-import diffrax
 from jaxmb import solvers
-tolerances: solvers.Tolerances = solvers.tolerances_of("Heun")  # A field of the method.
-term, t, h, y = diffrax.ODETerm(lambda t, y, args: -y), jnp.zeros(()), 0.1, jnp.ones(2)
-chart = solvers.next_chart(term, t, y, None, None)
-now = solvers.evaluate(term, t, solvers.ravel(y), y, chart, None)
-predicted = solvers.evaluate(term, t + h, now.y + h * now.f, y, chart, None)
-end = solvers.project_near(term, t + h, now.y + h * (now.f + predicted.f) / 2, y, predicted, None)
-error, never = jnp.max(jnp.abs(end.y - predicted.y)), jnp.array(False)
-errors, limits = jnp.stack([jnp.inf, error, jnp.inf]), {"target": 0.5, "work": jnp.array([2, 0])}
-may = {"may_fall": never, "may_rise": never, "known": ~never}
-change, estimate = solvers.choose_order(errors, jnp.full(3, 2.0), jnp.ones(()), **may, **limits)
-y = solvers.unravel_like(y, end.y)
+
+tolerances: solvers.Tolerances = solvers.tolerances_of("Heun")
+adjoint = solvers.MeshAdjoint(most=1024)  # Derivatives of up to so many steps of a multistep method.
+
+def heun(term, t, h, y, args, chart):
+    now = solvers.evaluate(term, t, solvers.ravel(y), y, chart, args)
+    predicted = solvers.evaluate(term, t + h, now.y + h * now.f, y, chart, args)
+    end = solvers.project_near(term, t + h, now.y + h * (now.f + predicted.f) / 2, y, predicted, args)
+    y1 = solvers.unravel_like(y, end.y)
+    return y1, jnp.max(jnp.abs(end.y - predicted.y)), solvers.next_chart(term, t + h, y1, end.chart, args)
+
+def next_step(error):  # Of a method of one order, whose error is of second order in the step.
+    never, errors = jnp.array(False), jnp.stack([jnp.inf, error, jnp.inf])
+    may = {"may_fall": never, "may_rise": never, "known": ~never}
+    return solvers.choose_order(errors, jnp.full(3, 2.0), jnp.ones(()), target=0.5, work=jnp.array([2, 0]), **may)
+
+change, estimate = next_step(0.3)
 ```
 """
 

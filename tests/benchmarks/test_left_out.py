@@ -27,6 +27,7 @@ def udot(system, y):
     return mb.formulations.accelerations(system, mb.formulations.Multipliers(), jnp.zeros(()), y.q, y.u)[0]
 
 
+@pytest.mark.long
 def test_variants_do_not_change_the_motion(pendulum):
     system, state = pendulum
     driven, rolling = in_time(system, state), nonholonomic(system, state)

@@ -54,6 +54,7 @@ def test_the_stub_has_all_names():
         assert getattr(mb, name) is getattr(module, name)
 
 
+@pytest.mark.long
 def test_names_may_be_used_first_in_a_function_that_jax_traces():
     """No array of a module is one of the trace."""
     code = """
