@@ -49,10 +49,11 @@ def left_out(
 ) -> Table:
     """Measure the time saved by leaving unused features out of the compiled program.
 
-    Each thing that the motion does not need is put in, in a form that does not change the motion: a joint twice, a
-    term in time of amplitude zero, with which the joint is known by its residual alone, rows between velocities that a joint implies, a damper of zero, an event that does
-    not occur, dense output, and a dense Jacobian with charts where blocks do. Only what is put in is measured. A
-    persistent cache of compiled programs shortens the compile times of a second report.
+    Each thing that the motion does not need is put in, in a form that does not change the motion: a joint twice, a term
+    in time of amplitude zero, with which the joint is known by its residual alone, rows between velocities that a joint
+    implies, a damper of zero, an event that does not occur, dense output, and a dense Jacobian with charts where blocks
+    do. Only what is put in is measured. A persistent cache of compiled programs shortens the compile times of a second
+    report.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`, or a mechanism of the library alone; `repeats`: timed
     runs, in turns.
