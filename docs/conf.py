@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jaxmb
 from jaxmb.reference import subjects
-from jaxmb.reference.entries import signature_of
+from jaxmb.reference.entries import entries, signature_of
 
 project, release = "jaxmb", jaxmb.__version__
 extensions = ["sphinx.ext.autodoc", "myst_nb"]
@@ -37,9 +37,13 @@ def as_rst(text):
 
 
 def code(found):
-    """A name stays in single backticks, which make links; other code goes into double ones."""
+    """A name stays in single backticks, which make links; other code goes into double ones.
+
+    Words in small letters mostly mean arguments.
+    """
     inside = found[1].replace("\\|", "|")
-    return (f"`{inside}`" if re.fullmatch(r"[\w.]+", inside) else f"``{inside}``") + "\\ " * bool(found[2])
+    target = f" <jaxmb.{inside}>" if inside in entries() and not inside.islower() else ""
+    return (f"`{inside}{target}`" if re.fullmatch(r"[\w.]+", inside) else f"``{inside}``") + "\\ " * bool(found[2])
 
 
 def signature(app, what, name, thing, *_):

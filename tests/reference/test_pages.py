@@ -27,6 +27,6 @@ def test_pages(tmp_path):
         assert ids[name] == 1, name
     # Names in docstrings are links, and no marks of Markdown are left in their text.
     (spatial,) = [page for page in pages.values() if 'id="jaxmb.spatial.Revolute"' in page]
-    assert 'title="jaxmb.assemble"' in spatial
+    assert 'title="jaxmb.DryFriction"' in spatial
     text = re.sub(r"<(pre|code|dt|script|style).*?</\1>", "", spatial, flags=re.DOTALL)
     assert not [mark for mark in ("**", "`", "$$") if mark in text]
