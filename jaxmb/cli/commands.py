@@ -40,13 +40,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         # What reads a pipe, such as head, has enough; nothing is left to be written when the process ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except Exception as error:
+    except (ValueError, RuntimeError, OSError) as error:
         if is_of_user(error):
             traceback.print_exception(error)
-        elif isinstance(error, ValueError | RuntimeError | OSError):
-            print(f"jaxmb: {error}", file=sys.stderr)
         else:
-            raise
+            print(f"jaxmb: {error}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1
     except KeyboardInterrupt:
         print("jaxmb: interrupted", file=sys.stderr)

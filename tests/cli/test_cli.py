@@ -94,23 +94,6 @@ def test_a_run_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path
         assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("line", ["raise TypeError('own')", "import no_such_package"])
-def test_errors_of_a_users_file_have_their_traceback(line, capsys, tmp_path):
-    file = tmp_path / "own.py"
-    file.write_text(f"def scene():\n    {line}\n")
-    assert main(["run", f"{file}:scene", "--out", str(tmp_path / "out")]) == 1
-    error = capsys.readouterr().err
-    assert f'own.py", line 2, in scene\n    {line}' in error and "give module:function" not in error
-
-
-def test_wrong_names_of_a_function(capsys, tmp_path):
-    file = tmp_path / "own.py"
-    file.write_text("")
-    for where, message in ((f"{file}:scene", "has no 'scene'"), ("no_such_module:scene", "No module named")):
-        assert main(["run", where, "--out", str(tmp_path / "out")]) == 2
-        assert message in capsys.readouterr().err
-
-
 def test_no_traceback_of_wrong_values(capsys, tmp_path):
     """One line, whatever the mechanism did with the value."""
     assert main(["run", "four_bar", "--set", "speed=fast", "--out", str(tmp_path)]) == 2
