@@ -80,8 +80,8 @@ def setup(
     jaxmb.setup()  # At the head of a script or notebook, before anything is computed.
     ```
 
-    It changes settings of JAX for the whole process. Importing jaxmb changes none; the command line calls this, except
-    for reports. `jaxmb help compiling` has more.
+    It changes settings of JAX for the whole process. Importing jaxmb changes none; the command line calls this.
+    `jaxmb help compiling` has more.
 
     **Arguments:**
 

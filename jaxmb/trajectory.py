@@ -24,11 +24,11 @@ from .formulations.laws import accelerations_at
 from .linalg.arrays import ARRAYS, is_traced
 from .linalg.jitted import jitted
 from .linalg.members import vmap_states
-from .manifold import after_jumps, next_number, project_normalized
+from .manifold.impulse import after_jumps, next_number
+from .manifold.orthogonal_projection import project_normalized
 from .parts.names import UnknownNameError, unknown
-from .system import Reaction, Solved
 from .system.instant import Instant
-from .system.quantities import with_shapes
+from .system.quantities import Reaction, Solved, with_shapes
 
 
 class ConstraintViolation(NamedTuple):

@@ -20,7 +20,7 @@ from ..linalg.blocks import transpose_vector_products, vector_products
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.sums import unchecked_take
-from ..solvers import AbstractFieldJacobian, AbstractResolvent
+from ..solvers.manifold_term import AbstractFieldJacobian, AbstractResolvent
 from .groups import Kinematics
 from .layout import Layout
 from .motion_graph import MotionOrder, motion_order

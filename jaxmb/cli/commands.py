@@ -7,12 +7,16 @@ import traceback
 import warnings
 from collections.abc import Sequence
 
-import jax
-
 from .. import mechanisms
 from .._setup import VARIABLE, setup
 from .._traced_functions import is_of_user
-from . import doctor, help, report, run, sweep
+from . import doctor, help, run, sweep
+
+# Commands of before, which are one line elsewhere.
+_ELSEWHERE = {
+    "report": "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python; mb.report.stress_test is the other",
+    "reference": "python -m sphinx -c tests/pages . FOLDER in a checkout of jaxmb",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,10 +27,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     **Returns:** the exit code: 0; with a message on stderr 1 if a simulation failed or a file could not be written, 2
     for a name or value that does not fit, and 130 after Ctrl-C. Errors of a user's file have their tracebacks.
     """
-    arguments = parser().parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
-    if not arguments.compile_anew:
-        _prepare()
+    words = sys.argv[1:] if argv is None else list(argv)
+    if words and words[0] in _ELSEWHERE:
+        print(f"jaxmb: `jaxmb {words[0]}` is now: {_ELSEWHERE[words[0]]}.", file=sys.stderr)
+        return 2
+    arguments = parser().parse_args(words)
+    _prepare()
     try:
         arguments.command(arguments)
         sys.stdout.flush()
@@ -52,19 +58,17 @@ def parser() -> argparse.ArgumentParser:
         prog="jaxmb",
         description="Accurate, differentiable dynamics of constrained mechanical systems.",
         epilog="Compiled programs are kept in the user's cache folder for later runs; the environment variable "
-        f"{VARIABLE} names another folder, or is off. `jaxmb doctor` says where they are. A report, which measures the "
-        "time to compile, neither keeps nor uses them.",
+        f"{VARIABLE} names another folder, or is off. `jaxmb doctor` says where they are.",
     )
-    out.set_defaults(compile_anew=False)
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
-    for command in (run, report, sweep, doctor, help):
+    for command in (run, sweep, doctor, help):
         command.add_to(commands)
     return out
 
 
 def _prepare() -> None:
-    """Compile quickly, and keep what is compiled."""
+    """Double precision, short waits for programs, and programs that are kept."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         setup()

@@ -1,4 +1,4 @@
-"""`jaxmb doctor`: the machine, what is installed on it, and how long first calls and steps take there."""
+"""`jaxmb doctor`: the machine, what is installed on it, and, with `--measure`, how long first calls and steps take."""
 
 import argparse
 import functools
@@ -48,6 +48,7 @@ done = lambda: times.append(time.perf_counter())
 import diffrax, jax
 done()
 import jaxmb as mb
+mb.simulate, mb.Scene
 done()
 mb.setup()
 stop = mb.Stop("stop", "slide.displacement", lower=0.3, restitution=0.5)
@@ -93,16 +94,19 @@ def add_to(commands: Any) -> None:
     """Add the command to a parser's commands."""
     command = commands.add_parser(
         "doctor",
-        help="say what is installed, where compiled programs are kept, and how long things take on this machine",
+        help="say what is installed, where compiled programs are kept, and, with --measure, how long things take here",
     )
-    command.add_argument("--quick", action="store_true", help="leave out the measurements, which take some minutes")
+    command.add_argument("--measure", action="store_true", help="measure first calls and steps, some minutes")
+    command.add_argument("--quick", action="store_true", help=argparse.SUPPRESS)
     command.set_defaults(command=_doctor)
 
 
 def _doctor(arguments: argparse.Namespace) -> None:
+    if arguments.quick:
+        raise ValueError("`jaxmb doctor` is quick without --quick; --measure measures.")
     for name, text in _facts():
         print(_FILLED.fill(f"{name:{_INDENT}}{text}"))
-    if arguments.quick:
+    if not arguments.measure:
         return
     print(
         "\nCalls in a new process [s], values with their scenes; the second finds the programs that the first kept:\n"

@@ -16,13 +16,6 @@ def add_parameters(command: argparse.ArgumentParser) -> None:
     )
 
 
-def count(text: str) -> int:
-    """A number of at least 1."""
-    if not (text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"expected a number of at least 1, got {text!r}")
-    return int(text)
-
-
 def assignment(text: str) -> tuple[str, object]:
     """A name and a Python literal, or a word."""
     name, equals, value = text.partition("=")

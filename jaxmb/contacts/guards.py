@@ -11,8 +11,8 @@ from ..formulations import AbstractFormulation
 from ..linalg.pairs import for_first, of_pairs, placed_pairs
 from ..linalg.rotations import norm
 from ..parts.modes import BEGUN
-from ..solvers import AbstractGuards
-from ..system import AbstractEquation
+from ..solvers.manifold_term import AbstractGuards
+from ..system.equation import AbstractEquation
 from .forces import contact_forces, largest_force, reserves
 from .impact import Impact, impact
 from .impacting import Event, find_event

@@ -30,7 +30,7 @@ from ..formulations import AbstractFormulation
 from ..linalg.pairs import of_pairs
 from ..linalg.pushed import dense, push
 from ..linalg.sums import with_entries
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from .forces import contact_forces, largest_force, reserves
 from .impacting import Event, find_event
 from .phases import Phases

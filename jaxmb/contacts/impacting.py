@@ -18,8 +18,8 @@ from ..linalg.pairs import for_first, of_pairs
 from ..linalg.rotations import norm
 from ..parts.modes import Modes, modes_of_contacts, modes_of_friction
 from ..solvers.events import Bracket, narrowed
-from ..system import AbstractEquation
 from ..system.contact_set import ContactSet
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .dry_laws import Answers
 from .forces import directions, free_accelerations, friction_coefficients

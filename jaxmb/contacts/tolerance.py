@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Velocities
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 
 # Rates below this fraction of their summands, and squares of gradients, are zero.
 REST = 1e-9

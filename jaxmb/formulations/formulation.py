@@ -16,7 +16,7 @@ from .._types import Coordinates, Scalar, Velocities
 from ..linalg.elimination import full_pivot
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from .._types import Coordinates, Scalar, Velocities
 from ..linalg.jacobian import AbstractJacobian
 from ..linalg.newton import root
 from ..linalg.sums import unchecked_take, with_entries
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .formulation import AbstractFormulation, check_mass, suitable_jacobian
 from .friction import find_multipliers

@@ -1,6 +1,5 @@
 """Hamel's equations: motion in a frame, with the structure functions of its vector fields."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar
-from ..linalg.elimination import PivotOrder, eliminate, full_pivot
+from ..linalg.elimination import eliminate, full_pivot
 from .kinematics import Parameters, QuasiVelocityFrame
 from .model import AbstractEquations
 from .transposition import Transposition, check_shape, share_of_suslov
@@ -117,42 +115,3 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse, with full pivoting."""
     n = matrix.shape[0]
     return eliminate(matrix, full_pivot(matrix).order, n).right_inverse
-
-
-def pivoted_frame(matrix: Callable[..., Array], order: PivotOrder, rank: int) -> QuasiVelocityFrame:
-    """A frame of the directions that Pfaffian constraints `A(t, q) q̇ = 0` allow, regular near where it was chosen.
-
-    ```python
-    from jaxmb.linalg.elimination import full_pivot
-    blade = lambda t, q, p: jnp.array([[-jnp.sin(q[2]), jnp.cos(q[2]), 0.0]])
-    order = full_pivot(blade(0.0, jnp.zeros(3), {})).order
-    frame = jaxmb.lagrangian.pivoted_frame(blade, order, rank=1)
-    ```
-
-    **Arguments:** `matrix(t, q, parameters)`: A, shape (rows, nq); `order` of elimination, from
-    `jaxmb.linalg.elimination.full_pivot` at a position nearby; `rank` of A. The velocities are the rates of the
-    coordinates that the pivots leave.
-    """
-    basis = lambda t, q, p: eliminate(jnp.asarray(matrix(t, q, p)), order, rank).null_space
-    return QuasiVelocityFrame(basis, columns=order.n - rank)
-
-
-def structure_functions(
-    frame: QuasiVelocityFrame, t: Scalar, q: Float[Array, "n"], parameters: Parameters
-) -> Float[Array, "n k k"]:
-    """`c^a_bc` of `[X_b, X_c] = c^a_bc X_a` for the frame's columns, in the completed frame; axes a, b, c.
-
-    ```python
-    def axes(t, q, p):  # Forwards, to the left and a turn, of (x, y, angle).
-        c, s = jnp.cos(q[2]), jnp.sin(q[2])
-        return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-    frame = jaxmb.lagrangian.QuasiVelocityFrame(axes, columns=3)
-    jaxmb.lagrangian.structure_functions(frame, 0.0, jnp.array([0.5, 0.4, -0.3]), {})[:, 2, 0]  # (0, 1, 0).
-    ```
-    """
-    columns = lambda q: frame.columns_of(t, q, parameters)
-    X = columns(q)
-    slope = jax.jacfwd(columns)(q)
-    brackets = jnp.einsum("mcn,nb->mbc", slope, X) - jnp.einsum("mbn,nc->mbc", slope, X)
-    return jnp.einsum("am,mbc->abc", inverse_of(complete(X)), brackets)

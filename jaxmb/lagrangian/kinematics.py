@@ -41,14 +41,7 @@ class AbstractKinematics(eqx.Module):
 
 
 class Rates(AbstractKinematics):
-    """Velocities are the coordinates' rates, `u = q̇`.
-
-    ```python
-    kinetic = lambda t, q, v, p: 0.5 * v @ v
-    rates = jaxmb.lagrangian.Rates()  # The default.
-    particle = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, kinematics=rates, q=[0.0, 0.0], u=[1.0, 0.0])
-    ```
-    """
+    """Velocities are the coordinates' rates, `u = q̇`: the kinematics by default."""
 
     identity: ClassVar[bool] = True
     linear: ClassVar[bool] = True

@@ -292,13 +292,7 @@ class Unanalysed(AbstractLagrangian):
 
 
 class Projected(AbstractEquations):
-    """Lagrange's equations in the coordinates, projected on the directions that velocities move them in.
-
-    ```python
-    kinetic = lambda t, q, v, p: 0.5 * v @ v
-    equations = jaxmb.lagrangian.Projected()  # The default.
-    particle = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, equations=equations, q=[0.0, 0.0], u=[1.0, 0.0])
-    ```
+    """Lagrange's equations in the coordinates, projected on the directions that velocities move them in: the default.
 
     For any kinematics, also nonlinear ones. The cheapest way: two derivatives of L, and one of the kinematics.
     """

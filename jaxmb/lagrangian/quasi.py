@@ -14,7 +14,6 @@ from .._types import Coordinates, Scalar, VectorLike, Velocities
 from ..linalg.elimination import eliminate, full_pivot
 from ..linalg.newton import newton
 from .kinematics import AbstractKinematics, Parameters
-from .system import LagrangianSystem
 
 _ITERATIONS = 50
 
@@ -122,33 +121,3 @@ def _inverse_jvp(primals, tangents):
 
 def _solve(matrix, right):
     return eliminate(matrix, lax.stop_gradient(full_pivot(matrix).order), matrix.shape[0]).right_inverse @ right
-
-
-def kinetostatic_forces(
-    system: LagrangianSystem, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
-) -> Float[Array, "dependent"]:
-    """The generalized forces Λ_D that hold the dependent quasi-velocities at zero, in the order of `dependent`.
-
-    ```python
-    omega = lambda t, q, v, p: jnp.array([v[0], v[1] - 0.5 * v[0]])  # A slope of 0.5 holds the second one at zero.
-    slope = jaxmb.lagrangian.QuasiVelocities(omega, near=(1.0, 0.5), dependent=(1,))
-    common = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "potential": lambda t, q, p: 9.81 * q[1], "q": [0.0, 0.0]}
-    block = jaxmb.lagrangian.LagrangianSystem(**common, kinematics=slope, u=[1.0])
-    q, u = block.guess.q, block.guess.u
-    udot, _ = jaxmb.formulations.accelerations(block, jaxmb.formulations.Multipliers(), 0.0, q, u)
-    jaxmb.lagrangian.kinetostatic_forces(block, 0.0, q, u, udot)  # 0.8 times the weight.
-    ```
-
-    `Λ_D = (∂q̇/∂ω_D)ᵀ (d/dt ∂L/∂q̇ − ∂L/∂q − Q)`, the left sides of the equations of those velocities.
-    """
-    kinematics, t = system.kinematics, jnp.asarray(t, q.dtype)
-    # A concrete class: only it has dependent velocities that forces hold at zero.
-    if not isinstance(kinematics, QuasiVelocities):
-        raise ValueError(f"These are forces of QuasiVelocities, but the system has {type(kinematics).__name__}.")
-    omega = kinematics.all_of(q.size, u)
-    columns = jax.jacfwd(lambda omega: kinematics.rates_of_all(t, q, omega, system.parameters_at(t)))(omega)
-    v, one = system.rates(t, q, u), jnp.ones_like(t)
-    momentum = lambda t, q, u: system.momentum(t, q, system.rates(t, q, u))
-    _, rate = jax.jvp(momentum, (t, q, u), (one, v, udot))
-    missing = rate - jax.grad(system.lagrangian, 1)(t, q, v, system.parameters_at(t)) - system.applied_force(t, q, v)
-    return missing @ columns[:, list(kinematics.dependent)]

@@ -34,3 +34,5 @@ surrounding operations (`blocks`, `rotations`). Written term by term it takes a 
 reduction. But a product of products must not be fused: each entry would compute its operands again. A reduction over
 some thousand numbers is a library call as well.
 """
+
+from . import rotations as rotations

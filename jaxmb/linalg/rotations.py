@@ -5,17 +5,16 @@ from jaxmb import rotations
 p = rotations.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)  # A quarter turn about z.
 q = rotations.multiply(rotations.from_axis_angle((1.0, 0.0, 0.0), 0.3), p)  # The second turn stands on the left.
 R, x = rotations.rotation_matrix(p), jnp.array([1.0, 0.0, 0.0])
-rotations.rotate(p, x), rotations.turned(R, x)  # To world components, both (0, 1, 0).
-rotations.unrotate(p, x), rotations.rotate(rotations.conjugate(p), x), rotations.turned_back(R, x)  # All (0, -1, 0).
+rotations.rotate(p, x), R @ x  # To world components, both (0, 1, 0).
+rotations.unrotate(p, x), rotations.rotate(rotations.conjugate(p), x)  # Both (0, -1, 0).
 rotations.from_matrix(R), rotations.from_xyzw(rotations.to_xyzw(p)), rotations.normalize(2.0 * p)  # All p.
 omega = jnp.array([0.0, 0.0, 2.0])
 rotations.angular_velocity(p, rotations.rates(p, omega))  # omega.
-rotations.rotate_2d(np.pi / 2, x[:2]), rotations.norm(rotations.cross(x, omega))  # (0, 1), and 2.
-rotations.dot(x, rotations.turned(R, x))  # 0.
-# The moment of a potential V(p) or V(R), in the body frame, is minus the gradient, pulled back.
-V = lambda R: 9.81 * R[2, 0]
-rotations.pull_back_matrix(R, jax.grad(V)(R)), rotations.matrix_rates(R, omega)
-rotations.pull_back(p, jax.grad(lambda p: V(rotations.rotation_matrix(p)))(p))
+rotations.norm(rotations.cross(x, omega))  # 2.
+rotations.dot(x, R @ x)  # 0.
+# The moment of a potential V(p), in the body frame, is minus the gradient, pulled back.
+V = lambda p: 9.81 * rotations.rotation_matrix(p)[2, 0]
+rotations.pull_back(p, jax.grad(V)(p))
 ```
 
 Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
@@ -37,6 +36,25 @@ from .._types import Scalar, VectorLike
 from .arrays import add_up, as_array, namespace
 from .bilinear import BilinearMap
 from .blocks import matrix_products
+
+__all__ = [
+    "angular_velocity",
+    "conjugate",
+    "cross",
+    "dot",
+    "from_axis_angle",
+    "from_matrix",
+    "from_xyzw",
+    "multiply",
+    "norm",
+    "normalize",
+    "pull_back",
+    "rates",
+    "rotate",
+    "rotation_matrix",
+    "to_xyzw",
+    "unrotate",
+]
 
 
 def _tables():

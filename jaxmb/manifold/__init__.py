@@ -7,18 +7,17 @@ rows are redundant) `simulate` chooses `Projection` with `Adams`. From 40 veloci
 eliminates bodies on stiff springs along with the joints. `print(system)` reports this choice and the order of
 elimination. Joint friction costs O(n³) in the number n of constraint rows with friction. `Hermite` needs dense matrices
 for friction, servos and internal states.
+
+```python
+on_constraints = jaxmb.manifold.project(system, 0.0, jaxmb.State(state.q + 1e-3, state.u))
+```
 """
 
-from ..contacts.guards import contact_guards as contact_guards
+from .._moved import tell_of_moved as _tell_of_moved
 from .baumgarte import Baumgarte as Baumgarte
-from .default import Unconstrained as Unconstrained, default_manifold as default_manifold
-from .impulse import after_jumps as after_jumps, find_jumps as find_jumps, next_number as next_number
-from .internal_states import (
-    counted_components as counted_components,
-    natural_units as natural_units,
-    state_blocks as state_blocks,
-)
 from .manifold import AbstractManifold as AbstractManifold
-from .orthogonal_projection import project as project, project_normalized as project_normalized
+from .orthogonal_projection import project as project
 from .partition import Partition as Partition
 from .projection import Projection as Projection
+
+_tell_of_moved(__name__)

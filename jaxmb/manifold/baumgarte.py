@@ -15,7 +15,7 @@ from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..formulations.laws import accelerations_at
 from ..solvers.manifold_term import AbstractVectorField
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .compliant_gaps import compliant_gaps
 from .manifold import AbstractManifold, normalize_state

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..solvers.manifold_term import AbstractGaps
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 
 # Depths below this many units in the last place of the system's size are rounding errors.
 _ROUNDING = 64

@@ -6,7 +6,7 @@ import diffrax
 
 from ..formulations import AbstractFormulation
 from ..solvers import AbstractMultistep
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from .manifold import AbstractManifold, VectorField
 from .orthogonal_projection import project_normalized
 from .partition import Partition
@@ -15,10 +15,6 @@ from .projection import Projection
 
 class Unconstrained(AbstractManifold):
     """Integrate all coordinates, and constraints on the level of accelerations only.
-
-    ```python
-    motion = jaxmb.simulate(system, state, t1=1.0, manifold=jaxmb.manifold.Unconstrained())
-    ```
 
     The policy of systems without constraints. With constraints the integration drifts off them by its error, which is
     for comparison only: saved states are the nearest ones on the constraints. Euler parameters are normalised where

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._types import Coordinates, Scalar, State
 from ..contacts.guards import ContactGuards
 from ..contacts.impacting import Event
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .orthogonal_projection import project_velocities
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..solvers import Block
+from ..solvers.scales import Block
 from ..system import AbstractSystem
 
 

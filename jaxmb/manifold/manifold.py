@@ -16,7 +16,7 @@ from ..formulations import AbstractFormulation, Multipliers, NullSpace
 from ..formulations.laws import accelerations_at
 from ..linalg.arrays import as_array, namespace
 from ..solvers.manifold_term import AbstractVectorField
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .compliant_gaps import compliant_gaps
 

@@ -21,7 +21,7 @@ from ..linalg.inertia import AbstractInertia, DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.newton import chord, solve_linear
 from ..linalg.pushed import push
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .constraints import AbstractConstraints, RestoredState
 from .manifold import normalize_state

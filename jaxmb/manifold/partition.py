@@ -35,8 +35,9 @@ from ..formulations.partitioned import reduced_accelerations
 from ..linalg.elimination import Factor, eliminate, full_pivot, positive_solver
 from ..linalg.jacobian import DenseJacobian
 from ..linalg.sums import unchecked_take
-from ..solvers import AbstractMultistep, ManifoldEvaluation
-from ..system import AbstractEquation
+from ..solvers import AbstractMultistep
+from ..solvers.manifold_term import ManifoldEvaluation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant, drops_rows
 from .constraints import (
     AbstractConstraints,

@@ -18,14 +18,10 @@ from ..formulations.laws import laws_of
 from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
-from ..solvers import (
-    AbstractMultistep,
-    AbstractMultistepState,
-    ManifoldEvaluation,
-    cond_of_jumps,
-    crossing,
-)
-from ..system import AbstractEquation
+from ..solvers import AbstractMultistep, AbstractMultistepState
+from ..solvers.events import cond_of_jumps, crossing
+from ..solvers.manifold_term import ManifoldEvaluation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant, drops_rows
 from .constraints import SolvedState, restore
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._compat import cond_of_lanes
 from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot
 from ..linalg.newton import chord
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .constraints import dense_along, push
 

@@ -10,8 +10,8 @@ from ..contacts.guards import contact_guards
 from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation
 from ..formulations.laws import Memory
-from ..solvers import AbstractManifoldTerm, ManifoldEvaluation
-from ..system import AbstractEquation
+from ..solvers.manifold_term import AbstractManifoldTerm, ManifoldEvaluation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .compliant_gaps import compliant_gaps
 from .constraints import Linearise, SolvedState, rates_along, solved

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import State
+from ..linalg.inertia import AbstractInertia
 from ..planar import DraftGear
-from ..system import AbstractInertia, AbstractSystem, DenseInertia
+from ..system import AbstractSystem, DenseInertia
 from ..system.description import Description, count_independent, remarks, shorten
 from ..system.design_variables import DesignVariables, description_rows
 from ..system.parameter_table import ParameterPath, ParameterTable

@@ -15,7 +15,9 @@ import jax.numpy as jnp
 
 from .. import planar
 from ..bodies.scene import Scene
-from ..lagrangian import AbstractEquations, Connection, LagrangianSystem, Pfaffian, QuasiVelocityFrame, Rates
+from ..lagrangian import Connection, LagrangianSystem, Pfaffian, QuasiVelocityFrame
+from ..lagrangian.kinematics import Rates
+from ..lagrangian.model import AbstractEquations
 from ..parts.fields import as_jax
 from ..system import parameters as parameters_of
 from .mechanism import Mechanism, Model, References, build, is_rigid

@@ -7,7 +7,8 @@ import numpy as np
 
 from .. import planar
 from ..bodies.scene import Scene
-from ..lagrangian import LagrangianSystem, Nonholonomic, QuasiVelocities, Rates
+from ..lagrangian import LagrangianSystem, Nonholonomic, QuasiVelocities
+from ..lagrangian.kinematics import Rates
 from ..parts.forces import Gravity
 from ..parts.functions import VelocityConstraint
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from ..lagrangian import AbstractEquations
+from ..lagrangian.model import AbstractEquations
 from ._wheeled import build_wheeled
 from .mechanism import Mechanism, Model, mechanism
 

@@ -20,6 +20,8 @@ from ..system import parameters
 from ..trajectory import Trajectory
 from .observe import point_acceleration
 
+__all__ = ["arm_travel", "seat_acceleration", "track_tension", "vertical_rms", "wheel_loads"]
+
 PREFIXES = ("", "rear_")
 
 

@@ -11,7 +11,9 @@ from jaxtyping import Array
 
 from .. import planar
 from ..bodies.scene import Scene
-from ..lagrangian import AbstractEquations, Connection, Holonomic, LagrangianSystem, Pfaffian, Rates
+from ..lagrangian import Connection, Holonomic, LagrangianSystem, Pfaffian
+from ..lagrangian.kinematics import Rates
+from ..lagrangian.model import AbstractEquations
 from ..parts.fields import as_jax
 from .mechanism import Mechanism, Model, References, build, is_rigid, mechanism
 from .observe import columns, lagrangian_coordinates

@@ -1,3 +1,4 @@
+# ruff: noqa: I001
 """The parts of a scene: base classes and field declarations, also for user-defined parts.
 
 ```python
@@ -30,70 +31,65 @@ A part is a class derived from one of the base classes. Helpers declare the mean
 the poses of its bodies. For examples of a joint, a force and a contact law see `notebooks/05_extending.ipynb`.
 """
 
+from .._moved import tell_of_moved as _tell_of_moved
+
+## Base classes
 from .base import (
-    AbstractActor as AbstractActor,
-    AbstractBody as AbstractBody,
-    AbstractCompound as AbstractCompound,
-    AbstractConstraint as AbstractConstraint,
-    AbstractDynamicForce as AbstractDynamicForce,
-    AbstractForce as AbstractForce,
-    AbstractInertialConstraint as AbstractInertialConstraint,
-    AbstractJoint as AbstractJoint,
-    AbstractLaw as AbstractLaw,
-    AbstractLink as AbstractLink,
-    AbstractNonIdeal as AbstractNonIdeal,
-    AbstractPair as AbstractPair,
     AbstractPart as AbstractPart,
     AbstractPlanarPart as AbstractPlanarPart,
-    AbstractPotentialForce as AbstractPotentialForce,
     AbstractSpatialPart as AbstractSpatialPart,
-    AbstractTendon as AbstractTendon,
+    AbstractLink as AbstractLink,
+    AbstractPair as AbstractPair,
+    AbstractBody as AbstractBody,
+    AbstractConstraint as AbstractConstraint,
     AbstractVelocityConstraint as AbstractVelocityConstraint,
+    AbstractJoint as AbstractJoint,
+    AbstractCompound as AbstractCompound,
+    AbstractForce as AbstractForce,
+    AbstractPotentialForce as AbstractPotentialForce,
+    AbstractDynamicForce as AbstractDynamicForce,
+    AbstractNonIdeal as AbstractNonIdeal,
+    AbstractTendon as AbstractTendon,
 )
-from .contact import (
-    AbstractContact as AbstractContact,
-    AbstractFrictionLaw as AbstractFrictionLaw,
-    AbstractNormalLaw as AbstractNormalLaw,
+from .unilateral import (
+    AbstractRigidContact as AbstractRigidContact,
+    AbstractGeometricContact as AbstractGeometricContact,
 )
-from .dry_friction import AbstractDryFriction as AbstractDryFriction
-from .elements import (
-    apart as apart,
-    coincident as coincident,
-    in_planes as in_planes,
-    perpendicular as perpendicular,
-)
+from .contact import AbstractNormalLaw as AbstractNormalLaw, AbstractFrictionLaw as AbstractFrictionLaw
+from .terrain import AbstractTerrain as AbstractTerrain
+
+## Fields
 from .fields import (
-    Module as Module,
-    Names as Names,
     Number as Number,
     Numbers as Numbers,
-    attitude as attitude,
-    axis as axis,
-    body_name as body_name,
-    body_names as body_names,
-    choice as choice,
-    function as function,
-    guess as guess,
-    internal_state as internal_state,
-    law as law,
-    length as length,
-    module as module,
+    Names as Names,
+    Module as Module,
     name as name,
     names as names,
-    numbers as numbers,
-    parameter as parameter,
+    body_name as body_name,
+    body_names as body_names,
     point as point,
+    axis as axis,
+    attitude as attitude,
+    length as length,
+    parameter as parameter,
+    numbers as numbers,
+    function as function,
+    module as module,
+    choice as choice,
+    law as law,
+    guess as guess,
+    internal_state as internal_state,
 )
+
+## Kernels
 from .space import (
     AbstractSpace as AbstractSpace,
-    force_pair as force_pair,
-    rate_of as rate_of,
     separation as separation,
     separation_rate as separation_rate,
+    rate_of as rate_of,
+    force_pair as force_pair,
 )
-from .terrain import AbstractTerrain as AbstractTerrain
-from .unilateral import (
-    AbstractGeometricContact as AbstractGeometricContact,
-    AbstractRigidContact as AbstractRigidContact,
-    AbstractUnilateralConstraint as AbstractUnilateralConstraint,
-)
+from .elements import coincident as coincident, in_planes as in_planes, perpendicular as perpendicular, apart as apart
+
+_tell_of_moved(__name__)

@@ -33,6 +33,8 @@ from .shapes import Ground, marked_ball, wheel
 from .smooth import dry_friction, ramp, step
 from .terrain import AbstractTerrain, distance, outward, pace_over
 
+__all__ = ["AbstractFrictionLaw", "AbstractNormalLaw", "Bekker", "Contact", "Coulomb", "Hertz", "Janosi", "Linear"]
+
 Number = Float[Array, ""]
 Vector = Float[Array, "d"]
 

@@ -3,14 +3,12 @@
 ```python
 from jaxmb import shapes
 beam = [shapes.Box((1.0, 0.1, 0.05)), shapes.Sphere(0.1, position=(0.5, 0.0, 0.0), color=(200, 60, 40))]
-strut = [shapes.cylinder_between((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), 0.03), *shapes.wheel(0.2, position=(0.5, 0.0, 0.0))]
-joints = [shapes.pin((-0.5, 0.0, 0.0), 0.05), shapes.ball((0.5, 0.0, 0.0), 0.05)]
-slider = [shapes.sleeve((0.0, 0.0, 0.0), 0.1, (1.0, 0.0, 0.0))]
+strut = shapes.cylinder_between((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), 0.03)
 lying = {"orientation": shapes.along((1.0, 0.0, 0.0))}  # From the z axis of a shape to the x axis of its body.
-logs = [shapes.Cylinder(0.1, 1.0, **lying), *shapes.capsule(0.1, 1.0, **lying), *shapes.marked_ball(0.2)]
+logs = [shapes.Cylinder(0.1, 1.0, **lying), *shapes.capsule(0.1, 1.0, **lying)]
 egg = shapes.Ellipsoid((0.3, 0.2, 0.2))
 flag = shapes.Mesh([(0.0, 0.0, 0.0), (0.3, 0.1, 0.0), (0.0, 0.2, 0.0)], [(0, 1, 2)])
-jaxmb.viz.show(motion, shapes={"bar": [*beam, *joints], "ground": shapes.Ground()})
+jaxmb.viz.show(motion, shapes={"bar": [*beam, strut], "ground": shapes.Ground()})
 ```
 
 A shape is placed in the frame of a body: `position` [m] of its origin, and `orientation`, Euler parameters from its own
@@ -27,6 +25,19 @@ import numpy as np
 
 from .._types import VectorLike
 from ..linalg import rotations as rot
+
+__all__ = [
+    "AbstractShape",
+    "Box",
+    "Cylinder",
+    "Ellipsoid",
+    "Ground",
+    "Mesh",
+    "Sphere",
+    "along",
+    "capsule",
+    "cylinder_between",
+]
 
 Color = tuple[int, int, int]
 STEEL, DARK, GROUND = (150, 155, 162), (64, 68, 76), (176, 170, 158)

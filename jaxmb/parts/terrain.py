@@ -7,8 +7,6 @@ bump, ramp = terrain.Bump(start=2.0, length=0.5, peak=0.1), terrain.Ramp(start=5
 waves = terrain.Sinusoid(amplitude=0.05, wavelength=3.0)
 measured = terrain.Spline(x=[0.0, 1.0, 2.0, 3.0], heights=[0.0, 0.1, 0.05, 0.0])
 bowl = terrain.Surface(lambda place, p: p["curvature"] * place @ place / 2, parameters={"curvature": 0.1})
-terrain.distance(hill, jnp.array([1.0, 0.5])), terrain.outward(hill, jnp.array([1.0, 0.5]))
-terrain.pace_over(bump, jnp.array([2.1, 0.5]), jnp.array([3.0, 0.0]))
 ```
 
 A place is the world position without the vertical: (x,) in a planar scene, where y is up, and (x, y) in a spatial one,
@@ -29,6 +27,8 @@ from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw
 from .smooth import step
+
+__all__ = ["AbstractTerrain", "Bump", "Flat", "Ramp", "Sinusoid", "Slope", "Spline", "Surface"]
 
 Place = Float[Array, "h"]
 # The share of a bump or wave within which the ground rises or falls once.

@@ -1,7 +1,8 @@
 """The public names, each once, by subject.
 
 A name is public in a module that defines it without an underscore, or that imports it in the form that makes it public
-for type checkers, `from .planar import Body as Body`. Names of plain values, such as those of types, have no entry: the
+for type checkers, `from .planar import Body as Body`. Where a module has `__all__`, only names in it are. Lines
+`## Joints` are headings of the names below. Names of plain values, such as those of types, have no entry: the
 docstrings of their modules say what they are.
 """
 
@@ -12,6 +13,7 @@ import importlib
 import inspect
 import re
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -19,28 +21,6 @@ from ..parts.base import AbstractPart
 from ..parts.names import UnknownNameError, unknown
 
 PACKAGE = __name__.split(".")[0]
-
-# The names of the package itself, which are too many for one list.
-_OF_PACKAGE = {
-    "Scenes and their numbers": "Scene RigidBodySystem State parameters with_parameters modules with_inputs "
-    "design Variable",
-    "States and motions": "assemble assembly_gap equilibrium simulate batch Trajectory ContactEvents Event load "
-    "RESULTS setup UnknownNameError",
-    "Forces and drives of both spaces": "Gravity Motor Actuator Controller Servo Series Tendon FixedTendon "
-    "JointSpring JointForce JointStop JointFriction DryFriction JointDriver JointInertia JointCoupling",
-    "Unilateral constraints": "Stop RigidContact RigidBallContact RigidPlaneContact RigidBoxContact Slack",
-    "Parts from functions": "Constraint VelocityConstraint Force NonIdeal",
-    "Identification": "identify Identification Experiment Measurements read_measurements Sensor",
-    "Optimisation": "optimise Optimum robust",
-    "Small motions": "linearise Linearisation root_locus RootLocus steady_motion floquet Floquet",
-    "Sweeps": "sweep load_sweep",
-}
-# In this order; a name that several modules have belongs to the first of them.
-_MODULES = (
-    *("planar", "spatial", "contact", "terrain", "shapes", "rotations", "cases", "studies", "mechanisms"),
-    *("mechanisms.ride", "importers", "viz", "report", "lagrangian", "parts", "formulations", "manifold", "solvers"),
-    *("solvers.stability", "system", "trajectory"),
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,13 +74,18 @@ class Subject:
     """Public names that belong together.
 
     **Fields:** `title`; `module`, the entry of the module that has them, None for names of the package itself;
-    `entries`; `others`, entries elsewhere for names that the module has as well.
+    `groups` of entries by their headings; `others`, entries elsewhere for names that the module has as well.
     """
 
     title: str
     module: Entry | None
-    entries: tuple[Entry, ...]
+    groups: dict[str, tuple[Entry, ...]]
     others: tuple[Entry, ...] = ()
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Those of all groups."""
+        return tuple(entry for group in self.groups.values() for entry in group)
 
 
 def _explains_arguments(thing: Any) -> bool:
@@ -108,20 +93,44 @@ def _explains_arguments(thing: Any) -> bool:
     return own is not None and (own.__doc__ or "").startswith("**Arguments:**")
 
 
-def public_names(module: ModuleType) -> Iterator[str]:
-    """The public names of a module, in its order."""
-    pending = list(ast.parse(inspect.getsource(module)).body)
-    while pending:
-        node = pending.pop(0)
-        match node:
-            case ast.If():
-                pending = node.body + pending
-            case ast.ImportFrom():
-                yield from (alias.name for alias in node.names if alias.asname == alias.name)
-            case ast.FunctionDef() | ast.ClassDef() if not node.name.startswith("_"):
-                yield node.name
-            case ast.Assign():
-                yield from (own.id for own in node.targets if isinstance(own, ast.Name) and not own.id.startswith("_"))
+def public_names(module: ModuleType) -> dict[str, str]:
+    """The public names of a module, in its order, each with its heading; those of its stub where it has one."""
+    path = Path(inspect.getfile(module))
+    stub = path.with_suffix(".pyi")
+    source = (stub if stub.exists() else path).read_text(encoding="utf-8")
+    headings = {k: line[3:] for k, line in enumerate(source.splitlines()) if line.startswith("## ")}
+    found = {}
+    for node in ast.parse(source).body:
+        heading = next((text for k, text in reversed(headings.items()) if k < node.lineno), "")
+        found |= dict.fromkeys(_defined(node), heading)
+    listed = vars(module).get("__all__", found)
+    return {name: heading for name, heading in found.items() if name in listed}
+
+
+def _defined(node: ast.stmt) -> list[str]:
+    match node:
+        case ast.ImportFrom():
+            return [alias.name for alias in node.names if alias.asname == alias.name]
+        case ast.FunctionDef() | ast.ClassDef():
+            names = [node.name]
+        case ast.Assign():
+            names = [own.id for own in node.targets if isinstance(own, ast.Name)]
+        case _:
+            names = []
+    return [name for name in names if not name.startswith("_")]
+
+
+def public_modules() -> dict[str, ModuleType]:
+    """The modules that are public names of the package or of one of them, by name, in the package's order."""
+
+    def below(path: str, module: ModuleType) -> Iterator[tuple[str, ModuleType]]:
+        for name in public_names(module):
+            own = getattr(module, name)
+            if inspect.ismodule(own):
+                yield f"{path}{name}", own
+                yield from below(f"{path}{name}.", own)
+
+    return dict(below("", importlib.import_module(PACKAGE)))
 
 
 def _is_described(thing: Any) -> bool:
@@ -133,21 +142,23 @@ def _is_described(thing: Any) -> bool:
 def subjects() -> tuple[Subject, ...]:
     """All subjects: those of the package, and then its modules."""
     package = importlib.import_module(PACKAGE)
-    made = [
-        Subject(title, None, tuple(Entry(name, getattr(package, name)) for name in names.split()))
-        for title, names in _OF_PACKAGE.items()
-    ]
-    known = {id(entry.thing): entry for subject in made for entry in subject.entries}
-    for path in _MODULES:
-        module = functools.reduce(getattr, path.split("."), package)
-        own, others = [], []
-        for name in public_names(module):
+    known: dict[int, Entry] = {}
+    made = []
+    for path, module in {"": package, **public_modules()}.items():
+        groups: dict[str, list[Entry]] = {}
+        others = []
+        for name, heading in public_names(module).items():
             thing = getattr(module, name)
             if id(thing) in known:
                 others.append(known[id(thing)])
             elif _is_described(thing):
-                own.append(known.setdefault(id(thing), Entry(f"{path}.{name}", thing)))
-        made.append(Subject(f"{PACKAGE}.{path}", Entry(path, module), tuple(own), tuple(others)))
+                known[id(thing)] = Entry(f"{path}.{name}".lstrip("."), thing)
+                groups.setdefault(heading, []).append(known[id(thing)])
+        own = {heading: tuple(group) for heading, group in groups.items()}
+        if module is package:
+            made += [Subject(heading, None, {heading: group}) for heading, group in own.items()]
+        else:
+            made.append(Subject(f"{PACKAGE}.{path}", Entry(path, module), own, tuple(others)))
     return tuple(made)
 
 
@@ -163,10 +174,8 @@ def entries() -> dict[str, Entry]:
 def other_names() -> dict[str, Entry]:
     """Entries by the further names that they have: in other modules, and in another spelling."""
     known = {id(entry.thing): entry for entry in entries().values()}
-    package = importlib.import_module(PACKAGE)
-    modules = {"": package} | {subject.module.name: subject.module.thing for subject in subjects() if subject.module}
     found = {}
-    for path, module in modules.items():
+    for path, module in {"": importlib.import_module(PACKAGE), **public_modules()}.items():
         for name in public_names(module):
             entry, own = known.get(id(getattr(module, name))), f"{path}.{name}".lstrip(".")
             if entry is not None and entry.name != own:
@@ -195,15 +204,65 @@ def bases(entry: Entry) -> tuple[Entry, ...]:
 
 def fields(entry: Entry) -> dict[str, str]:
     """The annotations of the fields of a class, as they are written."""
-    found = {}
-    for base in reversed(_of_package(entry.thing)):
-        found |= _annotations(base)
-    return found
+    return _fields(entry.thing)
+
+
+def _fields(cls: type) -> dict[str, str]:
+    return {name: own for base in reversed(_of_package(cls)) for name, own in _annotations(base).items()}
 
 
 def further_fields(entry: Entry, given: Iterable[str]) -> dict[str, str]:
     """The fields that a class itself has, but for those that are `given` as parameters."""
     return {name: annotation for name, annotation in _annotations(entry.thing).items() if name not in given}
+
+
+@functools.cache
+def signature(entry: Entry) -> inspect.Signature | None:
+    """What a function, class or method is called with, with annotations as the source has them; None for others."""
+    if entry.kind in ("module", "property", "field"):
+        return None
+    return signature_of(entry.thing, is_method=entry.kind == "method")
+
+
+def signature_of(thing: Any, *, is_method: bool = False) -> inspect.Signature | None:
+    """The signature of a class or function; of a method without the object. None where Python knows none."""
+    try:
+        made = inspect.signature(thing)
+    except (TypeError, ValueError):
+        return None
+    is_class = inspect.isclass(thing)
+    written = _written(inspect.unwrap(thing.__init__ if is_class else thing))
+    if is_class and not written:
+        written = _fields(thing)
+    parameters = []
+    for name, own in made.parameters.items():
+        annotation = _AsWritten(written[name]) if name in written else own.empty
+        # Dots for a default that is made anew or that cannot be typed.
+        dots = own.default is not own.empty and repr(own.default).startswith("<")
+        default = _AsWritten("...") if dots else own.default
+        if not (is_method and name == "self"):
+            parameters.append(own.replace(annotation=annotation, default=default))
+    returns = _AsWritten(written["return"]) if "return" in written and not is_class else made.empty
+    return inspect.Signature(parameters, return_annotation=returns)
+
+
+class _AsWritten(str):
+    """A text that stands in a signature as it is."""
+
+    __repr__ = str.__str__
+
+
+def _written(function: Any) -> dict[str, str]:
+    """The annotations in the source of a function; none where it has no source, as that of a dataclass."""
+    try:
+        tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(function))).body[0]
+    except (OSError, TypeError):
+        return {}
+    if not isinstance(tree, ast.FunctionDef):
+        return {}
+    given = [own for own in ast.walk(tree.args) if isinstance(own, ast.arg) and own.annotation is not None]
+    found = {own.arg: ast.unparse(own.annotation) for own in given if own.annotation is not None}
+    return found | ({} if tree.returns is None else {"return": ast.unparse(tree.returns)})
 
 
 @functools.cache

@@ -1,11 +1,11 @@
 """Entries as text for a terminal, filled to its width."""
 
+import inspect
 import re
 import textwrap
 from collections.abc import Iterable
 
-from .entries import Entry, bases, further_fields, members, subjects
-from .signatures import signature
+from .entries import Entry, bases, further_fields, members, signature, subjects
 from .topics import Topic, topics
 
 _HOW = (
@@ -60,19 +60,25 @@ def _heading(entry: Entry, width: int) -> str:
     line = f"{name}{own}"
     if len(line) <= width:
         return line.replace(name, f"**{name}**", 1)
-    returns = f" -> {own.returns}" if own.returns else ""
-    return "\n".join([f"**{name}**(", *(f"    {parameter}," for parameter in own.parameters), f"){returns}"])
+    parameters = list(own.parameters.values())
+    lines = [str(parameter) for parameter in parameters]
+    kinds = [parameter.kind for parameter in parameters]
+    if inspect.Parameter.KEYWORD_ONLY in kinds and inspect.Parameter.VAR_POSITIONAL not in kinds:
+        lines.insert(kinds.index(inspect.Parameter.KEYWORD_ONLY), "*")
+    returns = str(own.replace(parameters=[])).removeprefix("()")
+    return "\n".join([f"**{name}**(", *(f"    {parameter}," for parameter in lines), f"){returns}"])
 
 
 def _of_module(entry: Entry, width: int) -> Iterable[str]:
     (own,) = [subject for subject in subjects() if subject.module == entry]
-    yield from _section("Names", own.entries, width)
+    for heading, group in own.groups.items():
+        yield from _section(heading or "Names", group, width)
     yield from _section("Of other modules", own.others, width)
 
 
 def _of_class(entry: Entry, width: int) -> Iterable[str]:
     given = signature(entry)
-    others = further_fields(entry, given.names if given else ())
+    others = further_fields(entry, given.parameters if given else ())
     if others:
         lines = (_hanging(f"{name}: {annotation}", 4, 8, width) for name, annotation in others.items())
         yield "\n".join(["**Further fields**", *lines])

@@ -1,29 +1,27 @@
-"""Reports: error against run time, stiff and extreme variants, and the costs of formulations and of methods.
+"""Reports about a machine: error against run time, and stiff and extreme variants. Each is a `Table`.
 
 - `work_precision(system, state, t1=)`: error against run time and evaluations, for solvers and tolerances, against two
   methods that agree.
 - `stress_test(system, state, t1=)`: the true error, or the refusal, of stiff and extreme variants: springs, masses,
   lengths, speeds, redundant joints, tolerances.
-- `left_out(system, state, t1=)`: what specialisation saves: each unused feature is switched on in turn, and tracing,
-  compiling and evaluating are timed.
-- `formulation_costs(mechanism)`: run time and program size of every formulation, with derivatives.
-- `method_costs(mechanism)`: coordinate partitioning compared with integrating all coordinates: evaluations, linear
-  algebra and time at equal error.
 - `check_elements(system, state)`: whether the elementary constraints that joints declare are those of their residuals.
-
-`jaxmb report KIND NAME` writes one of them from the command line; NAME is a mechanism or `file.py:function`, where the
-function returns a scene, or a system and a state.
 """
 
+from .._moved import tell_of_moved as _tell_of_moved
 from ..bodies.elementary import check_elements as check_elements
-from .formulations import (
-    FormulationCost as FormulationCost,
-    FormulationCosts as FormulationCosts,
-    every_formulation as every_formulation,
-    formulation_costs as formulation_costs,
+from .stress_test import stress_test as stress_test
+from .table import Table as Table
+from .work_precision import work_precision as work_precision
+
+_tell_of_moved(
+    __name__,
+    left_out="a benchmark of jaxmb itself, tests/benchmarks/left_out.py of the checkout",
+    formulation_costs="a benchmark of jaxmb itself, tests/benchmarks/formulation_costs.py of the checkout",
+    every_formulation="part of tests/benchmarks/formulation_costs.py of the checkout",
+    method_costs="a benchmark of jaxmb itself, tests/benchmarks/method_costs.py of the checkout",
+    interleaved="jaxmb.report.timing.interleaved, which is not public",
+    timed_compile="jax.jit(function).lower(…).compile()",
+    WorkPrecision="jaxmb.report.Table",
+    StressTest="jaxmb.report.Table",
+    KINDS="the list of kinds that `jaxmb help report.stress_test` shows",
 )
-from .left_out import LeftOut as LeftOut, Measured as Measured, left_out as left_out
-from .method_costs import MethodCost as MethodCost, MethodCosts as MethodCosts, method_costs as method_costs
-from .stress_test import KINDS as KINDS, Case as Case, StressTest as StressTest, stress_test as stress_test
-from .timing import interleaved as interleaved, timed_compile as timed_compile
-from .work_precision import Run as Run, WorkPrecision as WorkPrecision, work_precision as work_precision

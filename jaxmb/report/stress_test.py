@@ -1,8 +1,8 @@
 """Stiff and extreme variants of a motion, with the true error of each or the reason why it is refused."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Collection, Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
@@ -10,7 +10,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._printed import Printed
 from .._results import RESULTS
 from .._types import State, VectorLike
 from ..mechanisms import Mechanism
@@ -22,7 +21,7 @@ from ..system import AbstractSystem, parameters, with_parameters
 from ..viz.figure import new_figure
 from .reference import MARGIN
 from .subject import subject
-from .table import aligned
+from .table import Table
 from .variants import doubled, scaled_lengths, units
 from .work_precision import outcome
 
@@ -34,71 +33,22 @@ _TIGHT = (1e-13, 1e-11)
 _TIMES = 21
 
 
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """One variant of a motion.
-
-    **Fields:** `kind` and `case`; `error` at the end, relative to the largest coordinate and the largest velocity: None
-    if it is not known, and `known_to`, the error that the reference can tell, None without one; `steps`, accepted and
-    rejected; `message`: why the variant was refused, or empty.
-    """
-
-    kind: str
-    case: str
-    error: float | None
-    known_to: float | None
-    steps: int
-    message: str = ""
-
-    @property
-    def verdict(self) -> str:
-        """The error, or a word instead."""
-        if self.message or self.error is not None:
-            return "refused" if self.message else f"{self.error:.1e}"
-        return "unknown" if self.known_to is None else "small"
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class StressTest(Printed):
-    """The result of `stress_test`; `print` shows a table. `remarks`: cases that do not apply, and why."""
-
-    mechanism: str
-    t1: float
-    rtol: float
-    solver: str
-    cases: tuple[Case, ...]
-    remarks: tuple[str, ...]
-
-    def __str__(self) -> str:
-        head = ("variant", "", "error", "known to", "steps")
-        known = lambda c: "–" if c.known_to is None else f"{c.known_to:.0e}"
-        rows = [(c.kind, c.case, c.verdict, known(c), str(c.steps)) for c in self.cases]
-        lines = [f"{self.mechanism}, {self.t1:g} s, {self.solver} at rtol {self.rtol:g}: relative error at the end"]
-        lines += aligned([head, *rows], words=2)
-        words = {c.verdict for c in self.cases}
-        lines += [text for word, text in _WORDS.items() if word in words]
-        refused: dict[str, list[str]] = {}
-        for c in self.cases:
-            if c.message:
-                refused.setdefault(c.message, []).append(f"{c.kind} {c.case}")
-        return "\n".join([*lines, *(f"{', '.join(own)}: {text}" for text, own in refused.items()), *self.remarks])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists, for JSON."""
-        return dataclasses.asdict(self)
-
-    def figure(self, path: str | Path) -> None:
-        """Write a picture (PNG, SVG or PDF by the path's ending): the error of each variant.
-
-        **Raises:** `ImportError` that names the extra to install if matplotlib is missing.
-        """
-        _plot(self).savefig(path, dpi=150)
-
-
 _WORDS = {
     "small": "small: below what the reference can tell, ten times the difference of its two methods",
     "unknown": "unknown: fewer than two of Adams, Dopri8 and Hermite reached the end at a tight tolerance",
 }
+_COLUMNS = {"variant": "", "": "", "error": ".1e", "known to": ".0e", "steps": "d"}
+
+
+class _Case(NamedTuple):
+    """One variant: its error, or a word instead; the error that the reference can tell; why it was refused."""
+
+    kind: str
+    case: str
+    error: float | str
+    known_to: float | None
+    steps: int
+    message: str = ""
 
 
 class _Trial(NamedTuple):
@@ -123,7 +73,7 @@ def stress_test(
     solver: diffrax.AbstractSolver | None = None,
     singular: Mapping[str, VectorLike] | None = None,
     only: Collection[str] | None = None,
-) -> StressTest:
+) -> Table:
     """Simulate stiff and extreme variants of a motion, and measure the true error of each.
 
     ```python
@@ -137,18 +87,21 @@ def stress_test(
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`, or a mechanism of the library alone; `rtol`; `solver`,
     default `Adams()`; `singular`: coordinates of a singular position by name, as `fix` of `assemble`, near which the
-    motion is started as well; `only`: the kinds of variants to try, default all of `KINDS`.
+    motion is started as well; `only`: the kinds of variants to try, default all: "rtol", "long horizon", "stiffness",
+    "mass", "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
 
-    **Returns:** a `StressTest`. A variant that cannot be built, or whose run fails, keeps its row, with a message.
+    **Returns:** a `Table` of variants. `error` is that at the end, relative to the largest coordinate and the largest
+    velocity; a word stands in its place where it is "small", that is less than the reference can tell ("known to"),
+    "unknown", or where the variant cannot be built or its run fails, "refused". Notes say why.
     """
     mechanism = subject(system, state, t1)
     solver = Adams() if solver is None else solver
-    wrong = [name for name in only or () if name not in KINDS]
+    wrong = [name for name in only or () if name not in _KINDS]
     if wrong:
-        raise unknown("kind of variant", wrong[0], KINDS)
+        raise unknown("kind of variant", wrong[0], _KINDS)
     base = _Base(mechanism, rtol, singular or {}, _truth(mechanism.system, mechanism.state, mechanism.t1))
     cases, remarks = [], []
-    for kind, trials in KINDS.items():
+    for kind, trials in _KINDS.items():
         if only is not None and kind not in only:
             continue
         try:
@@ -156,8 +109,16 @@ def stress_test(
                 cases.append(_judge(kind, trial, solver))
         except _NotHereError as reason:
             remarks.append(f"{kind}: {reason}.")
-    name = type(solver).__name__
-    return StressTest(mechanism.name, mechanism.t1, rtol, name, tuple(cases), tuple(remarks))
+    words = {case.error for case in cases}
+    notes = [text for word, text in _WORDS.items() if word in words]
+    refused: dict[str, list[str]] = {}
+    for case in cases:
+        if case.message:
+            refused.setdefault(case.message, []).append(f"{case.kind} {case.case}")
+    notes += [f"{', '.join(own)}: {text}" for text, own in refused.items()]
+    name = f"{mechanism.name}, {mechanism.t1:g} s, {type(solver).__name__} at rtol {rtol:g}"
+    draw = functools.partial(_plot, title=name, rtol=rtol)
+    return Table(f"{name}: relative error at the end", _COLUMNS, [case[:5] for case in cases], notes + remarks, draw)
 
 
 class _NotHereError(Exception):
@@ -275,7 +236,7 @@ def _doubled(base: _Base) -> Iterator[_Trial]:
     yield base.trial("1e-06 off", build=lambda: _with(base, doubled(own.system, own.state, off)))
 
 
-KINDS: dict[str, Callable[[_Base], Iterator[_Trial]]] = {
+_KINDS: dict[str, Callable[[_Base], Iterator[_Trial]]] = {
     "rtol": _tolerances,
     "long horizon": _horizon,
     "stiffness": _stiffness,
@@ -288,8 +249,8 @@ KINDS: dict[str, Callable[[_Base], Iterator[_Trial]]] = {
 }
 
 
-def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> Case:
-    refused = lambda message, steps=0: Case(kind, trial.case, None, None, steps, message)
+def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> _Case:
+    refused = lambda message, steps=0: _Case(kind, trial.case, "refused", None, steps, message)
     try:
         system, state, t1 = trial.build()
     except ValueError as error:
@@ -300,10 +261,10 @@ def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> Case:
         return refused(outcome(trajectory.result), steps)
     known = _truth(system, state, t1) if trial.truth is None else trial.truth[0]
     if known is None:
-        return Case(kind, trial.case, None, None, steps)
+        return _Case(kind, trial.case, "unknown", None, steps)
     truth, difference = known
     error, known_to = _distance(_natural(system, trajectory.ys), truth), MARGIN * difference
-    return Case(kind, trial.case, None if error < known_to else error, known_to, steps)
+    return _Case(kind, trial.case, "small" if error < known_to else error, known_to, steps)
 
 
 def _truth(system: Any, state: State, t1: float) -> Any:
@@ -343,26 +304,28 @@ def _distance(motion: Any, truth: Any) -> float:
     return max(float(np.max(np.abs((x - y)[-1]), initial=0.0)) / size(y) for x, y in zip(motion, truth, strict=True))
 
 
-def _plot(report: StressTest) -> "Figure":
+def _plot(table: Table, title: str, rtol: float) -> "Figure":
     """The error of every variant, from top to bottom; refusals and unknown errors at the right."""
-    figure = new_figure(7.5, 1.4 + 0.2 * len(report.cases))
+    figure = new_figure(7.5, 1.4 + 0.2 * len(table.rows))
     axes = figure.subplots()
     styles = {"error": "C0o", "small, at most": "C2<", "unknown": "C1D", "refused": "C3x"}
     points: dict[str, list[tuple[float, int]]] = {name: [] for name in styles}
-    numbers = [x for c in report.cases for x in (c.error, c.known_to) if x]
+    numbers = [x for x in (*table["error"], *table["known to"]) if isinstance(x, float) and x]
     right = 10 * max([1.0, *numbers])
-    for k, c in enumerate(report.cases):
-        name = {"small": "small, at most"}.get(c.verdict, c.verdict if c.verdict in styles else "error")
-        small = max(c.known_to or 0.0, np.finfo(float).eps)
-        points[name].append((c.error or (small if name == "small, at most" else right), k))
+    for k, (error, known_to) in enumerate(zip(table["error"], table["known to"], strict=True)):
+        small = max(known_to or 0.0, np.finfo(float).eps)
+        if error == "small":
+            points["small, at most"].append((small, k))
+        else:
+            points[error if error in styles else "error"].append((error if isinstance(error, float) else right, k))
     for name, style in styles.items():
         if points[name]:
             axes.semilogx(*zip(*points[name], strict=True), style, label=name)
-    axes.axvline(report.rtol, color="0.5", linestyle=":", label="rtol")
-    axes.set_yticks(range(len(report.cases)), [f"{c.kind}  {c.case}" for c in report.cases], fontsize="small")
-    axes.set_ylim(len(report.cases) - 0.5, -0.5)
+    axes.axvline(rtol, color="0.5", linestyle=":", label="rtol")
+    axes.set_yticks(range(len(table.rows)), [f"{kind}  {case}" for kind, case, *_ in table.rows], fontsize="small")
+    axes.set_ylim(len(table.rows) - 0.5, -0.5)
     axes.set_xlabel("relative error at the end")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside lower center", ncols=5, fontsize="small")
-    figure.suptitle(f"{report.mechanism}, {report.t1:g} s, {report.solver} at rtol {report.rtol:g}")
+    figure.suptitle(title)
     return figure

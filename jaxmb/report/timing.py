@@ -11,10 +11,6 @@ import jax
 def timed_compile(fn: Callable, *args: Any) -> tuple[Callable, float]:
     """Trace and compile a function for its arguments.
 
-    ```python
-    compiled, seconds = jaxmb.report.timed_compile(jnp.sin, jnp.ones(3))
-    ```
-
     **Returns:** the compiled function, and the time that took [s].
     """
     begin = time.perf_counter()
@@ -24,11 +20,6 @@ def timed_compile(fn: Callable, *args: Any) -> tuple[Callable, float]:
 
 def interleaved(runs: Sequence[Callable[[], Any]], repeats: int) -> list[tuple[float, ...]]:
     """Time several functions in turns, so that other load on the machine affects all of them alike.
-
-    ```python
-    first, second = lambda: np.sort(np.ones(1000)), lambda: np.cumsum(np.ones(1000))
-    times = jaxmb.report.interleaved([first, second], repeats=5)
-    ```
 
     Each is first called once without being timed.
 

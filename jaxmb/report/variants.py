@@ -1,4 +1,4 @@
-"""Variants of a system whose exact motion is known, or which have more than the system needs."""
+"""Variants of a system whose exact motion is known."""
 
 import dataclasses
 import re
@@ -12,11 +12,10 @@ import numpy as np
 
 from .._types import State
 from ..bodies.constraint_set import ConstraintSet
-from ..bodies.groups import ConstraintGroup, ForceGroup, Group, VelocityConstraintGroup, stack
+from ..bodies.groups import Group
 from ..bodies.structure import with_structure
-from ..parts.base import AbstractConstraint, AbstractVelocityConstraint
+from ..parts.base import AbstractConstraint
 from ..parts.fields import field_names, paths
-from ..parts.forces import Damper
 from ..system import AbstractSystem, parameters, with_parameters
 
 # Powers of the length in the units of parameters.
@@ -99,7 +98,7 @@ def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSy
 
     **Raises:** `ValueError` for a scene without joints, and where the scene with both does not compile.
     """
-    joint = _first_joint(system)
+    joint = first_joint(system)
     kind = "position" if isinstance(joint.part, AbstractConstraint) else "velocity"
     part = jax.tree.map(lambda x: x[:1], joint.part)
     if shift is not None:
@@ -108,83 +107,16 @@ def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSy
     names, bodies = (*joint.names, f"{joint.names[0]} again"), (*joint.bodies, joint.bodies[0])
     groups = getattr(system.constraints, kind)
     first = dataclasses.replace(groups[0], group=Group(both, names, bodies, joint.layout))
-    return _compiled(system, state, dataclasses.replace(system.constraints, **{kind: (first, *groups[1:])}))
+    return with_constraints(system, state, dataclasses.replace(system.constraints, **{kind: (first, *groups[1:])}))
 
 
-def in_time(system: Any, state: State) -> AbstractSystem:
-    """A scene whose first joint has a term in time of amplitude zero."""
-    joint = _first_joint(system)
-    if not isinstance(joint.part, AbstractConstraint):
-        raise ValueError(f"{joint.names[0]!r} is no constraint between positions")
-    part = _InTime("", (), joint.part, jnp.zeros(len(joint.names)))
-    first = ConstraintGroup(Group(part, joint.names, joint.bodies, joint.layout))
-    position = (first, *system.constraints.position[1:])
-    return _compiled(system, state, dataclasses.replace(system.constraints, position=position))
-
-
-def nonholonomic(system: Any, state: State) -> AbstractSystem:
-    """A scene with the rates of its first joint as constraints between velocities, which the joint implies."""
-    joint = _first_joint(system)
-    if not isinstance(joint.part, AbstractConstraint):
-        raise ValueError(f"{joint.names[0]!r} is no constraint between positions")
-    part = _Rate("", (), jax.tree.map(lambda x: x[:1], joint.part))
-    own = Group(part, (f"rate of {joint.names[0]}",), joint.bodies[:1], joint.layout)
-    velocity = (*system.constraints.velocity, VelocityConstraintGroup(own))
-    return _compiled(system, state, dataclasses.replace(system.constraints, velocity=velocity))
-
-
-def with_damper(system: Any, state: State) -> AbstractSystem:
-    """A scene with a force element that exerts no force, a damper between its first body and the ground."""
-    if not system.body_names:
-        raise ValueError("there are no bodies")
-    layout = system.layout
-    origin = np.zeros(layout.space.dimension)
-    part = Damper("a damper of zero", "ground", system.body_names[0], damping=0.0, point_a=origin, point_b=origin)
-    own = stack([(part, (layout.ground, 0))], layout)
-    forces = dataclasses.replace(system.forces, groups=(*system.forces.groups, *map(ForceGroup, own)))
-    return with_structure(dataclasses.replace(system, guess=state, forces=forces))
-
-
-def _first_joint(system: Any) -> Group:
+def first_joint(system: Any) -> Group:
+    """The first group of joints of a scene; `ValueError` where there is none."""
     if not (system.body_names and system.velocity_rows):
         raise ValueError("there are no joints of bodies")
     return system.constraints.groups[0].group
 
 
-def _compiled(system: Any, state: State, constraints: ConstraintSet) -> AbstractSystem:
+def with_constraints(system: Any, state: State, constraints: ConstraintSet) -> AbstractSystem:
+    """A scene with other constraints, which starts from a state."""
     return with_structure(dataclasses.replace(system, guess=state, constraints=constraints))
-
-
-class _InTime(AbstractConstraint):
-    name: str = eqx.field(static=True)
-    bodies: tuple = eqx.field(static=True)
-    part: Any
-    amplitude: Any
-    rheonomic = True
-
-    @property
-    def rows(self):
-        return self.part.rows
-
-    def residual(self, space, poses, t):
-        return self.part.residual(space, self.part.seen_poses(space, poses), t) + self.amplitude * jnp.sin(t)
-
-
-class _Rate(AbstractVelocityConstraint):
-    name: str = eqx.field(static=True)
-    bodies: tuple = eqx.field(static=True)
-    part: Any
-    linear = True
-
-    @property
-    def rows(self):
-        return self.part.rows
-
-    @property
-    def homogeneous(self):
-        return not self.part.rheonomic
-
-    def residual(self, space, poses, velocities, t):
-        rates, t = jax.vmap(space.rates)(poses, velocities), jnp.asarray(t, poses.dtype)
-        residual = lambda t, x: self.part.residual(space, self.part.seen_poses(space, x), t)
-        return jax.jvp(residual, (t, poses), (jnp.ones_like(t), rates))[1]

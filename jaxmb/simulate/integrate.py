@@ -8,8 +8,10 @@ import equinox as eqx
 import jax
 from jax import lax
 
-from ..manifold import project
-from ..solvers import MeshAdjoint, TangentControl, with_tangents
+from ..manifold.orthogonal_projection import project
+from ..solvers import MeshAdjoint
+from ..solvers.one_step import with_tangents
+from ..solvers.tangent import TangentControl
 from .loop import Loop
 from .room import Room, kept_steps
 from .saves import STATES, seen

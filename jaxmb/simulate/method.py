@@ -8,16 +8,13 @@ from jax import lax
 
 from .._types import State
 from ..formulations import AbstractFormulation
-from ..manifold import (
-    AbstractManifold,
-    counted_components,
-    default_manifold,
-    natural_units,
-    state_blocks,
-)
-from ..solvers import AbstractMultistep, MultistepController, RunningScales, with_counted
+from ..manifold import AbstractManifold
+from ..manifold.default import default_manifold
+from ..manifold.internal_states import counted_components, natural_units, state_blocks
+from ..solvers import AbstractMultistep, MultistepController
 from ..solvers.gaps import GapSolver
-from ..solvers.one_step import OneStepController
+from ..solvers.one_step import OneStepController, with_counted
+from ..solvers.scales import RunningScales
 from ..system import AbstractSystem
 
 

@@ -12,7 +12,7 @@ from .._results import RESULTS
 from ..formulations.friction import coupled_most
 from ..linalg.arrays import is_traced
 from ..linalg.recent import Recent
-from ..manifold import find_jumps
+from ..manifold.impulse import find_jumps
 from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
 from ..states.refusals import LostRank, lost_rank, violated_joints

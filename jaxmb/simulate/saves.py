@@ -15,7 +15,7 @@ from .._compat import changed
 from .._types import State
 from ..linalg.arrays import is_traced
 from ..linalg.members import vmap_states
-from ..manifold import after_jumps
+from ..manifold.impulse import after_jumps
 from ..system import AbstractSystem
 from .captured import captured_call
 from .span import Span, at_moving_times

@@ -12,11 +12,13 @@ from .._compat import with_values
 from .._results import RESULTS
 from .._types import State
 from ..contacts.events import FoundEvents
+from ..contacts.guards import contact_guards
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
-from ..manifold import contact_guards
 from ..manifold.diagnosis import diagnose_friction
-from ..solvers import NO_STATE, AbstractMultistep, events_found, intended_step
+from ..solvers import AbstractMultistep
+from ..solvers.controller import intended_step
+from ..solvers.events import NO_STATE, events_found
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.inputs import inputs_ended

@@ -17,8 +17,8 @@ from jax import lax
 
 from .._arguments import real_array
 from ..linalg.arrays import is_traced
-from ..manifold import next_number
-from ..solvers import twice_differentiable
+from ..manifold.impulse import next_number
+from ..solvers.times import twice_differentiable
 
 _FROZEN = contextvars.ContextVar("frozen", default=False)
 

@@ -12,9 +12,9 @@ from jax import lax
 
 from .._arguments import real_array
 from .._types import State, VectorLike
-from ..manifold import counted_components, natural_units, state_blocks
+from ..manifold.internal_states import counted_components, natural_units, state_blocks
 from ..parts.names import unknown
-from ..solvers import TangentControl
+from ..solvers.tangent import TangentControl
 from ..system import AbstractSystem
 from ..system.parameters import parameters, with_parameters
 

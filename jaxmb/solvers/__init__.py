@@ -1,35 +1,43 @@
-"""Multistep methods as diffrax solvers, with variable order and step, on vector fields and on manifolds."""
+"""Multistep methods as diffrax solvers, with variable order and step, on vector fields and on manifolds.
 
+Any solver of diffrax is one for `simulate`, as these are for `diffrax.diffeqsolve`, with a `MultistepController`. A
+multistep method of one's own derives from `AbstractMultistep`, with a field for its tolerances. Its steps are made of
+evaluations of the term that diffrax gives it, at predicted and at corrected states:
+
+```python
+from jaxmb import solvers
+
+tolerances: solvers.Tolerances = solvers.tolerances_of("Heun")
+adjoint = solvers.MeshAdjoint(most=1024)  # Derivatives of up to so many steps of a multistep method.
+
+def heun(term, t, h, y, args, chart):
+    now = solvers.evaluate(term, t, solvers.ravel(y), y, chart, args)
+    predicted = solvers.evaluate(term, t + h, now.y + h * now.f, y, chart, args)
+    end = solvers.project_near(term, t + h, now.y + h * (now.f + predicted.f) / 2, y, predicted, args)
+    y1 = solvers.unravel_like(y, end.y)
+    return y1, jnp.max(jnp.abs(end.y - predicted.y)), solvers.next_chart(term, t + h, y1, end.chart, args)
+
+def next_step(error):  # Of a method of one order, whose error is of second order in the step.
+    never, errors = jnp.array(False), jnp.stack([jnp.inf, error, jnp.inf])
+    may = {"may_fall": never, "may_rise": never, "known": ~never}
+    return solvers.choose_order(errors, jnp.full(3, 2.0), jnp.ones(()), target=0.5, work=jnp.array([2, 0]), **may)
+
+change, estimate = next_step(0.3)
+```
+"""
+
+from .._moved import tell_of_moved as _tell_of_moved
 from . import stability as stability
-from .adams import Adams as Adams, AdamsState as AdamsState
-from .controller import (
-    AbstractControllerState as AbstractControllerState,
-    ControllerState as ControllerState,
-    MultistepController as MultistepController,
-    intended_step as intended_step,
-)
+from .adams import Adams as Adams
+from .controller import MultistepController as MultistepController
 from .evaluation import (
-    Evaluation as Evaluation,
     evaluate as evaluate,
     next_chart as next_chart,
     project_near as project_near,
     ravel as ravel,
     unravel_like as unravel_like,
 )
-from .events import (
-    NO_STATE as NO_STATE,
-    cond_of_jumps as cond_of_jumps,
-    crossing as crossing,
-    events_found as events_found,
-)
-from .hermite import Hermite as Hermite, HermiteState as HermiteState
-from .manifold_term import (
-    AbstractFieldJacobian as AbstractFieldJacobian,
-    AbstractGuards as AbstractGuards,
-    AbstractManifoldTerm as AbstractManifoldTerm,
-    AbstractResolvent as AbstractResolvent,
-    ManifoldEvaluation as ManifoldEvaluation,
-)
+from .hermite import Hermite as Hermite
 from .mesh import MeshAdjoint as MeshAdjoint
 from .multistep import (
     AbstractAttempt as AbstractAttempt,
@@ -37,9 +45,7 @@ from .multistep import (
     AbstractMultistepState as AbstractMultistepState,
     tolerances_of as tolerances_of,
 )
-from .one_step import with_counted as with_counted, with_tangents as with_tangents
-from .order import StepEstimate as StepEstimate, choose_order as choose_order
-from .scales import Block as Block, RunningScales as RunningScales
-from .tangent import Tangent as Tangent, TangentControl as TangentControl
-from .times import twice_differentiable as twice_differentiable
+from .order import choose_order as choose_order
 from .tolerances import Tolerances as Tolerances
+
+_tell_of_moved(__name__)

@@ -4,9 +4,7 @@
 from jaxmb.solvers import stability
 formula = stability.formula("E", 3)  # Enright's, with three points of the past.
 stability.is_zero_stable(formula), stability.stability_angle(formula), stability.stiff_abscissa(formula)
-stability.damping_at_infinity(formula), stability.largest_growth("B", 2)
-stability.characteristic_roots(formula, -1.0), stability.spectral_radius(stability.adams(4), [-0.1, 0.1j])
-stability.boundary_locus(formula, np.linspace(0.0, np.pi, 50))
+stability.damping_at_infinity(formula), stability.spectral_radius(stability.adams(4), [-0.1, 0.1j])
 stability.plot_regions([stability.formula("E", k) for k in (1, 2, 3)]).savefig("regions.png")
 ```
 
@@ -37,6 +35,18 @@ from ._formulas import FAMILIES
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+__all__ = [
+    "Formula",
+    "adams",
+    "damping_at_infinity",
+    "formula",
+    "is_zero_stable",
+    "plot_regions",
+    "spectral_radius",
+    "stability_angle",
+    "stiff_abscissa",
+]
 
 Rationals: TypeAlias = tuple[Fraction, ...]
 

@@ -31,7 +31,7 @@ from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.jitted import jitted
 from ..linalg.newton import newton, root, solve_linear
-from ..system import AbstractEquation
+from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 
 # From this number of rows on, closest states of systems with an order of elimination are found in blocks.

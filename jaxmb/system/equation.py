@@ -23,8 +23,7 @@ from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.block_jacobian import JointOrder
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
-from ..solvers import AbstractFieldJacobian
-from ..solvers.manifold_term import GapsSeen
+from ..solvers.manifold_term import AbstractFieldJacobian, GapsSeen
 from .contact_set import ContactNumbers, ContactSet
 
 if TYPE_CHECKING:

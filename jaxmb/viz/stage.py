@@ -1,6 +1,7 @@
 """A recorded scene of viser: nodes that move, written as one page that needs no server and no network."""
 
 import dataclasses
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,9 @@ from .meshes import Triangles
 
 if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
+
+# The console that is quiet while a picture is recorded is the same for all threads.
+_RECORDS = threading.Lock()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,16 +107,17 @@ def _server() -> "Iterator[ViserServer]":
     # The server announces its address, which is of no use here.
     import rich
 
-    console = rich.get_console()
-    quiet, console.quiet = console.quiet, True
-    try:
-        server = viser().ViserServer(host="127.0.0.1", verbose=False)
+    with _RECORDS:
+        console = rich.get_console()
+        quiet, console.quiet = console.quiet, True
         try:
-            yield server
+            server = viser().ViserServer(host="127.0.0.1", verbose=False)
+            try:
+                yield server
+            finally:
+                server.stop()
         finally:
-            server.stop()
-    finally:
-        console.quiet = quiet
+            console.quiet = quiet
 
 
 # Kinds of nodes

@@ -1,6 +1,5 @@
 """The command line, run in this process."""
 
-import json
 import subprocess
 import sys
 
@@ -47,36 +46,33 @@ def test_run_of_a_lagrangian_system(capsys, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png", "work_precision.png"}
 
 
-def test_report(capsys, tmp_path, monkeypatch):
-    """Of a mechanism, and of a variant of it."""
-    monkeypatch.setattr("jaxmb.cli.report._VARIANTS", {"pendulum": ({"mass": 2.0},)})
-    words = ["report", "pendulum", "--t1", "1", "--tolerances", "1e-5", "--repeats", "1", "--out", str(tmp_path)]
-    assert main(words) == 0
-    out = capsys.readouterr().out
-    assert all(name in out for name in ("Adams", "Tsit5", "Dopri8"))
-    assert len(json.loads((tmp_path / "work_precision.json").read_text())["runs"]) == 3
-    # What partitioning costs, and the same with all coordinates.
-    costs = json.loads((tmp_path / "method_costs.json").read_text())["costs"]
-    assert {cost["bound"] for cost in costs} == {1e-3, 1e-5, 1e-7} and "multipliers, Baumgarte" in out
-    for cost in costs:
-        assert 0 < cost["error"] <= cost["bound"] and cost["evaluations"] > 0 and cost["flops"] > 0
-    assert "The same with mass=2.0:" in out
-    assert (tmp_path / "mass=2.0" / "method_costs.json").exists()
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (
+            ["report", "work_precision", "pendulum"],
+            "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python",
+        ),
+        (["reference", "site"], "python -m sphinx -c tests/pages . FOLDER"),
+        (["doctor", "--quick"], "is quick without --quick; --measure measures"),
+    ],
+)
+def test_what_went_tells_the_new_way(words, message, capsys):
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     "words, message",
     [
         (["run", "pendulm"], "did you mean 'pendulum'"),
-        (["report", "pendulm"], "did you mean 'pendulum'"),
         (["run", "pendulum", "--t1", "-1"], "--t1 must be positive"),
         (["run", "pendulum", "--rtol", "2"], "rtol must be between"),
-        (["report", "costs", "pendulum"], "got 'costs' before it"),
         (["run", "pendulum", "--set", "mas=2.0"], "did you mean 'mass'"),
         (["run", "pendulum", "--set", "mass=heavy"], "pendulum cannot be built with --set mass='heavy'"),
         (["run", "pendulum", "--set", "mass=[1, 2]"], "pendulum cannot be built with --set mass=[1, 2]"),
-        (["report", "n_four_bar", "--set", "n=two"], "n_four_bar cannot be built with --set n='two'"),
-        (["report", "train", "--set", "n={}"], "train cannot be built with --set n={}"),
+        (["run", "n_four_bar", "--set", "n=two"], "n_four_bar cannot be built with --set n='two'"),
+        (["run", "train", "--set", "n={}"], "train cannot be built with --set n={}"),
     ],
 )
 def test_wrong_words(words, message, capsys, tmp_path):
@@ -84,10 +80,10 @@ def test_wrong_words(words, message, capsys, tmp_path):
     assert message in capsys.readouterr().err
 
 
-def test_a_report_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path):
+def test_a_run_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path):
     file = tmp_path / "own.py"
     file.write_text("def scene(mass, length=1.0):\n    raise ValueError('called')\n")
-    words = ["report", f"{file}:scene", "--out", str(tmp_path / "out")]
+    words = ["run", f"{file}:scene", "--out", str(tmp_path / "out")]
     for given, message in (
         ([], "own.py:scene: missing a required argument: 'mass'; --set NAME=VALUE"),
         (["--set", "mas=2"], "missing a required argument: 'mass'"),
@@ -112,7 +108,7 @@ def test_where_to_write_is_checked_first(capsys, tmp_path, monkeypatch):
         assert main(["run", "pendulum", "--out", str(out)]) == 2
         assert "is a file and not a folder" in capsys.readouterr().err
     monkeypatch.setattr("os.access", lambda *args: False)
-    assert main(["report", "pendulum", "--out", str(tmp_path / "new")]) == 2
+    assert main(["run", "pendulum", "--out", str(tmp_path / "new")]) == 2
     assert "is not writable" in capsys.readouterr().err
 
 

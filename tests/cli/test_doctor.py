@@ -26,7 +26,7 @@ def said(capsys, *words):
 
 
 def test_quick(capsys):
-    facts, tables = said(capsys, "--quick")
+    facts, tables = said(capsys)
     assert tables == []
     assert facts["jaxmb"] == f"{mb.__version__}, Python {platform.python_version()}"
     for name in ("jax", "jaxlib", "diffrax", "equinox"):
@@ -41,7 +41,7 @@ def test_lines_are_short_but_for_paths(capsys, monkeypatch, tmp_path):
     folder.mkdir()
     monkeypatch.setattr(doctor, "kept_in", lambda: folder)
     monkeypatch.setattr(doctor, "_processor", lambda: "a processor of many words " * 5)
-    assert main(["doctor", "--quick"]) == 0
+    assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert all(len(line) <= 80 for line in lines if str(folder) not in line)
     assert any(str(folder) in line for line in lines)
@@ -58,7 +58,7 @@ def test_where_programs_are_kept(bound, of, capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "kept_in", lambda: folder)
     before = jax.config.jax_compilation_cache_max_size
     jax.config.update("jax_compilation_cache_max_size", bound)
-    facts, _ = said(capsys, "--quick")
+    facts, _ = said(capsys)
     jax.config.update("jax_compilation_cache_max_size", before)
     assert facts["kept programs"] == f"2 in ~/cache, 1.0{of} MiB"
 
@@ -66,13 +66,13 @@ def test_where_programs_are_kept(bound, of, capsys, monkeypatch, tmp_path):
 def test_where_none_are_kept(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "kept_in", lambda: None)
     monkeypatch.setenv("JAXMB_CACHE", "off")
-    assert said(capsys, "--quick")[0]["kept programs"] == "none, JAXMB_CACHE=off"
+    assert said(capsys)[0]["kept programs"] == "none, JAXMB_CACHE=off"
 
 
 def test_what_is_missing(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_OPTIONAL", {"plot": ("numpy",), "view": ("numpy", "no_such_package")})
     numpy = f"numpy {importlib.metadata.version('numpy')}"
-    facts, _ = said(capsys, "--quick")
+    facts, _ = said(capsys)
     assert facts["for plot"] == numpy
     assert facts["for view"] == f'{numpy}, no_such_package missing; pip install "jaxmb[view]"'
 
@@ -86,7 +86,7 @@ def test_the_extras_are_those_of_the_package():
 def test_measurements(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_FIRST_CALLS", NUMBERS)
     monkeypatch.setattr(doctor, "_STEPPED", ("pendulum",))
-    _, (_, calls, _, steps) = said(capsys)
+    _, (_, calls, _, steps) = said(capsys, "--measure")
     rows = dict(re.match(r"(.*\S)\s+([\d.]+)\s+[\d.]+$", line).groups() for line in calls.splitlines()[1:])
     assert rows == {name: f"{0.25 * place:.3f}" for name, place in doctor._SHOWN.items()}
     head, row = (line.split("  ") for line in steps.splitlines())
@@ -100,7 +100,7 @@ def test_measurements(capsys, monkeypatch):
 
 def test_a_process_that_fails(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_FIRST_CALLS", "raise SystemExit('no such thing')")
-    assert main(["doctor"]) == 1
+    assert main(["doctor", "--measure"]) == 1
     assert capsys.readouterr().err == "jaxmb: A new process failed: no such thing\n"
 
 
@@ -125,7 +125,9 @@ def test_the_second_process_waits_less():
 
 
 def test_the_readme_quotes_what_is_printed():
-    block = re.search(r"`jaxmb doctor` .*?```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL).group(1)
+    block = re.search(
+        r"`jaxmb doctor(?: --measure)?` .*?```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
+    ).group(1)
     names = [line.split("  ")[0] for line in block.splitlines() if re.match(r"\w.*  ", line)]
     printed = [*doctor._SHOWN, *doctor._STEPPED]
     assert names and names == [name for name in printed if name in names]

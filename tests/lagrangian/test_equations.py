@@ -19,12 +19,8 @@ from jaxmb.lagrangian import (
     QuasiVelocities,
     QuasiVelocityFrame,
     Voronets,
-    kinetostatic_forces,
-    pivoted_frame,
-    structure_functions,
 )
 from jaxmb.linalg import rotations
-from jaxmb.linalg.elimination import full_pivot
 
 ZERO = jnp.zeros(())
 
@@ -194,31 +190,6 @@ def test_a_drift_and_time_in_the_frame_and_in_the_connection():
     np.testing.assert_allclose(found[jnp.array([0, 2])], expected, rtol=1e-12)
 
 
-def test_a_frame_chosen_by_pivots_has_no_singularity_of_its_own():
-    """Platforms in line, where the connection over their angles has none."""
-    constrained = library("roller_racer", form="constraints").system
-    q = jnp.array([0.1, 0.2, 0.3, 0.0])
-    wheels = constrained.constraints[0].matrix
-    pivots = full_pivot(wheels(ZERO, q, constrained.parameters))
-    frame = pivoted_frame(wheels, pivots.order, 2)
-    system = LagrangianSystem(
-        constrained.lagrangian, kinematics=frame, equations=Hamel(), q=q, parameters=constrained.parameters
-    )
-    u = jnp.array([0.8, -0.6])
-    a = solved(system, q, u)[2]
-    np.testing.assert_allclose(a, solved(constrained, q, system.rates(ZERO, q, u))[0], rtol=0, atol=1e-13)
-
-
-def test_structure_functions_of_rotations():
-    """In body axes `[X_1, X_2] = X_3`, and in turn."""
-    frame = QuasiVelocityFrame(lambda t, q, p: _body_axes(q), 3)
-    c = structure_functions(frame, ZERO, jnp.array([0.5, 0.4, -0.3]), {})
-    expected = np.zeros((3, 3, 3))
-    for a, b, d in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        expected[d, a, b], expected[d, b, a] = 1.0, -1.0
-    np.testing.assert_allclose(c, expected, rtol=0, atol=1e-14)
-
-
 def _body_axes(q):
     """Rates of Euler angles z, x, z with turning about the body's axes."""
     _, theta, psi = q
@@ -314,20 +285,18 @@ def test_johnsen_hamel_equations_of_random_quasi_velocities():
         udot = accelerations(system, Partitioned(), t, q, u)[0]
         v = system.rates(t, q, u)
         a = jax.jvp(system.rates, (t, q, u), (jnp.ones(()), v, udot))[1]
-        left = johnsen_hamel_residual(system, t, q, u, udot)
-        return v, a, left, kinetostatic_forces(system, t, q, u, udot)
+        return v, a, johnsen_hamel_residual(system, t, q, u, udot)
 
-    v, a, left, held = everything(quasi)
+    v, a, left = everything(quasi)
     np.testing.assert_allclose(omega(t, q, v, {})[jnp.array(dependent)], 0.0, atol=1e-14)
     independent = np.delete(np.arange(n), dependent)
     np.testing.assert_allclose(left[independent], 0.0, atol=1e-12)
-    np.testing.assert_allclose(left[jnp.array(dependent)], held, rtol=1e-11)
-    # Chetaev's multipliers give the same motion.
+    # Chetaev's multipliers give the same motion, and are the forces that hold the dependent quasi-velocities at zero.
     rows = Nonholonomic("held", lambda t, q, v, p: omega(t, q, v, p)[jnp.array(dependent)])
     chetaev = LagrangianSystem(**common, constraints=[rows])
     found, multipliers = accelerations(chetaev, Multipliers(), t, q, v)
     np.testing.assert_allclose(a, found, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(held, multipliers, rtol=1e-10)
+    np.testing.assert_allclose(left[jnp.array(dependent)], multipliers, rtol=1e-10)
     rate = jax.jvp(lambda t, q, v: omega(t, q, v, {}), (t, q, v), (jnp.ones(()), v, a))[1]
     np.testing.assert_allclose(rate[jnp.array(dependent)], 0.0, atol=1e-14)
 

@@ -12,7 +12,8 @@ from sprung_pendulums import double_pendulum
 import jaxmb as mb
 from jaxmb.formulations import Multipliers, Partitioned
 from jaxmb.manifold import Partition, Projection
-from jaxmb.solvers import AbstractManifoldTerm, Hermite
+from jaxmb.solvers import Hermite
+from jaxmb.solvers.manifold_term import AbstractManifoldTerm
 
 
 def total(of, term, t, y, f, kept):

@@ -10,7 +10,6 @@ import inspect
 import re
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +17,7 @@ import pytest
 from exports import exported
 
 import jaxmb as mb
-from jaxmb import formulations, manifold, mechanisms, planar, spatial
+from jaxmb import mechanisms, planar, spatial
 from jaxmb.parts import AbstractCompound, AbstractConstraint, AbstractVelocityConstraint
 from jaxmb.reference import topics
 from jaxmb.reference.entries import entries, members
@@ -231,28 +230,9 @@ RESULTS_OF = {
     "cases.Cases": "cases",
     "mechanisms.Mechanism": "mechanisms",
     "mechanisms.References": "mechanisms",
-    "report.FormulationCost": "report.formulation_costs",
-    "report.FormulationCosts": "report.formulation_costs",
-    "report.LeftOut": "report.left_out",
-    "report.Measured": "report.left_out",
-    "report.MethodCost": "report.method_costs",
-    "report.MethodCosts": "report.method_costs",
-    "report.Case": "report.stress_test",
-    "report.StressTest": "report.stress_test",
-    "report.Run": "report.work_precision",
-    "report.WorkPrecision": "report.work_precision",
+    "report.Table": "report.work_precision",
     "parts.Module": "parts.module",
-    "trajectory.PartMotion": "Trajectory",
 }
-# Modules that hold what a new method or a new kind of system is made of.
-MACHINERY = ("formulations", "manifold", "solvers", "system")
-# What users hand to `simulate`.
-CHOICES = (
-    formulations.AbstractFormulation,
-    manifold.AbstractManifold,
-    diffrax.AbstractSolver,
-    diffrax.AbstractStepSizeController,
-)
 
 
 def referred_to():
@@ -272,13 +252,11 @@ def referred_to():
 
 
 def needs_no_example(entry):
-    """Modules, abstract classes, exceptions, tuples of results, mechanisms, machinery, results of functions."""
+    """Modules, abstract classes, exceptions, tuples of results, mechanisms, results of functions."""
     module, is_class = entry.name.rpartition(".")[0], inspect.isclass(entry.thing)
     if is_class and (entry.short.startswith("Abstract") or issubclass(entry.thing, Exception | tuple)):
         return True
     if module == "mechanisms" and entry.short in mechanisms.names():
-        return True
-    if module in MACHINERY and not (is_class and issubclass(entry.thing, CHOICES)):
         return True
     return entry.kind == "module" or entry.name in RESULTS_OF
 

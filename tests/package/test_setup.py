@@ -131,7 +131,7 @@ def test_what_is_asked_for_alone_is_set():
 
 @pytest.mark.parametrize("name", ["compile_quickly", "run_quickly", "keep_compiled"])
 def test_names_of_the_last_release_tell_the_new_one(name):
-    with pytest.raises(AttributeError, match=rf"jaxmb\.{name} is jaxmb\.setup\(.* now"):
+    with pytest.raises(AttributeError, match=rf"jaxmb\.{name} is now jaxmb\.setup\("):
         getattr(mb, name)
 
 
@@ -310,13 +310,3 @@ print(repr(jax.config.jax_compilation_cache_dir))
     folder, said = process(code, JAXMB_CACHE=str(tmp_path / "taken"))
     assert folder is None and said.startswith("jaxmb: compiled programs are not kept: ") and said.count("\n") == 1
     assert process(code, JAXMB_CACHE="off") == (None, "")
-
-
-def test_a_report_compiles_anew(tmp_path):
-    """What it prints of compiling is not the time to read from a disk."""
-    code = """
-from jaxmb.cli import main
-assert main(["report", "nothing_of_this_name"]) == 2
-print(repr(jax.config.jax_compilation_cache_dir))
-"""
-    assert process(code, JAXMB_CACHE=str(tmp_path))[0] is None

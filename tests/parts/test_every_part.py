@@ -17,9 +17,9 @@ from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import (
     AbstractCompound,
     AbstractConstraint,
-    AbstractInertialConstraint,
     AbstractVelocityConstraint,
 )
+from jaxmb.parts.base import AbstractInertialConstraint
 
 CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)
 

@@ -2,7 +2,7 @@
 
 import time
 
-from jaxmb.report import interleaved
+from jaxmb.report.timing import interleaved
 
 
 def test_interleaved_takes_turns():

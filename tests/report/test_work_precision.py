@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from jaxmb import mechanisms
-from jaxmb.report import work_precision
+from jaxmb.report import Table, work_precision
 from jaxmb.report.reference import reference
 from jaxmb.solvers import Adams
 
@@ -33,32 +33,39 @@ def precision(pendulum):
 
 
 def test_errors_fall_with_the_tolerance(precision):
-    runs = {(run.solver, run.rtol): run for run in precision.runs}
+    runs = {(run["solver"], run["rtol"]): run for run in precision.to_dict()["rows"]}
     for solver in ("Adams", "Dopri8"):
         loose, tight = runs[solver, 1e-5], runs[solver, 1e-9]
-        assert tight.error < 1e-7 and tight.error < 1e-2 * loose.error
-        assert tight.evaluations > loose.evaluations > 0
+        assert tight["error"] < 1e-7 and tight["error"] < 1e-2 * loose["error"]
+        assert tight["evaluations"] > loose["evaluations"] > 0
         for run in (loose, tight):
-            assert len(run.times) == 3
-            assert 0 < run.shortest <= run.median
-            assert run.compile_time > run.median
-            assert 0 <= run.rejected < run.steps
+            assert 0 < run["run [ms]"] <= run["median"] < 1e3 * run["compile [s]"]
+            assert 0 <= run["rejected"] < run["steps"]
 
 
 def test_forms(precision, tmp_path):
-    """A table for a terminal and for a notebook, plain data, and a picture."""
-    assert len(str(precision).splitlines()) == 2 + 1 + 4
+    """A table for a terminal and for a notebook, plain data, and a picture with these."""
+    assert len(str(precision).splitlines()) == 1 + 1 + 4 + 1
     assert "elliptic functions" in str(precision)
-    assert precision._repr_html_().count("<tr>") == 5
-    assert json.loads(json.dumps(precision.to_dict()))["runs"][0]["solver"] == "Adams"
+    assert precision._repr_html_().count("<tr>") == 5 and "elliptic functions" in precision._repr_html_()
+    plain = json.loads(json.dumps(precision.to_dict()))
+    assert plain["rows"][0]["solver"] == precision["solver"][0] == "Adams"
     precision.figure(tmp_path / "figure.png")
     with Image.open(tmp_path / "figure.png") as image:
-        assert image.format == "PNG" and json.loads(image.text["Description"]) == json.loads(
-            json.dumps(precision.to_dict())
-        )
+        assert image.format == "PNG" and json.loads(image.text["Description"]) == plain
     precision.figure(tmp_path / "figure.svg")
-    assert "&quot;disagreement&quot;" in (text := (tmp_path / "figure.svg").read_text()) or '"disagreement"' in text
+    assert "&quot;evaluations&quot;" in (text := (tmp_path / "figure.svg").read_text()) or '"evaluations"' in text
     precision.figure(tmp_path / "figure.pdf")
+
+
+def test_a_table_in_words():
+    rows = [("one", 0.5, 3), ("other", "small", None)]
+    table = Table("a <title>", {"name": "", "x": ".1e", "n": "d"}, rows, ["a note"])
+    lines = ["name         x  n", "one    5.0e-01  3", "other    small  –"]
+    assert str(table).splitlines() == ["a <title>", *lines, "a note"]
+    assert "a &lt;title&gt;" in table._repr_html_() and table["n"] == [3, None]
+    with pytest.raises(ValueError, match="no figure of this table: a <title>"):
+        table.figure("figure.png")
 
 
 def test_computed_reference(pendulum):
@@ -74,9 +81,7 @@ def test_computed_reference(pendulum):
 def test_failed_run_keeps_its_row(pendulum):
     lost = dataclasses.replace(pendulum, state=jax.tree.map(lambda x: x * jnp.nan, pendulum.state))
     failed = work_precision(lost, solvers={"Tsit5": diffrax.Tsit5()}, tolerances=(1e-5,), repeats=1)
-    (run,) = failed.runs
-    assert np.isnan(run.error) and run.message
-    assert "failed" in str(failed) and run.message in str(failed)
+    assert failed["error"] == ["failed"] and failed.notes[-1].startswith("Tsit5 at 1e-05: ")
 
 
 def test_no_arguments_to_work_with(pendulum):

@@ -12,7 +12,7 @@ from compiling import jit_quickly
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.manifold import counted_components
+from jaxmb.manifold.internal_states import counted_components
 from jaxmb.simulate.method import running_scales
 from jaxmb.solvers.tolerances import NormOfCounted
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from compiling import jit_as_users_do
 
-from jaxmb.solvers import AbstractManifoldTerm, Adams, ManifoldEvaluation, MultistepController
+from jaxmb.solvers import Adams, MultistepController
+from jaxmb.solvers.manifold_term import AbstractManifoldTerm, ManifoldEvaluation
 
 _AXES = np.arange(2, dtype=np.int32)
 

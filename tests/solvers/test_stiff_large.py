@@ -17,7 +17,8 @@ from jaxmb import planar, spatial
 from jaxmb.bodies.field_jacobian import motion_jacobian
 from jaxmb.linalg.block_elimination import eliminate_blocks
 from jaxmb.linalg.elimination_order import order_nodes
-from jaxmb.manifold import Partition, Projection, Unconstrained, default_manifold
+from jaxmb.manifold import Partition, Projection
+from jaxmb.manifold.default import Unconstrained, default_manifold
 from jaxmb.solvers import Hermite
 from jaxmb.solvers._structured import StructuredInverses, _spectrum
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from jaxmb.solvers import AbstractGuards, events
+from jaxmb.solvers import events
+from jaxmb.solvers.manifold_term import AbstractGuards
 
 FUNCTIONS = {
     "line": (lambda s: 0.37 - s, 8),

@@ -16,14 +16,14 @@ import numpy as np
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.lagrangian import (
-    AbstractCoordinateConstraint,
-    AbstractKinematics,
     Holonomic,
     LagrangianSystem,
     NonIdealForce,
     Pfaffian,
     QuasiVelocityFrame,
 )
+from jaxmb.lagrangian.constraints import AbstractCoordinateConstraint
+from jaxmb.lagrangian.kinematics import AbstractKinematics
 
 # Ways to hold a number
 

@@ -9,6 +9,7 @@ import numpy as np
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.manifold.default import Unconstrained
 from jaxmb.parts import AbstractForce, AbstractNonIdeal, contact, terrain
 
 
@@ -450,7 +451,7 @@ METHODS = {
     },
     "Hermite": {"solver": mb.solvers.Hermite()},
     "Baumgarte": {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Baumgarte(20.0)},
-    "without constraints": {"manifold": mb.manifold.Unconstrained()},
+    "without constraints": {"manifold": Unconstrained()},
 }
 
 

@@ -5,6 +5,3 @@ from .linearisation import Linearisation as Linearisation
 from .linearise import linearise as linearise
 from .root_locus import RootLocus as RootLocus, root_locus as root_locus
 from .steady import steady_motion as steady_motion
-
-# The American spelling.
-linearize = linearise

@@ -21,8 +21,9 @@ from jaxtyping import Array, Bool, Float
 from ..._types import Scalar, State
 from ...formulations import Partitioned
 from ...formulations.laws import accelerations_at
-from ...system import AbstractSystem, Solved, parameters, with_parameters
+from ...system import AbstractSystem, parameters, with_parameters
 from ...system.instant import Instant
+from ...system.quantities import Solved
 from .comoving import carriers
 from .perturbations import Perturbations, StateNames, joined, parted, perturbations
 from .quantities import measured

@@ -13,7 +13,7 @@ from ..._arguments import real_array
 from ..._printed import preformatted
 from ..._types import Scalar, State, VectorLike
 from ...linalg.arrays import is_traced
-from ...manifold import project_normalized
+from ...manifold.orthogonal_projection import project_normalized
 from ...system import AbstractSystem
 from .eigen import eigen
 

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from ..._types import Scalar, State
 from ...parts.names import unknown
-from ...system import AbstractSystem, Solved
-from ...system.quantities import component_names
+from ...system import AbstractSystem
+from ...system.quantities import Solved, component_names
 
 
 def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:

@@ -2,6 +2,3 @@
 
 from .optimise import Optimum as Optimum, optimise as optimise
 from .robust import robust as robust
-
-# The American spelling.
-optimize = optimise

@@ -19,6 +19,8 @@ from ..._arguments import whole_number
 from ...parts.names import unknown
 from ..sobol import sobol_points
 
+__all__ = ["Cases", "grid", "sobol", "table"]
+
 MEMBER = "member"
 
 

@@ -76,7 +76,7 @@ def test_a_double_pendulum_has_its_closed_form():
 def test_other_programs_and_responses():
     """The same numbers and names; free motion as SciPy computes it."""
     system, state = double_pendulum()
-    linear = mb.linearize(system, state, inputs=["motor.torque"], outputs=["lower.angle", "upper.angle"])
+    linear = mb.linearise(system, state, inputs=["motor.torque"], outputs=["lower.angle", "upper.angle"])
     scipys, controls = linear.to_scipy(), linear.to_control()
     for name in "ABCD":
         np.testing.assert_array_equal(getattr(scipys, name), getattr(linear, name))

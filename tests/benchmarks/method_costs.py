@@ -1,6 +1,10 @@
-"""The cost of methods of integrating a constrained motion at equal error: evaluations, linear algebra, and time."""
+"""The cost of methods of integrating a constrained motion at equal error: evaluations, linear algebra, and time.
+
+python tests/benchmarks/method_costs.py four_bar andrews
+"""
 
 import dataclasses
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -8,24 +12,21 @@ import diffrax
 import equinox as eqx
 import jax
 import numpy as np
+from stabilised_dae import applies_to, stabilised_dae
 
-from .._printed import Printed
-from .._results import RESULTS
-from .._types import State
-from ..bodies.motion_graph import motion_order
-from ..formulations import Multipliers
-from ..manifold import AbstractManifold, Baumgarte, Partition
-from ..manifold.default import default_manifold
-from ..mechanisms import Mechanism, References
-from ..simulate import simulate
-from ..solvers import Adams, Hermite
-from ..system import AbstractSystem
-from ..trajectory import Trajectory
-from .evaluations import evaluations
-from .reference import reference
-from .stabilised_dae import applies_to, stabilised_dae
-from .table import aligned
-from .timing import interleaved
+import jaxmb as mb
+from jaxmb import RESULTS, State, Trajectory, simulate
+from jaxmb.bodies.motion_graph import motion_order
+from jaxmb.formulations import Multipliers
+from jaxmb.manifold import AbstractManifold, Baumgarte, Partition
+from jaxmb.manifold.default import default_manifold
+from jaxmb.mechanisms import Mechanism, References
+from jaxmb.report import Table
+from jaxmb.report.evaluations import evaluations
+from jaxmb.report.reference import reference
+from jaxmb.report.timing import interleaved
+from jaxmb.solvers import Adams, Hermite
+from jaxmb.system import AbstractSystem
 
 ERRORS = (1e-3, 1e-5, 1e-7)
 
@@ -35,55 +36,17 @@ _TOLERANCES = 10.0 ** -np.arange(2.5, 12.0, 0.5)
 _RATE = 10.0
 
 
-@dataclasses.dataclass(frozen=True)
-class MethodCost:
-    """The cost of one method at the coarsest tolerance that meets a bound on the error.
-
-    **Fields:** `method`; `bound` and `error`, the largest relative error at the end of the quantities that the
-    mechanism observes; `rtol`; `evaluations` of the accelerations, or of the residual of implicit equations; `matrices`
-    factored for Newton's method; `flops` of linear algebra; `time` [s] of a warm run; `ratio`, that time over the time
-    of `Adams` as `simulate` chooses it, at the same bound. NaN and zeros if no tolerance meets the bound.
-    """
-
-    method: str
-    bound: float
-    error: float
-    rtol: float
-    evaluations: int
-    matrices: int
-    flops: float
-    time: float
-    ratio: float
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class MethodCosts(Printed):
-    """The result of `method_costs`; `print` shows a table. `remarks`: methods that were skipped, and why."""
-
-    mechanism: str
-    t1: float
-    costs: tuple[MethodCost, ...]
-    remarks: tuple[str, ...]
-
-    def __str__(self) -> str:
-        rows = [_HEADER, *map(_cells, self.costs)]
-        title = f"{self.mechanism}, {self.t1:g} s: cost of an error at the end below each bound"
-        return "\n".join([title, *aligned(rows), *self.remarks])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists, for JSON."""
-        return dataclasses.asdict(self)
-
-
-_HEADER = ("method", "bound", "error", "rtol", "evaluations", "matrices", "Mflop", "run [ms]", "ratio")
-
-
-def _cells(cost: MethodCost) -> tuple[str, ...]:
-    if not np.isfinite(cost.error):
-        return (cost.method, f"{cost.bound:.0e}", "not met", *["–"] * 6)
-    ratio = f"{cost.ratio:.2f}" if np.isfinite(cost.ratio) else "–"
-    counts = str(cost.evaluations), str(cost.matrices), f"{cost.flops / 1e6:.1f}", f"{1e3 * cost.time:.2f}", ratio
-    return (cost.method, f"{cost.bound:.0e}", f"{cost.error:.1e}", f"{cost.rtol:.0e}", *counts)
+COLUMNS = {
+    "method": "",
+    "bound": ".0e",
+    "error": ".1e",
+    "rtol": ".0e",
+    "evaluations": "d",
+    "matrices": "d",
+    "Mflop": ".1f",
+    "run [ms]": ".2f",
+    "ratio": ".2f",
+}
 
 
 class _Run(NamedTuple):
@@ -105,12 +68,8 @@ class _Method(NamedTuple):
     matrix: float
 
 
-def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repeats: int = 5) -> MethodCosts:
+def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repeats: int = 5) -> Table:
     """Compare coordinate partitioning with integrating all coordinates, at equal error.
-
-    ```python
-    print(jaxmb.report.method_costs(jaxmb.mechanisms.four_bar(), errors=(1e-3, 1e-5), repeats=3))
-    ```
 
     The methods are partitioning with `Adams` and with `Hermite`; all coordinates with multipliers and Baumgarte's
     stabilisation, with `Adams` and with `Dopri8` of diffrax; all coordinates with projection and sparse elimination,
@@ -122,6 +81,11 @@ def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repe
     Operations of linear algebra are counted for full matrices: elimination of the constraints and the Cholesky factor
     of the reduced mass matrix; that of A M⁻¹ Aᵀ; and LU of the whole system for the implicit methods. Where A M⁻¹ Aᵀ
     is eliminated sparsely, as multipliers and projections do in large scenes, those of its blocks are counted.
+
+    **Returns:** a row for each method and bound: the error and `rtol` of the coarsest tolerance that meets the bound,
+    "not met" if none does; evaluations of the accelerations, or of the residual of implicit equations; matrices
+    factored for Newton's method; millions of operations of linear algebra; the time of a warm run, and its ratio to
+    that of the first method at the same bound.
 
     **Arguments:** `errors`: bounds on the largest relative error at the end of the quantities that the mechanism
     observes; `repeats`: timed runs of each, in turns, of which the shortest counts.
@@ -155,18 +119,19 @@ def method_costs(mechanism: Mechanism, errors: Sequence[float] = ERRORS, *, repe
             else:
                 found.append((name, bound, float("nan"), None))
     times = iter(interleaved(runs, repeats))
-    costs, unit = [], {}
+    rows, unit = [], {}
     for name, bound, rtol, run in found:
         if run is None:
-            costs.append(MethodCost(name, bound, float("nan"), rtol, 0, 0, 0.0, float("nan"), float("nan")))
+            rows.append((name, bound, "not met", *[None] * 6))
             continue
         flops = run.evaluations * methods[name].evaluation + run.matrices * methods[name].matrix
         time = min(next(times))
         if name == found[0][0]:
             unit[bound] = time
-        ratio = time / unit.get(bound, float("nan"))
-        costs.append(MethodCost(name, bound, run.error, rtol, run.evaluations, run.matrices, flops, time, ratio))
-    return MethodCosts(mechanism.name, t1, tuple(costs), tuple(remarks))
+        counts = run.evaluations, run.matrices, flops / 1e6
+        ratio = time / unit[bound] if bound in unit else None
+        rows.append((name, bound, run.error, rtol, *counts, 1e3 * time, ratio))
+    return Table(f"{mechanism.name}, {t1:g} s: cost of an error at the end below each bound", COLUMNS, rows, remarks)
 
 
 def _simulations(mechanism: Mechanism, known: References) -> dict[str, _Method]:
@@ -263,3 +228,9 @@ def _error(mechanism: Mechanism, known: References, ts: Any, ys: Any) -> float:
     )
     errors = dataclasses.replace(mechanism, references=known).errors(trajectory)
     return max(float(error[-1]) for error in errors.values())
+
+
+if __name__ == "__main__":
+    mb.setup(keep=False)
+    for own in sys.argv[1:] or ("four_bar",):
+        print(method_costs(mb.mechanisms.get(own)))

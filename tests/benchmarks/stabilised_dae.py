@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import State
-from ..formulations import Multipliers, accelerations
-from ..system import AbstractSystem
+from jaxmb import State
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.system import AbstractSystem
 
 # Absolute tolerance of the multipliers, which follow from the other unknowns and need no error control.
 _LOOSE = 1e8

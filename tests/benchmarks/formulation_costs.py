@@ -1,7 +1,13 @@
-"""The cost of the formulations, side by side on one mechanism."""
+"""The cost of the formulations, side by side on one mechanism, with derivatives.
 
-import dataclasses
+    python tests/benchmarks/formulation_costs.py four_bar andrews
+
+Source of the question: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the Dynamic Analysis of
+Three-Dimensional Constrained Mechanical Systems", J. Mech. Design 104(4), 1982, compares what formulations cost.
+"""
+
 import functools
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,31 +17,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._printed import Printed
-from .._types import State
-from ..formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
-from ..formulations.formulation import row_levels
-from ..formulations.laws import laws_of
-from ..linalg.elimination import PivotOrder, full_pivot
-from ..linalg.jacobian import DenseJacobian
-from ..mechanisms import Mechanism
-from ..system import AbstractSystem
-from ..system.instant import Instant
-from .table import aligned
-from .timing import interleaved
+import jaxmb as mb
+from jaxmb import State
+from jaxmb.formulations import AbstractFormulation, Multipliers, NullSpace, Partitioned, Poincare, UdwadiaKalaba
+from jaxmb.formulations.formulation import row_levels
+from jaxmb.formulations.laws import laws_of
+from jaxmb.linalg.elimination import PivotOrder, full_pivot
+from jaxmb.linalg.jacobian import DenseJacobian
+from jaxmb.mechanisms import Mechanism
+from jaxmb.report import Table
+from jaxmb.report.timing import interleaved
+from jaxmb.system import AbstractSystem
+from jaxmb.system.instant import Instant
 
 # Consecutive evaluations in one timed run.
 _LENGTH = 200
 
 
 def every_formulation() -> dict[str, AbstractFormulation]:
-    """All formulations and their options, by name.
-
-    ```python
-    formulations = jaxmb.report.every_formulation()
-    list(formulations)
-    ```
-    """
+    """All formulations and their options, by name."""
     return {
         "Partitioned": Partitioned(),
         "Multipliers": Multipliers(),
@@ -47,69 +47,33 @@ def every_formulation() -> dict[str, AbstractFormulation]:
     }
 
 
-@dataclasses.dataclass(frozen=True)
-class FormulationCost:
-    """The cost of one formulation.
-
-    **Fields:** times [s] of one evaluation of all accelerations, including the Jacobian and its elimination in a given
-    pivot order: `evaluation`, `forward` with the derivative along one direction, `reverse` with the gradient; `lines`
-    of HLO of the three, before XLA optimises; `deviation` of the accelerations from those of the first formulation,
-    relative to the largest acceleration.
-    """
-
-    formulation: str
-    evaluation: float
-    forward: float
-    reverse: float
-    lines: tuple[int, int, int]
-    deviation: float
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class FormulationCosts(Printed):
-    """The result of `formulation_costs`; `print` shows a table."""
-
-    mechanism: str
-    costs: tuple[FormulationCost, ...]
-
-    def __str__(self) -> str:
-        head = (
-            "formulation",
-            "evaluation [µs]",
-            "forward",
-            "reverse",
-            "lines of HLO",
-            "forward",
-            "reverse",
-            "deviation",
-        )
-        rows = [head, *map(_cells, self.costs)]
-        return "\n".join([f"{self.mechanism}: accelerations at the start, by formulation", *aligned(rows)])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists, for JSON."""
-        return dataclasses.asdict(self)
-
-
-def _cells(cost: FormulationCost) -> tuple[str, ...]:
-    times = (f"{1e6 * time:.2f}" for time in (cost.evaluation, cost.forward, cost.reverse))
-    return (cost.formulation, *times, *map(str, cost.lines), f"{cost.deviation:.0e}")
+COLUMNS = {
+    "formulation": "",
+    "evaluation [µs]": ".2f",
+    "forward": ".2f",
+    "reverse": ".2f",
+    "lines of HLO": "d",
+    "lines, forward": "d",
+    "lines, reverse": "d",
+    "deviation": ".0e",
+}
 
 
 def formulation_costs(
     mechanism: Mechanism, formulations: Mapping[str, AbstractFormulation] | None = None, *, repeats: int = 5
-) -> FormulationCosts:
+) -> Table:
     """Time the accelerations by several formulations, and their derivatives with respect to the state.
-
-    ```python
-    print(jaxmb.report.formulation_costs(jaxmb.mechanisms.four_bar(), repeats=3))
-    ```
 
     Each evaluation depends on the previous one, as in a motion, and eliminates in the pivot order of one chart. The
     formulations are timed in turns.
 
     **Arguments:** `formulations` by name, default all that the mechanism's mass matrix allows; `repeats`: timed runs of
     each, of which the shortest counts.
+
+    **Returns:** a row for each: times [µs] of one evaluation of all accelerations, including the Jacobian and its
+    elimination in a given pivot order, with the derivative along one direction, and with the gradient; lines of HLO of
+    the three, before XLA optimises; the largest deviation of the accelerations from those of the first formulation,
+    relative to the largest acceleration.
 
     **Raises:** `ValueError` for a mechanism without constraints, where all formulations are the same.
     """
@@ -137,12 +101,11 @@ def formulation_costs(
     times = [min(own) / _LENGTH for own in interleaved(runs, repeats)]
     first = next(iter(accelerations.values()))
     size = max(float(np.max(np.abs(first))), float(np.finfo(first.dtype).tiny))
-    costs = []
+    rows = []
     for k, name in enumerate(chosen):
         deviation = float(np.max(np.abs(accelerations[name] - first))) / size
-        evaluation, forward, reverse = times[3 * k : 3 * k + 3]
-        costs.append(FormulationCost(name, evaluation, forward, reverse, lines[name], deviation))
-    return FormulationCosts(mechanism.name, tuple(costs))
+        rows.append((name, *(1e6 * time for time in times[3 * k : 3 * k + 3]), *lines[name], deviation))
+    return Table(f"{mechanism.name}: accelerations at the start, by formulation", COLUMNS, rows)
 
 
 def _accelerations(system: AbstractSystem, formulation: AbstractFormulation, y: State, order: PivotOrder):
@@ -174,3 +137,9 @@ def _repeated(program: Callable[[State], Any]):
         return jax.tree.map(lambda x: x + jnp.finfo(x.dtype).tiny * moved, y)
 
     return lambda y: lax.fori_loop(0, _LENGTH, step, y)
+
+
+if __name__ == "__main__":
+    mb.setup(keep=False)
+    for own in sys.argv[1:] or ("four_bar",):
+        print(formulation_costs(mb.mechanisms.get(own)))

@@ -1,0 +1,44 @@
+"""The pages of names, topics and notebooks: they build without a warning, and every public name is in them once."""
+
+import collections
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxmb.reference.entries import entries
+from jaxmb.reference.topics import topics
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.long
+def test_pages(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-E",
+        "-c",
+        "tests/pages",
+        ".",
+        str(tmp_path),
+    ]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout + run.stderr
+    pages = {path.stem: path.read_text() for path in tmp_path.rglob("*.html")}
+    assert {"index", *topics(), *(path.stem for path in (ROOT / "notebooks").glob("*.ipynb"))} <= pages.keys()
+    ids = collections.Counter(found for page in pages.values() for found in re.findall(r'id="([^"]*)"', page))
+    for entry in entries().values():
+        name = f"module-jaxmb.{entry.name}" if entry.kind == "module" else f"jaxmb.{entry.name}"
+        assert ids[name] == 1, name
+    # Names in docstrings are links, and no marks of Markdown are left in their text.
+    (spatial,) = [page for page in pages.values() if 'id="jaxmb.spatial.Revolute"' in page]
+    assert 'title="jaxmb.DryFriction"' in spatial
+    text = re.sub(r"<(pre|code|dt|script|style).*?</\1>", "", spatial, flags=re.DOTALL)
+    assert not [mark for mark in ("**", "`", "$$") if mark in text]
