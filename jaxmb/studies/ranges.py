@@ -1,4 +1,4 @@
-"""Bijections between bounded parameters and an unconstrained vector, which is zero at the starting values."""
+"""Bounded parameters as functions of a vector, which is zero at the starting values."""
 
 import abc
 from collections.abc import Mapping
@@ -8,7 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Float
+
+from .._arguments import real_array
+from ..system.quantities import component_names
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -94,6 +98,24 @@ class WholeLine(AbstractRange):
 
     def at_end(self, z, deviations):
         return _lost(np.asarray(self(z) - self.start), np.asarray(self.scale), deviations)
+
+
+class Box(WholeLine):
+    """Values between bounds that methods keep by themselves, infinite where there is none: `start + scale z`, never out
+    of bounds by rounding.
+    """
+
+    low: Array
+    high: Array
+
+    def __call__(self, z):
+        value = super().__call__(z)
+        # Rounding has no derivative.
+        return value + lax.stop_gradient(jnp.clip(value, self.low, self.high) - value)
+
+    @property
+    def ends(self):
+        return self.low, self.high
 
 
 class HalfLine(AbstractRange):
@@ -241,6 +263,11 @@ class FreeParameters(eqx.Module):
         parts = jnp.split(z, np.cumsum([r.size for r in self.ranges])[:-1])
         return {name: r(part) for name, r, part in zip(self.names, self.ranges, parts, strict=True)}
 
+    def components(self) -> list[str]:
+        """The names of all scalar components of the values: `"A.point_b[0]"`."""
+        each = zip(self.names, self.ranges, strict=True)
+        return [component for name, r in each for component in component_names(name, r.start.shape)]
+
     def flat(self, z: Float[Array, "n"]) -> Float[Array, "values"]:
         """All values, raveled one after the other."""
         return jnp.concatenate([value.reshape(-1) for value in self(z).values()])
@@ -305,16 +332,19 @@ def range_of(
         return _inertia(name, value, bounds)
     if bounds is None:
         bounds = (0.0, None) if positive else (None, None)
-    low, high = (_bound(name, value, bound, empty) for bound, empty in zip(bounds, (-np.inf, np.inf), strict=True))
-    if np.any(low >= high):
-        raise ValueError(f"The bounds of {name!r} must be (low, high) with low < high, got {bounds}.")
+    low, high = map(jnp.asarray, bounds_of(name, bounds, value.shape, value.dtype))
+    if any(np.isfinite(side).any() and not np.isfinite(side).all() for side in (low, high)):
+        raise ValueError(f"Bounds of {name!r} must be finite for all components, or for none.")
     if np.any(value <= low) or np.any(value >= high):
         raise ValueError(f"The start of {name!r} must lie strictly between {low} and {high}, got {np.asarray(value)}.")
-    if scale is not None:
-        return range_between(value, low, high, jnp.broadcast_to(scale, value.shape))
-    largest = jnp.max(jnp.abs(value))
-    typical = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    return range_between(value, low, high, jnp.where(value == 0, typical, jnp.abs(value)))
+    scale = typical_change(value) if scale is None else jnp.broadcast_to(scale, value.shape)
+    return range_between(value, low, high, scale)
+
+
+def typical_change(value: Array) -> Array:
+    """The sizes of components, for those that are zero the size of the largest one, or one."""
+    largest = jnp.max(jnp.abs(value), initial=0.0)
+    return jnp.where(value == 0, jnp.where(largest > 0, largest, jnp.ones_like(largest)), jnp.abs(value))
 
 
 def range_between(start: Array, low: Array, high: Array, scale: Array) -> AbstractRange:
@@ -341,12 +371,27 @@ def _inertia(name: str, value: Array, bounds: Bounds | None) -> Inertia:
     return Inertia(value)
 
 
-def _bound(name: str, value: Array, bound: ArrayLike | None, empty: float) -> Array:
-    bound = np.asarray(empty if bound is None else bound, dtype=value.dtype)
-    if bound.shape not in ((), value.shape):
-        raise ValueError(
-            f"Bounds of {name!r} have shape {bound.shape}; give numbers, or arrays of shape {value.shape}."
-        )
-    if not (np.all(np.isfinite(bound)) or np.all(bound == empty)):
-        raise ValueError(f"Bounds of {name!r} must be finite for all components, or for none.")
-    return jnp.broadcast_to(jnp.asarray(bound), value.shape)
+def bounds_of(
+    name: str, given: Any, shape: tuple[int, ...], dtype: Any = float, *, what: str = "bounds", equal: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both bounds of a named value as arrays of its shape, infinite where there is none.
+
+    **Arguments:** `given`: `(low, high)`, either of them None; `what` they are called; whether they may be `equal`.
+
+    **Raises:** `ValueError` for anything but a pair of numbers or arrays of the shape, and for reversed bounds.
+    """
+    try:
+        sides = tuple(given)
+    except TypeError:
+        sides = ()
+    if len(sides) != 2 or isinstance(given, str):
+        raise ValueError(f"The {what} of {name!r} must be a pair (low, high), either of them None; got {given!r}.")
+    shapes = ((), shape) if shape else ((),)
+    low, high = (
+        np.broadcast_to(real_array(f"A bound of {name!r}", empty if side is None else side, dtype, shapes), shape)
+        for side, empty in zip(sides, (-np.inf, np.inf), strict=True)
+    )
+    if np.any(low > high) or (not equal and np.any(low == high)):
+        sign = "≤" if equal else "<"
+        raise ValueError(f"The {what} of {name!r} must be (low, high) with low {sign} high, got {given}.")
+    return low, high

@@ -25,14 +25,16 @@ class Measurements(NamedTuple):
     values: dict[str, np.ndarray]
 
 
+# What to give in place of anything else.
+BY_NAME = (
+    "measured is given by name, such as {'crank.angle': array}, or by jaxmb.Experiment(measured, ts=…); "
+    "jaxmb.read_measurements reads files and tables"
+)
+
+
 def have_times(measured: Any) -> bool:
     """Whether measured data have values by name and their own times, as `Measurements` do."""
     return hasattr(measured, "ts") and isinstance(getattr(measured, "values", None), Mapping)
-
-
-def is_table(measured: Any) -> bool:
-    """Whether measured data are something that `read_measurements` reads: a path, a DataFrame or a Dataset."""
-    return isinstance(measured, str | Path) or hasattr(measured, "columns") or hasattr(measured, "data_vars")
 
 
 def read_measurements(

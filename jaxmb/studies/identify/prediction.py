@@ -46,8 +46,9 @@ def predict(
     ts: ArrayLike | None = None,
     experiment: str | None = None,
     level: float = 0.95,
+    trusted: bool = True,
 ) -> Prediction:
-    """As `Identification.predict`."""
+    """As `Identification.predict`; bands are NaN if the fit is not `trusted`."""
     level = probability("level", level)
     fit.whole_motions("A prediction")
     problem = fit.problem
@@ -63,7 +64,7 @@ def predict(
     columns = problem.columns(number)
     flat = jnp.asarray(np.asarray(problem.free.flat(fit.z))[columns])
     values, jacobians = _predicted(problem.system, trial, problem.options, names, ts, flat)
-    found = fit.covariance
+    found = fit.uncertainty
     width = float(ndtri((1 + level) / 2))
     out, deviations = {}, {}
     for name in names:
@@ -74,7 +75,7 @@ def predict(
             along = np.max(np.abs(jacobian @ found.lost[columns]), axis=-1)
             size = np.max(np.abs(jacobian)[..., None] * np.abs(found.lost[columns]), initial=0.0)
             deviation = np.where(along > 1e-6 * size, np.inf, deviation)
-        deviations[name] = np.full_like(deviation, np.nan) if fit.doubts else deviation
+        deviations[name] = deviation if trusted else np.full_like(deviation, np.nan)
     low = {name: out[name] - width * deviations[name] for name in names}
     high = {name: out[name] + width * deviations[name] for name in names}
     return Prediction(np.asarray(ts), out, deviations, low, high, level)

@@ -26,7 +26,8 @@ class Problem(eqx.Module):
     """Experiments that share unknowns.
 
     **Fields:** `names` of the experiments; `sources`: for each of them the names of its unknowns among all; `fitted`:
-    which of them are fitted, the others are held out.
+    which of them are fitted, the others are held out; `known_noise`: whether the noise level of every reading is known,
+    or an unknown of its own.
     """
 
     system: AbstractSystem
@@ -37,6 +38,7 @@ class Problem(eqx.Module):
     fitted: tuple[bool, ...] = eqx.field(static=True)
     trials: tuple[ExperimentModel, ...]
     options: dict[str, Any]
+    known_noise: bool = eqx.field(static=True)
 
     @property
     def loss(self) -> Loss:

@@ -73,7 +73,7 @@ def profile(fit: Fit, component: str, *, level: float = 0.95, values=None) -> Pr
         interval=(low, high),
         level=level,
         fits=np.array([minimum.success for *_, minimum in found]),
-        parameters={name: np.stack([np.asarray(own[name]) for own in each]) for name in fit.values},
+        parameters={name: np.stack([np.asarray(own[name]) for own in each]) for name in fit.parameters},
     )
 
 
@@ -94,14 +94,14 @@ class _Walk:
         self.row = fit.components.index(component)
         self.held = np.zeros(free.size, bool)
         self.held[self.index] = True
-        self.best = float(np.ravel(fit.values[name])[self.number])
-        self.deviation = float(np.sqrt(fit.covariance.matrix[self.row, self.row]))
+        self.best = float(np.ravel(fit.parameters[name])[self.number])
+        self.deviation = float(np.sqrt(fit.covariance[self.row, self.row]))
         self.squares = float(np.sum(fit.residuals**2))
         self.estimate = (self.best, 0.0, Minimum(self.fit.z, 0, fit.success, self.fit.objective))
 
     def at(self, value: float, start):
         """The fit with the component at a value."""
-        like = np.array(self.fit.values[self._name()], float)
+        like = np.array(self.fit.parameters[self._name()], float)
         like.reshape(-1)[self.number] = value
         z = float(self.range.locate(jnp.asarray(like, start.dtype))[self.number])
         if not np.isfinite(z):
@@ -115,7 +115,7 @@ class _Walk:
         else:
             minimum = levenberg_marquardt(linearised, start, fit.tol, fit.max_iterations, self.held)
         ratio = 2 * (minimum.value - fit.objective) / fit.dispersion
-        if not fit.known_noise:
+        if not fit.problem.known_noise:
             ratio = self.fit.residuals.size * np.log(2 * minimum.value / self.squares)
         return value, float(ratio), minimum
 

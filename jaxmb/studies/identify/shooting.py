@@ -35,13 +35,12 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING, _HALVINGS = 1e-6, 1e-12, 1e8, 6
 class Shot(NamedTuple):
     """Where multiple shooting ended.
 
-    **Fields:** `z`; `data`: residuals of data in units of the noise; `jacobian` of all rows along the directions that
-    keep the motion continuous, and `along`: how z changes along them; `objective`; `readings` by experiment and sensor;
-    `continuity`: the largest gap; `iterations`; `success`.
+    **Fields:** as of `Fit`: `jacobian` is along the directions that keep the motion continuous, `along` says how z
+    changes along them, and `continuity` is the largest gap.
     """
 
     z: Array
-    data: np.ndarray
+    residuals: np.ndarray
     jacobian: np.ndarray
     along: np.ndarray
     objective: float
