@@ -259,7 +259,7 @@ def _check_start(problem: Problem, model: Model) -> None:
                 # It names the coordinates, of fix, rates and free_initial together.
                 text = str(error)
             raise ValueError(f"The simulation{where} fails with the starting values: {text}")
-    residuals, jacobian, _ = model.plain
+    residuals, jacobian = model.plain.residuals, model.plain.jacobian
     if not np.all(np.isfinite(residuals)):
         raise ValueError("The residuals are not finite with the starting values.")
     size = max(trial.size for trial in problem.trials)
