@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from .._arguments import real_array
+from .._arguments import bounds_of
 from ..system.quantities import component_names
 
 if TYPE_CHECKING:
@@ -166,19 +166,27 @@ class Interval(AbstractRange):
         return jnp.log(share) - jnp.log1p(-share)
 
 
-class PositiveDefinite(AbstractRange):
-    """Positive definite matrices: `C T Tᵀ Cᵀ` with `C Cᵀ = start`, `T` lower triangular, `exp z` on its diagonal."""
+class Inertia(AbstractRange):
+    """Inertia matrices that a distribution of mass can have: their principal moments satisfy the triangle inequalities.
+
+    `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite: `Σ = C T Tᵀ Cᵀ`, with `C Cᵀ`
+    the start's, and T lower triangular with `exp z` on its diagonal. About the mass centre, which is where bodies have
+    their frame, the pseudo-inertia matrix is block diagonal, of Σ and the mass; it is positive definite if both are.
+
+    Source: C. Rucker and P. M. Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE Robotics and Automation
+    Letters 7(2), 2022.
+    """
 
     start: Array
 
     @property
     def size(self):
-        n = self.start.shape[0]
-        return n * (n + 1) // 2
+        return 6
 
     def __call__(self, z):
-        factor = jnp.linalg.cholesky(self.start) @ self._factor(z)
-        return factor @ factor.T
+        factor = jnp.linalg.cholesky(second_moments(self.start)) @ self._factor(z)
+        moments = factor @ factor.T
+        return jnp.trace(moments) * jnp.eye(3, dtype=moments.dtype) - moments
 
     def _factor(self, z):
         lower = jnp.zeros_like(self.start).at[self._below].set(z)
@@ -186,7 +194,8 @@ class PositiveDefinite(AbstractRange):
         return lower + jnp.diag(jnp.exp(diagonal) - diagonal)
 
     def locate(self, value):
-        lower = jnp.linalg.solve(jnp.linalg.cholesky(self.start), jnp.linalg.cholesky(value))
+        start, own = (jnp.linalg.cholesky(second_moments(inertia)) for inertia in (self.start, value))
+        lower = jnp.linalg.solve(start, own)
         diagonal = jnp.diag(lower)
         return (lower + jnp.diag(jnp.log(diagonal) - diagonal))[self._below]
 
@@ -201,50 +210,12 @@ class PositiveDefinite(AbstractRange):
 
     @property
     def _below(self):
-        return np.tril_indices(self.start.shape[0])
-
-
-class Inertia(AbstractRange):
-    """Inertia matrices that a distribution of mass can have: their principal moments satisfy the triangle inequalities.
-
-    `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite. About the mass centre, which is
-    where bodies have their frame, the pseudo-inertia matrix is block diagonal, of Σ and the mass; it is positive
-    definite if both are.
-
-    Source: C. Rucker and P. M. Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE Robotics and Automation
-    Letters 7(2), 2022.
-    """
-
-    start: Array
-
-    @property
-    def size(self):
-        return 6
-
-    def __call__(self, z):
-        return _second_moments_to_inertia(self._moments(z))
-
-    def locate(self, value):
-        return self._moments.locate(second_moments(value))
-
-    def at_end(self, z, deviations):
-        return self._moments.at_end(z, deviations)
-
-    def free_components(self, value):
-        return self._moments.free_components(value)
-
-    @property
-    def _moments(self):
-        return PositiveDefinite(second_moments(self.start))
+        return np.tril_indices(3)
 
 
 def second_moments(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """`Σ = ½ tr(I) 1 − I` of an inertia matrix [kg m²]."""
     return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
-
-
-def _second_moments_to_inertia(moments):
-    return jnp.trace(moments) * jnp.eye(3, dtype=moments.dtype) - moments
 
 
 class FreeParameters(eqx.Module):
@@ -332,7 +303,7 @@ def range_of(
         return _inertia(name, value, bounds)
     if bounds is None:
         bounds = (0.0, None) if positive else (None, None)
-    low, high = map(jnp.asarray, bounds_of(name, bounds, value.shape, value.dtype))
+    low, high = map(jnp.asarray, bounds_of(f"The bounds of {name!r}", bounds, value.shape, value.dtype))
     if any(np.isfinite(side).any() and not np.isfinite(side).all() for side in (low, high)):
         raise ValueError(f"Bounds of {name!r} must be finite for all components, or for none.")
     if np.any(value <= low) or np.any(value >= high):
@@ -369,29 +340,3 @@ def _inertia(name: str, value: Array, bounds: Bounds | None) -> Inertia:
             "principal moment must be smaller than the sum of the other two. Start from a slightly thicker body."
         )
     return Inertia(value)
-
-
-def bounds_of(
-    name: str, given: Any, shape: tuple[int, ...], dtype: Any = float, *, what: str = "bounds", equal: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    """Both bounds of a named value as arrays of its shape, infinite where there is none.
-
-    **Arguments:** `given`: `(low, high)`, either of them None; `what` they are called; whether they may be `equal`.
-
-    **Raises:** `ValueError` for anything but a pair of numbers or arrays of the shape, and for reversed bounds.
-    """
-    try:
-        sides = tuple(given)
-    except TypeError:
-        sides = ()
-    if len(sides) != 2 or isinstance(given, str):
-        raise ValueError(f"The {what} of {name!r} must be a pair (low, high), either of them None; got {given!r}.")
-    shapes = ((), shape) if shape else ((),)
-    low, high = (
-        np.broadcast_to(real_array(f"A bound of {name!r}", empty if side is None else side, dtype, shapes), shape)
-        for side, empty in zip(sides, (-np.inf, np.inf), strict=True)
-    )
-    if np.any(low > high) or (not equal and np.any(low == high)):
-        sign = "≤" if equal else "<"
-        raise ValueError(f"The {what} of {name!r} must be (low, high) with low {sign} high, got {given}.")
-    return low, high

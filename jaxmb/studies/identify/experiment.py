@@ -209,7 +209,7 @@ def with_times(experiment: Experiment, where: str = "") -> Experiment:
 
 def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, np.ndarray]]:
     """All times of an experiment in order, and for each measured name which of them are its own."""
-    names = tuple(_by_name(experiment) or ())
+    names = tuple(experiment.measured or ())
     given: Any = experiment.ts
     if not isinstance(given, Mapping):
         ts = measured_times(given, experiment.t0)
@@ -225,12 +225,6 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
     each = {name: np.asarray(measured_times(given[name], experiment.t0, name)) for name in names}
     ts = np.unique(np.concatenate(list(each.values())))
     return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
-
-
-def _by_name(experiment: Experiment) -> Mapping[str, VectorLike] | None:
-    """What was measured, of an experiment as `with_times` returns it."""
-    measured: Any = experiment.measured
-    return measured
 
 
 def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
@@ -268,8 +262,8 @@ def channels_of(
 
     **Arguments:** `free`: names of unknowns, without the experiment's; `places`: which of `ts` each name has.
     """
-    measured, residual = _by_name(experiment), experiment.residual
-    if (measured is None) == (residual is None):
+    measured: Any = experiment.measured
+    if (measured is None) == (experiment.residual is None):
         raise ValueError("Give either measured quantities by name or a residual function.")
     if measured is None:
         if experiment.sigma is not None:

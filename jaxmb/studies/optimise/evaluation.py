@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._arguments import bounds_of
 from ..._jaxpr_digest import Digest, digest_of_program
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 from ...system.quantities import component_names
 from ..batch import batch
-from ..ranges import bounds_of
 from .space import Space
 
 # Reverse mode costs about as much as this many tangents in forward mode, for every row: a gradient some three to five
@@ -172,7 +172,7 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
             raise ValueError(
                 f"The constraint of {name!r} must be (low, high), one of them None at most; got {given!r}."
             )
-        low, high = bounds_of(name, sides, shapes[name], what="constraint", equal=True)
+        low, high = bounds_of(f"The constraint of {name!r}", sides, shapes[name], equal=True)
         names.append(name)
         components += component_names(name, shapes[name])
         lows.append(low.ravel())

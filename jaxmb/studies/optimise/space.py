@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._arguments import real_array
+from ..._arguments import bounds_of, real_array
 from ..._types import VectorLike
 from ...linalg.arrays import is_traced
 from ...parts.names import unknown
 from ...system import AbstractSystem, parameters
 from ...system.design import Bounds, design_bounds
-from ..ranges import Box, FreeParameters, bounds_of, range_between, typical_change
+from ..ranges import Box, FreeParameters, range_between, typical_change
 
 # A parameter is at a bound if it is closer than this, relative to its scale.
 _NEAR = 1e-6
@@ -108,7 +108,7 @@ def space(
         if not np.all(np.isfinite(value)):
             raise ValueError(f"The start of {name!r} must be finite, got {given}.")
         limits = bounds.get(name, (None, None))
-        low, high = bounds_of(name, limits, value.shape, value.dtype)
+        low, high = bounds_of(f"The bounds of {name!r}", limits, value.shape, value.dtype)
         if np.any(value < low) or np.any(value > high):
             raise ValueError(f"The start of {name!r}, {value}, is not within its bounds {limits}.")
         own = declared[name].scale if name in declared else None

@@ -11,7 +11,7 @@ import jaxmb as mb
 from jaxmb.studies.identify import verdict
 from jaxmb.studies.identify.loss import LOSSES
 from jaxmb.studies.identify.residuals import Bias, Series, outliers
-from jaxmb.studies.ranges import HalfLine, Interval, PositiveDefinite, WholeLine
+from jaxmb.studies.ranges import HalfLine, Inertia, Interval, WholeLine
 
 # Compiles faster than Adams, where the solver does not matter.
 TSIT5 = diffrax.Tsit5()
@@ -350,9 +350,9 @@ def test_estimates_at_the_ends_of_their_ranges():
     assert at(between, 1e4 - 1e-3, 1.0) and at(between, 1e-3, 1.0) and not at(between, 2.0, 1.0)
     line = WholeLine(jnp.asarray(1.0), jnp.asarray(1.0))
     assert at(line, -1e5, 1e6) and not at(line, -1e5, 1.0)
-    matrix = PositiveDefinite(jnp.eye(2))
-    assert np.all(matrix.at_end(matrix.locate(jnp.diag(jnp.array([1.0, 1e-8]))), np.ones((2, 2))))
-    assert not np.any(matrix.at_end(matrix.locate(jnp.diag(jnp.array([1.0, 1e-3]))), np.ones((2, 2))))
+    matrix = Inertia(2 * jnp.eye(3))
+    thin = lambda share: matrix.at_end(matrix.locate(jnp.diag(jnp.array([1 + share, 1 + share, 2.0]))), np.ones((3, 3)))
+    assert np.all(thin(1e-8)) and not np.any(thin(1e-3))
 
 
 def test_starts_that_contradict_each_other():

@@ -220,7 +220,7 @@ def test_bounds_by_every_method(method):
 
 def test_equations_and_bounds_of_components():
     sides = {"square": 1.0, "x": ([0.0, None], None)}
-    with pytest.raises(ValueError, match="A bound of 'x' must be an array of real numbers"):
+    with pytest.raises(ValueError, match="The constraint of 'x': low must be an array of real numbers"):
         mb.optimise(valley, START, objective="f", constraints=sides)
     sides["x"] = ([-np.inf, 0.7], None)
     best = mb.optimise(valley, {"x": [0.9, 0.5]}, objective="f", constraints=sides)
