@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 # Damping of the first step, and its smallest value.
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
-# The largest gap that counts as closed.
-_CLOSED = 1e-9
+# The largest gap that counts as closed, and the smallest share of a step towards closed gaps.
+_CLOSED, _LEAST_SHARE = 1e-9, 2.0**-5
 
 
 class Linearised(NamedTuple):
@@ -61,8 +61,9 @@ def levenberg_marquardt(
     """Minimise an objective from its linearised residuals; trials that fail are rejected.
 
     A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt), subject to
-    `c + C s = 0` where there are gaps c; then `f + ν |c|₁` is to decrease. The damping μ follows the gain, the ratio of
-    the decrease to that of the linear model; after a step that is rejected, a smaller share of the gaps is closed.
+    `c + C s = 0` where there are gaps c; then `f + ν |c|₁` is to decrease, and a step that is rejected is halved first.
+    The damping μ follows the gain, the ratio of the decrease to that of the linear model.
+
     Where the model promises a decrease of less than `tol` times the objective, errors of the motions, which differ from
     step to step, are more than that: the objective does not tell good steps from bad ones any more. These steps are
     taken without it, as long as each is less than a tenth of the one before.
@@ -108,8 +109,8 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
         return Minimum(z, 1, False, np.inf)
     damping, growth, share, weight, last = _FIRST_DAMPING, 2.0, 1.0, 0.0, np.inf
     for iteration in range(1, limit):
-        step, multipliers = _step(model, damping, share)
-        weight = max(weight, 2 * float(np.max(np.abs(multipliers), initial=0.0)))
+        step, multipliers = _step(model, damping)
+        step, weight = share * step, max(weight, 2 * float(np.max(np.abs(multipliers), initial=0.0)))
         whole = np.zeros(step.size if held is None else held.size)
         whole[slice(None) if held is None else ~held] = step
         point = move(z, whole)
@@ -128,10 +129,14 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
         converged = length <= tol and settled and _closed(trial)
         gain, last = (1.0, length) if hidden else (gain, np.inf)
         if gain > 0 or (converged and later < gap):
-            damping, growth, share = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0, 1.0
+            # The curvature of gaps makes the gain small near the minimum as well.
+            factor = 1 / 3 if model.gaps.size else max(1 / 3, 1 - (2 * gain - 1) ** 3)
+            damping, growth, share = max(damping * factor, _LEAST_DAMPING), 2.0, 1.0
             z, model = point, trial
+        elif model.gaps.size and share > _LEAST_SHARE:
+            share *= 0.5
         else:
-            damping, growth, share = damping * growth, 2 * growth, 0.5 * share
+            damping, growth, share = damping * growth, 2 * growth, 1.0
         if converged:
             return Minimum(z, iteration + 1, True, model.value)
     return Minimum(z, limit, False, model.value)
@@ -151,10 +156,10 @@ def _closed(model: Linearised) -> bool:
     return bool(np.max(np.abs(model.gaps), initial=0.0) <= _CLOSED)
 
 
-def _step(model: Linearised, damping: float, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """The step that closes a share of the gaps, and the multipliers of these."""
+def _step(model: Linearised, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """The step, and the multipliers of the gaps."""
     rows, upper, null = null_basis(model.closing)
-    closed = rows @ np.linalg.solve(upper.T, -share * model.gaps)
+    closed = rows @ np.linalg.solve(upper.T, -model.gaps)
     norms = np.linalg.norm(model.jacobian, axis=0)
     weights = np.sqrt(damping) * np.where(norms > 0, norms, 1.0)
     whole = np.vstack([model.jacobian, np.diag(weights)])

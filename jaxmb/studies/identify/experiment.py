@@ -209,7 +209,7 @@ def with_times(experiment: Experiment, where: str = "") -> Experiment:
 
 def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, np.ndarray]]:
     """All times of an experiment in order, and for each measured name which of them are its own."""
-    names = tuple(experiment.measured or ())
+    names: tuple[str, ...] = tuple(experiment.measured or ())
     given: Any = experiment.ts
     if not isinstance(given, Mapping):
         ts = measured_times(given, experiment.t0)
