@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
@@ -16,6 +15,7 @@ from ...parts.names import unknown
 from ...system.quantities import with_shapes
 from .experiment import measured_times
 from .fit import Fit
+from .problem import jacobian_and_value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +63,7 @@ def predict(
     ts = trial.ts if ts is None else measured_times(ts, float(trial.t0))
     columns = problem.columns(number)
     flat = jnp.asarray(np.asarray(problem.free.flat(fit.z))[columns])
-    values, jacobians = _predicted(problem.system, trial, problem.options, names, ts, flat)
+    jacobians, values = _predicted(problem.system, trial, problem.options, names, ts, flat)
     found = fit.uncertainty
     width = float(ndtri((1 + level) / 2))
     out, deviations = {}, {}
@@ -89,11 +89,7 @@ def _predicted(system, trial, options, names, ts, flat) -> Any:
         values = {name: trajectory.quantity(name) for name in names}
         return values, values
 
-    if flat.size == 0:
-        values, _ = fn(flat)
-        return values, {name: jnp.zeros((*value.shape, 0)) for name, value in values.items()}
-    jacobians, values = jax.jacfwd(fn, has_aux=True)(flat)
-    return values, jacobians
+    return jacobian_and_value(fn, flat)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The misfit of all experiments as a function of one vector of unknowns, with its linearisation."""
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -144,11 +144,16 @@ def _with_jacobian(system, trial, options, flat):
         seen = trial.seen(*trial.start(system, theta), theta, options)
         return (seen.rows.residuals, seen.rows.scores), seen
 
-    if flat.size == 0:
-        (residuals, scores), seen = fn(flat)
-        return seen, (jnp.zeros((residuals.size, 0)), jnp.zeros((scores.size, 0)))
-    jacobians, seen = jax.jacfwd(fn, has_aux=True)(flat)
+    jacobians, seen = jacobian_and_value(fn, flat)
     return seen, jacobians
+
+
+def jacobian_and_value(fn: Callable[[Array], tuple[Any, Any]], flat: Float[Array, "n"]) -> tuple[Any, Any]:
+    """The derivatives of the first of two results, also in no unknowns, and the second one."""
+    if flat.size:
+        return jax.jacfwd(fn, has_aux=True)(flat)
+    out, value = fn(flat)
+    return jax.tree.map(lambda x: jnp.zeros((*x.shape, 0)), out), value
 
 
 @eqx.filter_jit

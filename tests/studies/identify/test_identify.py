@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from identifying import free_parameters, pendulum
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
 import jaxmb as mb
 from jaxmb import planar
@@ -103,13 +103,15 @@ def test_without_sigma_the_noise_is_estimated(system, motion):
     assert str(known.predict("rod.angle")) == f"Prediction: rod.angle ({TS.size},), with bands of 95%"
 
 
-def test_names_what_the_data_do_not_determine(system, motion):
+def test_names_what_the_data_do_not_determine(system, motion, tmp_path):
     """Mass, inertia, stiffness and damping scaled together leave the motion as it is."""
     free = ["rod.mass", "rod.inertia", "spring.stiffness", "spring.damping"]
     fit = mb.identify(system, noisy(motion, 2), ts=TS, free=free, sigma=SIGMA, solver=TSIT5)
     assert "spring.stiffness" in fit.undetermined and "rod.mass" in fit.undetermined
     assert np.isinf(fit.deviations["rod.mass"])
     assert "do not determine" in str(fit)
+    # Without warnings of NumPy.
+    assert "Correlations" in fit.report(tmp_path).read_text()
 
 
 def test_lengths_with_the_state_assembled_anew(system):
@@ -334,6 +336,23 @@ def test_least_squares_agree_with_scipy(residuals, start):
     known = least_squares(residuals, start, jax.jacfwd(residuals), xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale="jac")
     assert found.success and found.iterations < 50
     np.testing.assert_allclose(0.5 * np.sum(residuals(found.z) ** 2), known.cost, rtol=1e-8, atol=1e-10)
+
+
+def test_residuals_under_equations_agree_with_scipy():
+    """A circle and a parabola, from starts on which they do not hold."""
+    residuals = lambda z: np.array([z[0] - 2, z[1] - 1, z[2] * z[0]])
+    jacobian = lambda z: np.array([[1.0, 0, 0], [0, 1.0, 0], [z[2], 0, z[0]]])
+    gaps = lambda z: np.array([z[0] ** 2 - z[1], z @ z - 2])
+    closing = lambda z: np.array([[2 * z[0], -1.0, 0], 2 * z])
+    linearised = lambda z: Linearised(residuals(z), jacobian(z), None, gaps(z), closing(z))
+    for start in ([0.5, 0.5, 1.0], [-3.0, 4.0, 0.1], [3.0, -2.0, -1.0]):
+        found = levenberg_marquardt(lambda z: linearised(np.asarray(z)), jnp.array(start), tol=1e-10, limit=100)
+        objective = lambda z: 0.5 * np.sum(residuals(z) ** 2)
+        holds = {"type": "eq", "fun": gaps, "jac": closing}
+        known = minimize(objective, found.z, method="SLSQP", constraints=holds, options={"ftol": 1e-14})
+        assert found.success and found.iterations < 40
+        np.testing.assert_allclose(gaps(np.asarray(found.z)), 0, atol=1e-9)
+        np.testing.assert_allclose(found.value, known.fun, rtol=1e-8)
 
 
 DECAY = np.linspace(0.02, 1.0, 50)
