@@ -107,37 +107,28 @@ class Optimum(Printed):
         return f"Optimum: objective {self.objective:.6g}, {self.message}"
 
     def __str__(self) -> str:
+        numbers = lambda *given: tuple(f"{float(x):.6g}" for x in given)
         rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
         for name, value in self.parameters.items():
-            own = component_names(name, value.shape)
-            rows += [
-                (n, f"{a:.6g}", f"{b:.6g}") for n, a, b in zip(own, self.start[name].flat, value.flat, strict=True)
-            ]
+            each = zip(component_names(name, value.shape), self.start[name].flat, value.flat, strict=True)
+            rows += [(own, *numbers(a, b)) for own, a, b in each]
         rows += [(), ("output", "before", "after")]
-        for name, value in self.outputs.items():
-            if value.ndim == 0:
-                rows.append((name, f"{float(self.before[name]):.6g}", f"{float(value):.6g}"))
+        rows += [(name, *numbers(self.before[name], x)) for name, x in self.outputs.items() if x.ndim == 0]
         if self.constraints:
             rows += [(), ("constraint", "before", "after", "low", "high", "within", "multiplier")]
-            for c in self.constraints:
-                shown = f"{c.multiplier:.3g}" if c.active else ""
-                rows.append(
-                    (c.name, *(f"{x:.6g}" for x in (c.before, c.after, c.low, c.high)), f"{c.tolerance:.1g}", shown)
-                )
+        for c in self.constraints:
+            shown = f"{c.multiplier:.3g}" if c.active else ""
+            rows.append((c.name, *numbers(c.before, c.after, c.low, c.high), f"{c.tolerance:.1g}", shown))
         if len(self.attempts) > 1:
             rows += [(), ("attempt", "before", "after", "violation")]
-            rows += [
-                (str(k + 1), f"{a.before:.6g}", f"{a.after:.6g}", f"{a.violation:.1e}")
-                for k, a in enumerate(self.attempts)
-            ]
+            each = enumerate(self.attempts, 1)
+            rows += [(str(k), *numbers(own.before, own.after), f"{own.violation:.1e}") for k, own in each]
         rows += [(), ("iteration", "objective", "violation", "step", "trials", "failed")]
-        for k, i in enumerate(self.iterations):
-            if _FIRST <= k < len(self.iterations) - _LAST:
-                if k == _FIRST:
-                    rows.append(("…",))
-                continue
-            numbers = f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}"
-            rows.append((str(i.number), *numbers, str(i.trials), str(i.failed)))
+        log = [
+            (str(i.number), f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}", str(i.trials), str(i.failed))
+            for i in self.iterations
+        ]
+        rows += [*log[:_FIRST], ("…",), *log[-_LAST:]] if len(log) > _FIRST + _LAST else log
         # The last iteration need not be the best trial, which is the result.
         rows.append(("result", f"{self.objective:.8g}"))
         width = max(len(row[0]) for row in rows if row)
