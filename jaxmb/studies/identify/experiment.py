@@ -201,7 +201,7 @@ def with_times(experiment: Experiment, where: str = "") -> Experiment:
             raise ValueError(f"Measurements{where} have their own times; leave out ts.")
         experiment = dataclasses.replace(experiment, measured=measured.values, ts=measured.ts)
     elif measured is not None and not isinstance(measured, Mapping):
-        raise ValueError(f"An experiment: {BY_NAME}; got an object of type {type(measured).__name__}{where}.")
+        raise ValueError(f"identify: {BY_NAME}; got an object of type {type(measured).__name__}{where}.")
     if experiment.ts is None:
         raise ValueError(f"ts{where} is missing: the times of what was measured.")
     return experiment

@@ -160,7 +160,8 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, los
     for argument, value in (("sigma", sigma), ("bounds", bounds), ("prior", prior)):
         if value is not None and not isinstance(value, Mapping):
             raise ValueError(f"identify: {argument} is given by name, such as {{'crank.angle': …}}; got {value!r}.")
-    if measured is None or isinstance(measured, Mapping) or have_times(measured):
+    several = [measured] if hasattr(measured, "held_out") else measured
+    if have_times(measured) or not isinstance(several, list | tuple):
         experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
     else:
         given = [name for name, value in own.items() if value is not None and name != "free_initial"]
@@ -168,7 +169,7 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, los
         if given:
             arguments = ", ".join(f"{name}=…" for name in dict.fromkeys(("ts", given[0])))
             raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, {arguments}).")
-        experiments = experiments_by_name(measured if isinstance(measured, list | tuple) else [measured])
+        experiments = experiments_by_name(several)
     named = sensors_by_name(system, sensors)
     free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma, loss)
     problem = Problem(

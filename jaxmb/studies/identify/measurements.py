@@ -27,7 +27,7 @@ class Measurements(NamedTuple):
 
 # What to give in place of anything else.
 BY_NAME = (
-    "measured is given by name, such as {'crank.angle': array}, or by jaxmb.Experiment(measured, ts=…); "
+    "measured is given by name, such as {'crank.angle': array}, or by jaxmb.Experiment(measured, ts=…), and "
     "jaxmb.read_measurements reads files and tables"
 )
 
