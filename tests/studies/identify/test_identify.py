@@ -255,7 +255,7 @@ def test_no_effect(system):
         ({"t0": 0.5}, "after t0"),
         (
             {"measured": "run.csv"},
-            "'run.csv'; measured is given by name.*jaxmb.read_measurements reads files and tables",
+            "measured is given by name.*jaxmb.read_measurements reads files and tables; got an object of type str",
         ),
         ({"bounds": {"rod.mass": 3.0}}, r"bounds of 'rod.mass' must be a pair \(low, high\)"),
         ({"saveat": TS}, "identify sets 'saveat'"),
