@@ -33,7 +33,9 @@ class Linearised(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """The end of an iteration: `z`, the number of trials, whether it converged, and the objective."""
+    """The end of an iteration: `z`, the number of trials without those of halved steps, whether it converged, and the
+    objective.
+    """
 
     z: Any
     iterations: int
@@ -108,7 +110,9 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
     if not np.isfinite(model.value):
         return Minimum(z, 1, False, np.inf)
     damping, growth, share, weight, last = _FIRST_DAMPING, 2.0, 1.0, 0.0, np.inf
-    for iteration in range(1, limit):
+    least, iteration = _FIRST_DAMPING if model.gaps.size else 0.0, 1
+    while iteration < limit:
+        iteration += share == 1.0
         step, multipliers = _step(model, damping)
         step, weight = share * step, max(weight, 2 * float(np.max(np.abs(multipliers), initial=0.0)))
         whole = np.zeros(step.size if held is None else held.size)
@@ -125,20 +129,21 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
         hidden = settled and damping <= _FIRST_DAMPING and predicted <= tol * abs(objective) and _closed(model)
         length = size(z, whole)
         if hidden and length > 0.1 * last:
-            return Minimum(z, iteration + 1, True, objective)
+            return Minimum(z, iteration, True, objective)
         converged = length <= tol and settled and _closed(trial)
         gain, last = (1.0, length) if hidden else (gain, np.inf)
         if gain > 0 or (converged and later < gap):
             # The curvature of gaps makes the gain small near the minimum as well.
-            factor = 1 / 3 if model.gaps.size else max(1 / 3, 1 - (2 * gain - 1) ** 3)
+            factor = 0.1 if model.gaps.size else max(1 / 3, 1 - (2 * gain - 1) ** 3)
+            factor = factor if share == 1.0 else 1.0
             damping, growth, share = max(damping * factor, _LEAST_DAMPING), 2.0, 1.0
             z, model = point, trial
         elif model.gaps.size and share > _LEAST_SHARE:
             share *= 0.5
         else:
-            damping, growth, share = damping * growth, 2 * growth, 1.0
+            damping, growth, share = max(damping * growth, least), 2 * growth, 1.0
         if converged:
-            return Minimum(z, iteration + 1, True, model.value)
+            return Minimum(z, iteration, True, model.value)
     return Minimum(z, limit, False, model.value)
 
 

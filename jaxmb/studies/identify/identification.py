@@ -47,7 +47,7 @@ class Identification(Printed, Fit):
     - `residuals`: of the data at the solution, predicted minus measured, in units of the noise (of the range of the
         readings where it is not known); `rms`: their root mean square; `outliers`: those beyond five standard
         deviations of the noise, each an `Outlier`.
-    - `iterations`: how many trials were simulated.
+    - `iterations`: how many trials were simulated; of multiple shooting without steps that were halved.
     - `system`, `state`: with the estimated parameters, ready for `simulate`; of the first experiment.
     - `systems`, `states`: the same by experiment.
     - `objectives`: of every start, the smallest first: minus the logarithm of likelihood and prior.
