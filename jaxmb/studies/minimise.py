@@ -130,7 +130,7 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
         length = size(z, whole)
         if hidden and length > 0.1 * last:
             return Minimum(z, iteration, True, objective)
-        converged = length <= tol and settled and _closed(trial)
+        converged = share == 1.0 and length <= tol and settled and _closed(trial)
         gain, last = (1.0, length) if hidden else (gain, np.inf)
         if gain > 0 or (converged and later < gap):
             # The curvature of gaps makes the gain small near the minimum as well.
