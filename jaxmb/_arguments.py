@@ -54,6 +54,28 @@ def real_shape(name: str, value: Any, expected: str = "a real number or an array
     return array.shape
 
 
+def bounds_of(
+    label: str, given: Any, shape: tuple[int, ...], dtype: Any = float, equal: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both bounds of a value as arrays of its shape, infinite where there is none.
+
+    **Arguments:** `given`: `(low, high)`, either of them None; whether the two may be `equal`.
+
+    **Raises:** `ValueError` for anything but a pair of numbers or arrays of the shape, and for reversed bounds.
+    """
+    sides: Any = () if isinstance(given, str) else given
+    try:
+        low, high = sides
+    except (TypeError, ValueError):
+        raise ValueError(f"{label} must be a pair (low, high), either of them None; got {given!r}.") from None
+    shapes = ((), shape) if shape else ((),)
+    low = real_array(f"{label}: low", -np.inf if low is None else low, dtype, shapes)
+    high = real_array(f"{label}: high", np.inf if high is None else high, dtype, shapes)
+    if np.any(low > high) or (not equal and np.any(low == high)):
+        raise ValueError(f"{label} must be (low, high) with low {'≤' if equal else '<'} high, got {given}.")
+    return np.broadcast_to(low, shape), np.broadcast_to(high, shape)
+
+
 def whole_number(name: str, value: Any, least: int = 1, otherwise: str = "") -> int:
     """An integer argument, of Python or NumPy, as a Python integer.
 

@@ -3,17 +3,12 @@
 import difflib
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import ParamSpec, TypeVar
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
-# Arguments that earlier versions took, by the name of the function or class: what to do now.
-_GONE = {
-    ("sweep", "budget"): "leave it out; members of a block do not wait for slow ones after "
-    'jaxmb.setup(compile="for speed").',
-    ("sweep", "devices"): "give executor= an executor with one worker for each device.",
-}
 
 
 class UnknownNameError(ValueError, KeyError):
@@ -63,8 +58,6 @@ def check_arguments(what: str, signature: inspect.Signature, positional: int, na
     kinds = {own.kind for own in taken.values()}
     if inspect.Parameter.VAR_KEYWORD not in kinds:
         for name in names:
-            if (what, name) in _GONE:
-                raise TypeError(f"{what} has no argument {name!r} any more: {_GONE[what, name]}")
             if name not in taken:
                 near = difflib.get_close_matches(name, taken, n=2, cutoff=0.5)
                 hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it takes {', '.join(taken)}."
@@ -79,8 +72,13 @@ def check_arguments(what: str, signature: inspect.Signature, positional: int, na
         raise TypeError(f"{what} takes {listed}; got {positional}{by_name}.")
 
 
-def names_arguments(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """A function whose error for an unknown argument names the nearest one, or all that it takes."""
+def names_arguments(
+    function: Callable[_Arguments, _Result], gone: Mapping[str, str] = MappingProxyType({})
+) -> Callable[_Arguments, _Result]:
+    """A function whose error for an unknown argument names the nearest one, or all that it takes.
+
+    **Arguments:** `gone`: arguments of the last release by name, with the new way.
+    """
     signature = inspect.signature(function)
     taken = signature.parameters
     by_place = sum(own.kind is not inspect.Parameter.KEYWORD_ONLY for own in taken.values())
@@ -88,6 +86,8 @@ def names_arguments(function: Callable[_Arguments, _Result]) -> Callable[_Argume
     @functools.wraps(function)
     def checked(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         if len(args) > by_place or not kwargs.keys() <= taken.keys():
+            for name in kwargs.keys() & gone.keys():
+                raise TypeError(f"{function.__name__} has no argument {name!r} any more: {gone[name]}.")
             check_arguments(function.__name__, signature, len(args), kwargs)
         return function(*args, **kwargs)
 

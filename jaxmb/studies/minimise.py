@@ -1,32 +1,30 @@
-"""Two ways to make residuals small: Levenberg–Marquardt, and any optimiser of optax."""
+"""Levenberg–Marquardt: residuals made small, also under equations, and from several starts at once."""
 
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-# The objective as a function of the unknowns z; infinite where it fails.
-Objective = Callable[[Float[Array, "n"]], Float[Array, ""]]
-
-# Damping of the first step of Levenberg–Marquardt, and its smallest value.
+# Damping of the first step, and its smallest value.
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
+# The largest gap that counts as closed, and the smallest share of a step towards closed gaps.
+_CLOSED, _LEAST_SHARE = 1e-9, 2.0**-5
 
 
 class Linearised(NamedTuple):
     """A model of an objective at one point: its gradient is `Jᵀ r`, and `Jᵀ J` approximates its second derivatives.
 
     **Fields:** `residuals` r and their `jacobian` J, infinite where the simulation fails; `objective`, default
-    `½ |r|²`.
+    `½ |r|²`; `gaps`, which are to be zero, and their derivatives, `closing`, of full row rank.
     """
 
     residuals: Any
     jacobian: Any
     objective: Any = None
+    gaps: Any = None
+    closing: Any = None
 
     @property
     def value(self) -> float:
@@ -35,47 +33,64 @@ class Linearised(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """The end of an iteration: `z`, the number of trials, whether it converged, and the objective."""
+    """The end of an iteration: `z`, the number of trials without those of halved steps, whether it converged, and the
+    objective.
+    """
 
-    z: Float[Array, "n"]
+    z: Any
     iterations: int
     success: bool
     value: float
 
 
+def _relative(z: Any, step: np.ndarray) -> float:
+    return float(np.max(np.abs(step) / (1 + np.abs(z))))
+
+
+def _sum(z: Any, step: np.ndarray) -> Any:
+    return z + jnp.asarray(step, z.dtype)
+
+
 def levenberg_marquardt(
-    linearised: Callable[[Float[Array, "n"]], Any],
-    z: Float[Array, "n"],
+    linearised: Callable[[Any], Any],
+    z: Any,
     tol: float,
     limit: int,
     held: np.ndarray | None = None,
+    move: Callable[[Any, np.ndarray], Any] = _sum,
+    size: Callable[[Any, np.ndarray], float] = _relative,
 ) -> Minimum:
     """Minimise an objective from its linearised residuals; trials that fail are rejected.
 
-    A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt). The damping μ follows
-    the gain, the ratio of the decrease of the objective to that of the linear model. Where the model promises a
-    decrease of less than `tol` times the objective, errors of the motions, which differ from step to step, are more
-    than that: the objective does not tell good steps from bad ones any more. These steps are taken without it, as long
-    as each is less than a tenth of the one before.
+    A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt), subject to
+    `c + C s = 0` where there are gaps c; then `f + ν |c|₁` is to decrease, and a step that is rejected is halved first.
+    The damping μ follows the gain, the ratio of the decrease to that of the linear model.
+
+    Where the model promises a decrease of less than `tol` times the objective, errors of the motions, which differ from
+    step to step, are more than that: the objective does not tell good steps from bad ones any more. These steps are
+    taken without it, as long as each is less than a tenth of the one before.
 
     Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
 
     **Arguments:** `linearised`: residuals and their Jacobian, or a `Linearised`; `tol`: change of the unknowns and of
     the objective at which to stop, absolute and relative; `limit`: largest number of evaluations of `linearised`;
-    `held`: a mask of the unknowns that stay as they are.
+    `held`: a mask of the unknowns that stay as they are; `move(z, step)`: the point after a step, and `size(z, step)`
+    of a step, for points that are no vectors.
     """
-    return minimise_together(lambda zs: [linearised(zs[0])], [z], tol, limit, held)[0]
+    return minimise_together(lambda zs: [linearised(zs[0])], [z], tol, limit, held, move, size)[0]
 
 
 def minimise_together(
-    linearised: Callable[[list[Array]], list[Any]],
-    starts: Sequence[Float[Array, "n"]],
+    linearised: Callable[[list[Any]], list[Any]],
+    starts: Sequence[Any],
     tol: float,
     limit: int,
     held: np.ndarray | None = None,
+    move: Callable[[Any, np.ndarray], Any] = _sum,
+    size: Callable[[Any, np.ndarray], float] = _relative,
 ) -> list[Minimum]:
     """`levenberg_marquardt` from several starts, whose trials are evaluated together."""
-    runs = [_trials(z, tol, limit, held) for z in starts]
+    runs = [_trials(z, tol, limit, held, move, size) for z in starts]
     points = [next(run) for run in runs]
     found: dict[int, Minimum] = {}
     while len(found) < len(runs):
@@ -89,89 +104,78 @@ def minimise_together(
     return [found[k] for k in range(len(runs))]
 
 
-def _trials(
-    z: Float[Array, "n"], tol: float, limit: int, held: np.ndarray | None
-) -> Generator[Float[Array, "n"], Linearised, Minimum]:
+def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size) -> Generator[Any, Linearised, Minimum]:
     """The iteration: it yields trials, and is sent the model of the objective there."""
-    free = np.ones(z.size, bool) if held is None else ~held
-
-    def at(point, model):
-        residuals, jacobian = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
-        return point, residuals, jacobian, model.value if np.all(np.isfinite(jacobian)) else np.inf
-
-    z, residuals, jacobian, objective = at(z, (yield z))
-    if not np.isfinite(objective):
+    model = _numbers((yield z), held)
+    if not np.isfinite(model.value):
         return Minimum(z, 1, False, np.inf)
-    damping, growth, last = _FIRST_DAMPING, 2.0, np.inf
-    for iteration in range(1, limit):
-        norms = np.linalg.norm(jacobian, axis=0)
-        weights = np.sqrt(damping) * np.where(norms > 0, norms, 1.0)
-        rows, target = np.vstack([jacobian, np.diag(weights)]), np.append(-residuals, np.zeros_like(weights))
-        step = np.linalg.lstsq(rows, target, rcond=None)[0]
-        whole = np.zeros(z.size)
-        whole[free] = step
-        point = z + jnp.asarray(whole, z.dtype)
-        trial = at(point, (yield point))
-        decrease = objective - trial[-1]
-        predicted = 0.5 * step @ (weights**2 * step - jacobian.T @ residuals)
+    damping, growth, share, weight, last = _FIRST_DAMPING, 2.0, 1.0, 0.0, np.inf
+    least, iteration = _FIRST_DAMPING if model.gaps.size else 0.0, 1
+    while iteration < limit:
+        iteration += share == 1.0
+        step, multipliers = _step(model, damping)
+        step, weight = share * step, max(weight, 2 * float(np.max(np.abs(multipliers), initial=0.0)))
+        whole = np.zeros(step.size if held is None else held.size)
+        whole[slice(None) if held is None else ~held] = step
+        point = move(z, whole)
+        trial, objective = _numbers((yield point), held), model.value
+        gap, later = (np.sum(np.abs(own.gaps)) for own in (model, trial))
+        decrease = objective - trial.value + weight * (gap - later)
+        change = model.jacobian @ step
+        predicted = weight * share * gap - model.residuals @ change - 0.5 * change @ change
         gain = decrease / predicted if predicted > 0 else 0.0
         settled = predicted <= tol * (1 + abs(objective)) and abs(decrease) <= np.sqrt(tol) * (1 + abs(objective))
         # With more damping a step may promise little far from the minimum.
-        hidden = settled and damping <= _FIRST_DAMPING and predicted <= tol * abs(objective)
-        size = np.max(np.abs(whole) / (1 + np.abs(z)))
-        if hidden and size > 0.1 * last:
-            return Minimum(z, iteration + 1, True, objective)
-        converged = size <= tol and settled
-        gain, last = (1.0, size) if hidden else (gain, np.inf)
-        if gain > 0:
-            damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), _LEAST_DAMPING), 2.0
-            z, residuals, jacobian, objective = trial
+        hidden = settled and damping <= _FIRST_DAMPING and predicted <= tol * abs(objective) and _closed(model)
+        length = size(z, whole)
+        if hidden and length > 0.1 * last:
+            return Minimum(z, iteration, True, objective)
+        converged = share == 1.0 and length <= tol and settled and _closed(trial)
+        gain, last = (1.0, length) if hidden else (gain, np.inf)
+        if gain > 0 or (converged and later < gap):
+            # The curvature of gaps makes the gain small near the minimum as well.
+            factor = 0.1 if model.gaps.size else max(1 / 3, 1 - (2 * gain - 1) ** 3)
+            factor = factor if share == 1.0 else 1.0
+            damping, growth, share = max(damping * factor, _LEAST_DAMPING), 2.0, 1.0
+            z, model = point, trial
+        elif model.gaps.size and share > _LEAST_SHARE:
+            share *= 0.5
         else:
-            damping, growth = damping * growth, 2 * growth
+            damping, growth, share = max(damping * growth, least), 2 * growth, 1.0
         if converged:
-            return Minimum(z, iteration + 1, True, objective)
-    return Minimum(z, limit, False, objective)
+            return Minimum(z, iteration, True, model.value)
+    return Minimum(z, limit, False, model.value)
 
 
-def descend(
-    optimiser: optax.GradientTransformation, objective: Objective, z: Float[Array, "n"], tol: float, limit: int
-) -> Minimum:
-    """Minimise an objective, with reverse-mode derivatives; where a trial fails, half its step is taken.
-
-    **Arguments:** `tol`: size of a step at which to stop; `limit`: largest number of trials.
-    """
-    memory = optimiser.init(z)
-    best, best_value, good = z, np.inf, z
-    for iteration in range(limit):
-        value, finite, step, later = _step(objective, optimiser, z, memory)
-        if not bool(finite):
-            z = 0.5 * (good + z)
-            continue
-        if float(value) < best_value:
-            best, best_value = z, float(value)
-        good, memory, z = z, later, z + step
-        if float(jnp.max(jnp.abs(step))) <= tol:
-            return Minimum(best, iteration + 1, True, best_value)
-    return Minimum(best, limit, False, best_value)
+def _numbers(model: Linearised, held: np.ndarray | None) -> Linearised:
+    """A model for NumPy, of the unknowns that change; its objective is infinite where something is not finite."""
+    free = slice(None) if held is None else ~held
+    residuals, jacobian = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
+    gaps = np.zeros(0) if model.gaps is None else np.asarray(model.gaps)
+    closing = np.zeros((0, jacobian.shape[1])) if model.closing is None else np.asarray(model.closing)[:, free]
+    finite = all(np.all(np.isfinite(own)) for own in (jacobian, gaps, closing))
+    return Linearised(residuals, jacobian, model.value if finite else np.inf, np.where(finite, gaps, 0.0), closing)
 
 
-@eqx.filter_jit
-def _step(objective: Objective, optimiser: optax.GradientTransformation, z: Float[Array, "n"], memory: Any):
-    value, gradient = jax.value_and_grad(objective)(z)
-    finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
-    return value, finite, *next_step(optimiser, memory, z, value, gradient, objective)
+def _closed(model: Linearised) -> bool:
+    return bool(np.max(np.abs(model.gaps), initial=0.0) <= _CLOSED)
 
 
-def next_step(
-    optimiser: optax.GradientTransformation,
-    memory: Any,
-    z: Float[Array, "n"],
-    value: Array,
-    gradient: Array,
-    objective: Callable[[Float[Array, "n"]], Array],
-) -> tuple[Float[Array, "n"], Any]:
-    """A step of an optax optimiser from a point, and its memory after it."""
-    with jax.numpy_dtype_promotion("standard"):
-        update = optax.with_extra_args_support(optimiser).update
-        step, memory = update(gradient, memory, z, value=value, grad=gradient, value_fn=objective)
-    return jnp.asarray(step, z.dtype), memory
+def _step(model: Linearised, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """The step, and the multipliers of the gaps."""
+    rows, upper, null = null_basis(model.closing)
+    closed = rows @ np.linalg.solve(upper.T, -model.gaps)
+    norms = np.linalg.norm(model.jacobian, axis=0)
+    weights = np.sqrt(damping) * np.where(norms > 0, norms, 1.0)
+    whole = np.vstack([model.jacobian, np.diag(weights)])
+    target = np.append(-model.residuals, np.zeros_like(weights)) - whole @ closed
+    step = closed + null @ np.linalg.lstsq(whole @ null, target, rcond=None)[0]
+    gradient = model.jacobian.T @ (model.residuals + model.jacobian @ step) + weights**2 * step
+    return step, np.linalg.solve(upper, -rows.T @ gradient)
+
+
+def null_basis(matrix: Float[np.ndarray, "m n"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bases of the row space and of the null space of a matrix of full row rank, and its triangular factor."""
+    whole, upper = np.linalg.qr(matrix.T, mode="complete")
+    m = matrix.shape[0]
+    return whole[:, :m], upper[:m], whole[:, m:]

@@ -1,4 +1,4 @@
-"""Bijections between bounded parameters and an unconstrained vector, which is zero at the starting values."""
+"""Bounded parameters as functions of a vector, which is zero at the starting values."""
 
 import abc
 from collections.abc import Mapping
@@ -8,7 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Float
+
+from .._arguments import bounds_of
+from ..system.quantities import component_names
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -96,6 +100,24 @@ class WholeLine(AbstractRange):
         return _lost(np.asarray(self(z) - self.start), np.asarray(self.scale), deviations)
 
 
+class Box(WholeLine):
+    """Values between bounds that methods keep by themselves, infinite where there is none: `start + scale z`, never out
+    of bounds by rounding.
+    """
+
+    low: Array
+    high: Array
+
+    def __call__(self, z):
+        value = super().__call__(z)
+        # Rounding has no derivative.
+        return value + lax.stop_gradient(jnp.clip(value, self.low, self.high) - value)
+
+    @property
+    def ends(self):
+        return self.low, self.high
+
+
 class HalfLine(AbstractRange):
     """Values on one side of a bound: `bound + (start − bound) exp z`."""
 
@@ -144,19 +166,27 @@ class Interval(AbstractRange):
         return jnp.log(share) - jnp.log1p(-share)
 
 
-class PositiveDefinite(AbstractRange):
-    """Positive definite matrices: `C T Tᵀ Cᵀ` with `C Cᵀ = start`, `T` lower triangular, `exp z` on its diagonal."""
+class Inertia(AbstractRange):
+    """Inertia matrices that a distribution of mass can have: their principal moments satisfy the triangle inequalities.
+
+    `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite: `Σ = C T Tᵀ Cᵀ`, with `C Cᵀ`
+    the start's, and T lower triangular with `exp z` on its diagonal. About the mass centre, which is where bodies have
+    their frame, the pseudo-inertia matrix is block diagonal, of Σ and the mass; it is positive definite if both are.
+
+    Source: C. Rucker and P. M. Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE Robotics and Automation
+    Letters 7(2), 2022.
+    """
 
     start: Array
 
     @property
     def size(self):
-        n = self.start.shape[0]
-        return n * (n + 1) // 2
+        return 6
 
     def __call__(self, z):
-        factor = jnp.linalg.cholesky(self.start) @ self._factor(z)
-        return factor @ factor.T
+        factor = jnp.linalg.cholesky(second_moments(self.start)) @ self._factor(z)
+        moments = factor @ factor.T
+        return jnp.trace(moments) * jnp.eye(3, dtype=moments.dtype) - moments
 
     def _factor(self, z):
         lower = jnp.zeros_like(self.start).at[self._below].set(z)
@@ -164,7 +194,8 @@ class PositiveDefinite(AbstractRange):
         return lower + jnp.diag(jnp.exp(diagonal) - diagonal)
 
     def locate(self, value):
-        lower = jnp.linalg.solve(jnp.linalg.cholesky(self.start), jnp.linalg.cholesky(value))
+        start, own = (jnp.linalg.cholesky(second_moments(inertia)) for inertia in (self.start, value))
+        lower = jnp.linalg.solve(start, own)
         diagonal = jnp.diag(lower)
         return (lower + jnp.diag(jnp.log(diagonal) - diagonal))[self._below]
 
@@ -179,50 +210,12 @@ class PositiveDefinite(AbstractRange):
 
     @property
     def _below(self):
-        return np.tril_indices(self.start.shape[0])
-
-
-class Inertia(AbstractRange):
-    """Inertia matrices that a distribution of mass can have: their principal moments satisfy the triangle inequalities.
-
-    `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite. About the mass centre, which is
-    where bodies have their frame, the pseudo-inertia matrix is block diagonal, of Σ and the mass; it is positive
-    definite if both are.
-
-    Source: C. Rucker and P. M. Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE Robotics and Automation
-    Letters 7(2), 2022.
-    """
-
-    start: Array
-
-    @property
-    def size(self):
-        return 6
-
-    def __call__(self, z):
-        return _second_moments_to_inertia(self._moments(z))
-
-    def locate(self, value):
-        return self._moments.locate(second_moments(value))
-
-    def at_end(self, z, deviations):
-        return self._moments.at_end(z, deviations)
-
-    def free_components(self, value):
-        return self._moments.free_components(value)
-
-    @property
-    def _moments(self):
-        return PositiveDefinite(second_moments(self.start))
+        return np.tril_indices(3)
 
 
 def second_moments(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """`Σ = ½ tr(I) 1 − I` of an inertia matrix [kg m²]."""
     return 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=inertia.dtype) - inertia
-
-
-def _second_moments_to_inertia(moments):
-    return jnp.trace(moments) * jnp.eye(3, dtype=moments.dtype) - moments
 
 
 class FreeParameters(eqx.Module):
@@ -240,6 +233,11 @@ class FreeParameters(eqx.Module):
         """Values by name."""
         parts = jnp.split(z, np.cumsum([r.size for r in self.ranges])[:-1])
         return {name: r(part) for name, r, part in zip(self.names, self.ranges, parts, strict=True)}
+
+    def components(self) -> list[str]:
+        """The names of all scalar components of the values: `"A.point_b[0]"`."""
+        each = zip(self.names, self.ranges, strict=True)
+        return [component for name, r in each for component in component_names(name, r.start.shape)]
 
     def flat(self, z: Float[Array, "n"]) -> Float[Array, "values"]:
         """All values, raveled one after the other."""
@@ -305,16 +303,19 @@ def range_of(
         return _inertia(name, value, bounds)
     if bounds is None:
         bounds = (0.0, None) if positive else (None, None)
-    low, high = (_bound(name, value, bound, empty) for bound, empty in zip(bounds, (-np.inf, np.inf), strict=True))
-    if np.any(low >= high):
-        raise ValueError(f"The bounds of {name!r} must be (low, high) with low < high, got {bounds}.")
+    low, high = map(jnp.asarray, bounds_of(f"The bounds of {name!r}", bounds, value.shape, value.dtype))
+    if any(np.isfinite(side).any() and not np.isfinite(side).all() for side in (low, high)):
+        raise ValueError(f"Bounds of {name!r} must be finite for all components, or for none.")
     if np.any(value <= low) or np.any(value >= high):
         raise ValueError(f"The start of {name!r} must lie strictly between {low} and {high}, got {np.asarray(value)}.")
-    if scale is not None:
-        return range_between(value, low, high, jnp.broadcast_to(scale, value.shape))
-    largest = jnp.max(jnp.abs(value))
-    typical = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    return range_between(value, low, high, jnp.where(value == 0, typical, jnp.abs(value)))
+    scale = typical_change(value) if scale is None else jnp.broadcast_to(scale, value.shape)
+    return range_between(value, low, high, scale)
+
+
+def typical_change(value: Array) -> Array:
+    """The sizes of components, for those that are zero the size of the largest one, or one."""
+    largest = jnp.max(jnp.abs(value), initial=0.0)
+    return jnp.where(value == 0, jnp.where(largest > 0, largest, jnp.ones_like(largest)), jnp.abs(value))
 
 
 def range_between(start: Array, low: Array, high: Array, scale: Array) -> AbstractRange:
@@ -339,14 +340,3 @@ def _inertia(name: str, value: Array, bounds: Bounds | None) -> Inertia:
             "principal moment must be smaller than the sum of the other two. Start from a slightly thicker body."
         )
     return Inertia(value)
-
-
-def _bound(name: str, value: Array, bound: ArrayLike | None, empty: float) -> Array:
-    bound = np.asarray(empty if bound is None else bound, dtype=value.dtype)
-    if bound.shape not in ((), value.shape):
-        raise ValueError(
-            f"Bounds of {name!r} have shape {bound.shape}; give numbers, or arrays of shape {value.shape}."
-        )
-    if not (np.all(np.isfinite(bound)) or np.all(bound == empty)):
-        raise ValueError(f"Bounds of {name!r} must be finite for all components, or for none.")
-    return jnp.broadcast_to(jnp.asarray(bound), value.shape)

@@ -1,7 +1,7 @@
 """Design variables: named numbers that determine several parameters of a system."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool
 
-from .._arguments import real_array
+from .._arguments import bounds_of, real_array
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
 from ..parts.fields import as_jax
@@ -51,12 +51,7 @@ class Variable:
         value = real_array("value", self.value, np.result_type(float), None)
         if not np.all(np.isfinite(value)):
             raise ValueError(f"The value of a Variable must be finite, got {self.value!r}.")
-        if not isinstance(self.bounds, Sequence) or len(self.bounds) != 2:
-            raise ValueError(f"bounds must be a pair (low, high), either of them None; got {self.bounds!r}.")
-        pair = zip(("low", "high"), self.bounds, (-np.inf, np.inf), strict=True)
-        low, high = (_like(f"bounds: {side}", empty if bound is None else bound, value) for side, bound, empty in pair)
-        if np.any(low >= high):
-            raise ValueError(f"bounds must be (low, high) with low < high, got {self.bounds!r}.")
+        low, high = bounds_of("bounds", self.bounds, value.shape, value.dtype)
         if not np.all(_within(value, low, high)):
             raise ValueError(f"The value {_short(value)} is not within its bounds {_interval(low, high)}.")
         if self.scale is not None and np.any(_like("scale", self.scale, value) <= 0):

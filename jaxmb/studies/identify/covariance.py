@@ -30,6 +30,11 @@ class Covariance(NamedTuple):
     undetermined: np.ndarray
     noise: float
 
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviations of the components."""
+        return np.sqrt(np.diag(self.matrix))
+
 
 def covariance(
     jacobian: Float[np.ndarray, "rows n"],

@@ -39,7 +39,7 @@ class LogDensity(eqx.Module):
 
 def logdensity(fit: Fit) -> LogDensity:
     """As `Identification.logdensity`."""
-    if not fit.known_noise:
+    if not fit.problem.known_noise:
         raise ValueError("A density needs the noise level of every sensor: give sigma, or let it be free.")
     fit.whole_motions("A density")
     return LogDensity(fit.problem, fit.z)

@@ -21,7 +21,7 @@ from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...trajectory import Trajectory
 from .loss import Loss
-from .measurements import have_times, is_table, read_measurements
+from .measurements import BY_NAME, have_times
 from .sensors import Channel, Rows, Sensor, readings_of
 
 # The name of a residual function's result among the readings.
@@ -42,7 +42,7 @@ class Experiment:
     **Arguments:**
 
     - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.
-        `Measurements`, files and tables have their own `ts`; `sigma` replaces that of `identify` and of sensors.
+        `Measurements` have their own `ts`; `sigma` replaces that of `identify` and of sensors.
     - `inputs`: as of `simulate`.
     - `parameters`: what is known for this experiment alone, by name; the estimates of others do not replace it.
     - `own`: names of unknowns with a value for this experiment alone: `own=("A.friction",)` makes `"exp2/A.friction"`.
@@ -194,14 +194,14 @@ def _of_user(residuals: Array, loss: Loss) -> Rows:
 
 
 def with_times(experiment: Experiment, where: str = "") -> Experiment:
-    """An experiment with what was measured by name, and with times, whatever they were read from."""
+    """An experiment with what was measured by name, and with times."""
     measured: Any = experiment.measured
-    if is_table(measured):
-        measured = read_measurements(measured)
     if have_times(measured):
         if experiment.ts is not None:
             raise ValueError(f"Measurements{where} have their own times; leave out ts.")
         experiment = dataclasses.replace(experiment, measured=measured.values, ts=measured.ts)
+    elif measured is not None and not isinstance(measured, Mapping):
+        raise ValueError(f"identify: {BY_NAME}; got an object of type {type(measured).__name__}{where}.")
     if experiment.ts is None:
         raise ValueError(f"ts{where} is missing: the times of what was measured.")
     return experiment
@@ -209,7 +209,7 @@ def with_times(experiment: Experiment, where: str = "") -> Experiment:
 
 def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, np.ndarray]]:
     """All times of an experiment in order, and for each measured name which of them are its own."""
-    names = tuple(_by_name(experiment) or ())
+    names: tuple[str, ...] = tuple(experiment.measured or ())
     given: Any = experiment.ts
     if not isinstance(given, Mapping):
         ts = measured_times(given, experiment.t0)
@@ -225,12 +225,6 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
     each = {name: np.asarray(measured_times(given[name], experiment.t0, name)) for name in names}
     ts = np.unique(np.concatenate(list(each.values())))
     return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
-
-
-def _by_name(experiment: Experiment) -> Mapping[str, VectorLike] | None:
-    """What was measured, of an experiment as `with_times` returns it."""
-    measured: Any = experiment.measured
-    return measured
 
 
 def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
@@ -268,8 +262,8 @@ def channels_of(
 
     **Arguments:** `free`: names of unknowns, without the experiment's; `places`: which of `ts` each name has.
     """
-    measured, residual = _by_name(experiment), experiment.residual
-    if (measured is None) == (residual is None):
+    measured: Any = experiment.measured
+    if (measured is None) == (experiment.residual is None):
         raise ValueError("Give either measured quantities by name or a residual function.")
     if measured is None:
         if experiment.sigma is not None:

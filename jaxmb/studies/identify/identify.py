@@ -1,27 +1,26 @@
 """Parameters by name from measured motion."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, ArrayLike
 
 from ..._arguments import whole_number
 from ..._results import RESULTS
 from ..._types import Scalar, State, VectorLike
-from ...linalg.arrays import ARRAYS
 from ...parts.names import names_arguments
 from ...states.arguments import check_no_states
 from ...system import AbstractSystem
 from ...trajectory import Trajectory
-from ..minimise import Minimum, descend, minimise_together
+from ..minimise import Minimum, minimise_together
 from ..ranges import Bounds
 from .experiment import Experiment, with_times
-from .identification import Identification, identification
+from .identification import Identification
 from .loss import loss_named
-from .measurements import have_times, is_table
+from .measurements import have_times
 from .problem import Model, Problem, level_mask, linearise, linearise_batch, with_likely_levels
 from .sensors import Sensor
 from .shooting import shoot
@@ -30,10 +29,8 @@ from .unknowns import Prior, experiments_by_name, sensors_by_name, unknowns
 # A parameter that changes the residuals by less than this, relative to the size of what is measured, has no effect.
 _NO_EFFECT = 1e-10
 
-_ITERATIONS = {"lm": 100, "optax": 1000}
 
-
-@names_arguments
+@functools.partial(names_arguments, gone={"method": "it is Levenberg–Marquardt; optax needs a loss of your own"})
 def identify(
     system: AbstractSystem,
     measured: Any = None,
@@ -54,8 +51,7 @@ def identify(
     starts: int | Sequence[Mapping[str, VectorLike]] = 1,
     seed: int = 0,
     segments: int = 1,
-    method: str | optax.GradientTransformation = "lm",
-    max_iterations: int | None = None,
+    max_iterations: int = 100,
     tol: float = 1e-8,
     **options: Any,
 ) -> Identification:
@@ -76,9 +72,8 @@ def identify(
         `orientation`, `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
         coordinates and their rates q̇, `"theta"` and `"theta_rate"`, shape (times,), and generalized forces of its
         constraints, `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without
-        wrapping. Instead, the `Measurements` that `read_measurements` returns, with their times; what it reads with
-        every column by its own name, the path of a CSV file, a DataFrame or a Dataset; or an `Experiment` or a list of
-        them, each with its own data, times and initial state.
+        wrapping. Instead, `Measurements`, with their times, which `read_measurements` makes of files and tables; or
+        an `Experiment` or a list of them, each with its own data, times and initial state.
     - `ts`: times [s], shape (times,), increasing, from `t0` on. Where sensors have times of their own, by name of what
         was measured: `ts={"encoder": (times1,), "gyro": (times2,)}`; each measured array has the length of its own.
     - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
@@ -116,11 +111,8 @@ def identify(
     - `segments`: more than one is multiple shooting, for motions that are chaotic or unstable, which a simulation over
         the whole time does not follow: each experiment is cut into so many segments of nearly as many samples,
         simulated in one batch from states of their own, which are joined as the iteration goes on.
-    - `method`: `"lm"`, Levenberg–Marquardt with forward-mode derivatives, best up to some dozens of parameters; or an
-        optax optimiser with reverse-mode derivatives of the objective divided by the number of residuals, such as
-        `optax.adam(0.02)`.
-    - `max_iterations`: default 100 for `"lm"`, 1000 for optax; `tol`: change of unknowns and residuals, absolute and
-        relative, or size of an optax step, at which to stop.
+    - `max_iterations` of Levenberg–Marquardt, whose derivatives are in forward mode, best up to some dozens of
+        parameters; `tol`: change of unknowns and residuals, absolute and relative, at which to stop.
     - `options`: passed on to `simulate`: `rtol`, `solver`, `manifold`, `max_steps`, …
 
     A trial at which the mechanism cannot be assembled or the simulation fails is rejected, and a smaller step is tried.
@@ -135,72 +127,41 @@ def identify(
     and if the simulation with the starting values fails or a free parameter has no effect on the residuals there.
     """
     own = {"ts": ts, "state": state, "fix": fix, "rates": rates, "residual": residual, "free_initial": free_initial}
-    problem, known_noise = _problem(
-        system, measured, own, t0, sensors, sigma, free, bounds, prior, loss_named(loss), options
-    )
-    if method != "lm" and not isinstance(method, optax.GradientTransformation):
-        raise ValueError(f"method must be 'lm' or an optax optimiser, got {method!r}.")
-    default = _ITERATIONS["lm" if method == "lm" else "optax"]
-    limit = default if max_iterations is None else whole_number("max_iterations", max_iterations, 1, ", or None")
-    segments = whole_number("segments", segments)
-
+    problem = _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss_named(loss), options)
+    limit, segments = whole_number("max_iterations", max_iterations), whole_number("segments", segments)
     points = _starts(problem, starts, seed)
-    if segments != 1:
-        if method != "lm" or len(points) > 1:
-            raise ValueError("Multiple shooting, segments > 1, has one start and method='lm'.")
+    if segments > 1:
+        if len(points) > 1:
+            raise ValueError("Multiple shooting, segments > 1, has one start.")
         check_no_states("identify with segments", system)
         shot = shoot(problem, points[0], segments, tol, limit)
-        return identification(
-            problem,
-            shot.z,
-            data=shot.data,
-            jacobian=shot.jacobian,
-            along=shot.along,
-            objective=shot.objective,
-            readings=shot.readings,
-            known_noise=known_noise,
-            iterations=shot.iterations,
-            success=shot.success,
-            ends=[(shot.objective, shot.z)],
-            tol=tol,
-            max_iterations=limit,
-            segments=segments,
-            continuity=shot.continuity,
-        )
-    model = linearise(problem, points[0])
-    _check_start(problem, model)
-    if isinstance(method, str):
-        solutions = _least_squares(problem, points, tol, limit)
-    else:
-        objective = lambda z: problem.objective(z) / model.data
-        solutions = [descend(method, objective, z, tol, limit) for z in points]
-    solutions = sorted(solutions, key=lambda solution: np.inf if np.isnan(solution.value) else solution.value)
+        ends = [(shot.objective, shot.z)]
+        return Identification(problem, **shot._asdict(), ends=ends, segments=segments, tol=tol, max_iterations=limit)
+    _check_start(problem, linearise(problem, points[0]))
+    solutions = sorted(_least_squares(problem, points, tol, limit), key=lambda solution: solution.value)
     best = solutions[0]
     model = linearise(problem, best.z)
-    return identification(
+    return Identification(
         problem,
         best.z,
-        data=model.plain.residuals[: model.data],
-        jacobian=model.plain.jacobian,
         objective=model.linearised.value,
+        ends=[(solution.value, solution.z) for solution in solutions],
+        residuals=model.plain.residuals[: model.data],
+        jacobian=model.plain.jacobian,
         readings=model.readings,
-        known_noise=known_noise,
         iterations=best.iterations,
         success=best.success,
-        ends=[(solution.value, solution.z) for solution in solutions],
         tol=tol,
         max_iterations=limit,
     )
 
 
-def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> tuple[Problem, bool]:
-    """The problem, and whether the noise levels of all readings are known or unknowns of their own."""
+def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> Problem:
     for argument, value in (("sigma", sigma), ("bounds", bounds), ("prior", prior)):
         if value is not None and not isinstance(value, Mapping):
             raise ValueError(f"identify: {argument} is given by name, such as {{'crank.angle': …}}; got {value!r}.")
-    if isinstance(measured, ARRAYS):
-        raise ValueError("identify: measured is given by name, such as {'crank.angle': array}; got an array.")
-    if measured is None or isinstance(measured, Mapping) or have_times(measured) or is_table(measured):
+    several = [measured] if hasattr(measured, "held_out") else measured
+    if have_times(measured) or not isinstance(several, list | tuple):
         experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
     else:
         given = [name for name, value in own.items() if value is not None and name != "free_initial"]
@@ -208,7 +169,7 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, los
         if given:
             arguments = ", ".join(f"{name}=…" for name in dict.fromkeys(("ts", given[0])))
             raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, {arguments}).")
-        experiments = experiments_by_name(measured if isinstance(measured, Sequence) else [measured])
+        experiments = experiments_by_name(several)
     named = sensors_by_name(system, sensors)
     free, trials, sources, priors = unknowns(system, experiments, named, free, bounds, prior, sigma, loss)
     problem = Problem(
@@ -220,16 +181,16 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, los
         fitted=tuple(not experiment.held_out for experiment in experiments.values()),
         trials=trials,
         options=_checked(options),
+        known_noise=_known_noise(experiments, named, sigma, trials),
     )
-    known_noise = _known_noise(experiments, named, sigma, trials)
-    if loss.robust and not (known_noise and np.all(~level_mask(problem))):
+    if loss.robust and not (problem.known_noise and np.all(~level_mask(problem))):
         raise ValueError(f"loss={loss.name!r} needs to know from where on a residual is large: give sigma, as numbers.")
-    if priors.names and not known_noise:
+    if priors.names and not problem.known_noise:
         raise ValueError(
             f"The prior of {priors.names[0]!r} is weighed against noise of a known size: give sigma, or free the noise "
             "levels of the sensors, such as 'encoder.sigma'."
         )
-    return problem, known_noise
+    return problem
 
 
 def _known_noise(experiments, sensors, sigma, trials) -> bool:
@@ -299,7 +260,7 @@ def _check_start(problem: Problem, model: Model) -> None:
                 # It names the coordinates, of fix, rates and free_initial together.
                 text = str(error)
             raise ValueError(f"The simulation{where} fails with the starting values: {text}")
-    residuals, jacobian, _ = model.plain
+    residuals, jacobian = model.plain.residuals, model.plain.jacobian
     if not np.all(np.isfinite(residuals)):
         raise ValueError("The residuals are not finite with the starting values.")
     size = max(trial.size for trial in problem.trials)

@@ -25,14 +25,16 @@ class Measurements(NamedTuple):
     values: dict[str, np.ndarray]
 
 
+# What to give in place of anything else.
+BY_NAME = (
+    "measured is given by name, such as {'crank.angle': array}, or by jaxmb.Experiment(measured, ts=…), and "
+    "jaxmb.read_measurements reads files and tables"
+)
+
+
 def have_times(measured: Any) -> bool:
     """Whether measured data have values by name and their own times, as `Measurements` do."""
     return hasattr(measured, "ts") and isinstance(getattr(measured, "values", None), Mapping)
-
-
-def is_table(measured: Any) -> bool:
-    """Whether measured data are something that `read_measurements` reads: a path, a DataFrame or a Dataset."""
-    return isinstance(measured, str | Path) or hasattr(measured, "columns") or hasattr(measured, "data_vars")
 
 
 def read_measurements(
@@ -92,7 +94,8 @@ def read_measurements(
 def _of_file(path: Path) -> dict[str, np.ndarray]:
     with path.open(newline="", encoding="utf-8-sig") as file:
         text = file.read()
-    reader = csv.reader(text.splitlines(), _dialect(text))
+    delimiter = max(",;\t", key=text.partition("\n")[0].count)
+    reader = csv.reader(text.splitlines(), delimiter=delimiter)
     lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     if not lines:
         raise ValueError(f"{path} is empty.")
@@ -107,12 +110,6 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
         name: np.array([_number(path, name, number, cells[k]) for number, cells in lines[1:]], float)
         for k, name in enumerate(header)
     }
-
-
-def _dialect(text: str) -> Any:
-    first = text.splitlines()[0] if text.strip() else ""
-    delimiter = max(",;\t", key=first.count)
-    return type("_Dialect", (csv.excel,), {"delimiter": delimiter})
 
 
 def _number(path, column, line, cell) -> float:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
@@ -16,6 +15,7 @@ from ...parts.names import unknown
 from ...system.quantities import with_shapes
 from .experiment import measured_times
 from .fit import Fit
+from .problem import jacobian_and_value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +46,9 @@ def predict(
     ts: ArrayLike | None = None,
     experiment: str | None = None,
     level: float = 0.95,
+    trusted: bool = True,
 ) -> Prediction:
-    """As `Identification.predict`."""
+    """As `Identification.predict`; bands are NaN if the fit is not `trusted`."""
     level = probability("level", level)
     fit.whole_motions("A prediction")
     problem = fit.problem
@@ -62,8 +63,8 @@ def predict(
     ts = trial.ts if ts is None else measured_times(ts, float(trial.t0))
     columns = problem.columns(number)
     flat = jnp.asarray(np.asarray(problem.free.flat(fit.z))[columns])
-    values, jacobians = _predicted(problem.system, trial, problem.options, names, ts, flat)
-    found = fit.covariance
+    jacobians, values = _predicted(problem.system, trial, problem.options, names, ts, flat)
+    found = fit.uncertainty
     width = float(ndtri((1 + level) / 2))
     out, deviations = {}, {}
     for name in names:
@@ -74,7 +75,7 @@ def predict(
             along = np.max(np.abs(jacobian @ found.lost[columns]), axis=-1)
             size = np.max(np.abs(jacobian)[..., None] * np.abs(found.lost[columns]), initial=0.0)
             deviation = np.where(along > 1e-6 * size, np.inf, deviation)
-        deviations[name] = np.full_like(deviation, np.nan) if fit.doubts else deviation
+        deviations[name] = deviation if trusted else np.full_like(deviation, np.nan)
     low = {name: out[name] - width * deviations[name] for name in names}
     high = {name: out[name] + width * deviations[name] for name in names}
     return Prediction(np.asarray(ts), out, deviations, low, high, level)
@@ -88,11 +89,7 @@ def _predicted(system, trial, options, names, ts, flat) -> Any:
         values = {name: trajectory.quantity(name) for name in names}
         return values, values
 
-    if flat.size == 0:
-        values, _ = fn(flat)
-        return values, {name: jnp.zeros((*value.shape, 0)) for name, value in values.items()}
-    jacobians, values = jax.jacfwd(fn, has_aux=True)(flat)
-    return values, jacobians
+    return jacobian_and_value(fn, flat)
 
 
 @dataclasses.dataclass(frozen=True)

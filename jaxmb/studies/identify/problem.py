@@ -1,7 +1,7 @@
 """The misfit of all experiments as a function of one vector of unknowns, with its linearisation."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,6 +19,7 @@ from ..minimise import Linearised
 from ..ranges import FreeParameters
 from .experiment import ExperimentModel, Seen
 from .loss import Loss
+from .sensors import Channel
 from .unknowns import Priors
 
 
@@ -26,7 +27,8 @@ class Problem(eqx.Module):
     """Experiments that share unknowns.
 
     **Fields:** `names` of the experiments; `sources`: for each of them the names of its unknowns among all; `fitted`:
-    which of them are fitted, the others are held out.
+    which of them are fitted, the others are held out; `known_noise`: whether the noise level of every reading is known,
+    or an unknown of its own.
     """
 
     system: AbstractSystem
@@ -37,6 +39,7 @@ class Problem(eqx.Module):
     fitted: tuple[bool, ...] = eqx.field(static=True)
     trials: tuple[ExperimentModel, ...]
     options: dict[str, Any]
+    known_noise: bool = eqx.field(static=True)
 
     @property
     def loss(self) -> Loss:
@@ -141,11 +144,16 @@ def _with_jacobian(system, trial, options, flat):
         seen = trial.seen(*trial.start(system, theta), theta, options)
         return (seen.rows.residuals, seen.rows.scores), seen
 
-    if flat.size == 0:
-        (residuals, scores), seen = fn(flat)
-        return seen, (jnp.zeros((residuals.size, 0)), jnp.zeros((scores.size, 0)))
-    jacobians, seen = jax.jacfwd(fn, has_aux=True)(flat)
+    jacobians, seen = jacobian_and_value(fn, flat)
     return seen, jacobians
+
+
+def jacobian_and_value(fn: Callable[[Array], tuple[Any, Any]], flat: Float[Array, "n"]) -> tuple[Any, Any]:
+    """The derivatives of the first of two results, also in no unknowns, and the second one."""
+    if flat.size:
+        return jax.jacfwd(fn, has_aux=True)(flat)
+    out, value = fn(flat)
+    return jax.tree.map(lambda x: jnp.zeros((*x.shape, 0)), out), value
 
 
 @eqx.filter_jit
@@ -196,17 +204,14 @@ def with_likely_levels(
     """The vector with the noise levels that are most likely for predicted readings, by experiment and sensor."""
     values = {name: np.asarray(value) for name, value in problem.free(z).items()}
     squares: dict[str, list] = {}
-    for number, trial in enumerate(problem.trials):
-        for name, source in zip(dict(trial.unknowns), problem.sources[number], strict=True):
-            channel = next((own for own in trial.channels if name == f"{own.name}.sigma"), None)
-            if channel is not None and problem.fitted[number]:
-                level = channel.level(readings[problem.names[number]][channel.name], values[source])
-                squares.setdefault(source, []).append((level**2, int(np.sum(channel.present))))
+    for number, source, channel in _levels(problem):
+        if problem.fitted[number]:
+            level = channel.level(readings[problem.names[number]][channel.name], values[source])
+            squares.setdefault(source, []).append((level**2, int(np.sum(channel.present))))
     for source, own in squares.items():
         total = sum(count for _, count in own)
         level = np.sqrt(sum(square * count for square, count in own) / total)
-        inside = np.all(level > 0) and np.all(np.isfinite(level))
-        if inside:
+        if np.all(level > 0) and np.all(np.isfinite(level)):
             place, number = problem.free.place(source), problem.free.names.index(source)
             z = z.at[place].set(problem.free.ranges[number].locate(jnp.asarray(level, z.dtype)))
     return z
@@ -215,8 +220,15 @@ def with_likely_levels(
 def level_mask(problem: Problem) -> np.ndarray:
     """Which components of the vector are noise levels."""
     mask = np.zeros(problem.free.size, bool)
-    for number, trial in enumerate(problem.trials):
-        for name, source in zip(dict(trial.unknowns), problem.sources[number], strict=True):
-            if any(name == f"{channel.name}.sigma" for channel in trial.channels):
-                mask[problem.free.place(source)] = True
+    for _, source, _ in _levels(problem):
+        mask[problem.free.place(source)] = True
     return mask
+
+
+def _levels(problem: Problem) -> Iterator[tuple[int, str, Channel]]:
+    """The unknown noise levels: the number of the experiment, the name among all unknowns, and the sensor."""
+    for number, trial in enumerate(problem.trials):
+        channels = {f"{channel.name}.sigma": channel for channel in trial.channels}
+        for name, source in zip(dict(trial.unknowns), problem.sources[number], strict=True):
+            if name in channels:
+                yield number, source, channels[name]

@@ -44,110 +44,88 @@ def profile(fit: Fit, component: str, *, level: float = 0.95, values=None) -> Pr
     if component not in fit.components:
         raise unknown("component", component, fit.components)
     fit.whole_motions("A profile")
-    walk = _Walk(fit, component)
-    limit = float(ndtri((1 + level) / 2)) ** 2
-    found = [walk.estimate]
-    if values is not None:
-        values = np.asarray(values, float)
-        for side in (np.sort(values[values >= walk.best]), np.sort(values[values < walk.best])[::-1]):
-            found += walk.along(side)
-    else:
+    held, limit = _Held(fit, component), float(ndtri((1 + level) / 2)) ** 2
+    found = [(held.best, 0.0, Minimum(fit.z, 0, fit.success, fit.objective))]
+    if values is None:
         for sign in (1, -1):
-            found += walk.until(sign, limit)
+            found += held.along(held.best + sign * held.step * np.arange(1, _MOST + 1), 1.2 * limit)
+    else:
+        values = np.sort(np.asarray(values, float))
+        found += held.along(values[values >= held.best]) + held.along(values[values < held.best][::-1])
     found = sorted(found, key=lambda own: own[0])
-    places = np.array([value for value, *_ in found])
-    ratios = np.array([ratio for _, ratio, _ in found])
-    low, high = (_end(places, ratios, walk.best, limit, sign) for sign in (-1, 1))
-    if values is not None:
-        keep = np.isin(places, values)
-        places, ratios, found = (
-            places[keep],
-            ratios[keep],
-            [own for own, there in zip(found, keep, strict=True) if there],
-        )
-    each = [fit.problem.free(minimum.z) for *_, minimum in found]
+    places, ratios = (np.array([own[k] for own in found]) for k in (0, 1))
+    low, high = (_end(places, ratios, held.best, limit, sign) for sign in (-1, 1))
+    keep = np.ones(places.size, bool) if values is None else np.isin(places, values)
+    minima = [minimum for (*_, minimum), there in zip(found, keep, strict=True) if there]
+    each = [fit.problem.free(minimum.z) for minimum in minima]
     return Profile(
         component=component,
-        values=places,
-        ratios=ratios,
+        values=places[keep],
+        ratios=ratios[keep],
         interval=(low, high),
         level=level,
-        fits=np.array([minimum.success for *_, minimum in found]),
-        parameters={name: np.stack([np.asarray(own[name]) for own in each]) for name in fit.values},
+        fits=np.array([minimum.success for minimum in minima]),
+        parameters={name: np.stack([np.asarray(own[name]) for own in each]) for name in fit.parameters},
     )
 
 
-class _Walk:
-    """Fits with one component held, each started from the last."""
+class _Held:
+    """Fits with one component held at a value."""
 
     def __init__(self, fit: Fit, component: str):
-        self.fit = fit
-        free = self.fit.problem.free
-        name = component.split("[")[0]
-        place = free.place(name)
-        self.range = free.ranges[free.names.index(name)]
+        free, row = fit.problem.free, fit.components.index(component)
+        self.fit, self.name = fit, component.split("[")[0]
+        self.range = free.ranges[free.names.index(self.name)]
         if not self.range.componentwise:
-            raise ValueError(f"{name!r} is a matrix whose components cannot be held alone; profile another parameter.")
-        own = [c for c in fit.components if c == name or c.startswith(f"{name}[")]
-        self.number = own.index(component)
-        self.index = place.start + self.number
-        self.row = fit.components.index(component)
-        self.held = np.zeros(free.size, bool)
-        self.held[self.index] = True
-        self.best = float(np.ravel(fit.values[name])[self.number])
-        self.deviation = float(np.sqrt(fit.covariance.matrix[self.row, self.row]))
-        self.squares = float(np.sum(fit.residuals**2))
-        self.estimate = (self.best, 0.0, Minimum(self.fit.z, 0, fit.success, self.fit.objective))
+            raise ValueError(
+                f"{self.name!r} is a matrix whose components cannot be held alone; profile another parameter."
+            )
+        self.number = [own for own in fit.components if own.split("[")[0] == self.name].index(component)
+        self.mask = np.zeros(free.size, bool)
+        self.mask[free.place(self.name).start + self.number] = True
+        self.best = float(np.ravel(fit.parameters[self.name])[self.number])
+        step = 0.5 * float(fit.uncertainty.deviations[row])
+        self.step = step if np.isfinite(step) and step > 0 else 0.1 * (abs(self.best) or 1.0)
 
-    def at(self, value: float, start):
-        """The fit with the component at a value."""
-        like = np.array(self.fit.values[self._name()], float)
-        like.reshape(-1)[self.number] = value
-        z = float(self.range.locate(jnp.asarray(like, start.dtype))[self.number])
-        if not np.isfinite(z):
-            raise ValueError(f"{self.fit.components[self.row]} = {value:g} is out of its bounds.")
-        start = start.at[self.index].set(z)
-        problem, fit = self.fit.problem, self.fit
-        linearised = lambda z: linearise(problem, z).linearised
-        if self.held.all():
-            model = linearised(start)
-            minimum = Minimum(start, 1, bool(np.isfinite(model.value)), model.value)
-        else:
-            minimum = levenberg_marquardt(linearised, start, fit.tol, fit.max_iterations, self.held)
-        ratio = 2 * (minimum.value - fit.objective) / fit.dispersion
-        if not fit.known_noise:
-            ratio = self.fit.residuals.size * np.log(2 * minimum.value / self.squares)
-        return value, float(ratio), minimum
+    def along(self, values, limit: float = np.inf) -> list[tuple[float, float, Minimum]]:
+        """Values, ratios and fits, each started from the last, up to a ratio beyond the limit.
 
-    def _name(self):
-        return self.fit.components[self.row].split("[")[0]
-
-    def along(self, values):
+        **Raises:** `ValueError` for a value out of bounds if there is no limit; otherwise that is the end.
+        """
         out, z = [], self.fit.z
         for value in values:
-            out.append(self.at(float(value), z))
-            z = out[-1][-1].z
+            place = self._located(value)
+            if not np.isfinite(place) and np.isinf(limit):
+                raise ValueError(f"{self.name} = {value:g} is out of its bounds.")
+            if not np.isfinite(place):
+                break
+            ratio, minimum = self._fitted(jnp.where(self.mask, place, z))
+            if not np.isfinite(ratio) and np.isfinite(limit):
+                break
+            out.append((float(value), ratio, minimum))
+            z = minimum.z
+            if ratio > limit:
+                break
         return out
 
-    def until(self, sign: int, limit: float):
-        """Steps to one side until the ratio is beyond a limit, or the bound is near."""
-        step = 0.5 * self.deviation
-        if not np.isfinite(step) or step == 0:
-            step = 0.1 * (abs(self.best) or 1.0)
-        out, z, value = [], self.fit.z, self.best
-        for _ in range(_MOST):
-            value = value + sign * step
-            try:
-                out.append(self.at(value, z))
-            except ValueError:
-                break
-            if not np.isfinite(out[-1][1]):
-                out.pop()
-                break
-            z = out[-1][-1].z
-            if out[-1][1] > 1.2 * limit:
-                break
-        return out
+    def _located(self, value: float) -> float:
+        """The component of the vector for a value."""
+        like = np.array(self.fit.parameters[self.name], float)
+        like.reshape(-1)[self.number] = value
+        return float(self.range.locate(jnp.asarray(like, self.fit.z.dtype))[self.number])
+
+    def _fitted(self, start) -> tuple[float, Minimum]:
+        """Twice the logarithm of the likelihood ratio, and the fit."""
+        fit, problem = self.fit, self.fit.problem
+        linearised = lambda z: linearise(problem, z).linearised
+        if self.mask.all():
+            value = linearised(start).value
+            minimum = Minimum(start, 1, bool(np.isfinite(value)), value)
+        else:
+            minimum = levenberg_marquardt(linearised, start, fit.tol, fit.max_iterations, self.mask)
+        if problem.known_noise:
+            return float(2 * (minimum.value - fit.objective) / fit.dispersion), minimum
+        return float(fit.residuals.size * np.log(2 * minimum.value / np.sum(fit.residuals**2))), minimum
 
 
 def _end(values, ratios, best, limit, sign) -> float:

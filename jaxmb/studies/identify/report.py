@@ -26,43 +26,34 @@ _STYLE = (
 def write_report(
     fit: Fit,
     path: str | Path,
-    *,
     verdict: Sequence[str],
-    start: np.ndarray,
-    deviations: Sequence[str],
-    combinations: Sequence[dict[str, float]],
-    outliers: Sequence[Outlier],
+    rows: Sequence[tuple[str, ...]],
     profiles: Sequence[str],
 ) -> Path:
-    """As `Identification.report`."""
+    """As `Identification.report`; `verdict`: its lines, `rows`: those of the table of estimates."""
     path = Path(path)
     path = path if path.suffix == ".html" else path / "identification.html"
     path.parent.mkdir(parents=True, exist_ok=True)
-    values = np.concatenate([np.ravel(value) for value in fit.values.values()])
-    rows = zip(fit.components, start, values, deviations, strict=True)
     headline, *reasons = map(html.escape, verdict)
     parts = ["<h1>Identification</h1>", f"<p><strong>{headline}</strong></p>"]
     if reasons:
         parts.append("<ul>" + "".join(f"<li>{reason}</li>" for reason in reasons) + "</ul>")
     parts += [
-        _table(
-            ("parameter", "start", "estimate", "standard deviation"),
-            [(name, f"{a:.6g}", f"{b:.6g}", c) for name, a, b, c in rows],
-        ),
+        _table(("parameter", "start", "estimate", "standard deviation"), rows),
         f"<p>{fit.size_of_residuals}</p>",
     ]
-    for direction in combinations:
+    for direction in fit.combinations:
         text = ", ".join(f"{name} {100 * share:+.3g} %" for name, share in direction.items())
         parts.append(f"<p>The data do not change with {html.escape(text)} together.</p>")
     for name, trial, fitted in zip(fit.problem.names, fit.problem.trials, fit.problem.fitted, strict=True):
         readings = fit.readings[name] if fitted else held_out(fit)[name].readings
         for channel in trial.channels:
             label = " ".join(filter(None, (name, channel.name, "" if fitted else "(held out)")))
-            far = [own for own in outliers if (own.experiment, own.sensor) == (name, channel.name)]
+            far = [own for own in fit.outliers if (own.experiment, own.sensor) == (name, channel.name)]
             predicted = np.asarray(readings[channel.name])
             parts += [f"<h2>{html.escape(label)}</h2>", _fit_figure(trial, channel, predicted, fitted, far)]
-    if outliers:
-        parts += ["<h2>Residuals beyond 5 σ</h2>", _outliers(outliers)]
+    if fit.outliers:
+        parts += ["<h2>Residuals beyond 5 σ</h2>", _outliers(fit.outliers)]
     if len(fit.components) > 1:
         parts += ["<h2>Correlations</h2>", _correlations(fit)]
     for component in profiles:
@@ -120,22 +111,23 @@ def _fit_figure(trial, channel, predicted, fitted, far: Sequence[Outlier]) -> st
         sample, component = outlier.sample[0], int(np.ravel_multi_index(outlier.sample[1:], shape)) if shape else 0
         ring = {"marker": "o", "markersize": 8, "markerfacecolor": "none", "color": "red", "linestyle": "none"}
         above.plot(ts[sample], measured[sample, component], **ring)
-        below.plot(ts[sample], measured[sample, component] - predicted[sample, component], **ring)
+        below.plot(ts[sample], predicted[sample, component] - measured[sample, component], **ring)
     for k in range(measured.shape[1]):
         above.plot(ts, measured[:, k], ".", color=f"C{k}", markersize=3)
         above.plot(ts, predicted[:, k], "-", color=f"C{k}", linewidth=1)
-        below.plot(ts, measured[:, k] - predicted[:, k], ".", color=f"C{k}", markersize=3)
+        below.plot(ts, predicted[:, k] - measured[:, k], ".", color=f"C{k}", markersize=3)
     above.set_ylabel("measured and fitted")
-    below.set_ylabel("measured − fitted")
+    below.set_ylabel("fitted − measured")
     below.set_xlabel("time [s]")
     below.axhline(0, color="0.7", linewidth=0.8)
     return _image(figure)
 
 
 def _correlations(fit: Fit) -> str:
-    deviations = np.sqrt(np.diag(fit.covariance.matrix))
-    correlations = fit.covariance.matrix / np.outer(deviations, deviations)
-    correlations[~np.isfinite(correlations)] = np.nan
+    deviations = fit.uncertainty.deviations
+    # What is not determined has no correlation: a square without colour.
+    sizes = np.where(np.isfinite(deviations) & (deviations > 0), deviations, np.nan)
+    correlations = np.where(np.isfinite(fit.covariance), fit.covariance, np.nan) / np.outer(sizes, sizes)
     figure, (axes,) = _axes(1, 1.5 + 0.4 * len(fit.components))
     image = axes.imshow(correlations, vmin=-1, vmax=1, cmap="RdBu")
     axes.set_xticks(range(len(fit.components)), fit.components, rotation=90)

@@ -72,7 +72,6 @@ def series(
     problem: Problem,
     values: Mapping[str, np.ndarray],
     readings: Mapping[str, Mapping[str, Any]],
-    known_noise: bool,
 ) -> tuple[Series, ...]:
     """The residuals of everything that was fitted, from the unknowns by name and the readings at them."""
     out = []
@@ -84,7 +83,7 @@ def series(
             for channel in trial.channels:
                 level, bias = theta.get(f"{channel.name}.sigma"), _bias(problem, number, channel)
                 predicted = np.asarray(readings[name][channel.name])
-                out += _of_channel(name, trial, channel, predicted, level, bias, known_noise)
+                out += _of_channel(name, trial, channel, predicted, level, bias, problem.known_noise)
     return tuple(out)
 
 

@@ -1,6 +1,5 @@
 """The segments of multiple shooting: charts of the constraint manifold at their starts, and the linearised misfit."""
 
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,11 +10,10 @@ from jaxtyping import Array
 
 from ..._types import State
 from ...states.assembly import assemble
-from ...system import AbstractSystem
 from ..batch import batch
 from ..minimise import Linearised
 from .experiment import ExperimentModel
-from .problem import Problem, numbers, values_and_derivatives, weighted
+from .problem import Model, Problem, numbers, values_and_derivatives, weighted
 
 
 class Lanes(NamedTuple):
@@ -27,24 +25,26 @@ class Lanes(NamedTuple):
     samples: tuple[int, ...]
 
 
-class Point(NamedTuple):
-    """The unknowns, and the linearised problem there; infinite where a simulation failed.
+class Place(NamedTuple):
+    """The vector of the unknowns, and for each experiment the states at the starts of its segments with charts there.
 
-    `residuals` and `jacobian` are weighted by the loss, those of `plain` are as they are.
+    A chart has bases of the tangent spaces, of q and of u, and the map from changes of both to its coordinates.
     """
 
     z: Array
     states: tuple[State, ...]
     charts: tuple[Any, ...]
-    objective: float
-    data: int
-    residuals: np.ndarray
-    jacobian: np.ndarray
-    plain: Linearised
-    gaps: np.ndarray
-    continuity: np.ndarray
-    readings: dict[str, dict[str, np.ndarray]]
-    alone: tuple[Any, ...]
+
+    @property
+    def size(self) -> int:
+        """The number of the unknowns and the coordinates of all charts."""
+        return self.z.size + sum(onto[..., 0].size for *_, onto in self.charts)
+
+    def split(self, vector: Any) -> list[Any]:
+        """The coordinates of the charts in such a vector, for each experiment in the shape (segments, coordinates)."""
+        ends = np.cumsum([self.z.size, *(onto[..., 0].size for *_, onto in self.charts)])
+        each = zip(self.charts, ends[:-1], ends[1:], strict=True)
+        return [vector[begin:end].reshape(onto.shape[:2]) for (*_, onto), begin, end in each]
 
 
 def segmented(name: str, number: int, trial: ExperimentModel, segments: int) -> Lanes:
@@ -81,112 +81,79 @@ def _column(mask: np.ndarray, like: Array) -> np.ndarray:
     return mask.reshape(-1, *(1 for _ in like.shape[1:]))
 
 
+def first_place(problem: Problem, lanes: tuple[Lanes, ...], z: Array) -> Place:
+    """The initial state of each experiment at the starts of all its segments."""
+    several = lambda x, count: jnp.broadcast_to(x, (count, *x.shape))
+    starts = [(problem.start(lane.number, z)[1], len(lane.samples)) for lane in lanes]
+    states = [State(several(state.q, count), several(state.u, count)) for state, count in starts]
+    return _placed(problem, lanes, z, states)
+
+
+def moved(problem: Problem, lanes: tuple[Lanes, ...], place: Place, step: np.ndarray) -> Place:
+    """The place after a step, the states back on the constraints of the new parameters."""
+    change = jnp.asarray(step, place.z.dtype)
+    z, states = place.z + change[: place.z.size], []
+    each = zip(lanes, place.states, place.charts, place.split(change), strict=True)
+    for lane, state, charts, move in each:
+        trial, flat = problem.trials[lane.number], _own_values(problem, lane, z)
+        states.append(_on_constraints(problem.system, trial, flat, lane.trials.t0, state, charts[:2], move))
+    return _placed(problem, lanes, z, states)
+
+
+def _placed(problem, lanes, z, states) -> Place:
+    each = zip(lanes, states, strict=True)
+    charts = tuple(_charts(problem, lane, _own_values(problem, lane, z), state) for lane, state in each)
+    return Place(z, tuple(states), charts)
+
+
 def _own_values(problem, lane, z):
-    values, derivatives, *_ = values_and_derivatives(problem, z)
-    columns = problem.columns(lane.number)
-    return jnp.asarray(values[columns]), derivatives[columns]
+    """The unknowns of one experiment, one after the other."""
+    return jnp.asarray(values_and_derivatives(problem, z)[0][problem.columns(lane.number)])
 
 
-def initial_everywhere(problem, lane, z) -> State:
-    """The initial state of the experiment, once for every segment."""
-    state = problem.start(lane.number, z)[1]
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(lane.samples), *x.shape)), state)
-
-
-def evaluated(problem: Problem, lanes: tuple[Lanes, ...], z, states) -> Point:
-    _, derivatives, prior_rows, prior_jacobian = values_and_derivatives(problem, z)
-    sizes = [len(lane.samples) * _freedoms(problem.system) for lane in lanes]
-    first = np.cumsum([z.size, *sizes])
-    total, freedoms = int(first[-1]), _freedoms(problem.system)
-    residuals, jacobian, scores, score_rows, gaps, continuity = [], [], [], [], [], []
-    readings, alone, all_charts, objective = {}, [], [], 0.5 * prior_rows @ prior_rows
-    for lane, state, begin in zip(lanes, states, first, strict=False):
-        trial = problem.trials[lane.number]
-        flat, inward = jnp.asarray(_own_values(problem, lane, z)[0]), derivatives[problem.columns(lane.number)]
-        charts = _charts(problem.system, trial, lane, flat, state)
+def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model:
+    """The linearised problem at a place, in the unknowns and the coordinates of all charts."""
+    _, derivatives, prior_rows, prior_jacobian = values_and_derivatives(problem, place.z)
+    n, total = place.z.size, place.size
+    residuals, jacobian, scores, score_rows, gaps, closing = [], [], [], [], [], []
+    readings, objective = {}, 0.5 * prior_rows @ prior_rows
+    columns = place.split(np.arange(total))
+    for lane, state, charts, own in zip(lanes, place.states, place.charts, columns, strict=True):
+        trial, flat = problem.trials[lane.number], _own_values(problem, lane, place.z)
+        inward = derivatives[problem.columns(lane.number)]
         found = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
         seen, (rows, levels, starts, ends) = numbers(found)
+
+        def whole(by_unknowns, by_states, inward=inward, own=own):
+            """Derivatives in the unknowns of the experiment and in each segment's state as those in all unknowns."""
+            out = np.zeros((*by_unknowns.shape[:2], total))
+            out[..., :n] = by_unknowns @ inward
+            for k, these in enumerate(own):
+                out[k][:, these] = by_states[k]
+            return out
+
+        present = seen.rows.present
+        residuals.append(seen.rows.residuals[present])
+        jacobian.append(whole(*rows[1:])[present])
+        scores.append(seen.rows.scores.reshape(-1))
+        score_rows.append(whole(*levels[1:]).reshape(-1, total))
+        start, end = whole(*starts[1:]), whole(*ends[1:])
         initial, of_initial = (np.asarray(x) for x in _initial(problem.system, trial, flat))
-        rows_alone, jacobian_alone = [], []
-        for k in range(len(lane.samples)):
-            place = slice(begin + k * freedoms, begin + (k + 1) * freedoms)
-            placed = functools.partial(_placed, k, inward, place, total)
-            present = seen.rows.present[k]
-            residuals.append(seen.rows.residuals[k][present])
-            jacobian.append(placed(rows[1:])[present])
-            scores.append(seen.rows.scores[k])
-            score_rows.append(placed(levels[1:]))
-            rows_alone.append(seen.rows.residuals[k])
-            jacobian_alone.append(rows[2][k])
-            start = placed(starts[1:])
-            if k == 0:
-                arrival, change = initial, np.zeros_like(start)
-                change[:, : z.size] = of_initial @ inward
-            else:
-                arrival, before = ends[0][k - 1], slice(place.start - freedoms, place.start)
-                change = np.zeros_like(start)
-                change[:, : z.size], change[:, before] = ends[1][k - 1] @ inward, ends[2][k - 1]
-            onto = charts[2][k]
-            gaps.append(onto @ (arrival - starts[0][k]))
-            continuity.append(onto @ (change - start))
+        first = np.pad(of_initial @ inward, ((0, 0), (0, total - n)))
+        arrival, change = np.stack([initial, *ends[0][:-1]]), np.stack([first, *end[:-1]])
+        gaps.append((charts[2] @ (arrival - starts[0])[..., None]).reshape(-1))
+        closing.append((charts[2] @ (change - start)).reshape(-1, total))
         objective = objective + np.sum(seen.rows.objective)
-        several = seen.readings.items()
-        own = {name: np.concatenate([x[k][:n] for k, n in enumerate(lane.samples)]) for name, x in several}
-        readings[problem.names[lane.number]] = own
-        alone.append(((problem.system, flat, trial), np.stack(rows_alone), np.stack(jacobian_alone)))
-        all_charts.append(charts)
+        readings[problem.names[lane.number]] = {
+            name: np.concatenate([x[k][:count] for k, count in enumerate(lane.samples)])
+            for name, x in seen.readings.items()
+        }
+    prior_whole = np.pad(prior_jacobian, ((0, 0), (0, total - n)))
+    whole_rows = np.concatenate([*residuals, prior_rows, *scores])
+    plain = Linearised(whole_rows, np.vstack([*jacobian, prior_whole, *score_rows]), objective)
     data = sum(own.size for own in residuals)
-    prior_whole = np.hstack([prior_jacobian, np.zeros((prior_rows.size, total - z.size))])
-    whole = np.concatenate([*residuals, prior_rows, *scores]), np.vstack([*jacobian, prior_whole, *score_rows])
-    finite = np.isfinite(objective) and all(np.all(np.isfinite(x)) for x in (*whole, *gaps, *continuity))
-    objective = float(objective) if finite else np.inf
-    plain = Linearised(*whole, objective)
-    model = weighted(problem, plain, data)
-    return Point(
-        z=z,
-        states=tuple(states),
-        charts=tuple(all_charts),
-        objective=objective,
-        data=data,
-        residuals=model.residuals,
-        jacobian=model.jacobian,
-        plain=plain,
-        gaps=np.concatenate(gaps),
-        continuity=np.vstack(continuity),
-        readings=readings,
-        alone=tuple(alone),
-    )
-
-
-def _placed(k, inward, place, total, derivatives) -> np.ndarray:
-    """Derivatives of one segment, in its unknowns and its own state, as those in all unknowns."""
-    in_unknowns, in_state = derivatives
-    out = np.zeros((in_unknowns.shape[1], total))
-    out[:, : inward.shape[1]], out[:, place] = in_unknowns[k] @ inward, in_state[k]
-    return out
-
-
-def _freedoms(system: AbstractSystem) -> int:
-    """Independent coordinates and velocities."""
-    return system.nq - system.coordinate_rank + system.nu - system.velocity_rank
-
-
-def moved(problem, lanes, point: Point, step: np.ndarray):
-    """The unknowns after a step, the states back on the constraints of the new parameters."""
-    z = point.z + jnp.asarray(step[: point.z.size], point.z.dtype)
-    states, begin, freedoms = [], point.z.size, _freedoms(problem.system)
-    for lane, state, charts in zip(lanes, point.states, point.charts, strict=True):
-        size = len(lane.samples) * freedoms
-        move = step[begin : begin + size].reshape(len(lane.samples), freedoms)
-        flat = _own_values(problem, lane, z)[0]
-        states.append(retracted(lane, (problem.system, flat, problem.trials[lane.number]), state, charts, move))
-        begin += size
-    return z, tuple(states)
-
-
-def retracted(lane, system, state, charts, move) -> State:
-    own, flat, trial = system
-    return _on_constraints(own, trial, flat, lane.trials.t0, state, charts[:2], jnp.asarray(move, state.q.dtype))
+    linearised = weighted(problem, plain, data)._replace(gaps=np.concatenate(gaps), closing=np.vstack(closing))
+    return Model(linearised, plain, data, (), readings)
 
 
 @eqx.filter_jit
@@ -214,8 +181,8 @@ def _initial(system, trial, flat):
     return fn(flat), jax.jacfwd(fn)(flat)
 
 
-def _charts(system, trial, lane, flat, states) -> tuple[Any, Any, np.ndarray]:
-    """Bases of the tangent spaces at the states, of q and of u, and the map from changes of both to coordinates."""
+def _charts(problem, lane, flat, states) -> tuple[Any, Any, np.ndarray]:
+    system, trial = problem.system, problem.trials[lane.number]
     positions, velocities = map(np.asarray, _constraint_jacobians(system, trial, flat, lane.trials.t0, states))
     sizes = np.asarray(system.coordinate_scale()), np.asarray(system.velocity_scale())
     bases, inverses = [], []

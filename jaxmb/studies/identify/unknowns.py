@@ -28,6 +28,7 @@ from .experiment import (
     with_times,
 )
 from .loss import Loss
+from .measurements import BY_NAME
 from .sensors import SENSOR_FIELDS, Channel, Sensor
 
 Prior = tuple[VectorLike, VectorLike]
@@ -70,7 +71,7 @@ def experiments_by_name(experiments: Sequence[Experiment]) -> dict[str, Experime
     """Experiments by their names, which are made where they are missing."""
     out = {}
     for number, experiment in enumerate(experiments, 1):
-        check_kind("An experiment", experiment, Experiment, "a jaxmb.Experiment", "jaxmb.Experiment(measured, ts=…)")
+        check_kind("An experiment", experiment, Experiment, "a jaxmb.Experiment", BY_NAME)
         name = f"exp{number}" if experiment.name is None else experiment.name
         if name in out or not name or "/" in name:
             raise ValueError(f"The name {name!r} of an experiment must be its own, not empty and without '/'.")

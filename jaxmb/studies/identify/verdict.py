@@ -1,8 +1,7 @@
 """Tests of a fit: of the residuals, of the estimates, and of the ends of several starts.
 
-Every test of residuals accuses a right fit with normal noise with a probability of less than one in a million, by
-Chernoff's bounds of the distributions' tails, which hold for few samples as well. It accuses only where the misfit is
-not small compared with the noise either: a significant difference may not matter.
+Every test of residuals accuses a right fit with normal noise with a probability of about one in a million. It accuses
+only where the misfit is not small compared with the noise either: a significant difference may not matter.
 
 Source: L. Ljung, "System Identification: Theory for the User", 2nd ed., Prentice Hall 1999, chapter 16; J. D. Gibbons
 and S. Chakraborti, "Nonparametric Statistical Inference", 5th ed., CRC Press 2011, chapter 3 (runs); R. Leipnik,
@@ -14,7 +13,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
+from ...simulate.arguments import DEFAULT_RTOL
+from .fit import Fit, flat
 from .loss import Loss
 from .residuals import Outlier, Series
 
@@ -32,6 +34,20 @@ _SHARE = 0.2
 # Two minima that differ by less than this, in twice the logarithm of the likelihood ratio, fit as well as each other;
 # their estimates contradict each other where they differ by more than so many standard deviations.
 _AS_WELL, _APART = 10.0, 5.0
+# Why a component has no standard deviation where it can change without changing the residuals.
+UNDETERMINED = "undetermined"
+
+
+class Verdict(NamedTuple):
+    """What speaks against a fit.
+
+    **Fields:** `doubts`: what speaks against the estimates as a whole; `reasons`: in a few words, why components have
+    no standard deviation, by their names; `warnings`: all that was found, and what helps.
+    """
+
+    doubts: tuple[str, ...]
+    reasons: dict[str, str]
+    warnings: tuple[str, ...]
 
 
 class Tried(NamedTuple):
@@ -39,6 +55,63 @@ class Tried(NamedTuple):
 
     starts: int
     segments: int
+
+
+def judge(fit: Fit) -> Verdict:
+    """What speaks against the end of an iteration."""
+    finite, starts = np.isfinite(fit.ends[0][0]), len(fit.ends)
+    doubts = [] if fit.success else ["the iteration did not converge; try another start, or more iterations"]
+    if finite:
+        directions, tried = fit.uncertainty.root.shape[1], Tried(starts, fit.segments)
+        doubts += of_residuals(fit.series, fit.outliers, directions, fit.problem.loss, tried)
+    reasons, warnings = {}, list(doubts)
+    if np.any(np.isnan(fit.uncertainty.deviations)):
+        reasons |= dict.fromkeys(fit.components, "too few data")
+    if fit.undetermined:
+        finer = f", or simulate with a smaller rtol than {fit.problem.rtol:g}"
+        warnings.append(
+            f"the data do not determine {', '.join(fit.undetermined)} separately (`combinations` says which changes "
+            "leave the residuals as they are): free fewer of them, or measure more"
+            + finer
+            * (fit.problem.rtol > DEFAULT_RTOL)
+        )
+        reasons |= dict.fromkeys(fit.undetermined, UNDETERMINED)
+    for name, words in _at_ends(fit):
+        warnings.append(words)
+        reasons[name] = "at its end"
+    if finite and starts > 1:
+        warnings += _of_other_starts(fit)
+    if doubts:
+        reasons = dict.fromkeys(fit.components, "no fit" if fit.success else "not converged")
+    return Verdict(tuple(doubts), reasons, tuple(warnings))
+
+
+def _at_ends(fit: Fit) -> Iterator[tuple[str, str]]:
+    """The components that are at an end of their ranges, with a warning for each."""
+    free = fit.problem.free
+    reached = free.at_end(fit.z, fit.uncertainty.deviations)
+    each = zip(fit.components, reached, flat(fit.start), flat(fit.parameters), free.ends(), strict=True)
+    for name, there, start, value, bounds in each:
+        if not there:
+            continue
+        cure = "restrict it to plausible values (bounds=)"
+        if bounds is not None:
+            cure = "it is held by bounds=({:.6g}, {:.6g}): widen them".format(*bounds)
+        yield (
+            name,
+            f"{name} = {value:.3g} is at an end of its range, from a start at {start:.3g}: {cure}, try other starts "
+            "(starts=), or leave it out of free if its effect is nothing",
+        )
+
+
+def _of_other_starts(fit: Fit) -> Iterator[str]:
+    others = [(value, np.asarray(fit.problem.free.flat(z))) for value, z in fit.ends if np.isfinite(value)]
+    known, noise = fit.problem.known_noise, fit.uncertainty.noise
+    # Noise that the residuals show is at least what matters, or rounding would tell two ends apart.
+    least = max(part.small for part in fit.series) / noise if noise > 0 else np.inf
+    least = 1.0 if known and not fit.problem.loss.robust else max(1.0, least)
+    count = None if known else fit.residuals.size
+    return of_starts(others, fit.components, fit.uncertainty.deviations * least, count, fit.dispersion * least**2)
 
 
 def of_residuals(
@@ -114,7 +187,7 @@ def _explains_nothing(found: list[Series]) -> Iterator[str]:
     constants, rest = len(found), sum(own.residuals.size for own in found) - len(found)
     # Both sums of squares are χ² distributed if nothing but noise is left, and if the truth is constant; if it is not,
     # the test accuses less often.
-    if rest > 0 and left - right > small and _beta(right / left, rest / 2, constants / 2) < _LEVEL:
+    if rest > 0 and left - right > small and special.betainc(rest / 2, constants / 2, right / left) < _LEVEL:
         explained = 1 - left / right if right > 0 else -np.inf
         yield f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g})"
 
@@ -191,29 +264,18 @@ def _offset(own: Series) -> str:
 
 
 def chi_squared(value: float, freedoms: int) -> float:
-    """At least the probability that a sum of squares of normal variables is larger."""
-    ratio = value / freedoms
-    return float(np.exp(-0.5 * freedoms * (ratio - 1 - np.log(ratio)))) if ratio > 1 else 1.0
-
-
-def _beta(value: float, a: float, b: float) -> float:
-    """At least the probability that a variable with a beta distribution is smaller."""
-    mean = a / (a + b)
-    return (value / mean) ** a * ((1 - value) / (1 - mean)) ** b if value < mean else 1.0
+    """The probability that a sum of squares of normal variables is larger."""
+    return float(special.chdtrc(freedoms, value))
 
 
 def _fair_trials(successes: float, trials: int) -> float:
-    """At least the probability of so many successes, or fewer, of trials that are as likely to fail."""
-    share = successes / trials
-    if share >= 0.5:
-        return 1.0
-    entropy = -sum(x * np.log(x) for x in (share, 1 - share) if x > 0)
-    return float(np.exp(trials * (entropy - np.log(2))))
+    """The probability of so many successes, or fewer, of trials that are as likely to fail."""
+    return float(special.betainc(trials - successes, successes + 1, 0.5)) if successes < trials else 1.0
 
 
 def _correlation(size: float, count: int) -> float:
-    """At least the probability that the correlation of noise with something else is of this size or larger."""
-    return max(1 - size**2, 0.0) ** ((count - 1) / 2)
+    """The probability that the correlation of noise with something else is of this size or larger."""
+    return float(special.betaincc(0.5, (count - 1) / 2, min(size**2, 1.0)))
 
 
 def of_starts(

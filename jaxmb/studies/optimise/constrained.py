@@ -1,16 +1,15 @@
-"""SciPy's methods for optimisation with constraints, SLSQP and trust-constr, on trials that may fail.
+"""Optimisation with constraints by SciPy's SLSQP, on trials that may fail.
 
-Where a trial fails, the objective is far above all others and everything else is as at the last good trial, so that
-both methods shorten the step: SLSQP its line search, trust-constr its trust region.
+Where a trial fails, the objective is far above all others and everything else is as at the last good trial, so that the
+line search shortens the step.
 """
 
 import dataclasses
-import importlib
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy import linalg, optimize
 
 from .trials import HOLDS, Trial, Trials, nearer
 
@@ -29,94 +28,19 @@ _LESS = 0.9
 # A gradient of unit length is a combination of others where no more than this is left of it.
 _DEPENDENT = 1e-8
 
-# The factor from run to run of the first barrier of trust-constr.
-_BARRIER = 1e-2
-# The least size of a side of a constraint for trust-constr, as a fraction of that of the other one.
-_LEAST_SIDE = 1e-6
-
 
 def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, str]:
-    """Sequential least squares programming."""
-    optimize = _scipy()
+    """Sequential least squares programming, again and again from its own result, with the objective in units of what is
+    left of it and of its gradient, until a run gains no more than the tolerance: SciPy's tolerances are absolute, and
+    its Hessians may mislead it.
 
-    def run(here, size, left, number):
-        del number
-        unit = _unit(trials, here, size, tol)
-        values, slopes, equal = _one_sided(trials, unit, trials.scales)
-        kept = _independent(slopes(here.z / unit), equal)
-        constraints = [
-            {"type": kind, "fun": lambda y, own=own: values(y)[own], "jac": lambda y, own=own: slopes(y)[own]}
-            for kind, own in (("eq", kept & equal), ("ineq", kept & ~equal))
-            if own.any()
-        ]
-        result = _quietly(
-            optimize.minimize,
-            lambda y: _value(trials, y * unit, size),
-            here.z / unit,
-            jac=lambda y: _good(trials, y * unit).jacobian[0] * unit / size,
-            method="SLSQP",
-            bounds=optimize.Bounds(*(side / unit for side in trials.box)),
-            constraints=constraints,
-            callback=lambda y: trials.record(y * unit),
-            options={"ftol": tol, "maxiter": left},
-        )
-        if result.status == 0:
-            trials.ended(result.x * unit)
-        return result.nit, result.status == 0, str(result.message)
-
-    return _repeated(run, trials, start, tol, limit)
-
-
-def trust_constr(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, str]:
-    """SciPy's trust-region interior point method, with quasi-Newton Hessians."""
-    optimize = _scipy()
-    # A side that is almost zero beside the other one would have slopes that SciPy's method cannot follow.
-    scales = np.maximum(trials.scales, _LEAST_SIDE * np.max(trials.scales, axis=0, initial=0.0))
-    values, slopes, equal = _one_sided(trials, 1.0, scales)
-
-    def ended(z, state):
-        """SciPy's own test disregards the barrier, which keeps the result off the bounds of constraints."""
-        trials.record(z)
-        return max(state.optimality, state.constr_violation, state.get("barrier_parameter", 0.0)) < tol
-
-    def run(here, size, left, number):
-        kept = _independent(slopes(here.z), equal)
-        constraints = []
-        if kept.any():
-            high = np.where(equal[kept], 0.0, np.inf)
-            functions = (lambda z: values(z)[kept], 0.0, high, lambda z: slopes(z)[kept])
-            constraints = [optimize.NonlinearConstraint(*functions, hess=optimize.BFGS())]
-        result = _quietly(
-            optimize.minimize,
-            lambda z: _value(trials, z, size),
-            here.z,
-            jac=lambda z: _good(trials, z).jacobian[0] / size,
-            hess=optimize.BFGS(),
-            method="trust-constr",
-            bounds=optimize.Bounds(*trials.box, keep_feasible=True),
-            constraints=constraints,
-            callback=ended,
-            options={"gtol": 0.0, "xtol": tol, "barrier_tol": tol, "maxiter": left}
-            | {name: max(_BARRIER**number, tol) for name in ("initial_barrier_parameter", "initial_barrier_tolerance")},
-        )
-        # The trust region may have become too small for steps as well; without a tolerance SciPy calls that 4.
-        well = result.status == 3 or (result.status in (2, 4) and result.constr_violation <= tol)
-        return result.nit, well, str(result.message)
-
-    return _repeated(run, trials, start, tol, limit)
-
-
-def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: Trial, tol: float, limit: int):
-    """Run a method from its own result, with the objective in units of what is left of it and of its gradient, until a
-    run gains no more than the tolerance: SciPy's tolerances are absolute, and its Hessians and barriers may mislead it.
-
-    A method that cannot go on starts anew at a point where constraints hold better, or a little aside.
+    Where it cannot go on it starts anew at a point where constraints hold better, or a little aside.
     """
     here, left, ended, message = start, limit, False, ""
     aside = list(_ASIDE)
-    for number in range(1, _RUNS + 1):
+    for _ in range(_RUNS):
         size = objective_size(here)
-        spent, well, how = run(here, size, left, number)
+        spent, well, how = _run(trials, here, size, tol, left)
         left -= max(spent, 1)
         new = trials.best
         gained = _nearer(trials, new, here) or (
@@ -139,6 +63,34 @@ def _repeated(run: Callable[..., tuple[int, bool, str]], trials: Trials, start: 
         if left <= 0:
             return False, "the iterations are used up"
     return ended, "converged" if ended else message
+
+
+def _run(trials: Trials, here: Trial, size: float, tol: float, left: int) -> tuple[int, bool, str]:
+    """One run, the objective in units of a size: the number of iterations, whether it converged, and SciPy's words."""
+    unit = _unit(trials, here, size, tol)
+    values, slopes, equal = _one_sided(trials, unit)
+    kept = _independent(slopes(here.z / unit), equal)
+    constraints = [
+        {"type": kind, "fun": lambda y, own=own: values(y)[own], "jac": lambda y, own=own: slopes(y)[own]}
+        for kind, own in (("eq", kept & equal), ("ineq", kept & ~equal))
+        if own.any()
+    ]
+    with warnings.catch_warnings():
+        # SciPy warns of functions that are linear, and of steps to a bound; the result says how it ended.
+        warnings.simplefilter("ignore")
+        result: Any = optimize.minimize(
+            lambda y: _value(trials, y * unit, size),
+            here.z / unit,
+            jac=lambda y: _good(trials, y * unit).jacobian[0] * unit / size,
+            method="SLSQP",
+            bounds=np.stack(trials.box, axis=1) / unit,
+            constraints=constraints,
+            callback=lambda y: trials.record(y * unit),
+            options={"ftol": tol, "maxiter": left},
+        )
+    if result.status == 0:
+        trials.ended(result.x * unit)
+    return result.nit, result.status == 0, str(result.message)
 
 
 def _nearer(trials: Trials, trial: Trial, other: Trial) -> bool:
@@ -182,40 +134,40 @@ def balance_at(trials: Trials, trial: Trial) -> Balance:
     found = np.zeros(0)
     # SciPy's solver crashes without unknowns.
     if inwards.size:
-        found = _scipy().nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
+        found = optimize.nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
     sides, bounds = np.zeros((2, low.size)), np.zeros((2, trial.z.size))
     ends = np.cumsum([below.sum(), above.sum(), at_low.sum()])
     sides[0, below], sides[1, above], bounds[0, at_low], bounds[1, at_high] = np.split(found, ends)
     return Balance(sides[0] - sides[1], below | above, bounds[0] - bounds[1], gradient - inwards.T @ found)
 
 
-def _one_sided(trials: Trials, unit: float, sizes: np.ndarray):
-    """The constraints as SciPy wants them, relative to sizes of their sides: functions of z in a unit, which are not
-    negative, or zero for equations; their derivatives; and which of them are equations.
+def _one_sided(trials: Trials, unit: float):
+    """The constraints as SciPy wants them, relative to the sizes of their sides: functions of z in a unit, which are
+    not negative, or zero for equations; their derivatives; and which of them are equations.
     """
     limits = trials.limits
     equal = limits.low == limits.high
     lower, upper = np.flatnonzero(np.isfinite(limits.low)), np.flatnonzero(np.isfinite(limits.high) & ~equal)
     which = 1 + np.concatenate([lower, upper])
     bounds = np.concatenate([limits.low[lower], limits.high[upper]])
-    scales = np.concatenate([sizes[0, lower], -sizes[1, upper]])
+    scales = np.concatenate([trials.scales[0, lower], -trials.scales[1, upper]])
     values = lambda y: (_good(trials, y * unit).rows[which] - bounds) / scales
     slopes = lambda y: _good(trials, y * unit).jacobian[which] / scales[:, None] * unit
     return values, slopes, np.concatenate([equal[lower], np.zeros(upper.size, bool)])
 
 
 def _independent(slopes: np.ndarray, equal: np.ndarray) -> np.ndarray:
-    """Constraints for SciPy's methods, which take any point for an optimum where gradients of equations are linearly
+    """Constraints for SciPy's method, which takes any point for an optimum where gradients of equations are linearly
     dependent, or where an inequality's gradient is a combination of them.
     """
-    linalg: Any = importlib.import_module("scipy.linalg")
     lengths = np.linalg.norm(slopes, axis=1)
     units = slopes / np.where(lengths > 0, lengths, 1.0)[:, None]
     equations = np.flatnonzero(equal & (lengths > 0))
     kept = lengths == 0
     if equations.size == 0:
         return np.ones(kept.size, bool)
-    basis, triangle, order = linalg.qr(units[equations].T, mode="economic", pivoting=True)
+    factors: Any = linalg.qr(units[equations].T, mode="economic", pivoting=True)
+    basis, triangle, order = factors
     rank = int(np.sum(np.abs(np.diag(triangle)) > _DEPENDENT))
     kept[equations[order[:rank]]] = True
     left = units - (units @ basis[:, :rank]) @ basis[:, :rank].T
@@ -250,18 +202,3 @@ def _value(trials: Trials, z: np.ndarray, size: float) -> float:
 def _good(trials: Trials, z: np.ndarray) -> Trial:
     trial = trials(z)
     return trial if trial.good else trials.good
-
-
-def _quietly(run: Callable[..., Any], *args: Any, **options: Any) -> Any:
-    with warnings.catch_warnings():
-        # SciPy warns of functions that are linear, and of steps to a bound; the result says how it ended.
-        warnings.simplefilter("ignore")
-        return run(*args, **options)
-
-
-def _scipy() -> Any:
-    try:
-        from scipy import optimize
-    except ImportError:
-        raise ImportError("This method is SciPy's: install it, or jaxmb[studies].") from None
-    return optimize

@@ -2,20 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from ..._arguments import bounds_of
 from ..._jaxpr_digest import Digest, digest_of
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 from ...system.quantities import component_names
 from ..batch import batch
-from ..ranges import FreeParameters
 from .space import Space
 
 # Reverse mode costs about as much as this many tangents in forward mode, for every row: a gradient some three to five
@@ -34,7 +34,7 @@ class Program(eqx.Module):
     """
 
     function: Callable[..., Any]
-    space: Space | FreeParameters
+    space: Space
     names: tuple[str, ...] = eqx.field(static=True)
     forward: bool = eqx.field(static=True)
 
@@ -87,7 +87,7 @@ class Told:
         return self.function(values)
 
 
-def told_apart(function: Callable[..., Any], space: Space | FreeParameters) -> Told:
+def told_apart(function: Callable[..., Any], space: Space) -> Told:
     """A function of named parameters as one that is told apart by what it computes now."""
     traced = jax.make_jaxpr(lambda z: function(space(z)))(jnp.zeros(space.size))
     return Told(function, digest_of(traced, rules=False))
@@ -165,14 +165,14 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
     for name, given in (constraints or {}).items():
         if name not in shapes:
             raise unknown("output", name, shapes)
-        sides = given if isinstance(given, tuple) else (given, given)
-        if len(sides) != 2 or all(side is None for side in sides):
+        # A list is an array that the output equals, but for a number, which has two bounds.
+        pair = isinstance(given, tuple) or (isinstance(given, list) and shapes[name] == ())
+        sides = given if pair else (given, given)
+        if all(side is None for side in sides):
             raise ValueError(
                 f"The constraint of {name!r} must be (low, high), one of them None at most; got {given!r}."
             )
-        low, high = (_side(name, side, shapes[name], e) for side, e in zip(sides, (-np.inf, np.inf), strict=True))
-        if np.any(low > high):
-            raise ValueError(f"The constraint of {name!r} must be (low, high) with low ≤ high, got {given!r}.")
+        low, high = bounds_of(f"The constraint of {name!r}", sides, shapes[name], equal=True)
         names.append(name)
         components += component_names(name, shapes[name])
         lows.append(low.ravel())
@@ -181,24 +181,14 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
     return Limits(tuple(names), tuple(components), flat(lows), flat(highs))
 
 
-def _side(name: str, side: ArrayLike | None, shape: tuple[int, ...], empty: float) -> np.ndarray:
-    value = np.asarray(empty if side is None else side, float)
-    if value.shape not in ((), shape) or np.any(np.isnan(value)):
-        raise ValueError(f"A bound of {name!r} must be a number, or an array of shape {shape}; got {side!r}.")
-    return np.broadcast_to(value, shape)
+def with_derivatives(program: Program, rows: int) -> Program:
+    """The program in the mode of derivatives that is cheaper, of those that the function allows.
 
-
-def with_derivatives(program: Program, derivatives: Literal["auto", "forward", "reverse"], rows: int) -> Program:
-    """The program in the mode that is asked for; with `"auto"`, in the cheaper one that the function allows.
-
-    **Raises:** `ValueError` where the function has no derivatives in that mode.
+    **Raises:** `ValueError` where the function has no derivatives.
     """
-    if derivatives not in ("auto", "forward", "reverse"):
-        raise ValueError(f"derivatives must be 'auto', 'forward' or 'reverse', got {derivatives!r}.")
     cheaper = program.space.size <= _TANGENTS_A_ROW * rows
-    modes = (cheaper, not cheaper) if derivatives == "auto" else (derivatives == "forward",)
     first: Exception | None = None
-    for forward in modes:
+    for forward in (cheaper, not cheaper):
         trial = Program(program.function, program.space, program.names, forward)
         try:
             eqx.filter_eval_shape(trial.linearised, jnp.zeros(program.space.size))
@@ -206,8 +196,7 @@ def with_derivatives(program: Program, derivatives: Literal["auto", "forward", "
             first = first or error
             continue
         return trial
-    which = "in either mode" if len(modes) == 2 else f"in {derivatives} mode"
     raise ValueError(
-        f"The function has no derivatives {which}. One with a jax.custom_vjp has none in forward mode, one with a loop "
-        "such as jax.lax.while_loop none in reverse mode, and a simulation with an adjoint those of that adjoint only."
+        "The function has no derivatives in either mode. One with a jax.custom_vjp has none in forward mode, one with "
+        "a loop such as jax.lax.while_loop none in reverse mode, and a simulation with an adjoint the mode of that."
     ) from first

@@ -1,13 +1,12 @@
 """The trials of an optimisation: each is evaluated once, and those that fail are told apart."""
 
 import dataclasses
-import importlib
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy import optimize
 
 from .evaluation import Limits, Program, linearised
 
@@ -57,11 +56,11 @@ class Trial:
 
 
 class Trials:
-    """Evaluates a program at vectors within a box, and keeps what it found."""
+    """Evaluates a program at vectors within the box of its space, and keeps what it found."""
 
-    def __init__(self, program: Program, limits: Limits, box: tuple[np.ndarray, np.ndarray], start: Trial):
-        self.program, self.limits, self.box = program, limits, box
-        self.start = self.good = self.best = self.last = start
+    def __init__(self, program: Program, limits: Limits, start: Trial):
+        self.program, self.limits, self.box = program, limits, program.space.box
+        self.start = self.good = self.best = start
         self.count = self.failed = 0
         self.scales = constraint_scales(limits, start)
         self.log: list[Iteration] = []
@@ -80,7 +79,6 @@ class Trials:
             self._kept[z.tobytes()] = trial
             if len(self._kept) > _KEPT:
                 self._kept.pop(next(iter(self._kept)))
-        self.last = trial
         if trial.good:
             self.good = trial
             self.best = min(self.best, trial, key=self.merit)
@@ -148,7 +146,6 @@ def nearer(trials: Trials, here: Trial, aside: float, most: int) -> Trial:
 
     **Arguments:** `aside`: how far from `here` to begin, in a random direction; `most`: largest number of trials.
     """
-    optimize: Any = importlib.import_module("scipy.optimize")
     limits = trials.limits
     step = aside * np.random.default_rng(0).uniform(-1.0, 1.0, here.z.size)
     low, high = trials.box
@@ -164,68 +161,7 @@ def nearer(trials: Trials, here: Trial, aside: float, most: int) -> Trial:
 
     excess = lambda z: limits.excess(trials(z).rows[1:], trials.scales)
     if excess(start.z).any():
-        found = optimize.least_squares(excess, start.z, slopes, bounds=trials.box, ftol=_STALLED, max_nfev=most)
+        options: dict[str, Any] = {"jac": slopes, "bounds": trials.box, "ftol": _STALLED, "max_nfev": most}
+        found = optimize.least_squares(excess, start.z, **options)
         start = trials(found.x)
     return start
-
-
-def first_feasible(
-    program: Program,
-    whole: Callable[[np.ndarray], Trial],
-    limits: Limits,
-    start: np.ndarray,
-    box: tuple[np.ndarray, np.ndarray],
-    most: int,
-) -> tuple[Trial | None, int]:
-    """From a start where the objective is NaN to a trial where everything is finite.
-
-    Gauss–Newton steps make the excess of those constraints small that have a value, such as a gap of assembly, and go
-    beyond their bounds by a part of the way, since at the bounds themselves a mechanism is singular.
-
-    **Arguments:** `program`: of the constraints that have a value at the start; `whole(z)`: a trial of everything;
-    `limits` of these constraints; `box`: bounds of z; `most`: largest number of trials.
-
-    **Returns:** the trial, or None; and the number of trials.
-    """
-    low, high = box
-    here = evaluate(program, start)
-    scales = constraint_scales(limits, Trial(here.z, np.append(0.0, here.rows), _padded(here.jacobian), {}))
-    beyond = np.zeros_like(start)
-    count = 1
-    while count < most:
-        excess = limits.excess(here.rows, scales)
-        violated = excess > 0
-        if not violated.any():
-            break
-        slope = np.where(here.rows < limits.low, -1 / scales[0], 1 / scales[1])[:, None] * here.jacobian
-        step = -np.linalg.lstsq(slope[violated], excess[violated], rcond=1e-8)[0]
-        # No step is longer than half the scale of a parameter.
-        step *= min(1.0, 0.5 / max(np.max(np.abs(step)), 1e-300))
-        length, moved = 1.0, None
-        while length > 1e-3 and count < most:
-            trial = evaluate(program, np.clip(here.z + length * step, low, high))
-            count += 1
-            smaller = np.linalg.norm(limits.excess(trial.rows, scales)) < (1 - 1e-3 * length) * np.linalg.norm(excess)
-            if trial.good and smaller:
-                moved = trial
-                break
-            length *= 0.5
-        if moved is None:
-            break
-        beyond = moved.z - here.z
-        here = moved
-        if np.max(limits.excess(here.rows, scales)) < 1e-2:
-            break
-    # The last steps, lengthened until the objective has a value.
-    way = here.z - start if np.any(here.z != start) else beyond
-    for share in (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8):
-        for direction in (beyond, way):
-            trial = whole(np.clip(here.z + share * direction, low, high))
-            count += 1
-            if trial.good:
-                return trial, count
-    return None, count
-
-
-def _padded(jacobian: np.ndarray) -> np.ndarray:
-    return np.vstack([np.zeros((1, jacobian.shape[1])), jacobian])

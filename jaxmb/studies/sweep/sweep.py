@@ -1,6 +1,7 @@
 """A function of named parameters over many cases."""
 
 import contextlib
+import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -31,7 +32,14 @@ _CHUNK, _OF_THREAD, _OF_ACCELERATOR = 512, 128, 8192
 _WORDS = {"jaxmb_version": "version of jaxmb", "jax_version": "version of JAX", "version": "argument version"}
 
 
-@names_arguments
+# Arguments of the last release, with the new way.
+_GONE = {
+    "budget": 'leave it out; jaxmb.setup(compile="for speed") computes members that do not wait for slow ones',
+    "devices": "give executor= an executor with one worker for each device",
+}
+
+
+@functools.partial(names_arguments, gone=_GONE)
 def sweep(
     function: Callable[..., Mapping[str, Any]],
     cases: Any,
