@@ -1,7 +1,9 @@
 """A spanning tree of a scene's joints, and the constraints that close loops."""
 
 import dataclasses
+import functools
 import itertools
+from collections.abc import Mapping
 from typing import Any
 from xml.etree import ElementTree
 
@@ -10,20 +12,31 @@ import numpy as np
 
 from .._types import Coordinates
 from ..bodies import RigidBodySystem
-from ..parts.base import GROUND, AbstractInertialConstraint
-from ..parts.coordinate_parts import turns
-from ..parts.spatial.composite import coordinate_names
+from ..parts.base import GROUND, AbstractConstraint, AbstractInertialConstraint
+from ..parts.combinations import JointCoupling
+from ..parts.coordinate_parts import JointDriver, turns
+from ..parts.spatial.axes import ElementaryJoint
 from ..parts.spatial.kinematics import SPACE
-from .description import rotation_of, turn_about, unused
+from .description import rotation_of, unused
 from .notes import Notes
 
 # What MuJoCo calls the fixed world.
 _WORLD = "world"
+# The methods by which a class says what its parts do.
+_LAWS = {"residual", "coordinates", "wrenches", "energy", "state_rates", "length", "force"}
 
 
 def numbers(values: Any) -> str:
     """Numbers as text, to the last digit."""
     return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def of_class(table: Mapping[type, Any], part: Any) -> Any:
+    """The entry of a table for the class of a part, or for the one that its laws are from; None without one."""
+    for cls in type(part).__mro__:
+        if cls in table or _LAWS & vars(cls).keys():
+            return table.get(cls)
+    return None
 
 
 @dataclasses.dataclass
@@ -33,13 +46,23 @@ class PlacedPart:
     """
 
     name: str
-    kind: str
     part: Any
     bodies: tuple[str, ...]
     poses: np.ndarray
     acts_on: tuple[str, ...]
     scalars: tuple[float, ...]
     names: set[str]
+
+    @property
+    def label(self) -> str:
+        """The type and name of the part, for messages."""
+        return f"{self.part.kind} {self.name!r}"
+
+    @functools.cached_property
+    def joints(self) -> list[ElementaryJoint] | None:
+        """The hinges, slides and balls in succession that the part is; None if it is no such joint."""
+        is_known = isinstance(self.part, AbstractConstraint) and self.part.declares("elementary_joints", "coordinates")
+        return self.part.elementary_joints(SPACE, self.poses) if is_known else None
 
     def named(self, word: str) -> str:
         """A name for an element of the file that the part needs."""
@@ -50,10 +73,6 @@ class PlacedPart:
         pose, point = self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])
         return pose[:3] + rotation_of(pose[3:7]) @ point
 
-    def direction(self, field: str, k: int = 0) -> np.ndarray:
-        """A direction of the part that is fixed in its k-th body, in the world."""
-        return rotation_of(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
-
     def is_periodic(self, k: int = 0) -> bool:
         """Whether the k-th coordinate that the part acts on is an angle known up to full turns."""
         return self.acts_on[k].partition(".")[2] in self.part.joints[str(k)].periodic
@@ -63,10 +82,6 @@ class PlacedPart:
         angle the one within half a turn of another.
         """
         return float(turns(jnp.asarray(value - about).reshape(()))) if self.is_periodic(k) else 0.0
-
-    def coordinates(self) -> dict[str, np.ndarray]:
-        found = self.part.coordinates(SPACE, jnp.asarray(self.poses))
-        return {name: np.asarray(value) for name, value in found.items()}
 
 
 @dataclasses.dataclass
@@ -135,9 +150,7 @@ def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPar
             )
             places = np.stack([tree.poses[body] for body in bodies])
             places = np.asarray(own.seen_poses(SPACE, places))
-            out.append(
-                PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k), values, tree.names)
-            )
+            out.append(PlacedPart(name, own, bodies, places, _acts_on(group.group, own, k), values, tree.names))
     return out
 
 
@@ -163,9 +176,9 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
         if not isinstance(p.part, AbstractInertialConstraint) and not notes.leaves_out("joints", p.name)
     ]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
-    waiting = [p for p in parts if p.kind in _JOINTS and all(rotates.get(body, True) for body in p.bodies)]
+    waiting = [p for p in parts if p.joints is not None and all(rotates.get(body, True) for body in p.bodies)]
     closing = [p for p in parts if p not in waiting]
-    waiting.sort(key=lambda part: part.kind in _CLOSING)
+    waiting.sort(key=lambda part: _closing(part) is not None)
     reached, left = {GROUND}, list(system.body_names)
     while left:
         part = next((p for p in waiting if len({*p.bodies} & reached) == 1), None)
@@ -184,9 +197,10 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
             if not notes.leaves_out("joints", name):
                 notes.refused.append(f"{velocity.group.part.kind} {name!r} cannot be expressed.")
     for part in (*waiting, *closing):
-        equalities = _CLOSING.get(part.kind, lambda *_: None)(part, tree)
+        close = _closing(part)
+        equalities = None if close is None else close(part, tree)
         if equalities is None:
-            notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed where it closes a loop.")
+            notes.refused.append(f"{part.label} cannot be expressed where it closes a loop.")
         else:
             tree.loops.append(LoopEqualities(part.name, equalities))
     return tree
@@ -217,102 +231,18 @@ def _free(body, tree, rotates):
 
 def _oriented(part, tree, child):
     """The joints of MuJoCo that a joint is, from the parent to the child."""
-    found = _JOINTS[part.kind](part)
-    for coordinate, joint in found:
-        tree.coordinates[coordinate] = joint
-    joints = [joint for _, joint in found]
+    joints = []
+    for own in part.joints:
+        name = part.name if len(part.joints) == 1 else part.named(own.name)
+        value = 0.0 if own.kind == "ball" else float(own.value)
+        joint = TreeJoint(name, own.kind, np.asarray(own.point), np.asarray(own.axis), value)
+        tree.coordinates[f"{part.name}.{own.name}"] = joint
+        joints.append(joint)
     if child == part.bodies[0]:
         for joint in joints:
             joint.axis = -joint.axis
         joints.reverse()
     return joints
-
-
-def _hinges(part, **axes):
-    """Joints by the names of their coordinates, each with its type and its axis in the world."""
-    values, out = part.coordinates(), []
-    for field, (kind, axis) in axes.items():
-        name = part.name if len(axes) == 1 else part.named(field)
-        joint = TreeJoint(name, kind, part.point(1), axis, float(values[field].reshape(-1)[0]))
-        out.append((f"{part.name}.{field}", joint))
-    return out
-
-
-# The types of the joints that a part has about axes of its own, by the names of its coordinates, each with the axis and
-# the number of the body that this is fixed in.
-_OWN_AXES = {
-    "Revolute": {"angle": ("hinge", "axis_a", 0)},
-    "Prismatic": {"displacement": ("slide", "axis_a", 0)},
-    "Cylindrical": {"displacement": ("slide", "axis_a", 0), "angle": ("hinge", "axis_a", 0)},
-    "Universal": {"angle_a": ("hinge", "axis_a", 0), "angle_b": ("hinge", "axis_b", 1)},
-}
-
-
-def _about_own_axes(part):
-    return _hinges(part, **{name: (kind, part.direction(*at)) for name, (kind, *at) in _OWN_AXES[part.kind].items()})
-
-
-def _gimbal(part):
-    own = part.part
-    values = part.coordinates()
-    first, second = np.asarray(own.axis_1), np.asarray(own.axis_2)
-    to_world, angle = rotation_of(part.poses[0][3:7]), float(values["angle_1"])
-    axis_2 = np.cos(angle) * second + np.sin(angle) * np.cross(first, second)
-    back = rotation_of(np.asarray(own.orientation)).T @ np.asarray(own.axis_3)
-    return _hinges(
-        part,
-        angle_1=("hinge", to_world @ first),
-        angle_2=("hinge", to_world @ axis_2),
-        angle_3=("hinge", rotation_of(part.poses[1][3:7]) @ back),
-    )
-
-
-def _composite(part):
-    """From the first joint on, which is fixed in A, each where the coordinates of those before it put it."""
-    own, values, out = part.part, part.coordinates(), []
-    start = np.asarray(own.point_a)
-    points = itertools.repeat(start) if own.points is None else iter(np.asarray(own.points))
-    place, turn = part.poses[0][:3], rotation_of(part.poses[0][3:7])
-    for word, axis, field in zip(own.sequence, np.asarray(own.axes), coordinate_names(own.sequence), strict=True):
-        value, point = values[field], next(points) if word == "hinge" else start
-        joint = TreeJoint(part.named(field), word, place + turn @ point, turn @ axis)
-        if word == "ball":
-            size = float(np.linalg.norm(value))
-            axis, angle = (value / size, size) if size > 0 else (axis, 0.0)
-        else:
-            joint.value = angle = float(value)
-        if word == "slide":
-            place = place + turn @ (joint.value * axis)
-        else:
-            own_turn = turn_about(axis, angle)
-            place, turn = place + turn @ (point - own_turn @ point), turn @ own_turn
-        out.append((f"{part.name}.{field}", joint))
-    return out
-
-
-def _spherical(part):
-    return [(f"{part.name}.rotation", TreeJoint(part.name, "ball", part.point(1), np.zeros(3)))]
-
-
-def _planar(part):
-    axis, x = part.direction("axis_a"), part.direction("x_a")
-    values = part.coordinates()
-    ways = zip("xy", (x, np.cross(axis, x)), values["displacement"], strict=True)
-    slides = [TreeJoint(part.named(w), "slide", part.point(1), a, float(v)) for w, a, v in ways]
-    hinge = TreeJoint(part.named("angle"), "hinge", part.point(1), axis, float(values["angle"]))
-    # Nothing acts on one of the two displacements.
-    own = {f"{part.name}.displacement {way}": slide for way, slide in zip("xy", slides, strict=True)}
-    return [*own.items(), (f"{part.name}.angle", hinge)]
-
-
-_JOINTS = {
-    **dict.fromkeys(_OWN_AXES, _about_own_axes),
-    "Gimbal": _gimbal,
-    "Composite": _composite,
-    "Spherical": _spherical,
-    "Planar": _planar,
-    "Fixed": lambda part: [],
-}
 
 
 # Loops
@@ -332,18 +262,18 @@ def _connect(part, tree, name, point):
     return "connect", {"name": name, **bodies, "anchor": numbers(anchor)}
 
 
-def _close_spherical(part, tree):
+def _close_ball(part, tree):
     return [_connect(part, tree, part.name, part.point(1))]
 
 
-def _close_revolute(part, tree):
+def _close_hinge(part, tree):
     """Two points of the axis coincide."""
-    point = part.point(1)
-    second = point + part.direction("axis_a")
+    (hinge,) = part.joints
+    point, second = np.asarray(hinge.point), np.asarray(hinge.point + hinge.axis)
     return [_connect(part, tree, part.name, point), _connect(part, tree, part.named("axis"), second)]
 
 
-def _close_fixed(part, tree):
+def _close_weld(part, tree):
     bodies, _ = _ends(part, tree)
     return [("weld", {"name": part.name, **bodies})]
 
@@ -374,10 +304,13 @@ def _close_driver(part, tree):
     return [("joint", {"name": part.name, "joint1": joint.name, "polycoef": numbers(constant)})]
 
 
-_CLOSING = {
-    "Spherical": _close_spherical,
-    "Revolute": _close_revolute,
-    "Fixed": _close_fixed,
-    "JointCoupling": _close_coupling,
-    "JointDriver": _close_driver,
-}
+# How loops are closed, by the kinds of the joints in succession, and by the classes of parts on their coordinates.
+_CLOSING_JOINTS = {("ball",): _close_ball, ("hinge",): _close_hinge, (): _close_weld}
+_CLOSING_PARTS = {JointCoupling: _close_coupling, JointDriver: _close_driver}
+
+
+def _closing(part):
+    """What writes a part as equality constraints; None if there is nothing."""
+    if part.joints is None:
+        return of_class(_CLOSING_PARTS, part.part)
+    return _CLOSING_JOINTS.get(tuple(joint.kind for joint in part.joints))

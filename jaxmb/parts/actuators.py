@@ -40,18 +40,12 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     """
 
     mode: Literal["force", "speed", "position"] = fields.choice("force", "speed", "position", default="force")
-    command: fields.Number = fields.parameter(shape=None, unit="N m, rad/s, rad or N, m/s, m")
+    command: fields.Number = fields.parameter(shape=None)
     lag: fields.Number = fields.parameter(unit="s", sign="positive")
     gain: fields.Number = fields.parameter(sign="non-negative", optional=True)
-    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
-    limit: fields.Number = fields.parameter(unit="N m or N", sign="positive", optional=True)
-    force: fields.Number = fields.internal_state(shape=None, unit="N m or N")
-
-    def unit(self, field, alternatives):
-        known = super().unit(field, alternatives)
-        if known is None or field != "command":
-            return known
-        return known.split(", ")[("force", "speed", "position").index(self.mode)]
+    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
+    limit: fields.Number = fields.parameter(unit=("N m", "N"), sign="positive", optional=True)
+    force: fields.Number = fields.internal_state(shape=None, unit=("N m", "N"))
 
     def validate(self):
         if self.mode == "force" and (np.any(self.gain) or np.any(self.damping)):
@@ -116,7 +110,7 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     gear: fields.Number = fields.parameter(unit="1", default=1.0)
     gain: fields.Number = fields.parameter(shape=(3,), default=(1.0, 0.0, 0.0))
     bias: fields.Number = fields.parameter(shape=(3,), default=(0.0, 0.0, 0.0))
-    middle: fields.Number = fields.parameter(unit="rad or m", default=0.0)
+    middle: fields.Number = fields.parameter(unit=("rad", "m"), default=0.0)
     control_range: fields.Number = fields.parameter(shape=(2,), optional=True)
     force_range: fields.Number = fields.parameter(shape=(2,), optional=True)
     lag: fields.Number = fields.parameter(unit="s", sign="positive", optional=True)

@@ -43,6 +43,8 @@ GROUND = "ground"
 
 # How a picture draws the line of a part.
 PathKind = Literal["rod", "coil", "belt"]
+# What coordinates are, by their names: an angle [rad], a rotation vector [rad] or a length [m].
+Quantities = Mapping[str, Literal["angle", "rotation", "length"]]
 
 
 class ScalarCoordinate(NamedTuple):
@@ -117,9 +119,11 @@ class AbstractPart(eqx.Module):
         """Hook: whether the numbers are as `validate` asks, which it cannot tell of those that are traced."""
         return True
 
-    def unit(self, field: str, alternatives: str) -> str | None:
-        """Hook: of the units that a number is declared with, `"N m or N"`, the one that it has; None if not known."""
-        del field, alternatives
+    def is_of_length(self, field: str) -> Any:
+        """Hook: of a number with a unit for an angle and one for a length, whether it has the second one, or which of
+        its components have; None if it is not known.
+        """
+        del field
 
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
@@ -290,10 +294,19 @@ class AbstractLink(AbstractActor):
     several_from: ClassVar[int | None] = None
     # Whether it has a function of time, in which steps look for pulses, by `given_in_time`.
     of_time: ClassVar[bool] = False
-    # Names of the coordinates that are angles.
-    angles: ClassVar[frozenset[str]] = frozenset()
+    # What its coordinates are; not known without an entry.
+    quantities: ClassVar[Quantities] = {}
     # Names of the coordinates that measure how the bodies slide over each other, where they do in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
+
+    def is_length(self, coordinate: str) -> bool | None:
+        """Whether a coordinate is a length, otherwise an angle; None if it is not known."""
+        return None if coordinate not in self.quantities else self.quantities[coordinate] == "length"
+
+    @property
+    def angles(self) -> frozenset[str]:
+        """Names of the coordinates that are angles."""
+        return frozenset(name for name, quantity in self.quantities.items() if quantity == "angle")
 
     @property
     def periodic(self) -> frozenset[str]:
@@ -425,11 +438,18 @@ class AbstractConstraint(AbstractLink):
         """
         return None
 
+    def elementary_joints(self, space: AbstractSpace, poses: Poses) -> Any:
+        """Hook: the hinges, slides and balls in succession, from `body_a` to `body_b`, that a spatial joint is: an
+        `ElementaryJoint` for each of its coordinates at these poses. None for a joint that is no such succession.
+        """
+        del space, poses
+        return None
+
     @classmethod
-    def declares_elements(cls) -> bool:
-        """Whether the class declares `elements`, and has no `residual` of its own that is newer than these."""
+    def declares(cls, hook: str, *laws: str) -> bool:
+        """Whether the class defines a hook, and neither its `residual` nor other laws of the hook are newer."""
         where = lambda name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind))
-        return cls.elements is not AbstractConstraint.elements and where("elements") <= where("residual")
+        return all(where(hook) <= where(law) for law in ("residual", *laws))
 
 
 class AbstractInertialConstraint(AbstractConstraint):
@@ -460,6 +480,7 @@ class AbstractTendon(AbstractLink):
     """
 
     rheonomic: ClassVar[bool] = False
+    quantities: ClassVar[Quantities] = {"length": "length"}
 
     @property
     def rows(self) -> int:

@@ -14,7 +14,7 @@ from .._types import VectorLike
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
-from .coordinate_parts import AbstractOfJoints, is_length, shortest, turns, unit_of
+from .coordinate_parts import AbstractOfJoints, shortest, turns
 
 # Points of a tendon coincide if they are no farther apart than this share of its length.
 _APART = 1e-9
@@ -50,8 +50,13 @@ class AbstractCombination(AbstractOfJoints):
             given.append(float(value.reshape(())))
         return self.with_given(np.array(given))
 
-    def unit(self, field, alternatives):
-        return unit_of(self.within, alternatives)
+    def is_of_length(self, field):
+        return self._are_lengths(range(len(self.within)))
+
+    def _are_lengths(self, numbers):
+        """Which of the coordinates with these numbers are lengths; None if it is not known."""
+        known = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
+        return None if None in known else np.array(known if len(known) > 1 else known[0])
 
     def with_given(self, given: np.ndarray) -> Any:
         """Hook: a checked copy with omitted numbers filled in, from the coordinates at the given poses."""
@@ -90,8 +95,8 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
     coordinate: str = fields.name()
     other: fields.Names = fields.names()
     coefficients: fields.Number = fields.parameter(shape=None)
-    zero: fields.Number = fields.parameter(unit="rad or m", optional=True)
-    other_zero: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    zero: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
+    other_zero: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -111,8 +116,8 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
         if twice:
             raise ValueError(f"{self.label} couples {twice[0]!r} with itself.")
 
-    def unit(self, field, alternatives):
-        return unit_of(self.within[:1] if field == "zero" else self.within[1:], alternatives)
+    def is_of_length(self, field):
+        return self._are_lengths([0] if field == "zero" else range(1, len(self.within)))
 
     def with_given(self, given):
         return self.filled(zero=given[0], other_zero=given[1] if len(given) == 2 else given[1:])
@@ -153,7 +158,7 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
     """
 
     coordinate: str = fields.name()
-    inertia: fields.Number = fields.parameter(unit="kg m² or kg", sign="positive", constant=True)
+    inertia: fields.Number = fields.parameter(unit=("kg m²", "kg"), sign="positive", constant=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -162,10 +167,16 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
         return (self.coordinate,)
 
     def scalar_coordinates(self, space, parts):
-        del space, parts
-        length = is_length(self.coordinate.partition(".")[2])
-        name = f"{self.name}.{'displacement' if length else 'angle'}"
-        return (ScalarCoordinate(name, is_length=length, moves=True),)
+        del space
+        joint, _, within = self.coordinate.partition(".")
+        is_length = joint in parts and bool(parts[joint].is_length(within))
+        name = f"{self.name}.{'displacement' if is_length else 'angle'}"
+        return (ScalarCoordinate(name, is_length=is_length, moves=True),)
+
+    def with_given(self, given):
+        del given
+        self.source_is_length(0, self.within[0])
+        return self
 
     def residual(self, space, poses, t):
         (value,) = self.values(space, poses[:-1])
@@ -195,7 +206,7 @@ class FixedTendon(AbstractCombination, AbstractTendon):
 
     along: fields.Names = fields.names()
     stage: ClassVar[int] = 1
-    coefficients: fields.Number = fields.parameter(shape=None, unit="m/rad or 1")
+    coefficients: fields.Number = fields.parameter(shape=None, unit=("m/rad", "1"))
 
     @property
     def combined(self):

@@ -92,8 +92,8 @@ class Bekker(AbstractNormalLaw):
     `width` b [m], the smaller side of the contact patch; `area` [m²] of the patch.
     """
 
-    cohesive_modulus: fields.Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
-    frictional_modulus: fields.Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
+    cohesive_modulus: fields.Number = fields.parameter(sign="non-negative")
+    frictional_modulus: fields.Number = fields.parameter(sign="non-negative")
     exponent: fields.Number = fields.parameter(unit="1", sign="positive")
     width: fields.Number = fields.parameter(unit="m", sign="positive")
     area: fields.Number = fields.parameter(unit="m²", sign="positive")

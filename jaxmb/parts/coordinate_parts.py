@@ -63,6 +63,19 @@ class AbstractOfJoints(AbstractLink):
         held = {str(k): part for k, part in enumerate(parts) if part is not None}
         return self.with_fields(joints=held, places=tuple(places))
 
+    def source_is_length(self, k: int, within: str) -> bool:
+        """Whether a coordinate of a source is a length, otherwise an angle.
+
+        **Raises:** `ValueError` if its class does not say so.
+        """
+        joint = self.joints[str(k)]
+        if (known := joint.is_length(within)) is None:
+            raise ValueError(
+                f"{self.label}: {joint.label} does not say whether its coordinate {within!r} is an angle or a length; "
+                f"declare quantities = {{{within!r}: 'angle'}} or 'length' in the class {joint.kind}."
+            )
+        return known
+
     def coordinates_of(self, k: int, space, poses) -> dict[str, Array]:
         """The coordinates of a source, by their names within it."""
         at = self.places[k]
@@ -110,8 +123,8 @@ class AbstractCoordinatePart(AbstractOfJoints):
     def complete(self, space, poses):
         return self.with_numbers(self.given_coordinate(0, self.coordinate, space, poses))
 
-    def unit(self, field, alternatives):
-        return unit_of([self.within], alternatives)
+    def is_of_length(self, field):
+        return self.joint.is_length(self.within)
 
     @abc.abstractmethod
     def with_numbers(self, given: np.ndarray) -> Any:
@@ -157,20 +170,6 @@ class AbstractCoordinatePart(AbstractOfJoints):
             )
 
 
-def is_length(within: str) -> bool:
-    """Whether the coordinate of this name within its joint is a length, otherwise an angle."""
-    return within.startswith(("displacement", "length", "gap"))
-
-
-def unit_of(coordinates: Sequence[str], alternatives: str) -> str | None:
-    """Of the units for an angle and for a displacement, `"N m or N"`, the one for coordinates with these names in
-    their joints; None if some are angles and others are displacements.
-    """
-    kinds = {is_length(name) for name in coordinates}
-    of_angle, _, of_displacement = alternatives.partition(" or ")
-    return None if len(kinds) > 1 else of_displacement if kinds.pop() else of_angle
-
-
 def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The angle [rad] less full turns, in [−π, π]."""
     return angle - turns(angle)
@@ -195,10 +194,10 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
     angle stays, it takes the way within half a turn of that.
     """
 
-    stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
-    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
-    free: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
-    middle: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
+    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
+    free: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
+    middle: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
 
     def with_numbers(self, given):
         part = self.filled(free=given)
@@ -234,7 +233,7 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
     function of time.
     """
 
-    force: fields.Number = fields.parameter(shape=None, unit="N m or N")
+    force: fields.Number = fields.parameter(shape=None, unit=("N m", "N"))
 
     def with_numbers(self, given):
         self._check_shape("force", given)
@@ -258,8 +257,8 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
     function of time.
     """
 
-    value: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
-    rate: fields.Number = fields.parameter(shape=None, unit="rad/s or m/s", optional=True)
+    value: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
+    rate: fields.Number = fields.parameter(shape=None, unit=("rad/s", "m/s"), optional=True)
     rows: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
     rheonomic: ClassVar[bool] = True
 
@@ -298,11 +297,11 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     angle must be less than a full turn.
     """
 
-    lower: fields.Number = fields.parameter(unit="rad or m")
-    upper: fields.Number = fields.parameter(unit="rad or m")
-    stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
-    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
-    smoothing: fields.Number = fields.parameter(unit="rad or m", sign="positive", default=1e-3)
+    lower: fields.Number = fields.parameter(unit=("rad", "m"))
+    upper: fields.Number = fields.parameter(unit=("rad", "m"))
+    stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
+    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
+    smoothing: fields.Number = fields.parameter(unit=("rad", "m"), sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("lower", "upper")
     has_gaps: ClassVar[bool] = True
 
@@ -362,8 +361,8 @@ class JointFriction(AbstractScalarPart, AbstractForce):
     below which friction is viscous.
     """
 
-    force: fields.Number = fields.parameter(unit="N m or N", sign="non-negative")
-    transition_speed: fields.Number = fields.parameter(unit="rad/s or m/s", sign="positive", default=1e-2)
+    force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative")
+    transition_speed: fields.Number = fields.parameter(unit=("rad/s", "m/s"), sign="positive", default=1e-2)
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.force * jnp.tanh(v / self.transition_speed)

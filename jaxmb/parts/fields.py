@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 from .._compat import default_float, is_weakly_typed, with_values
 from ..linalg.arrays import is_traced
 from .module_weights import ModuleWeights, as_weights
+from .units import Unit, power_of_length
 
 # Types of fields. A number may be given as any array-like value and is stored as an array; type checkers do not see the
 # converters of these helpers.
@@ -56,7 +57,7 @@ class Declaration:
         another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
         `"internal"` for an internal state (`"internals"` for a dictionary of them); these are not parameters.
     - `shape`: of a number, None for any, and None in it for any size; `sign`; `unit`, `"1"` for a number without one,
-        `""` where it is not known, and `"N m or N"` where it is the first for an angle, the second for a displacement.
+        None where it is not known, and `("N m", "N")` where it is the first for an angle, the second for a length.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters; of
         several points or unit vectors each row is one.
@@ -72,7 +73,7 @@ class Declaration:
     kind: str
     shape: tuple[Size, ...] | None = None
     sign: Sign | None = None
-    unit: str = ""
+    unit: Unit = None
     body: int | None = None
     is_point: bool = False
     is_direction: bool = False
@@ -85,6 +86,10 @@ class Declaration:
     of: Any = None
     what: str = ""
     constant: bool = False
+
+    def __post_init__(self):
+        for unit in (self.unit,) if isinstance(self.unit, str) else self.unit or ():
+            power_of_length(unit)
 
     @property
     def is_number(self) -> bool:
@@ -248,7 +253,7 @@ def function(*, default: Any = dataclasses.MISSING, kw_only: bool = False) -> An
 def parameter(
     *,
     shape: tuple[Size, ...] | None = (),
-    unit: str = "",
+    unit: Unit = None,
     sign: Sign | None = None,
     default: Any = dataclasses.MISSING,
     optional: bool = False,
@@ -263,11 +268,18 @@ def parameter(
     stiffness: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N/m", sign="positive")
     ```
 
-    **Arguments:** `shape`, in which `"d"` is the dimension of the space and None any size, None for any; `unit`, `"1"`
-    of a number without one, which `report.stress_test` needs to know of lengths; `sign` of every component:
-    `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`; `optional`: default
-    None, which the part's `complete` replaces; `sizes`: whether the scene's size is computed from this length;
-    `converter`, applied before the checks; `constant`: whether it cannot be a function of time.
+    **Arguments:**
+
+    - `shape`, in which `"d"` is the dimension of the space and None any size, None for any.
+    - `unit`: a product of powers of SI units, `"1"` of a number without one; of a number that belongs to a coordinate
+        the unit for an angle and for a length, `("N m/rad", "N/m")`; None, the default, where it is not known, so that
+        `report.stress_test` cannot scale lengths.
+    - `sign` of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix.
+    - `default`; `optional`: default None, which the part's `complete` replaces.
+    - `sizes`: whether the scene's size is computed from this length; `constant`: whether it cannot be a function of
+        time; `converter`, applied before the checks.
+
+    **Raises:** `ValueError` for a unit that cannot be read.
     """
     declaration = Declaration(
         "number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes, constant=constant
@@ -374,7 +386,7 @@ def attitude(*, default: Any = dataclasses.MISSING, optional: bool = False, stat
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
 
 
-def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
+def guess(*, shape: tuple[Size, ...] = (), unit: Unit, default: Any) -> Any:
     """A number of a body's initial guess, which `assemble` improves; not a parameter.
 
     ```python
@@ -385,7 +397,7 @@ def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
 
 
 def internal_state(
-    *, shape: tuple[Size, ...] | None = (), unit: str = "", default: Any = 0.0, optional: bool = False
+    *, shape: tuple[Size, ...] | None = (), unit: Unit = None, default: Any = 0.0, optional: bool = False
 ) -> Any:
     """An internal state, a number that changes by an equation of first order; see `AbstractDynamicForce`.
 

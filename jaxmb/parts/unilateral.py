@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate, Velocities
+from .base import AbstractInertialConstraint, AbstractPair, Poses, Quantities, ScalarCoordinate, Velocities
 from .coordinate_parts import AbstractScalarPart
 from .forces import over_ground
 from .modes import CLOSED, kind_of
@@ -96,8 +96,8 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
     has both ends. `JointStop` is a compliant one.
     """
 
-    lower: fields.Number = fields.parameter(unit="rad or m", optional=True)
-    upper: fields.Number = fields.parameter(unit="rad or m", optional=True)
+    lower: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
+    upper: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
 
     def validate(self):
         super().validate()
@@ -140,6 +140,8 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
 
 class AbstractGeometricContact(AbstractUnilateralConstraint):
     """A unilateral constraint of lengths; its coordinate is the `gap` [m], `"floor.gap"`."""
+
+    quantities: ClassVar[Quantities] = {"gap": "length"}
 
     def coordinates(self, space, poses):
         return {"gap": self.gap(space, poses[:-1])}

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .. import fields
 from ..base import AbstractForce, AbstractPair, AbstractPlanarPart, AbstractPotentialForce
@@ -82,7 +83,7 @@ class BumpStop(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     [rad] > 0.
     """
 
-    stiffness: fields.Number = fields.parameter(unit="N m/rad^exponent", sign="non-negative")
+    stiffness: fields.Number = fields.parameter(sign="non-negative")
     lower: fields.Number = fields.parameter(unit="rad")
     upper: fields.Number = fields.parameter(unit="rad")
     exponent: fields.Number = fields.parameter(unit="1", sign="positive", default=3.0)
@@ -133,9 +134,9 @@ class Bushing(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     points as in `Revolute`; `free_angle` [rad], default that of the given poses.
     """
 
-    stiffness: fields.Number = fields.parameter(shape=(3,), unit="N/m, N m/rad", sign="non-negative")
+    stiffness: fields.Number = fields.parameter(shape=(3,), unit=("N m/rad", "N/m"), sign="non-negative")
     damping: fields.Number = fields.parameter(
-        shape=(3,), unit="N s/m, N m s/rad", sign="non-negative", default=(0.0, 0.0, 0.0)
+        shape=(3,), unit=("N m s/rad", "N s/m"), sign="non-negative", default=(0.0, 0.0, 0.0)
     )
     point_a: fields.Number = fields.point(body=0, optional=True)
     point_b: fields.Number = fields.point(body=1, optional=True)
@@ -144,6 +145,9 @@ class Bushing(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
 
     def complete(self, space, poses):
         return self.filled(free_angle=relative_angle(poses))
+
+    def is_of_length(self, field):
+        return np.arange(len(self.stiffness)) < self.dimensions[0]
 
     def _motions(self, space, poses):
         shift = space.body_point(poses[0], space.point(poses[1], self.point_b)) - self.point_a

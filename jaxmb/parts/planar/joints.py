@@ -20,7 +20,7 @@ from ..._types import Scalar
 from ...linalg.arrays import namespace
 from ...linalg.rotations import norm, rotate_2d
 from .. import fields
-from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractPlanarPart
+from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractPlanarPart, Quantities
 from ..elements import apart, coincident, in_planes, perpendicular
 from ..shapes import pin, sleeve, wheel
 from ..space import both_points, nearest_to_origin, separation
@@ -51,7 +51,7 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
     """
 
     rows: ClassVar[int] = 2
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"angle": "angle"}
 
     @property
     def elements(self):
@@ -129,7 +129,7 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"displacement": "length", "angle": "angle"}
 
     @property
     def elements(self):
@@ -178,6 +178,7 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     angle: fields.Number = fields.parameter(unit="rad", optional=True)
     rows: ClassVar[int] = 2
+    quantities: ClassVar[Quantities] = {"displacement": "length"}
 
     def complete(self, space, poses):
         return self.filled(angle=relative_angle(poses))
@@ -295,7 +296,7 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0))
     parameters: fields.Numbers = fields.numbers()
     rows: ClassVar[int] = 1
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"angle": "angle"}
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):

@@ -3,6 +3,7 @@
 from typing import Literal
 
 import jax.numpy as jnp
+import numpy as np
 
 from .. import fields
 from ..base import AbstractForce, AbstractPair, AbstractPotentialForce, AbstractSpatialPart
@@ -118,9 +119,9 @@ class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
     the given poses.
     """
 
-    stiffness: fields.Number = fields.parameter(shape=(6,), unit="N/m (3), N m/rad (3)", sign="non-negative")
+    stiffness: fields.Number = fields.parameter(shape=(6,), unit=("N m/rad", "N/m"), sign="non-negative")
     damping: fields.Number = fields.parameter(
-        shape=(6,), unit="N s/m (3), N m s/rad (3)", sign="non-negative", default=(0.0,) * 6
+        shape=(6,), unit=("N m s/rad", "N s/m"), sign="non-negative", default=(0.0,) * 6
     )
     point_a: fields.Number = fields.point(body=0, optional=True)
     point_b: fields.Number = fields.point(body=1, optional=True)
@@ -129,6 +130,9 @@ class Bushing(AbstractSpatialPart, AbstractPair, AbstractPotentialForce):
 
     def complete(self, space, poses):
         return with_given_orientation(self, poses)
+
+    def is_of_length(self, field):
+        return np.arange(len(self.stiffness)) < self.dimensions[0]
 
     def _motions(self, space, poses):
         return jnp.concatenate([offset_in_a(space, self, poses), rotation_error(self, poses)])

@@ -20,9 +20,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import conjugate, cross, dot, multiply, rotate, unrotate
+from ...linalg.rotations import conjugate, cross, dot, from_axis_angle, multiply, rotate, unrotate
 from .. import fields
-from ..base import AbstractJoint, AbstractSpatialPart
+from ..base import AbstractJoint, AbstractSpatialPart, Quantities
 from ..elements import coincident, in_planes, perpendicular
 from ..shapes import ball, pin, sleeve
 from ..space import both_points, nearest_to_origin, separation
@@ -34,6 +34,7 @@ from .axes import (
     direction_in_a,
     displacement_along,
     half_sine,
+    joints_through_b,
     measured_from_given_poses,
     offset_in_a,
     parallel,
@@ -84,6 +85,7 @@ class Spherical(AbstractOriented):
     """
 
     rows: ClassVar[int] = 3
+    quantities: ClassVar[Quantities] = {"rotation": "rotation"}
 
     @property
     def elements(self):
@@ -94,6 +96,9 @@ class Spherical(AbstractOriented):
 
     def coordinates(self, space, poses):
         return {"rotation": rotation_vector(self, poses)}
+
+    def elementary_joints(self, space, poses):
+        return joints_through_b(space, self, poses, rotation=np.zeros(3))
 
     def shapes(self, space, size):
         return ((0, ball(self.point_a, size)),)
@@ -107,7 +112,7 @@ class AbstractAxial(AbstractSpatialPart, AbstractJoint):
     axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"angle": "angle"}
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)
@@ -151,6 +156,9 @@ class Revolute(AbstractAxial):
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses)}
 
+    def elementary_joints(self, space, poses):
+        return joints_through_b(space, self, poses, angle=space.direction(poses[0], self.axis_a))
+
     def shapes(self, space, size):
         return ((0, pin(self.point_a, size, self.axis_a)),)
 
@@ -189,7 +197,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
-    angles: ClassVar[frozenset[str]] = frozenset({"angle_a", "angle_b"})
+    quantities: ClassVar[Quantities] = {"angle_a": "angle", "angle_b": "angle"}
 
     def validate(self):
         if self.axis_a_W is not None and self.axis_b_W is not None:
@@ -219,6 +227,10 @@ class Universal(AbstractSpatialPart, AbstractJoint):
             "angle_a": turn_about(self.axis_a, self.x_a, arm_b),
             "angle_b": -turn_about(self.axis_b, self.x_b, arm_a),
         }
+
+    def elementary_joints(self, space, poses):
+        first, last = space.direction(poses[0], self.axis_a), space.direction(poses[1], self.axis_b)
+        return joints_through_b(space, self, poses, angle_a=first, angle_b=last)
 
     def shapes(self, space, size):
         return (0, pin(self.point_a, size, self.axis_a)), (1, pin(self.point_b, size, self.axis_b))
@@ -257,7 +269,7 @@ class Gimbal(AbstractOriented):
     axis_2_W: fields.Number = fields.axis(body=None, gives=("axis_2",))
     axis_3_W: fields.Number = fields.axis(body=None, gives=("axis_3",))
     rows: ClassVar[int] = 3
-    angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
+    quantities: ClassVar[Quantities] = {"angle_1": "angle", "angle_2": "angle", "angle_3": "angle"}
 
     def complete(self, space, poses):
         triad = np.stack([self.axis_1, self.axis_2, self.axis_3])
@@ -286,9 +298,21 @@ class Gimbal(AbstractOriented):
             "angle_3": jnp.arctan2(-hand * c[0, 1], c[0, 0]),
         }
 
+    def elementary_joints(self, space, poses):
+        first = from_axis_angle(self.axis_1, self.coordinates(space, jnp.asarray(poses))["angle_1"])
+        axes = (
+            self.axis_1,
+            rotate(first, self.axis_2),
+            direction_in_a(space, poses, unrotate(self.orientation, self.axis_3)),
+        )
+        own = {f"angle_{k}": space.direction(poses[0], axis) for k, axis in enumerate(axes, 1)}
+        return joints_through_b(space, self, poses, **own)
+
 
 class AbstractSliding(AbstractAxial):
     """A joint whose two axes stay on one line, along which one body also slides."""
+
+    quantities: ClassVar[Quantities] = {"angle": "angle", "displacement": "length"}
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
@@ -339,6 +363,10 @@ class Cylindrical(AbstractSliding):
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
+
+    def elementary_joints(self, space, poses):
+        axis = space.direction(poses[0], self.axis_a)
+        return joints_through_b(space, self, poses, displacement=axis, angle=axis)
 
 
 class Screw(AbstractSliding):
@@ -425,6 +453,7 @@ class Prismatic(AbstractOriented):
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 5
+    quantities: ClassVar[Quantities] = {"displacement": "length"}
 
     @property
     def elements(self):
@@ -435,6 +464,9 @@ class Prismatic(AbstractOriented):
 
     def coordinates(self, space, poses):
         return {"displacement": displacement_along(space, self, poses)}
+
+    def elementary_joints(self, space, poses):
+        return joints_through_b(space, self, poses, displacement=space.direction(poses[0], self.axis_a))
 
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, unrotate(self.orientation, self.axis_a)))
@@ -474,6 +506,7 @@ class Planar(AbstractAxial):
     """
 
     rows: ClassVar[int] = 3
+    quantities: ClassVar[Quantities] = {"displacement": "length", "angle": "angle"}
     slides: ClassVar[tuple[str, ...]] = ("displacement",)
 
     @property
@@ -488,6 +521,16 @@ class Planar(AbstractAxial):
         shift, y_a = offset_in_a(space, self, poses), cross(self.axis_a, self.x_a)
         displacement = jnp.stack([dot(self.x_a, shift), dot(y_a, shift)])
         return {"displacement": displacement, "angle": angle(space, self, poses)}
+
+    def elementary_joints(self, space, poses):
+        ways = {"x": self.x_a, "y": cross(self.axis_a, self.x_a)}
+        (turn,) = joints_through_b(space, self, poses, angle=space.direction(poses[0], self.axis_a))
+        shift = offset_in_a(space, self, poses)
+        slides = (
+            turn._replace(kind="slide", name=name, axis=space.direction(poses[0], way), value=dot(way, shift))
+            for name, way in ways.items()
+        )
+        return [*slides, turn]
 
 
 class Fixed(AbstractOriented):
@@ -520,3 +563,6 @@ class Fixed(AbstractOriented):
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), rotation_error(self, poses)])
+
+    def elementary_joints(self, space, poses):
+        return []

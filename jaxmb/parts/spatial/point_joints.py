@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from ...linalg.rotations import dot, norm
 from .. import fields
-from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart
+from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractSpatialPart, Quantities
 from ..elements import apart, in_planes
 from ..shapes import ball
 from ..space import both_points, separation
@@ -112,6 +112,7 @@ class PointOnLine(AbstractSpatialPart, AbstractJoint):
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 2
+    quantities: ClassVar[Quantities] = {"displacement": "length"}
 
     @property
     def elements(self):
