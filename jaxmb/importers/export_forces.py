@@ -11,8 +11,7 @@ from ..parts.actuators import Actuator
 from ..parts.base import AbstractInertialConstraint
 from ..parts.combinations import FixedTendon, JointInertia, Tendon
 from ..parts.coordinate_parts import JointFriction, JointSpring, JointStop
-from ..parts.forces import SpringDamper
-from ..parts.spatial.forces import RotationalDamper
+from ..parts.forces import RotationalDamper, SpringDamper
 from ..parts.spatial.kinematics import SPACE
 from .description import rotation_of
 from .export_tree import Tree, numbers, of_class, parts_of

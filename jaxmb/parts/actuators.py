@@ -32,11 +32,11 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     with a limit F it becomes `F tanh(demand / F)`. The force of the motor, an internal state, follows it as
     `lag · d(force)/dt = demand − force`.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `command` of the coordinate's shape, [N m, N], [rad/s, m/s] or
-    [rad, m]; as an input of `simulate`, `"motor.command"` is a function of time; `gain` and `damping` ≥ 0, of a force
-    over the command's unit and over a speed; the modes `"speed"` and `"position"` need a gain; `lag` [s] > 0; `limit`
-    [N m, N] > 0 of the demand, default none; `force` [N m, N], its initial value. Positive forces increase the
-    coordinate, with the reaction on the joint's other body.
+    **Arguments:** `command` of the coordinate's shape, [N m, N], [rad/s, m/s] or [rad, m]; as an input of `simulate`,
+    `"motor.command"` is a function of time; `gain` and `damping` ≥ 0, of a force over the command's unit and over a
+    speed; the modes `"speed"` and `"position"` need a gain; `lag` [s] > 0; `limit` [N m, N] > 0 of the demand, default
+    none; `force` [N m, N], its initial value. Positive forces increase the coordinate, with the reaction on the joint's
+    other body.
     """
 
     mode: Literal["force", "speed", "position"] = fields.choice("force", "speed", "position", default="force")
@@ -99,11 +99,10 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     With a `lag` an internal state, the `activation`, takes the place of the control and follows it,
     `lag · d(activation)/dt = control − activation`. Of a `Motor` it is the force that follows.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; an angle in space counts in (−π, π] about `middle` [rad],
-    default zero, and other coordinates have no middle; `control`, default zero, as an input of `simulate`,
-    `"motor.control"`, a function of time; `gain` and `bias`, shape (3,); `gear`; `control_range` and `force_range`,
-    shape (2,): the control and f are clipped to them, by default they are not; `lag` [s] > 0, default none;
-    `activation`, its initial value, default zero.
+    **Arguments:** `control`, default zero, as an input of `simulate`, `"motor.control"`, a function of time; `gain` and
+    `bias`, shape (3,); `gear`; `middle` [rad], default zero, about which an angle in space counts in (−π, π], and which
+    other coordinates have not; `control_range` and `force_range`, shape (2,): the control and f are clipped to them, by
+    default they are not; `lag` [s] > 0, default none; `activation`, its initial value, default zero.
     """
 
     control: fields.Number = fields.parameter(default=0.0)

@@ -26,6 +26,7 @@ from .._types import Scalar
 from ..linalg.arrays import namespace
 from ..linalg.rotations import norm
 from . import fields
+from .inherited import with_inherited_arguments
 from .names import check_arguments
 from .shapes import AbstractShape
 from .space import AbstractSpace
@@ -86,6 +87,10 @@ class AbstractPart(eqx.Module):
 
     name: AbstractVar[str]
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
+
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        cls.__doc__ = with_inherited_arguments(cls)
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         check_arguments(cls.__name__, _signature(cls), len(args), kwargs)
@@ -408,7 +413,13 @@ class AbstractLink(AbstractActor):
 
 
 class AbstractPair(AbstractLink):
-    """A part that acts between two bodies, either of which may be `"ground"`."""
+    """A part that acts between two bodies.
+
+    **Arguments:**
+
+    - `name`, of the part; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    """
 
     name: str = fields.name()
     body_a: str = fields.body_name()
@@ -461,16 +472,31 @@ class AbstractInertialConstraint(AbstractConstraint):
 
 
 class AbstractJoint(AbstractPair, AbstractConstraint):
-    """A constraint between a point of `body_a` and one of `body_b`.
+    """A constraint between a point of `body_a` and a point of `body_b`.
 
-    The points [m] are given in the body frames (`point_a`, `point_b`), or both by one world point at the given poses
-    (`point`).
+    **Arguments:**
+
+    - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`; or `point` [m]: both, at this place of the
+        world at the given poses. In the plane they have shape (2,), in space (3,).
     """
 
     point_a: fields.Number = fields.point(body=0, optional=True)
     point_b: fields.Number = fields.point(body=1, optional=True)
     point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
     rheonomic: ClassVar[bool] = False
+
+
+class AbstractAxisJoint(AbstractJoint):
+    """A joint with an axis in `body_a`.
+
+    **Arguments:**
+
+    - `axis_a`, unit, shape (2,) in the plane and (3,) in space: the axis fixed in `body_a`; or `axis`, unit: the axis
+        in the world at the given poses.
+    """
+
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
 
 
 class AbstractTendon(AbstractLink):

@@ -101,8 +101,12 @@ class AbstractOfJoints(AbstractLink):
 class AbstractCoordinatePart(AbstractOfJoints):
     """A part that acts on a coordinate of a joint or tendon, in the plane or in space.
 
-    **Fields:** `coordinate`: `"joint.coordinate"`, a coordinate that the joint's class documents. A scene fills in its
-    name `within` the joint.
+    **Fields:** a scene fills in the name of the coordinate `within` the joint.
+
+    **Arguments:**
+
+    - `name`, of the part; `coordinate` of a joint or tendon, which its class documents, such as `"hip.angle"` or
+        `"cord.length"`.
     """
 
     coordinate: str = fields.name()
@@ -188,10 +192,10 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[spring]).compile()
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m]
-    ≥ 0; `free` [rad, m], where the spring exerts no force, default the coordinate at the given poses. In space the
-    spring of an angle takes the shortest way to it, up to half a turn; with `middle` [rad], of the range in which the
-    angle stays, it takes the way within half a turn of that.
+    **Arguments:** `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m] ≥ 0; `free` [rad, m], where the spring
+    exerts no force, default the coordinate at the given poses. In space the spring of an angle takes the shortest way
+    to it, up to half a turn; with `middle` [rad], of the range in which the angle stays, it takes the way within half a
+    turn of that.
     """
 
     stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
@@ -228,9 +232,8 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m of an angle, N of a displacement], of the
-    coordinate's shape, positive where it increases the coordinate. As an input of `simulate`, `"motor.force"` is a
-    function of time.
+    **Arguments:** `force` [N m, N], of the coordinate's shape, positive where it increases the coordinate. As an input
+    of `simulate`, `"motor.force"` is a function of time.
     """
 
     force: fields.Number = fields.parameter(shape=None, unit=("N m", "N"))
@@ -252,9 +255,8 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
     system = jaxmb.Scene([bar], joints=[pin, turn]).compile()
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `value` [rad, m], default that at the given poses; `rate`
-    [rad/s, m/s], default zero; both of the coordinate's shape. As an input of `simulate`, `"drive.value"` is any
-    function of time.
+    **Arguments:** `value` [rad, m], default that at the given poses; `rate` [rad/s, m/s], default zero; both of the
+    coordinate's shape. As an input of `simulate`, `"drive.value"` is any function of time.
     """
 
     value: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
@@ -290,16 +292,19 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     ```
 
     The depth δ beyond a stop is that of a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or
-    value − upper. The stop has the potential `½ stiffness δ²` and the dissipation `damping δ̇²`.
+    value − upper. The stop has the potential `½ stiffness δ²`, so that its force is `stiffness δ`, and the dissipation
+    `damping δ̇²`. With an `exponent` the stop is progressive: its potential is `stiffness δ^(exponent + 1) /
+    (exponent + 1)`, and its force nearly `stiffness d^exponent`.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0;
-    `damping` [N m s/rad, N s/m] ≥ 0; `smoothing` [rad, m] > 0, in which the ramp bends. In space the range of an
-    angle must be less than a full turn.
+    **Arguments:** `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0, or over this power of an angle or length;
+    `exponent` > 0, default none; `damping` [N m s/rad, N s/m] ≥ 0; `smoothing` [rad, m] > 0, in which the ramp bends.
+    In space the range of an angle must be less than a full turn.
     """
 
     lower: fields.Number = fields.parameter(unit=("rad", "m"))
     upper: fields.Number = fields.parameter(unit=("rad", "m"))
     stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
+    exponent: fields.Number = fields.parameter(unit="1", sign="positive", optional=True)
     damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
     smoothing: fields.Number = fields.parameter(unit=("rad", "m"), sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("lower", "upper")
@@ -320,6 +325,9 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
             )
         return super().with_numbers(given)
 
+    def is_of_length(self, field):
+        return None if field == "stiffness" and self.exponent is not None else super().is_of_length(field)
+
     def gaps(self, space, poses, t):
         return self._gaps(self.measured(space, poses))
 
@@ -338,13 +346,17 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
         def law(x, v):
             depth, rate = jax.jvp(self._depths, (x,), (v,))
             rate = with_drift(self, rate, lambda part: part._depths(x))
-            (force,) = jax.vjp(self._depths, x)[1](self.stiffness * depth + self.damping * rate)
+            power = depth if self.exponent is None else depth**self.exponent
+            (force,) = jax.vjp(self._depths, x)[1](self.stiffness * power + self.damping * rate)
             return -force
 
         return self.force_along(space, poses, velocities, law)
 
     def energy(self, space, poses, t):
-        return 0.5 * self.stiffness * jnp.sum(self._depths(self.measured(space, poses)) ** 2)
+        depths = self._depths(self.measured(space, poses))
+        if self.exponent is None:
+            return 0.5 * self.stiffness * jnp.sum(depths**2)
+        return self.stiffness * jnp.sum(depths ** (self.exponent + 1)) / (self.exponent + 1)
 
 
 class JointFriction(AbstractScalarPart, AbstractForce):
@@ -355,10 +367,9 @@ class JointFriction(AbstractScalarPart, AbstractForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[rub]).compile()
     ```
 
-    Unlike `Friction` it does not depend on the reaction of the joint.
+    It does not depend on the reaction of the joint; `Friction` lists the ways in which a joint rubs.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0,
-    below which friction is viscous.
+    **Arguments:** `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0, below which friction is viscous.
     """
 
     force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative")

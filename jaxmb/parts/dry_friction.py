@@ -175,7 +175,7 @@ class DryFriction(AbstractDryFriction):
     `Trajectory.reactions["rub"]` is its force on the last body, of stick and of slip.
 
     If the normal force does not exist, or more than one does (Painlevé's paradox), the run ends with a failure that
-    names the friction. `Friction` is smooth instead: it creeps where this one sticks.
+    names the friction. `Friction` lists the ways in which a joint rubs.
 
     **Arguments:**
 

@@ -39,7 +39,7 @@ else:
     Number, Numbers, Names, Module = Array, dict[str, Array | ModuleWeights], tuple[str, ...], ModuleWeights
 
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
-Size = int | Literal["d"] | None
+Size = int | Literal["d", "v"] | None
 
 # A direction counts as a unit vector if its length differs from one by no more than this.
 _UNIT = 1e-6
@@ -270,7 +270,8 @@ def parameter(
 
     **Arguments:**
 
-    - `shape`, in which `"d"` is the dimension of the space and None any size, None for any.
+    - `shape`, in which `"d"` is the dimension of the space, `"v"` the size of a velocity and None any size; None for
+        any shape.
     - `unit`: a product of powers of SI units, `"1"` of a number without one; of a number that belongs to a coordinate
         the unit for an angle and for a length, `("N m/rad", "N/m")`; None, the default, where it is not known, so that
         `report.stress_test` cannot scale lengths.
@@ -563,7 +564,8 @@ def _check_finite(value: Any, label: str, shown: str) -> None:
 
 def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
     if declared.shape is not None:
-        shape = tuple(dimension if size == "d" else size for size in declared.shape)
+        sizes = {"d": dimension, "v": 3 * (dimension - 1)}
+        shape = tuple(sizes.get(size, size) for size in declared.shape)
         any_size = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
         if not any_size:
             wanted = str(shape).replace("None", "any")

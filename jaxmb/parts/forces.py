@@ -1,16 +1,18 @@
 """Forces with the same definition in the plane and in space."""
 
+import abc
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce, PathKind
-from .space import both_points, force_pair, rate_of, separation, separation_rate, with_drift
+from .space import both_points, force_pair, moment_pair, rate_of, separation, separation_rate, with_drift
 
 
 class Gravity(AbstractPart):
@@ -136,3 +138,92 @@ class PointForce(AbstractForce):
     def wrenches(self, space, poses, velocities, t):
         force_W = self.force if self.frame == "world" else space.direction(poses[0], self.force)
         return space.point_force(poses[0], self.point, force_W)[None]
+
+
+class Torque(AbstractForce):
+    """A constant moment on `body`, with its reaction on another one.
+
+    ```python
+    motor = planar.Torque("motor", "bar", torque=2.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
+    ```
+
+    In `Trajectory.forces` the reaction is the first row, and the moment on `body` the second.
+
+    **Arguments:** `torque` [N m], a number in the plane; in space shape (3,), in world axes or, with `frame="body"`,
+    turning with the body; `reaction`, the body that bears the reaction, default ground.
+    """
+
+    name: str = fields.name()
+    reaction: str = fields.body_name(default="ground")
+    body: str = fields.body_name()
+    torque: fields.Number = fields.parameter(shape=None, unit="N m")
+    frame: Literal["world", "body"] = fields.choice("world", "body", default="world")
+
+    def complete(self, space, poses):
+        shape = () if space.dimension == 2 else (3,)
+        if self.torque.shape != shape:
+            raise ValueError(f"{self.label}: torque must have shape {shape}, got {self.torque.shape}.")
+        return self
+
+    def wrenches(self, space, poses, velocities, t):
+        turns_along = self.frame == "body" and space.dimension == 3
+        torque_W = space.direction(poses[1], self.torque) if turns_along else self.torque.reshape(-1)
+        return moment_pair(space, poses, torque_W)
+
+
+class RotationalDamper(AbstractPair, AbstractForce):
+    """A linear damper on the relative angular velocity, about every axis: moment `−damping (ω_B − ω_A)` on B.
+
+    ```python
+    ball = spatial.Body("ball", mass=1.0, inertia=spatial.sphere(1.0, 0.1), angular_velocity=(0.0, 0.0, 10.0))
+    oil = spatial.RotationalDamper("oil", "ground", "ball", damping=0.01)
+    socket = spatial.Spherical("socket", "ground", "ball", point=(0.0, 0.0, 0.0))
+    system = jaxmb.Scene([ball], joints=[socket], forces=[oil]).compile()
+    ```
+
+    **Arguments:** `damping` [N m s/rad] ≥ 0.
+    """
+
+    damping: fields.Number = fields.parameter(unit="N m s/rad", sign="non-negative")
+
+    def wrenches(self, space, poses, velocities, t):
+        omega_a, omega_b = (space.turning(x, v) for x, v in zip(poses, velocities, strict=True))
+        return moment_pair(space, poses, -self.damping * (omega_b - omega_a))
+
+
+class AbstractBushing(AbstractPair, AbstractPotentialForce):
+    """Springs and dampers on the relative motions of a frame in B with respect to one in A, which subclasses define.
+
+    **Arguments:**
+
+    - `stiffness` ≥ 0: [N/m] of the displacements, then [N m/rad] of the rotations; shape (3,) in the plane, (6,) in
+        space. `damping` ≥ 0 [N s/m, N m s/rad], likewise, default zero.
+    - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`; or `point` [m]: both, at this place of the
+        world at the given poses.
+    """
+
+    stiffness: fields.Number = fields.parameter(shape=("v",), unit=("N m/rad", "N/m"), sign="non-negative")
+    damping: fields.Number = fields.parameter(
+        shape=("v",), unit=("N m s/rad", "N s/m"), sign="non-negative", optional=True
+    )
+    point_a: fields.Number = fields.point(body=0, optional=True)
+    point_b: fields.Number = fields.point(body=1, optional=True)
+    point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
+
+    @abc.abstractmethod
+    def motions(self, space, poses) -> Float[Array, "v"]:
+        """The displacements [m] and rotations [rad] that it acts on."""
+
+    def is_of_length(self, field):
+        return np.arange(len(self.stiffness)) < self.dimensions[0]
+
+    def complete(self, space, poses):
+        return self.filled(damping=np.zeros(self.stiffness.shape))
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda x, v: -self.stiffness * x - self.damping * v
+        return generalized_force(space, self, lambda part, p: part.motions(space, p), poses, velocities, law)
+
+    def energy(self, space, poses, t):
+        return 0.5 * jnp.sum(self.stiffness * self.motions(space, poses) ** 2)

@@ -53,6 +53,14 @@ class AbstractSpace(abc.ABC):
         """Wrench of a force [N], in world axes, at the body-fixed point `s` [m]."""
 
     @abc.abstractmethod
+    def turning(self, pose: Pose, velocity: Velocity) -> Float[Array, "r"]:
+        """The angular velocity [rad/s], in world axes; one number in the plane."""
+
+    @abc.abstractmethod
+    def moment(self, pose: Pose, moment_W: Float[Array, "r"]) -> Wrench:
+        """Wrench of a moment [N m] in world axes, one number in the plane."""
+
+    @abc.abstractmethod
     def direction(self, pose: Pose, v: Point) -> Point:
         """World components of a body-fixed direction."""
 
@@ -176,3 +184,8 @@ def force_pair(space: AbstractSpace, part: Any, poses: Float[Array, "k p"], forc
     """Wrenches of `force_W` [N] on B at point B and of its reaction on A at point A."""
     forces = jnp.stack([-force_W, force_W])
     return _of_both(lambda pose, force, s: space.point_force(pose, s, force), part, poses[:2], forces)
+
+
+def moment_pair(space: AbstractSpace, poses: Float[Array, "2 p"], moment_W: Float[Array, "r"]) -> Float[Array, "2 v"]:
+    """Wrenches of `moment_W` [N m] on the second body and of its reaction on the first."""
+    return jnp.stack([space.moment(poses[0], -moment_W), space.moment(poses[1], moment_W)])

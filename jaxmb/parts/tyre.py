@@ -27,10 +27,10 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     """A tyre on a wheel, on one terrain. Subclasses know the directions of the wheel; the laws are those of
     `planar.Tyre` and `spatial.Tyre`.
 
-    **Fields:**
+    **Arguments:**
 
-    - `body`: the wheel, or a frame fixed in it; `radius` [m] > 0; `centre` [m], default the
-        origin of the frame.
+    - `name`, of the tyre; `body`: the wheel, or a frame fixed in it.
+    - `radius` [m] > 0; `centre` [m], default the origin of the frame.
     - `terrain`, from `jaxmb.terrain`; `normal`: the load [N] as a function of the depth, from `jaxmb.contact`;
         `damping` [N s/m] ≥ 0 against the rate of the depth, fully from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
         of the depth, `½ (δ + √(δ² + smoothing²))`.

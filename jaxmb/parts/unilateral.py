@@ -38,7 +38,10 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     energy back (T. R. Kane and D. A. Levinson, "Dynamics", McGraw-Hill, 1985, §5.9): the rebounds of such an impact are
     all less, by the share at which no energy is gained.
 
-    **Fields:** `restitution` from 0 to 1, default 0; `impact_law`: `"newton"`, the default, or `"poisson"`.
+    **Arguments:**
+
+    - `restitution` from 0 to 1, default 0: the rate after an impact over that before; `impact_law`, `"newton"`
+        (default) or `"poisson"`.
     """
 
     restitution: fields.Number = fields.parameter(unit="1", sign="non-negative", default=0.0, constant=True)
@@ -90,10 +93,10 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
     scene = jaxmb.Scene([bar], joints=[pin, buffer], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"` or `"rope.length"`, a number; `lower` < `upper` [rad, m], of
-    which one may be left out; `restitution` from 0 to 1, default 0: the rate after an impact over that before;
-    `impact_law`, `"newton"` (default) or `"poisson"`. In space the range of an angle must be less than a full turn, and
-    has both ends. `JointStop` is a compliant one.
+    `JointStop` is a compliant one.
+
+    **Arguments:** `lower` < `upper` [rad, m], of which one may be left out. In space the range of an angle must be less
+    than a full turn, and has both ends.
     """
 
     lower: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
@@ -218,9 +221,11 @@ class RigidContact(AbstractRigidContact):
     The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is a
     compliant one.
 
-    **Arguments:** `body`; `terrain`, from `jaxmb.terrain`, fixed in the world; `radius` [m] ≥ 0, 0 for a point;
-    `centre` [m], body-fixed, default the origin of the frame; `restitution` from 0 to 1, default 0; `impact_law`,
-    `"newton"` (default) or `"poisson"`.
+    **Arguments:**
+
+    - `name`, of the contact; `body`: the body that touches, or a frame in it, by name.
+    - `terrain`, from `jaxmb.terrain`, fixed in the world.
+    - `radius` [m] ≥ 0, 0 for a point; `centre` [m], body-fixed, default the origin of the frame.
     """
 
     name: str = fields.name()
@@ -258,8 +263,7 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
     ```
 
     **Arguments:** `radius_a`, `radius_b` [m] ≥ 0, of which one may be zero, of a point; `point_a`, `point_b` [m], the
-    centres, body-fixed, default the origins of the frames; `restitution` from 0 to 1, default 0; `impact_law`,
-    `"newton"` (default) or `"poisson"`. The centres must not coincide.
+    centres, body-fixed, default the origins of the frames. The centres must not coincide.
     """
 
     radius_a: fields.Number = fields.length(sign="non-negative")
@@ -301,7 +305,7 @@ class RigidPlaneContact(AbstractRigidContact, AbstractPair):
 
     **Arguments:** `point_a` [m] of the plane and `point_b` [m], the centre, body-fixed, default the origins of the
     frames; `normal_a`, the plane's normal, fixed in `body_a`, or `normal` in the world at the given poses; `radius` [m]
-    ≥ 0, default 0; `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`.
+    ≥ 0, default 0.
     """
 
     point_a: fields.Number = fields.point(body=0, default="origin")
@@ -331,9 +335,8 @@ class RigidBoxContact(AbstractRigidContact, AbstractPair):
     The ball rolls or slides from a face over an edge without an event; where it does, its acceleration jumps.
 
     **Arguments:** `size` [m], the lengths of the box along the axes of the frame of `body_a`; `radius` [m] > 0;
-    `point_a` and `point_b` [m], the centres of the box and of the ball, body-fixed, default the origins of the frames;
-    `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`. The ball's centre stays
-    outside of the box.
+    `point_a` and `point_b` [m], the centres of the box and of the ball, body-fixed, default the origins of the frames.
+    The ball's centre stays outside of the box.
     """
 
     size: fields.Number = fields.parameter(shape=("d",), unit="m", sign="positive")
@@ -370,8 +373,7 @@ class Slack(AbstractGeometricContact, AbstractPair):
     scene = jaxmb.Scene([bob], joints=[rope], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    **Arguments:** `point_a`, `point_b` [m], body-fixed, default the origins of the frames; `length` [m] > 0;
-    `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`.
+    **Arguments:** `point_a`, `point_b` [m], body-fixed, default the origins of the frames; `length` [m] > 0.
     """
 
     point_a: fields.Number = fields.point(body=0, default="origin")

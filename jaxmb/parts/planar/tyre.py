@@ -20,8 +20,6 @@ class Tyre(AbstractPlanarPart, AbstractTyre):
     speed `V = √(v² + transition_speed²)` of its centre, so that in steady rolling the slip `d/σ` is `−v_s/V`. The force
     on the wheel at its lowest point is `μ N tanh(c |d| / (σ μ))` in the direction of d, with the load N: `c N d/σ` for
     small slips, and friction for large ones. It has no rolling resistance.
-
-    **Arguments:** see `AbstractTyre`.
     """
 
     def axle(self, space):

@@ -57,11 +57,7 @@ class Composite(AbstractSpatialPart, AbstractJoint):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
     - `sequence`: the words `"hinge"`, `"slide"` and `"ball"` from A to B.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
     - `axes`, shape (n, 3), unit, one for each word (that of a ball has no effect), in the axes of `body_a`; or in the
         world at the given poses, `axes_W`.
     - `points` [m], shape (hinges, 3), one on each hinge, in the frame of `body_a`, or in the world, `points_W`; by

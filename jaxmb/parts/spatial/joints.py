@@ -22,7 +22,7 @@ import numpy as np
 
 from ...linalg.rotations import conjugate, cross, dot, from_axis_angle, multiply, rotate, unrotate
 from .. import fields
-from ..base import AbstractJoint, AbstractSpatialPart, Quantities
+from ..base import AbstractAxisJoint, AbstractJoint, AbstractSpatialPart, Quantities
 from ..elements import coincident, in_planes, perpendicular
 from ..shapes import ball, pin, sleeve
 from ..space import both_points, nearest_to_origin, separation
@@ -53,7 +53,13 @@ def _parallel(space, part, poses):
 
 
 class AbstractOriented(AbstractSpatialPart, AbstractJoint):
-    """A joint that knows the relative attitude at which its rotation is zero, `orientation`, as in `Spherical`."""
+    """A joint that knows a relative attitude.
+
+    **Arguments:**
+
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` that is kept, or
+        where the coordinates are zero; default the attitude at the given poses.
+    """
 
     orientation: fields.Number = fields.attitude(optional=True)
 
@@ -73,15 +79,6 @@ class Spherical(AbstractOriented):
     Its coordinate is `rotation` [rad], shape (3,): the rotation vector, in the axes of `body_a`, of the shortest turn
     from `orientation` to the relative attitude; zero at the given poses, unless `orientation` is given. It is not
     smooth at half a turn.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where the rotation
-        is zero, default that of the given poses.
     """
 
     rows: ClassVar[int] = 3
@@ -105,7 +102,15 @@ class Spherical(AbstractOriented):
 
 
 class AbstractAxial(AbstractSpatialPart, AbstractJoint):
-    """A joint with an axis in each body, about which one turns in the other; arguments as in `Revolute`."""
+    """A joint with an axis in each body, about which one turns in the other.
+
+    **Arguments:**
+
+    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
+        both in the world at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
+        between which the angle is measured; default two that coincide at the given poses.
+    """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis_b: fields.Number = fields.axis(body=1, optional=True)
@@ -131,17 +136,6 @@ class Revolute(AbstractAxial):
 
     Its coordinate is `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
     given poses, unless these are given.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
-        that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 5
@@ -180,10 +174,6 @@ class Universal(AbstractSpatialPart, AbstractJoint):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
     - `axis_a`, `axis_b`, unit, shape (3,): the arms of the cross, fixed in `body_a` and in `body_b`; each may be given
         in the world at the given poses instead, as `axis_a_W` and `axis_b_W`.
     - `x_a`, `x_b`, unit, shape (3,): where both angles are zero, the direction in `body_a` of `axis_b`, and that in
@@ -252,14 +242,8 @@ class Gimbal(AbstractOriented):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
     - `axis_1`, `axis_2`, `axis_3`, unit, shape (3,), perpendicular to each other: the axes where all angles are zero,
         in the axes of `body_a`; or in the world at the given poses, `axis_1_W`, `axis_2_W`, `axis_3_W`.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where all angles
-        are zero, default that of the given poses.
     """
 
     axis_1: fields.Number = fields.axis(body=0, optional=True)
@@ -340,17 +324,6 @@ class Cylindrical(AbstractSliding):
     Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
     given poses, unless these are given; and `displacement` [m], how far B is from A along the axis: zero where they
     coincide, so at the given poses if both are given by a world `point`.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
-        that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 4
@@ -389,14 +362,6 @@ class Screw(AbstractSliding):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
-        that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     - `pitch` [m], not zero: the advance of B along the axis per turn, positive for a right-handed screw.
     - `offset` [m]: the displacement where the angle is zero, default that which the given poses ask for.
     """
@@ -420,7 +385,7 @@ class Screw(AbstractSliding):
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread])
 
 
-class Prismatic(AbstractOriented):
+class Prismatic(AbstractOriented, AbstractAxisJoint):
     """A slide: point B stays on the line through A without turning. Rows 5: the components across the axis (2) of d
     from A to B, and the rotation (3).
 
@@ -437,21 +402,8 @@ class Prismatic(AbstractOriented):
     are given by a world `point`, where they coincide, the displacement is zero at the given poses, wherever the body
     then is; give `point_a` and `point_b` to count from a place of your own. Where B is along the axis has no effect on
     the motion, and a picture shows the slide next to the mass centre of `body_b`.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, unit, shape (3,): the direction of the slide fixed in `body_a`; or `axis`, unit, shape (3,): that in the
-        world at the given poses.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` along the motion,
-        default that of the given poses.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 5
     quantities: ClassVar[Quantities] = {"displacement": "length"}
 
@@ -492,17 +444,6 @@ class Planar(AbstractAxial):
     given poses, unless these are given; and `displacement` [m], shape (2,), the components of d along `x_a` and along
     the cross product of `axis_a` and `x_a`: zero where B is next to A, so at the given poses if both are given by a
     world `point`.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the normal of the face fixed in `body_a` and in `body_b`; or `axis`, unit,
-        shape (3,): that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 3
@@ -544,15 +485,6 @@ class Fixed(AbstractOriented):
     ```
 
     It leaves no motion and has no coordinates.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` that is kept,
-        default that of the given poses.
     """
 
     rows: ClassVar[int] = 6

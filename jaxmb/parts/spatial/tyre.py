@@ -24,8 +24,8 @@ class Tyre(AbstractSpatialPart, AbstractTyre):
     lowest point is `μ N tanh(|s|) s/|s|`, with the load N: `c N d/σ` for small slips, and friction for large ones. The
     wheel's inclination only moves the contact; there are no aligning torque and no rolling resistance.
 
-    **Arguments:** see `AbstractTyre`; and `axis`, unit, shape (3,), the axle fixed in the body, pointing to the left of
-    a wheel that rolls forwards. The wheel must not lie flat.
+    **Arguments:** `axis`, unit, shape (3,), the axle fixed in the body, pointing to the left of a wheel that rolls
+    forwards. The wheel must not lie flat.
     """
 
     axis: fields.Number = fields.axis(body=0, default=(0.0, 1.0, 0.0))
