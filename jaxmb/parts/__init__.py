@@ -32,6 +32,7 @@ the poses of its bodies. For examples of a joint, a force and a contact law see 
 
 from .base import (
     AbstractActor as AbstractActor,
+    AbstractAxisJoint as AbstractAxisJoint,
     AbstractBody as AbstractBody,
     AbstractCompound as AbstractCompound,
     AbstractConstraint as AbstractConstraint,

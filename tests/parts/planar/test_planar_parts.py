@@ -304,7 +304,7 @@ def springs(damping):
 def pairs():
     return springs(1.0) | {
         "Torque": planar.Torque("F", "b", torque=2.0, reaction="a"),
-        "BumpStop": planar.BumpStop("F", "a", "b", stiffness=30.0, lower=-0.4, upper=0.3),
+        "RotationalDamper": planar.RotationalDamper("F", "a", "b", damping=2.0),
     }
 
 
