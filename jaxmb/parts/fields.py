@@ -68,6 +68,7 @@ class Declaration:
         be given.
     - `of`: the type of a law, or the words of a choice; `what`: a description of the law, for messages.
     - `constant`: whether a number cannot be a function of time.
+    - `dimension`: 2 or 3, of the scenes that the field is for; None for both.
     """
 
     kind: str
@@ -86,6 +87,7 @@ class Declaration:
     of: Any = None
     what: str = ""
     constant: bool = False
+    dimension: int | None = None
 
     def __post_init__(self):
         for unit in (self.unit,) if isinstance(self.unit, str) else self.unit or ():
@@ -261,6 +263,7 @@ def parameter(
     kw_only: bool = True,
     converter: Callable[[Any], Any] | None = None,
     constant: bool = False,
+    dimension: int | None = None,
 ) -> Any:
     """A number or an array of numbers.
 
@@ -278,13 +281,12 @@ def parameter(
     - `sign` of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix.
     - `default`; `optional`: default None, which the part's `complete` replaces.
     - `sizes`: whether the scene's size is computed from this length; `constant`: whether it cannot be a function of
-        time; `converter`, applied before the checks.
+        time; `dimension`, 2 or 3, of the scenes that it is for, default both; `converter`, applied before the checks.
 
     **Raises:** `ValueError` for a unit that cannot be read.
     """
-    declaration = Declaration(
-        "number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes, constant=constant
-    )
+    options = {"optional": optional, "sizes": sizes, "constant": constant, "dimension": dimension}
+    declaration = Declaration("number", shape=shape, sign=sign, unit=unit, **options)
     default = None if optional else default
     convert = _NUMBER if converter is None else _lenient(converter)
     return _field(declaration, converter=_optional(convert), default=default, kw_only=kw_only)
@@ -351,6 +353,7 @@ def axis(
     optional: bool = False,
     gives: tuple[str, ...] = (),
     needed: bool = True,
+    dimension: int | None = None,
 ) -> Any:
     """A unit vector, fixed in a body, or in the world with `body=None`; arguments as in `point`.
 
@@ -358,7 +361,7 @@ def axis(
     axis_a: jaxmb.parts.Number = jaxmb.parts.axis(body=0, default=(0.0, 0.0, 1.0))
     ```
 
-    `needed=False`: both the world axis and the body-fixed ones may be omitted.
+    `needed=False`: both the world axis and the body-fixed ones may be omitted; `dimension` as in `parameter`.
     """
     declaration = Declaration(
         "number",
@@ -369,20 +372,21 @@ def axis(
         optional=optional or bool(gives),
         gives=gives,
         needed=needed,
+        dimension=dimension,
     )
     default = None if declaration.optional else default
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
 
 
 def attitude(*, default: Any = dataclasses.MISSING, optional: bool = False, state: bool = False) -> Any:
-    """Unit Euler parameters, scalar first.
+    """Unit Euler parameters, scalar first, for spatial scenes.
 
     ```python
     orientation: jaxmb.parts.Number = jaxmb.parts.attitude(default=(1.0, 0.0, 0.0, 0.0))
     ```
     """
     kind = "state" if state else "number"
-    declaration = Declaration(kind, shape=(4,), unit="1", is_attitude=True, optional=optional)
+    declaration = Declaration(kind, shape=(4,), unit="1", is_attitude=True, optional=optional, dimension=3)
     default = None if optional else default
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
 
@@ -543,6 +547,9 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
     values = values_of(part)
     for field, declared in declarations(type(part)).items():
         value, shown = values[field], prefix + field
+        if value is not None and declared.dimension not in (None, dimension):
+            scenes = "planar" if declared.dimension == 2 else "spatial"
+            raise ValueError(f"{label}: {shown} belongs to {scenes} scenes; leave it out.")
         if declared.kind == "law":
             if value is not None:
                 check_numbers(value, label, dimension, f"{shown}.")

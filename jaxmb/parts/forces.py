@@ -1,12 +1,10 @@
 """Forces with the same definition in the plane and in space."""
 
-import abc
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
@@ -190,40 +188,3 @@ class RotationalDamper(AbstractPair, AbstractForce):
     def wrenches(self, space, poses, velocities, t):
         omega_a, omega_b = (space.turning(x, v) for x, v in zip(poses, velocities, strict=True))
         return moment_pair(space, poses, -self.damping * (omega_b - omega_a))
-
-
-class AbstractBushing(AbstractPair, AbstractPotentialForce):
-    """Springs and dampers on the relative motions of a frame in B with respect to one in A, which subclasses define.
-
-    **Arguments:**
-
-    - `stiffness` ≥ 0: [N/m] of the displacements, then [N m/rad] of the rotations; shape (3,) in the plane, (6,) in
-        space. `damping` ≥ 0 [N s/m, N m s/rad], likewise, default zero.
-    - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`; or `point` [m]: both, at this place of the
-        world at the given poses.
-    """
-
-    stiffness: fields.Number = fields.parameter(shape=("v",), unit=("N m/rad", "N/m"), sign="non-negative")
-    damping: fields.Number = fields.parameter(
-        shape=("v",), unit=("N m s/rad", "N s/m"), sign="non-negative", optional=True
-    )
-    point_a: fields.Number = fields.point(body=0, optional=True)
-    point_b: fields.Number = fields.point(body=1, optional=True)
-    point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
-
-    @abc.abstractmethod
-    def motions(self, space, poses) -> Float[Array, "v"]:
-        """The displacements [m] and rotations [rad] that it acts on."""
-
-    def is_of_length(self, field):
-        return np.arange(len(self.stiffness)) < self.dimensions[0]
-
-    def complete(self, space, poses):
-        return self.filled(damping=np.zeros(self.stiffness.shape))
-
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: -self.stiffness * x - self.damping * v
-        return generalized_force(space, self, lambda part, p: part.motions(space, p), poses, velocities, law)
-
-    def energy(self, space, poses, t):
-        return 0.5 * jnp.sum(self.stiffness * self.motions(space, poses) ** 2)

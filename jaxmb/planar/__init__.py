@@ -8,8 +8,10 @@ body. Classes of your own derive from those of `jaxmb.parts`.
 
 from typing import TYPE_CHECKING
 
+from ..parts.bushing import Bushing as Bushing
 from ..parts.contact import Contact as Contact
 from ..parts.distance import Distance as Distance
+from ..parts.drivers import Driver as Driver
 from ..parts.forces import (
     Damper as Damper,
     PointForce as PointForce,
@@ -18,6 +20,7 @@ from ..parts.forces import (
     Torque as Torque,
 )
 from ..parts.friction import Friction as Friction
+from ..parts.knife_edge import KnifeEdge as KnifeEdge
 from ..parts.planar.bodies import (
     AbstractRigidBody as AbstractRigidBody,
     Body as Body,
@@ -28,8 +31,6 @@ from ..parts.planar.bodies import (
 )
 from ..parts.planar.body_contact import DiscContact as DiscContact, PlateContact as PlateContact
 from ..parts.planar.draft_gear import DraftGear as DraftGear
-from ..parts.planar.drivers import Driver as Driver
-from ..parts.planar.forces import Bushing as Bushing, TorsionalSpringDamper as TorsionalSpringDamper
 from ..parts.planar.frames import Frame as Frame
 from ..parts.planar.joints import (
     Fixed as Fixed,
@@ -40,9 +41,9 @@ from ..parts.planar.joints import (
     RackAndPinion as RackAndPinion,
     Revolute as Revolute,
 )
-from ..parts.planar.knife_edge import KnifeEdge as KnifeEdge
+from ..parts.planar.torsion import TorsionalSpringDamper as TorsionalSpringDamper
 from ..parts.planar.track import Track as Track
-from ..parts.planar.tyre import Tyre as Tyre
+from ..parts.tyre import Tyre as Tyre
 
 if not TYPE_CHECKING:
 

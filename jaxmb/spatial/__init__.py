@@ -8,8 +8,10 @@ a `Frame`, fixed in a body, in place of the body. Classes of your own derive fro
 
 from typing import TYPE_CHECKING
 
+from ..parts.bushing import Bushing as Bushing
 from ..parts.contact import Contact as Contact
 from ..parts.distance import Distance as Distance
+from ..parts.drivers import Driver as Driver
 from ..parts.forces import (
     Damper as Damper,
     PointForce as PointForce,
@@ -18,6 +20,7 @@ from ..parts.forces import (
     Torque as Torque,
 )
 from ..parts.friction import Friction as Friction
+from ..parts.knife_edge import KnifeEdge as KnifeEdge
 from ..parts.spatial.bodies import (
     AbstractRigidBody as AbstractRigidBody,
     Body as Body,
@@ -29,8 +32,6 @@ from ..parts.spatial.bodies import (
     sphere as sphere,
 )
 from ..parts.spatial.composite import Composite as Composite
-from ..parts.spatial.drivers import Driver as Driver
-from ..parts.spatial.forces import Bushing as Bushing
 from ..parts.spatial.frames import Frame as Frame
 from ..parts.spatial.joints import (
     Cylindrical as Cylindrical,
@@ -44,8 +45,8 @@ from ..parts.spatial.joints import (
     Universal as Universal,
 )
 from ..parts.spatial.point_joints import PointOnLine as PointOnLine, PointOnPlane as PointOnPlane
-from ..parts.spatial.rolling import KnifeEdge as KnifeEdge, RollingDisc as RollingDisc, RollingSphere as RollingSphere
-from ..parts.spatial.tyre import Tyre as Tyre
+from ..parts.spatial.rolling import RollingDisc as RollingDisc, RollingSphere as RollingSphere
+from ..parts.tyre import Tyre as Tyre
 
 if not TYPE_CHECKING:
 

@@ -1,4 +1,4 @@
-"""Spatial velocity constraints: blades, and wheels and balls that roll on a plane.
+"""Wheels and balls that roll on a plane in space.
 
 The plane is fixed in the world, given by a point and its normal `e`, which points to the side of the body.
 """
@@ -10,49 +10,9 @@ import jax.numpy as jnp
 from ...linalg.rotations import cross, dot, norm
 from .. import fields
 from ..base import AbstractCompound, AbstractConstraint, AbstractSpatialPart, AbstractVelocityConstraint
-from ..shapes import Ground, along, marked_ball, sleeve, wheel
+from ..shapes import Ground, along, marked_ball, wheel
 from ..space import with_drift
 from .axes import perpendiculars
-
-
-class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
-    """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`, with the normal e of the
-    plane, the direction h of the blade and the velocity v of the contact point.
-
-    ```python
-    sled = spatial.Body("sled", mass=1.0, inertia=spatial.box(1.0, 0.5, 0.2, 0.1), velocity=(1.0, 0.0, 0.0))
-    ice = spatial.Planar("ice", "ground", "sled", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
-    blade = spatial.KnifeEdge("blade", "sled", point=(0.2, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
-    system = jaxmb.Scene([sled], joints=[ice, blade]).compile()
-    ```
-
-    The constraint does not hold the body on the plane; add a `Planar` or `PointOnPlane` joint. It has no coordinates of
-    its own.
-
-    **Arguments:**
-
-    - `name`, of the blade; `body`: that it is fixed in, or a frame in it, by name.
-    - `point` [m], shape (3,): the contact point fixed in the body, default the origin of its frame.
-    - `axis`, unit, shape (3,): the direction of the blade fixed in the body, default its x axis.
-    - `normal`, unit, shape (3,): that of the plane in the world, default z.
-    """
-
-    name: str = fields.name()
-    body: str = fields.body_name()
-    point: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0))
-    axis: fields.Number = fields.axis(body=0, default=(1.0, 0.0, 0.0))
-    normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
-    rows: ClassVar[int] = 1
-    linear: ClassVar[bool] = True
-    homogeneous: ClassVar[bool] = True
-
-    def residual(self, space, poses, velocities, t):
-        v = space.point_velocity(poses[0], velocities[0], self.point)
-        v = with_drift(self, v, lambda part: space.point(poses[0], part.point))
-        return dot(cross(self.normal, space.direction(poses[0], self.axis)), v)[None]
-
-    def shapes(self, space, size):
-        return (0, sleeve(self.point, size, self.axis)), (None, Ground(orientation=along(self.normal)))
 
 
 class AbstractRolling(AbstractSpatialPart):

@@ -1,10 +1,7 @@
-"""Planar forces that act on the relative angle."""
-
-import jax.numpy as jnp
+"""A torsional spring between planar bodies."""
 
 from .. import fields
 from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce
-from ..forces import AbstractBushing
 from ..space import moment_pair
 from .joints import relative_angle
 
@@ -36,28 +33,3 @@ class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialF
 
     def energy(self, space, poses, t):
         return 0.5 * self.stiffness * (relative_angle(poses) - self.free_angle) ** 2
-
-
-class Bushing(AbstractPlanarPart, AbstractBushing):
-    """A compliant joint: springs and dampers on the three relative motions of a frame in B with respect to one in A.
-
-    ```python
-    stiffness, damping = (1e5, 1e5, 10.0), (100.0, 100.0, 0.1)
-    bush = planar.Bushing("bush", "ground", "bar", stiffness=stiffness, damping=damping, point=(0.0, 0.0))
-    system = jaxmb.Scene([bar], forces=[bush]).compile()
-    ```
-
-    The motions are the position of B's point in the axes of `body_a` relative to A's point (2) [m] and the relative
-    angle less that of the given poses [rad].
-
-    **Arguments:** `free_angle` [rad], default that of the given poses.
-    """
-
-    free_angle: fields.Number = fields.parameter(unit="rad", optional=True)
-
-    def complete(self, space, poses):
-        return super().complete(space, poses).filled(free_angle=relative_angle(poses))
-
-    def motions(self, space, poses):
-        shift = space.body_point(poses[0], space.point(poses[1], self.point_b)) - self.point_a
-        return jnp.concatenate([shift, (relative_angle(poses) - self.free_angle)[None]])
