@@ -59,7 +59,7 @@ class _Writer:
 
     def site(self, name: str, body: str, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
         """A site at a place and attitude in the world."""
-        place = self.tree.place(body)
+        place = self.tree.poses[body]
         back = rotation_of(place[3:]).T
         own = ElementTree.SubElement(self.elements[body], "site", name=name, pos=numbers(back @ (position - place[:3])))
         if rotation is not None:
@@ -80,7 +80,7 @@ class _Writer:
     def frame(self, name, group, k, system):
         number = group.group.bodies[k][0]
         body = system.body_names[number] if number < len(system.body_names) else "ground"
-        pose = np.asarray(group.group.single(k, 0.0).pose(SPACE, self.tree.place(body)))
+        pose = np.asarray(group.group.single(k, 0.0).pose(SPACE, self.tree.poses[body]))
         self.site(name, body, pose[:3], rotation_of(pose[3:7]))
 
     def tendon(self, part):
@@ -118,7 +118,7 @@ class _Writer:
         own = part.part
         (coordinate,) = part.acts_on
         tendon, joint = self.tendons.get(coordinate), self.tree.coordinates.get(coordinate)
-        if tendon is None and (joint is None or joint.type == "ball"):
+        if tendon is None and (joint is None or joint.kind == "ball"):
             return False
         element: Any = tendon if joint is None else self.tree.elements[joint.name]
         _add(element, "damping", own.damping)
@@ -155,7 +155,7 @@ class _Writer:
             for node in self.tree.nodes
             if {node.body, node.parent} == {*part.bodies}
             for joint in node.joints
-            if joint.type == "ball"
+            if joint.kind == "ball"
         ]
         if len(balls) != 1:
             return False

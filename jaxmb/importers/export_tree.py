@@ -5,8 +5,8 @@ import functools
 import itertools
 from collections.abc import Mapping
 from typing import Any
-from xml.etree import ElementTree
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -62,7 +62,7 @@ class PlacedPart:
     def joints(self) -> list[ElementaryJoint] | None:
         """The hinges, slides and balls in succession that the part is; None if it is no such joint."""
         is_known = isinstance(self.part, AbstractConstraint) and self.part.declares("elementary_joints", "coordinates")
-        return self.part.elementary_joints(SPACE, self.poses) if is_known else None
+        return jax.device_get(self.part.elementary_joints(SPACE, self.poses)) if is_known else None
 
     def named(self, word: str) -> str:
         """A name for an element of the file that the part needs."""
@@ -85,42 +85,20 @@ class PlacedPart:
 
 
 @dataclasses.dataclass
-class TreeJoint:
-    """A joint of MuJoCo: its name, type, point and axis in the world, and its value."""
-
-    name: str
-    type: str
-    point: np.ndarray
-    axis: np.ndarray
-    value: float = 0.0
-
-
-@dataclasses.dataclass
 class TreeBody:
-    """A body of the tree, with its joints from the parent on."""
+    """A body of the tree, with its joints from the parent on, which have the names that MuJoCo knows them by."""
 
     body: str
     parent: str
-    joints: list[TreeJoint]
-
-
-@dataclasses.dataclass
-class LoopEqualities:
-    """Equality constraints: tags, each with its attributes."""
-
-    name: str
-    equalities: Any
-
-    def write(self, section: Any) -> None:
-        for tag, attributes in self.equalities:
-            ElementTree.SubElement(section, tag, attrib=attributes)
+    joints: list[ElementaryJoint]
 
 
 @dataclasses.dataclass
 class Tree:
-    """The bodies in order, parents first; the constraints that close loops; and for each coordinate, `"hip.angle"`, the
-    name of MuJoCo's joint. `scalars`: the scalar coordinates of the scene; `names`: those of the scene and of elements
-    that have none there; `bodies`: what MuJoCo calls the bodies; `elements`: the XML elements of joints.
+    """The bodies in order, parents first; the constraints that close loops, each with the name of the part, a tag and
+    attributes; and for each coordinate, `"hip.angle"`, MuJoCo's joint. `scalars`: the scalar coordinates of the scene;
+    `names`: those of the scene and of elements that have none there; `bodies`: what MuJoCo calls the bodies;
+    `elements`: the XML elements of joints.
     """
 
     poses: dict[str, np.ndarray]
@@ -128,13 +106,9 @@ class Tree:
     names: set[str]
     bodies: dict[str, str]
     nodes: list[TreeBody] = dataclasses.field(default_factory=list)
-    loops: list[LoopEqualities] = dataclasses.field(default_factory=list)
-    coordinates: dict[str, TreeJoint] = dataclasses.field(default_factory=dict)
+    loops: list[tuple[str, str, dict[str, str]]] = dataclasses.field(default_factory=list)
+    coordinates: dict[str, ElementaryJoint] = dataclasses.field(default_factory=dict)
     elements: dict[str, Any] = dataclasses.field(default_factory=dict)
-
-    def place(self, body: str) -> np.ndarray:
-        """The pose of a body."""
-        return self.poses[body]
 
 
 def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPart]:
@@ -202,7 +176,7 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
         if equalities is None:
             notes.refused.append(f"{part.label} cannot be expressed where it closes a loop.")
         else:
-            tree.loops.append(LoopEqualities(part.name, equalities))
+            tree.loops += [(part.name, *equality) for equality in equalities]
     return tree
 
 
@@ -223,26 +197,22 @@ def _bodies(system, names, notes):
 
 
 def _free(body, tree, rotates):
-    place, named = tree.place(body), lambda word: _new(f"{body} {word}", tree.names)
+    place, named = tree.poses[body], lambda word: _new(f"{body} {word}", tree.names)
     if rotates:
-        return [TreeJoint(named("free"), "free", place[:3], np.zeros(3))]
-    return [TreeJoint(named(way), "slide", place[:3], axis) for way, axis in zip("xyz", np.eye(3), strict=True)]
+        return [ElementaryJoint("free", named("free"), place[:3], np.zeros(3), 0.0)]
+    ways = zip("xyz", np.eye(3), strict=True)
+    return [ElementaryJoint("slide", named(way), place[:3], axis, 0.0) for way, axis in ways]
 
 
 def _oriented(part, tree, child):
     """The joints of MuJoCo that a joint is, from the parent to the child."""
+    back, single = child == part.bodies[0], len(part.joints) == 1
     joints = []
     for own in part.joints:
-        name = part.name if len(part.joints) == 1 else part.named(own.name)
-        value = 0.0 if own.kind == "ball" else float(own.value)
-        joint = TreeJoint(name, own.kind, np.asarray(own.point), np.asarray(own.axis), value)
+        joint = own._replace(name=part.name if single else part.named(own.name), axis=-own.axis if back else own.axis)
         tree.coordinates[f"{part.name}.{own.name}"] = joint
         joints.append(joint)
-    if child == part.bodies[0]:
-        for joint in joints:
-            joint.axis = -joint.axis
-        joints.reverse()
-    return joints
+    return joints[::-1] if back else joints
 
 
 # Loops
@@ -257,7 +227,7 @@ def _ends(part, tree):
 
 def _connect(part, tree, name, point):
     bodies, k = _ends(part, tree)
-    place = tree.place(part.bodies[k])
+    place = tree.poses[part.bodies[k]]
     anchor = rotation_of(place[3:]).T @ (point - place[:3])
     return "connect", {"name": name, **bodies, "anchor": numbers(anchor)}
 
@@ -269,8 +239,8 @@ def _close_ball(part, tree):
 def _close_hinge(part, tree):
     """Two points of the axis coincide."""
     (hinge,) = part.joints
-    point, second = np.asarray(hinge.point), np.asarray(hinge.point + hinge.axis)
-    return [_connect(part, tree, part.name, point), _connect(part, tree, part.named("axis"), second)]
+    second = _connect(part, tree, part.named("axis"), hinge.point + hinge.axis)
+    return [_connect(part, tree, part.name, hinge.point), second]
 
 
 def _close_weld(part, tree):
@@ -297,7 +267,7 @@ def _close_coupling(part, tree):
 def _close_driver(part, tree):
     own = part.part
     joint = tree.coordinates.get(part.acts_on[0])
-    if joint is None or joint.type == "ball" or np.any(np.asarray(own.rate)):
+    if joint is None or joint.kind == "ball" or np.any(np.asarray(own.rate)):
         return None
     off = float(np.reshape(own.value, -1)[0]) - joint.value
     constant = [off - part.turns(off, 0.0), *itertools.repeat(0.0, 4)]

@@ -3,12 +3,10 @@
 ```python
 from jaxmb import parts
 
-class Maxwell(parts.AbstractPair, parts.AbstractDynamicForce):
+class Maxwell(parts.AbstractPointPair, parts.AbstractDynamicForce):
     stiffness: parts.Number = parts.parameter(unit="N/m", sign="positive")
     damping: parts.Number = parts.parameter(unit="N s/m", sign="positive")
     tension: parts.Number = parts.internal_state(unit="N")
-    point_a: parts.Number = parts.point(body=0, default="origin")
-    point_b: parts.Number = parts.point(body=1, default="origin")
 
     def wrenches(self, space, poses, velocities, t):
         d = parts.separation(space, self, poses)
@@ -46,6 +44,7 @@ from .base import (
     AbstractPair as AbstractPair,
     AbstractPart as AbstractPart,
     AbstractPlanarPart as AbstractPlanarPart,
+    AbstractPointPair as AbstractPointPair,
     AbstractPotentialForce as AbstractPotentialForce,
     AbstractSpatialPart as AbstractSpatialPart,
     AbstractTendon as AbstractTendon,

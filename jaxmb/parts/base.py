@@ -426,6 +426,18 @@ class AbstractPair(AbstractLink):
     body_b: str = fields.body_name()
 
 
+class AbstractPointPair(AbstractPair):
+    """A part that acts between a point of one body and a point of another one.
+
+    **Arguments:**
+
+    - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`, default the origins of the frames.
+    """
+
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
+
+
 class AbstractConstraint(AbstractLink):
     """A position constraint, `residual = 0`.
 

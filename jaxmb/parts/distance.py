@@ -4,12 +4,12 @@ from typing import ClassVar
 
 from ..linalg.rotations import dot, norm
 from . import fields
-from .base import AbstractConstraint, AbstractPair
+from .base import AbstractConstraint, AbstractPointPair
 from .elements import apart
 from .space import both_points, separation
 
 
-class Distance(AbstractPair, AbstractConstraint):
+class Distance(AbstractPointPair, AbstractConstraint):
     """A massless rod: points A and B of two bodies keep their distance. Rows 1: `(d·d − length²) / (2 length) = 0`,
     with d from A to B; the multiplier is the rod force [N].
 
@@ -21,14 +21,9 @@ class Distance(AbstractPair, AbstractConstraint):
 
     It has no coordinates of its own.
 
-    **Arguments:**
-
-    - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`, default the origins of the frames.
-    - `length` [m] > 0, default that of the given poses.
+    **Arguments:** `length` [m] > 0, default that of the given poses.
     """
 
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
     length: fields.Number = fields.length(sign="positive", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False

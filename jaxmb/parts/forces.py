@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce, PathKind
+from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPointPair, AbstractPotentialForce, PathKind
 from .space import both_points, force_pair, moment_pair, rate_of, separation, separation_rate, with_drift
 
 
@@ -47,7 +47,7 @@ def generalized_force(space, part, coordinates, poses, velocities, law):
     return jax.vmap(space.pull_back)(poses, gradient)
 
 
-class SpringDamper(AbstractPair, AbstractPotentialForce):
+class SpringDamper(AbstractPointPair, AbstractPotentialForce):
     """A linear spring and damper along the line between two points: tension `stiffness (l − free_length) + damping l̇`.
 
     ```python
@@ -62,14 +62,12 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
     that comes to zero length.
 
     **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
-    given poses; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
+    given poses.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative")
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
     path_kind: ClassVar[PathKind] = "coil"
 
     def complete(self, space, poses):
@@ -93,7 +91,7 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
         return both_points(space, self, poses)
 
 
-class Damper(AbstractPair, AbstractForce):
+class Damper(AbstractPointPair, AbstractForce):
     """A linear damper on the relative velocity of two points, in every direction: force `−damping (v_B − v_A)` on B.
 
     ```python
@@ -103,12 +101,10 @@ class Damper(AbstractPair, AbstractForce):
 
     The two points should coincide or `body_a` be the ground; otherwise the pair of forces has a moment.
 
-    **Arguments:** `damping` [N s/m] ≥ 0; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
+    **Arguments:** `damping` [N s/m] ≥ 0.
     """
 
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative")
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
 
     def wrenches(self, space, poses, velocities, t):
         rate = separation_rate(space, self, poses, velocities)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import namespace
+from .shapes import AbstractShape, marked_ball, wheel
 
 Pose = Float[Array, "p"]
 Velocity = Float[Array, "v"]
@@ -147,10 +148,8 @@ def rate_of(
     """The value and the rate of `function(part, poses)`, which contains those of numbers of the part that are inputs.
 
     ```python
-    class Rope(jaxmb.parts.AbstractPair, jaxmb.parts.AbstractForce):
+    class Rope(jaxmb.parts.AbstractPointPair, jaxmb.parts.AbstractForce):
         drag: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N s/m", sign="positive")
-        point_a: jaxmb.parts.Number = jaxmb.parts.point(body=0, default="origin")
-        point_b: jaxmb.parts.Number = jaxmb.parts.point(body=1, default="origin")
 
         def length(self, space, poses):
             return jaxmb.rotations.norm(jaxmb.parts.separation(space, self, poses))
@@ -189,3 +188,9 @@ def force_pair(space: AbstractSpace, part: Any, poses: Float[Array, "k p"], forc
 def moment_pair(space: AbstractSpace, poses: Float[Array, "2 p"], moment_W: Float[Array, "r"]) -> Float[Array, "2 v"]:
     """Wrenches of `moment_W` [N m] on the second body and of its reaction on the first."""
     return jnp.stack([space.moment(poses[0], -moment_W), space.moment(poses[1], moment_W)])
+
+
+def round_shapes(space: AbstractSpace, body: int, radius: Any, centre: Any) -> tuple[tuple[int, AbstractShape], ...]:
+    """The shapes of a disc, in space of a ball, each with the number of its body; none of a point."""
+    solid = wheel if space.dimension == 2 else marked_ball
+    return tuple((body, shape) for shape in solid(radius, position=space.in_space(centre))) if radius > 0 else ()

@@ -5,6 +5,7 @@ body, so contact adds no constraint and no event.
 """
 
 import abc
+import itertools
 from typing import ClassVar
 
 import equinox as eqx
@@ -17,8 +18,8 @@ from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce
 from ..contact import AbstractFrictionLaw, AbstractNormalLaw
-from ..shapes import wheel
 from ..smooth import ramp, step
+from ..space import round_shapes
 
 Number = Float[Array, ""]
 Vector = Float[Array, "2"]
@@ -114,7 +115,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         return self.distance(place, surface) - self.radius
 
     def shapes(self, space, size):
-        return tuple((0, shape) for shape in wheel(self.radius, position=space.in_space(self.centre)))
+        return round_shapes(space, 0, self.radius, self.centre)
 
     def _depth(self, place, surface):
         """Depth of the disc's deepest point, smoothed."""
@@ -352,13 +353,8 @@ class DiscContact(AbstractBodyContact):
     def shapes(self, space, size):
         n = len(self.bodies) - 1
         centres, radii = np.broadcast_to(self.centres, (n, 2)), np.broadcast_to(self.radii, n)
-        others = [
-            (k, shape)
-            for k, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1)
-            if radius > 0
-            for shape in wheel(radius, position=space.in_space(centre))
-        ]
-        return (*super().shapes(space, size), *others)
+        others = (round_shapes(space, k + 1, radii[k], centres[k]) for k in range(n))
+        return (*super().shapes(space, size), *itertools.chain(*others))
 
     def surfaces(self):
         return self._rows(self.radii, ()), self._rows(self.centres, (2,))

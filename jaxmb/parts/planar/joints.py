@@ -1,12 +1,6 @@
 """Planar joints.
 
-Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
-the body frames (`point_a`, `point_b`, `axis_a`), or all at once by a world point and axis at the given poses (`point`,
-`axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of the axis.
-
-Their own coordinates are `angle` [rad], that of `body_b` less that of `body_a`, and `displacement` [m], the component
-of d along the axis, zero where B is next to A. Points given by a world `point` coincide at the given poses, so that the
-displacement counts from there.
+In their classes `A` and `B` are the world positions of the two points, `d = B − A`, and `n` is the normal of the axis.
 """
 
 from collections.abc import Callable

@@ -27,7 +27,7 @@ class ElementaryJoint(NamedTuple):
     [m] and its `axis` in the world, zero for a ball.
     """
 
-    kind: Literal["hinge", "slide", "ball"]
+    kind: Literal["hinge", "slide", "ball", "free"]
     name: str
     point: Vector3
     axis: Vector3

@@ -1,18 +1,11 @@
 """Spatial joints.
 
-Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
-the body frames (`point_a`, `point_b`, `axis_a`, `axis_b`), or all at once by a world point and axis at the given poses
-(`point`, `axis`). Axes are unit vectors. Below, `A` and `B` are the world positions of the two points, `d = B − A`, `a`
-and `b` the two axes, `u` and `v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
+In their classes `A` and `B` are the world positions of the two points, `d = B − A`, `a` and `b` the two axes, `u` and
+`v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
 
 Where axes are parallel, they point the same way. Their rows are those of the tilt, the components along u and v of
 `2 sin(θ/2)` times the unit vector of `b` across `a`, with the angle θ between the axes: they vanish only where the axes
 agree, and not where they point against each other.
-
-Their own coordinates are `angle` [rad], the turn of `body_b` about the axis, and `displacement` [m], the component of d
-along it. An angle is zero at the given poses, or where the directions `x_a` and `x_b` that are given with the joint
-coincide. A displacement is zero where B is next to A; points given by a world `point` coincide at the given poses, so
-that it counts from there.
 """
 
 from typing import ClassVar
