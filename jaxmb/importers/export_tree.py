@@ -106,7 +106,7 @@ class Tree:
     names: set[str]
     bodies: dict[str, str]
     nodes: list[TreeBody] = dataclasses.field(default_factory=list)
-    loops: list[tuple[str, str, dict[str, str]]] = dataclasses.field(default_factory=list)
+    loops: list[Any] = dataclasses.field(default_factory=list)
     coordinates: dict[str, ElementaryJoint] = dataclasses.field(default_factory=dict)
     elements: dict[str, Any] = dataclasses.field(default_factory=dict)
 

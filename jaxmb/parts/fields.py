@@ -546,7 +546,8 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
     """
     values = values_of(part)
     for field, declared in declarations(type(part)).items():
-        value, shown = values[field], prefix + field
+        value: Any = values[field]
+        shown = prefix + field
         if value is not None and declared.dimension not in (None, dimension):
             scenes = "planar" if declared.dimension == 2 else "spatial"
             raise ValueError(f"{label}: {shown} belongs to {scenes} scenes; leave it out.")
@@ -571,7 +572,7 @@ def _check_finite(value: Any, label: str, shown: str) -> None:
 
 def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
     if declared.shape is not None:
-        sizes = {"d": dimension, "v": 3 * (dimension - 1)}
+        sizes: dict[Any, int] = {"d": dimension, "v": 3 * (dimension - 1)}
         shape = tuple(sizes.get(size, size) for size in declared.shape)
         any_size = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
         if not any_size:

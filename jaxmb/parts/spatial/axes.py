@@ -3,7 +3,7 @@
 Quantities "in A" are components in the axes of the first body of the part.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,25 +16,25 @@ from ..elements import Product, perpendicular
 
 Vector3 = Float[Array, "3"]
 # The elementary joints that coordinates belong to, by what these are.
-_KINDS: dict[str, Any] = {"angle": "hinge", "length": "slide", "rotation": "ball"}
+_KINDS = {"angle": "hinge", "length": "slide", "rotation": "ball"}
 
 # Angles nearer to half a turn than 0.1 rad count as opposite, by their cosine plus one.
 _OPPOSITE = 0.005
 
 
 class ElementaryJoint(NamedTuple):
-    """A hinge, a slide or a ball that a joint consists of: the `name` and the `value` of its coordinate, and a `point`
+    """A `"hinge"`, `"slide"` or `"ball"` that a joint consists of: the `name` and the `value` of its coordinate, and a `point`
     [m] and its `axis` in the world, zero for a ball.
     """
 
-    kind: Literal["hinge", "slide", "ball", "free"]
+    kind: str
     name: str
-    point: Vector3
-    axis: Vector3
+    point: Any
+    axis: Any
     value: Any
 
 
-def joints_through_b(space, part, poses: Float[Array, "2 p"], **axes: Vector3) -> list[ElementaryJoint]:
+def joints_through_b(space, part, poses: Float[Array, "2 p"], **axes: Any) -> list[ElementaryJoint]:
     """The elementary joints of a joint through its point B, by the names of its coordinates, about `axes` in the
     world.
     """
