@@ -92,7 +92,7 @@ class _Writer:
         self.tendons[f"{part.name}.length"] = element
 
     def fixed_tendon(self, part):
-        joints = [self.tree.coordinates.get(name) for name in part.acts_on]
+        joints: list[Any] = [self.tree.coordinates.get(name) for name in part.acts_on]
         if None in joints:
             return False
         element = ElementTree.SubElement(self.sections["tendon"], "fixed", name=part.name)

@@ -461,7 +461,7 @@ class AbstractConstraint(AbstractLink):
         """
         return None
 
-    def elementary_joints(self, space: AbstractSpace, poses: Poses) -> Any:
+    def elementary_joints(self, space: AbstractSpace, poses: Any) -> Any:
         """Hook: the hinges, slides and balls in succession, from `body_a` to `body_b`, that a spatial joint is: an
         `ElementaryJoint` for each of its coordinates at these poses. None for a joint that is no such succession.
         """

@@ -546,11 +546,7 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
     """
     values = values_of(part)
     for field, declared in declarations(type(part)).items():
-        value: Any = values[field]
-        shown = prefix + field
-        if value is not None and declared.dimension not in (None, dimension):
-            scenes = "planar" if declared.dimension == 2 else "spatial"
-            raise ValueError(f"{label}: {shown} belongs to {scenes} scenes; leave it out.")
+        value, shown = values[field], prefix + field
         if declared.kind == "law":
             if value is not None:
                 check_numbers(value, label, dimension, f"{shown}.")
@@ -571,6 +567,9 @@ def _check_finite(value: Any, label: str, shown: str) -> None:
 
 
 def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
+    if declared.dimension not in (None, dimension):
+        scenes = "planar" if declared.dimension == 2 else "spatial"
+        raise ValueError(f"{label}: {shown} belongs to {scenes} scenes; leave it out.")
     if declared.shape is not None:
         sizes: dict[Any, int] = {"d": dimension, "v": 3 * (dimension - 1)}
         shape = tuple(sizes.get(size, size) for size in declared.shape)

@@ -23,8 +23,8 @@ _OPPOSITE = 0.005
 
 
 class ElementaryJoint(NamedTuple):
-    """A `"hinge"`, `"slide"` or `"ball"` that a joint consists of: the `name` and the `value` of its coordinate, and a `point`
-    [m] and its `axis` in the world, zero for a ball.
+    """A `"hinge"`, `"slide"` or `"ball"` that a joint consists of: the `name` and the `value` of its coordinate, and a
+    `point` [m] and its `axis` in the world, zero for a ball.
     """
 
     kind: str
