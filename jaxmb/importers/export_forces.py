@@ -99,7 +99,7 @@ class _Writer:
         counts, ahead = iter(part.scalars), 0.0
         for k, (joint, coefficient) in enumerate(zip(joints, np.asarray(part.part.coefficients), strict=True)):
             ElementTree.SubElement(element, "joint", joint=joint.name, coef=numbers(coefficient))
-            if part.is_periodic(k):
+            if part.part.is_periodic(k):
                 ahead += float(coefficient) * part.turns(joint.value, next(counts), k)
         self.lengths[f"{part.name}.length"] = ahead
         self.tendons[f"{part.name}.length"] = element
@@ -125,7 +125,7 @@ class _Writer:
         stiffness, free = float(own.stiffness), float(np.reshape(own.free, ()))
         if stiffness == 0:
             return None
-        if joint is not None and part.is_periodic() and own.middle is None:
+        if joint is not None and own.is_periodic() and own.middle is None:
             self.notes.say(_COUNTS, part.name)
         free += self.ahead(part, free if own.middle is None else own.middle)
         before, its_free = self.springs.get(coordinate, (0.0, 0.0))

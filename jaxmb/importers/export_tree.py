@@ -73,15 +73,11 @@ class PlacedPart:
         pose, point = self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])
         return pose[:3] + rotation_of(pose[3:7]) @ point
 
-    def is_periodic(self, k: int = 0) -> bool:
-        """Whether the k-th coordinate that the part acts on is an angle known up to full turns."""
-        return self.acts_on[k].partition(".")[2] in self.part.joints[str(k)].periodic
-
     def turns(self, value: float, about: Any, k: int = 0) -> float:
         """By how many full turns [rad] a value of its k-th coordinate is ahead of the one that the part sees, of an
         angle the one within half a turn of another.
         """
-        return float(turns(jnp.asarray(value - about).reshape(()))) if self.is_periodic(k) else 0.0
+        return float(turns(jnp.asarray(value - about).reshape(()))) if self.part.is_periodic(k) else 0.0
 
 
 @dataclasses.dataclass
@@ -130,10 +126,8 @@ def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPar
 
 def _acts_on(group, part, k):
     """The coordinates that a part acts on: stacked parts know their joints by number only."""
-    within = getattr(part, "within", ())
-    within = (within,) if isinstance(within, str) else within
     names = [own[k] for keys, own in group.inner if len(keys) == 2 and keys[0] == "joints"]
-    return tuple(f"{name}.{own}" for name, own in zip(names, within, strict=False))
+    return tuple(f"{name}.{own}" for name, own in zip(names, getattr(part, "within", ()), strict=False))
 
 
 def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree:

@@ -1,6 +1,5 @@
 """Couplings between coordinates of joints, tendons along them, and inertias that move with them."""
 
-import abc
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -14,32 +13,14 @@ from .._types import VectorLike
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
-from .coordinate_parts import AbstractOfJoints, shortest, turns
+from .coordinate_parts import AbstractOfCoordinates, shortest, turns
 
 # Points of a tendon coincide if they are no farther apart than this share of its length.
 _APART = 1e-9
 
 
-class AbstractCombination(AbstractOfJoints):
-    """A part that acts on several coordinates of joints or tendons, each a number.
-
-    **Fields:** a scene fills in the names of the coordinates `within` their joints.
-    """
-
-    within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
-
-    @property
-    @abc.abstractmethod
-    def combined(self) -> tuple[str, ...]:
-        """The names of the coordinates, `"hip.angle"`."""
-
-    @property
-    def sources(self):
-        return tuple(name.split(".")[0] for name in self.combined)
-
-    def of_sources(self, parts, places):
-        within = tuple(name.partition(".")[2] for name in self.combined)
-        return super().of_sources(parts, places).with_fields(within=within)
+class AbstractCombination(AbstractOfCoordinates):
+    """A part that acts on several coordinates of joints or tendons, each a number."""
 
     def complete(self, space, poses):
         given = []
@@ -50,14 +31,6 @@ class AbstractCombination(AbstractOfJoints):
             given.append(float(value.reshape(())))
         return self.with_given(np.array(given))
 
-    def is_of_length(self, field):
-        return self._are_lengths(range(len(self.within)))
-
-    def _are_lengths(self, numbers):
-        """Which of the coordinates with these numbers are lengths; None if it is not known."""
-        known = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
-        return None if None in known else np.array(known if len(known) > 1 else known[0])
-
     def with_given(self, given: np.ndarray) -> Any:
         """Hook: a checked copy with omitted numbers filled in, from the coordinates at the given poses."""
         del given
@@ -66,10 +39,6 @@ class AbstractCombination(AbstractOfJoints):
     def values(self, space, poses) -> list[Float[Array, ""]]:
         """The coordinates."""
         return [self.coordinates_of(k, space, poses)[own].reshape(()) for k, own in enumerate(self.within)]
-
-    def is_periodic(self, k: int) -> bool:
-        """Whether a coordinate is an angle known up to full turns."""
-        return self.within[k] in self.joints[str(k)].periodic
 
 
 class JointCoupling(AbstractCombination, AbstractConstraint):
@@ -117,7 +86,7 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
             raise ValueError(f"{self.label} couples {twice[0]!r} with itself.")
 
     def is_of_length(self, field):
-        return self._are_lengths([0] if field == "zero" else range(1, len(self.within)))
+        return self.are_lengths([0] if field == "zero" else range(1, len(self.within)))
 
     def with_given(self, given):
         return self.filled(zero=given[0], other_zero=given[1] if len(given) == 2 else given[1:])

@@ -3,7 +3,7 @@ prescribed motions.
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -98,10 +98,42 @@ class AbstractOfJoints(AbstractLink):
         return np.asarray(known[within])
 
 
-class AbstractCoordinatePart(AbstractOfJoints):
-    """A part that acts on a coordinate of a joint or tendon, in the plane or in space.
+class AbstractOfCoordinates(AbstractOfJoints):
+    """A part that acts on coordinates of joints or tendons.
 
-    **Fields:** a scene fills in the name of the coordinate `within` the joint.
+    **Fields:** a scene fills in the names of the coordinates `within` their joints.
+    """
+
+    within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
+
+    @property
+    @abc.abstractmethod
+    def combined(self) -> tuple[str, ...]:
+        """The names of the coordinates, `"hip.angle"`."""
+
+    @property
+    def sources(self):
+        return tuple(name.split(".")[0] for name in self.combined)
+
+    def of_sources(self, parts, places):
+        within = tuple(name.partition(".")[2] for name in self.combined)
+        return super().of_sources(parts, places).with_fields(within=within)
+
+    def is_of_length(self, field):
+        return self.are_lengths(range(len(self.within)))
+
+    def are_lengths(self, numbers: Iterable[int]) -> Any:
+        """Which of the coordinates with these numbers are lengths; None if it is not known."""
+        known = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
+        return None if None in known else np.array(known if len(known) > 1 else known[0])
+
+    def is_periodic(self, k: int = 0) -> bool:
+        """Whether a coordinate is an angle known up to full turns."""
+        return self.within[k] in self.joints[str(k)].periodic
+
+
+class AbstractCoordinatePart(AbstractOfCoordinates):
+    """A part that acts on a coordinate of a joint or tendon, in the plane or in space.
 
     **Arguments:**
 
@@ -110,25 +142,18 @@ class AbstractCoordinatePart(AbstractOfJoints):
     """
 
     coordinate: str = fields.name()
-    within: str = eqx.field(static=True, default_factory=str, init=False)
 
     @property
-    def sources(self) -> tuple[str, ...]:
-        return (self.coordinate.split(".")[0],)
+    def combined(self):
+        return (self.coordinate,)
 
     @property
     def joint(self) -> AbstractLink:
         """The joint or tendon."""
         return self.joints["0"]
 
-    def of_sources(self, parts, places):
-        return super().of_sources(parts, places).with_fields(within=self.coordinate.partition(".")[2])
-
     def complete(self, space, poses):
         return self.with_numbers(self.given_coordinate(0, self.coordinate, space, poses))
-
-    def is_of_length(self, field):
-        return self.joint.is_length(self.within)
 
     @abc.abstractmethod
     def with_numbers(self, given: np.ndarray) -> Any:
@@ -136,7 +161,7 @@ class AbstractCoordinatePart(AbstractOfJoints):
 
     def measured(self, space, poses) -> Float[Array, "n"]:
         """The coordinate, raveled."""
-        return self.coordinates_of(0, space, poses)[self.within].reshape(-1)
+        return self.coordinates_of(0, space, poses)[self.within[0]].reshape(-1)
 
     def measured_with_rate(self, space, poses, velocities) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """The coordinate and its rate, raveled."""
@@ -149,16 +174,16 @@ class AbstractCoordinatePart(AbstractOfJoints):
     def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`; of angles that are known up to full turns the smallest such difference."""
         out = value - target.reshape(-1)
-        return shortest(out) if self.within in self.joint.periodic else out
+        return shortest(out) if self.is_periodic() else out
 
     def shortest_difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`; of an angle less full turns, in [−π, π]."""
         out = value - target.reshape(-1)
-        return shortest(out) if self.within in self.joint.angles else out
+        return shortest(out) if self.within[0] in self.joint.angles else out
 
     def near(self, value: Float[Array, "n"], middle: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """The value; of angles that are known up to full turns the one within half a turn of `middle`."""
-        return middle.reshape(-1) + self.difference(value, middle) if self.within in self.joint.periodic else value
+        return middle.reshape(-1) + self.difference(value, middle) if self.is_periodic() else value
 
     def _check_shape(self, field: str, given: np.ndarray) -> None:
         shape = np.shape(getattr(self, field))
@@ -168,7 +193,7 @@ class AbstractCoordinatePart(AbstractOfJoints):
             )
 
     def _check_middle(self) -> None:
-        if self.within not in self.joint.periodic:
+        if not self.is_periodic():
             raise ValueError(
                 f"{self.label}: middle is that of an angle in space, which {self.coordinate!r} is not; leave it out."
             )
@@ -318,7 +343,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
         return self.lower < self.upper
 
     def with_numbers(self, given):
-        if self.within in self.joint.periodic and self.upper - self.lower >= 2 * np.pi:
+        if self.is_periodic() and self.upper - self.lower >= 2 * np.pi:
             raise ValueError(
                 f"{self.label}: the range of an angle in space must be less than a full turn, got {self.lower} to "
                 f"{self.upper}."

@@ -114,7 +114,7 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
         return agree if self.lower is None or self.upper is None else agree & (self.lower < self.upper)
 
     def with_numbers(self, given):
-        if self.within in self.joint.periodic:
+        if self.is_periodic():
             if self.lower is None or self.upper is None:
                 raise ValueError(
                     f"{self.label}: an angle in space is known up to full turns; give lower and upper of its range."

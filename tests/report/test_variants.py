@@ -89,8 +89,7 @@ ON_ANGLE, ON_BOTH = ("angle", "displacement"), ("angle", "angle", "displacement"
 )
 def test_units_by_the_coordinates_that_a_part_acts_on(part, within, field, expected):
     joints = {str(k): planar.PointOnLine("a", "ground", "rod", point=(0.0, 0.0)) for k in range(len(within))}
-    own = within if isinstance(part.within, tuple) else within[0]
-    found = _unit(part.with_fields(within=own, joints=joints), field, declarations(type(part))[field])
+    found = _unit(part.with_fields(within=within, joints=joints), field, declarations(type(part))[field])
     assert found is expected is None or np.array_equal(found, expected)
 
 
