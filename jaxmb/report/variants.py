@@ -20,11 +20,11 @@ from ..parts.units import power_of_length
 from ..system import AbstractSystem, parameters, with_parameters
 
 
-def units(system: Any) -> dict[str, Any]:
-    """The units of all parameters by name, or of their components; None where it is not declared, or a user's function
-    gives it.
+def units(system: Any) -> dict[str, str | None]:
+    """The units of all parameters by name, `"N/m, N m/rad"` of components with several; None where it is not declared,
+    or a user's function gives it.
     """
-    out: dict[str, Any] = dict.fromkeys(parameters(system))
+    out: dict[str, str | None] = dict.fromkeys(parameters(system))
     for g in _groups(system):
         for _, shown, declared in paths(g.group.part):
             field = ".".join(shown)
@@ -33,11 +33,11 @@ def units(system: Any) -> dict[str, Any]:
     return out | {f"{weight.name}.acceleration": "m/s²" for weight in weights}
 
 
-def _unit(part: Any, field: str, declared: Declaration) -> Any:
+def _unit(part: Any, field: str, declared: Declaration) -> str | None:
     if not isinstance(declared.unit, tuple):
         return declared.unit
     (of_angle, of_length), which = declared.unit, part.is_of_length(field)
-    return None if which is None else np.where(which, of_length, of_angle)
+    return None if which is None else ", ".join(np.ravel(np.where(which, of_length, of_angle)))
 
 
 def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State]:
@@ -56,7 +56,8 @@ def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State
         raise ValueError(f"the units of {', '.join(unknown[:3]) or 'a Lagrangian'} are not known")
     values = {}
     for name, value in parameters(system).items():
-        values[name] = np.asarray(value) * float(factor) ** np.vectorize(power_of_length)(known[name])
+        exponents = np.array([power_of_length(unit) for unit in (known[name] or "").split(", ")])
+        values[name] = np.asarray(value) * float(factor) ** np.squeeze(exponents)
     scaled = with_parameters(system, values)
     scaled = eqx.tree_at(lambda s: s.length, scaled, system.length * factor)
     natural = lambda s: (s.coordinate_scale(), s.velocity_scale())
