@@ -29,7 +29,7 @@ from . import fields
 from .inherited import with_inherited_arguments
 from .names import check_arguments
 from .shapes import AbstractShape
-from .space import AbstractSpace
+from .space import AbstractSpace, both_points
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -293,7 +293,8 @@ class AbstractLink(AbstractActor):
     """A part that acts between bodies, `bodies`."""
 
     bodies = _Bodies()
-    path_kind: ClassVar[PathKind] = "rod"
+    # How a picture draws the line between its points A and B; none by default.
+    path_kind: ClassVar[PathKind | None] = None
 
     # From which of its bodies on several may be one, on which the part has several places; None where all must differ.
     several_from: ClassVar[int | None] = None
@@ -405,11 +406,10 @@ class AbstractLink(AbstractActor):
         return ()
 
     def path(self, space: AbstractSpace, poses: Poses) -> Float[Array, "points d"] | None:
-        """Hook: the world points [m] through which a picture draws the part, as `path_kind` says: `"rod"` and `"coil"`
-        between two points, `"belt"` a closed line through any number; None if it shows no line.
+        """Hook: the world points [m] through which a picture draws the part, as `path_kind` says: `"rod"`, the default,
+        and `"coil"` between two points, `"belt"` a closed line through any number; None if it shows no line.
         """
-        del space, poses
-        return None
+        return None if self.path_kind is None else both_points(space, self, poses)
 
 
 class AbstractPair(AbstractLink):

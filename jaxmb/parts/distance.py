@@ -4,9 +4,9 @@ from typing import ClassVar
 
 from ..linalg.rotations import dot, norm
 from . import fields
-from .base import AbstractConstraint, AbstractPointPair
+from .base import AbstractConstraint, AbstractPointPair, PathKind
 from .elements import apart
-from .space import both_points, separation
+from .space import separation
 
 
 class Distance(AbstractPointPair, AbstractConstraint):
@@ -27,6 +27,7 @@ class Distance(AbstractPointPair, AbstractConstraint):
     length: fields.Number = fields.length(sign="positive", optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
+    path_kind: ClassVar[PathKind] = "rod"
 
     def complete(self, space, poses):
         return self.filled(length=norm(separation(space, self, poses)))
@@ -38,6 +39,3 @@ class Distance(AbstractPointPair, AbstractConstraint):
     def residual(self, space, poses, t):
         d = separation(space, self, poses)
         return ((dot(d, d) - self.length**2) / (2 * self.length))[None]
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)

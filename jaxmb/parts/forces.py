@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPointPair, AbstractPotentialForce, PathKind
-from .space import both_points, force_pair, moment_pair, rate_of, separation, separation_rate, with_drift
+from .space import force_pair, moment_pair, rate_of, separation, separation_rate, with_drift
 
 
 class Gravity(AbstractPart):
@@ -86,9 +86,6 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
         d = separation(space, self, poses)
         # ½ k (l − l0)², written so that its derivative at l = 0 is finite.
         return 0.5 * self.stiffness * (jnp.dot(d, d) - 2 * self.free_length * norm(d) + self.free_length**2)
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
 
 class Damper(AbstractPointPair, AbstractForce):

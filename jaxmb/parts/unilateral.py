@@ -15,12 +15,20 @@ from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractInertialConstraint, AbstractPointPair, Poses, Quantities, ScalarCoordinate, Velocities
+from .base import (
+    AbstractInertialConstraint,
+    AbstractPointPair,
+    PathKind,
+    Poses,
+    Quantities,
+    ScalarCoordinate,
+    Velocities,
+)
 from .coordinate_parts import AbstractScalarPart
 from .forces import over_ground
 from .modes import CLOSED, kind_of
 from .shapes import Box, Ground
-from .space import AbstractSpace, both_points, round_shapes, separation
+from .space import AbstractSpace, round_shapes, separation
 from .terrain import AbstractTerrain, distance
 
 
@@ -363,11 +371,9 @@ class Slack(AbstractGeometricContact, AbstractPointPair):
     """
 
     length: fields.Number = fields.length(sign="positive")
+    path_kind: ClassVar[PathKind] = "rod"
 
     def gap(self, space, poses):
         d = separation(space, self, poses)
         # Smooth where the points coincide.
         return (self.length**2 - jnp.dot(d, d)) / (2 * self.length)
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)

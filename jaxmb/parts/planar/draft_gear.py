@@ -9,7 +9,7 @@ from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce, PathKind
 from ..smooth import quintic, sign
-from ..space import both_points, force_pair, separation, separation_rate
+from ..space import force_pair, separation, separation_rate
 
 
 class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
@@ -97,9 +97,6 @@ class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
         strokes = jnp.stack([extension - self.slack, -extension - self.slack])
         # The ramps begin half their width before.
         return -jnp.concatenate([strokes, strokes - self.travel]) - 0.5 * self.smoothing
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def _against(self, stroke, rate):
         engaged, ramp, _ = self._engaged(stroke)

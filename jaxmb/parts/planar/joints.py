@@ -14,10 +14,18 @@ from ..._types import Scalar
 from ...linalg.arrays import namespace
 from ...linalg.rotations import rotate_2d
 from .. import fields
-from ..base import AbstractAxisJoint, AbstractConstraint, AbstractJoint, AbstractPair, AbstractPlanarPart, Quantities
+from ..base import (
+    AbstractAxisJoint,
+    AbstractConstraint,
+    AbstractJoint,
+    AbstractPair,
+    AbstractPlanarPart,
+    PathKind,
+    Quantities,
+)
 from ..elements import coincident, in_planes, perpendicular
 from ..shapes import pin, sleeve, wheel
-from ..space import both_points, nearest_to_origin, separation
+from ..space import nearest_to_origin, separation
 
 
 def relative_angle(poses: Float[Array, "k p"]) -> Float[Array, ""]:
@@ -102,6 +110,7 @@ class PointOnLine(AbstractPlanarPart, AbstractAxisJoint):
 
     rows: ClassVar[int] = 1
     quantities: ClassVar[Quantities] = {"displacement": "length", "angle": "angle"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     @property
     def elements(self):
@@ -112,9 +121,6 @@ class PointOnLine(AbstractPlanarPart, AbstractAxisJoint):
 
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses), "angle": relative_angle(poses)}
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, pin(space.in_space(self.point_b), size)),)
@@ -143,6 +149,7 @@ class Prismatic(AbstractPlanarPart, AbstractAxisJoint):
     angle: fields.Number = fields.parameter(unit="rad", optional=True)
     rows: ClassVar[int] = 2
     quantities: ClassVar[Quantities] = {"displacement": "length"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     def complete(self, space, poses):
         return self.filled(angle=relative_angle(poses))
@@ -163,9 +170,6 @@ class Prismatic(AbstractPlanarPart, AbstractAxisJoint):
 
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, self._axis_b))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, sleeve(space.in_space(self.point_b), size, space.in_space(self._axis_b))),)

@@ -15,10 +15,10 @@ import numpy as np
 
 from ...linalg.rotations import conjugate, cross, dot, from_axis_angle, multiply, rotate, unrotate
 from .. import fields
-from ..base import AbstractAxisJoint, AbstractJoint, AbstractSpatialPart, Quantities
+from ..base import AbstractAxisJoint, AbstractJoint, AbstractSpatialPart, PathKind, Quantities
 from ..elements import coincident, in_planes, perpendicular
 from ..shapes import ball, pin, sleeve
-from ..space import both_points, nearest_to_origin, separation
+from ..space import nearest_to_origin, separation
 from .axes import (
     across,
     aligned,
@@ -290,15 +290,13 @@ class AbstractSliding(AbstractAxial):
     """A joint whose two axes stay on one line, along which one body also slides."""
 
     quantities: ClassVar[Quantities] = {"angle": "angle", "displacement": "length"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, self.axis_b))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, sleeve(self.point_b, size, self.axis_b)),)
@@ -399,6 +397,7 @@ class Prismatic(AbstractOriented, AbstractAxisJoint):
 
     rows: ClassVar[int] = 5
     quantities: ClassVar[Quantities] = {"displacement": "length"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     @property
     def elements(self):
@@ -415,9 +414,6 @@ class Prismatic(AbstractOriented, AbstractAxisJoint):
 
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, unrotate(self.orientation, self.axis_a)))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, sleeve(self.point_b, size, unrotate(self.orientation, self.axis_a))),)

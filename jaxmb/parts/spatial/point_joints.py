@@ -3,10 +3,9 @@
 from typing import ClassVar
 
 from ...linalg.rotations import dot
-from ..base import AbstractAxisJoint, AbstractSpatialPart, Quantities
+from ..base import AbstractAxisJoint, AbstractSpatialPart, PathKind, Quantities
 from ..elements import in_planes
 from ..shapes import ball
-from ..space import both_points
 from .axes import across, displacement_along, offset_in_a, perpendiculars
 
 
@@ -49,6 +48,7 @@ class PointOnLine(AbstractSpatialPart, AbstractAxisJoint):
 
     rows: ClassVar[int] = 2
     quantities: ClassVar[Quantities] = {"displacement": "length"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     @property
     def elements(self):
@@ -59,9 +59,6 @@ class PointOnLine(AbstractSpatialPart, AbstractAxisJoint):
 
     def coordinates(self, space, poses):
         return {"displacement": displacement_along(space, self, poses)}
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, ball(self.point_b, size)),)
