@@ -113,7 +113,7 @@ def held_groups(
         part = driver.with_fields(
             joints={"0": jax.tree.map(lambda leaf, k=own.member: leaf[k], group.part)},
             places=(tuple(range(len(group.bodies[own.member]))),),
-            within=own.field,
+            within=(own.field,),
             rows=math.prod(own.shape),
         )
         stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)

@@ -519,7 +519,9 @@ def test_part_errors(part, message):
 
 def test_errors_of_choices():
     with pytest.raises(ValueError, match="'drive': quantity must be one of"):
-        driver("z")
+        driver("w")
+    with pytest.raises(ValueError, match="'drive': quantity='z' belongs to spatial scenes"):
+        driver("z").resolve(PLANE, jnp.zeros((2, 3)))
     with pytest.raises(ValueError, match="'F': frame must be"):
         planar.PointForce("F", "a", force=X, frame="space")
 
