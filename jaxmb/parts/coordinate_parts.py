@@ -322,7 +322,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     (exponent + 1)`, and its force nearly `stiffness d^exponent`.
 
     **Arguments:** `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0, or over this power of an angle or length;
-    `exponent` > 0, default none; `damping` [N m s/rad, N s/m] ≥ 0; `smoothing` [rad, m] > 0, in which the ramp bends.
+    `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, in which the ramp bends.
     In space the range of an angle must be less than a full turn.
     """
 
@@ -330,7 +330,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     upper: fields.Number = fields.parameter(unit=("rad", "m"))
     stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
     exponent: fields.Number = fields.parameter(unit="1", sign="positive", optional=True)
-    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
+    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", optional=True)
     smoothing: fields.Number = fields.parameter(unit=("rad", "m"), sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("lower", "upper")
     has_gaps: ClassVar[bool] = True
@@ -369,11 +369,12 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         def law(x, v):
-            depth, rate = jax.jvp(self._depths, (x,), (v,))
-            rate = with_drift(self, rate, lambda part: part._depths(x))
-            power = depth if self.exponent is None else depth**self.exponent
-            (force,) = jax.vjp(self._depths, x)[1](self.stiffness * power + self.damping * rate)
-            return -force
+            depth, pull = jax.vjp(self._depths, x)
+            push = self.stiffness * (depth if self.exponent is None else depth**self.exponent)
+            if self.damping is not None:
+                _, rate = jax.jvp(self._depths, (x,), (v,))
+                push += self.damping * with_drift(self, rate, lambda part: part._depths(x))
+            return -pull(push)[0]
 
         return self.force_along(space, poses, velocities, law)
 
