@@ -322,7 +322,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     (exponent + 1)`, and its force nearly `stiffness d^exponent`.
 
     **Arguments:** `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0, or over this power of an angle or length;
-    `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, in which the ramp bends.
+    `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, where the ramp bends.
     In space the range of an angle must be less than a full turn.
     """
 
