@@ -21,8 +21,8 @@ class KnifeEdge(AbstractVelocityConstraint):
     system = jaxmb.Scene([sled], joints=[blade]).compile()
     ```
 
-    In space it does not hold the body on the plane; add a `spatial.Planar` or `PointOnPlane` joint. It has no
-    coordinates of its own.
+    It has no coordinates of its own. In space it does not hold the body on the plane; add a `spatial.Planar` or
+    `PointOnPlane` joint.
 
     **Arguments:**
 
