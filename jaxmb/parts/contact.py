@@ -169,52 +169,25 @@ class Janosi(AbstractFrictionLaw):
         return -strength * scale * jnp.where(small, series, (other + jnp.expm1(-other)) / other**2) * slip
 
 
-class AbstractCompliantContact(AbstractPotentialForce):
-    """A contact whose force is a function of the depth.
-
-    **Arguments:**
-
-    - `name`, of the contact.
-    - `normal`: the normal force as a function of the depth, `Linear`, `Hertz` or `Bekker` from `jaxmb.contact`.
-    - `damping` [N s/m] ≥ 0 against the rate of the depth, and `damping_depth` [m] > 0, from which on it acts fully.
-    - `smoothing` [m] > 0 of the depth, `δ = ½ (d + √(d² + smoothing²))` for a distance d inside. Far outside a depth of
-        `smoothing² / (4 |d|)` remains.
+class AbstractContact(AbstractPotentialForce):
+    """Base class of contacts with one terrain. Subclasses define the distance from the ground (`distance`, `outward`)
+    and the onset of damping (`onset`); the fields are those of `Contact`.
     """
 
     name: str = fields.name()
-    normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
-    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
-    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
-    has_gaps: ClassVar[bool] = True
-
-    @property
-    def gap_width(self):
-        return self.smoothing
-
-
-class AbstractContact(AbstractCompliantContact):
-    """Base class of contacts with one terrain. Subclasses define the distance from the ground (`distance`, `outward`)
-    and the onset of damping (`onset`).
-
-    **Arguments:**
-
-    - `bodies`: one name or several; all share one terrain, one law and one set of parameters.
-    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but that it rises and sinks where its
-        numbers are inputs.
-    - `friction`: `Coulomb` or `Janosi` from `jaxmb.contact`, default none.
-    - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
-    - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the origins of the frames.
-    """
-
     bodies: fields.Names = fields.body_names()
     terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
+    normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     friction: AbstractFrictionLaw | None = fields.law(
         AbstractFrictionLaw | None, what="a law from jaxmb.contact", default=None
     )
     radius: fields.Number = fields.length(shape=None, sign="non-negative", default=0.0)
     centres: fields.Number = fields.parameter(shape=None, unit="m", optional=True)
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
+    has_gaps: ClassVar[bool] = True
 
     @abc.abstractmethod
     def distance(self, centre: Vector) -> Number:
@@ -250,6 +223,10 @@ class AbstractContact(AbstractCompliantContact):
 
     def gaps(self, space, poses, t):
         return self._each(space, lambda pose, point, radius: self.distance(space.point(pose, point)) - radius, poses)
+
+    @property
+    def gap_width(self):
+        return self.smoothing
 
     def gap_pace(self, space, poses, velocities, t):
         def passing(pose, velocity, point, radius):
@@ -303,12 +280,23 @@ class Contact(AbstractContact):
     system = jaxmb.Scene([wheel], forces=[ground, jaxmb.Gravity((0.0, -9.81))]).compile()
     ```
 
-    The penetration depth is smoothed, and has a potential, the energy of `normal`. The contact also exerts normal
-    damping, with the coefficient `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping
-    may pull while a body separates.
+    The penetration depth is smoothed, `δ = ½ (d + √(d² + smoothing²))` for a distance d below the ground, and has a
+    potential, the energy of `normal`. The contact also exerts normal damping, with the coefficient
+    `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body separates.
 
     The distance d is normal to the terrain, exact on even ground and to first order in its curvature; the step has two
     continuous derivatives.
+
+    **Arguments:**
+
+    - `bodies`: one name or several; all share one terrain, one law and one set of parameters.
+    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but that it rises and sinks where its
+        numbers are inputs.
+    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
+    - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
+    - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the origins of the frames.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
+    - `smoothing` [m] > 0. Far above the ground a depth of `smoothing² / (4 |d|)` remains.
     """
 
     def distance(self, centre):

@@ -12,16 +12,16 @@ import numpy as np
 
 from ..linalg.rotations import cross, norm
 from . import fields
-from .base import AbstractDynamicForce
+from .base import AbstractDynamicForce, AbstractPotentialForce
 from .boundary import check_returns
-from .contact import AbstractCompliantContact
+from .contact import AbstractNormalLaw
 from .forces import over_ground
 from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step
 from .terrain import AbstractTerrain, distance, outward, pace_over
 
 
-class Tyre(AbstractDynamicForce, AbstractCompliantContact):
+class Tyre(AbstractDynamicForce, AbstractPotentialForce):
     """A tyre on a thin wheel, with relaxation, and with slip lengthwise and in space sideways.
 
     ```python
@@ -39,11 +39,13 @@ class Tyre(AbstractDynamicForce, AbstractCompliantContact):
 
     **Arguments:**
 
-    - `body`: the wheel, or a frame fixed in it.
+    - `name`, of the tyre; `body`: the wheel, or a frame fixed in it.
     - `radius` [m] > 0; `centre` [m], default the origin of the frame.
     - `axis`, unit, shape (3,), in space: the axle fixed in the body, pointing to the left of a wheel that rolls
         forwards, default the y axis. The wheel must not lie flat.
-    - `terrain`, from `jaxmb.terrain`.
+    - `terrain`, from `jaxmb.terrain`; `normal`: the load [N] as a function of the depth, from `jaxmb.contact`;
+        `damping` [N s/m] ≥ 0 against the rate of the depth, fully from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
+        of the depth, `½ (δ + √(δ² + smoothing²))`.
     - `slip_stiffness` c > 0, of one direction or of all, (d − 1,): force over load and slip, for small slips;
         `coefficient` μ > 0 of friction.
     - `relaxation_length` σ [m] > 0, of one direction or of all; `transition_speed` [m/s] > 0: rolling speeds below it
@@ -52,17 +54,23 @@ class Tyre(AbstractDynamicForce, AbstractCompliantContact):
         space, to the left; initially zero. Off the ground, where there is no force, it follows the slip all the same.
     """
 
+    name: str = fields.name()
     body: str = fields.body_name()
     radius: fields.Number = fields.length(sign="positive")
     centre: fields.Number = fields.point(body=0, default="origin")
     axis: fields.Number = fields.axis(body=0, optional=True, dimension=3)
     terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
+    normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     coefficient: fields.Number = fields.parameter(unit="1", sign="positive")
     slip_stiffness: fields.Number = fields.parameter(shape=None, unit="1", sign="positive")
     relaxation_length: fields.Number = fields.parameter(shape=None, unit="m", sign="positive")
     transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.1)
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     deflection: fields.Number = fields.internal_state(shape=None, unit="m")
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
+    has_gaps: ClassVar[bool] = True
 
     def complete(self, space, poses):
         count = space.dimension - 1
@@ -97,6 +105,10 @@ class Tyre(AbstractDynamicForce, AbstractCompliantContact):
 
     def gaps(self, space, poses, t):
         return self._gap(space, poses[0])[None]
+
+    @property
+    def gap_width(self):
+        return self.smoothing
 
     def gap_pace(self, space, poses, velocities, t):
         centre = space.point(poses[0], self.centre)

@@ -6,6 +6,7 @@ body, so contact adds no constraint and no event.
 
 import abc
 import itertools
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -15,8 +16,8 @@ from jaxtyping import Array, Float
 
 from ...linalg.rotations import norm
 from .. import fields
-from ..base import AbstractPlanarPart
-from ..contact import AbstractCompliantContact, AbstractFrictionLaw
+from ..base import AbstractPlanarPart, AbstractPotentialForce
+from ..contact import AbstractFrictionLaw, AbstractNormalLaw
 from ..smooth import ramp, step
 from ..space import round_shapes
 
@@ -42,7 +43,7 @@ class _Disc:
         return self.space.point_force(self.pose, self.space.body_point(self.pose, x), force)
 
 
-class AbstractBodyContact(AbstractPlanarPart, AbstractCompliantContact):
+class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     """Base class of contacts of one disc with other bodies. Subclasses define the numbers of each of the others
     (`surfaces`), and with these the distance of the disc's centre from its surface (`distance`) and how much of the
     force acts (`share`), as functions of the place of that centre in the other body's frame.
@@ -51,18 +52,26 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractCompliantContact):
 
     **Arguments:**
 
-    - `bodies`: names, first that of the body of the disc, then those of the others, one that is
+    - `name`, of the contact; `bodies`: names, first that of the body of the disc, then those of the others, one that is
         touched at several places for each of them.
-    - `friction`: `Coulomb` or `Janosi` from `jaxmb.contact`, default none.
+    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
+    - `smoothing` [m] > 0. At a distance d a depth of `smoothing² / (4 d)` remains.
     """
 
+    name: str = fields.name()
     bodies: fields.Names = fields.body_names()
+    normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     friction: AbstractFrictionLaw | None = fields.law(
         AbstractFrictionLaw | None, what="a law from jaxmb.contact", default=None
     )
     radius: fields.Number = fields.length(sign="positive")
     centre: fields.Number = fields.point(body=0, default="origin")
+    damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
+    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+    has_gaps: ClassVar[bool] = True
 
     several_from = 1
 
@@ -96,6 +105,10 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractCompliantContact):
         centre = space.point(poses[0], self.centre)
         own = lambda pose, surface: self.clearance(space.body_point(pose, centre), surface)
         return jax.vmap(own)(poses[1:], self.surfaces())
+
+    @property
+    def gap_width(self):
+        return self.smoothing
 
     def clearance(self, place: Vector, surface: Surface) -> Number:
         """How far [m] the disc is from where a force acts, negative where it does."""
