@@ -115,7 +115,7 @@ def held_groups(
         part = driver.with_fields(
             joints={"0": jax.tree.map(lambda leaf, k=coordinate.member: leaf[k], group.part)},
             places=(tuple(range(len(group.bodies[coordinate.member]))),),
-            within=coordinate.field,
+            within=(coordinate.field,),
             rows=math.prod(coordinate.shape),
         )
         stacked = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], part)

@@ -105,7 +105,7 @@ def _paths(system, group, ts, ys) -> dict[str, Line]:
         return {}
     lines = np.asarray(lines)
     lines = np.concatenate([lines, np.zeros((*lines.shape[:-1], 3 - lines.shape[-1]))], axis=-1)
-    return {name: Line(group.part.path_kind, lines[:, k]) for k, name in enumerate(group.names)}
+    return {name: Line(group.part.path_kind or "rod", lines[:, k]) for k, name in enumerate(group.names)}
 
 
 @eqx.filter_jit

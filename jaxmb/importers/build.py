@@ -12,10 +12,9 @@ from ..parts.actuators import Actuator
 from ..parts.base import GROUND
 from ..parts.combinations import FixedTendon, JointCoupling, JointInertia, Tendon
 from ..parts.coordinate_parts import JointDriver, JointFriction, JointSpring, JointStop
-from ..parts.forces import Damper, Gravity, PointForce
+from ..parts.forces import Damper, Gravity, PointForce, RotationalDamper
 from ..parts.shapes import AbstractShape
 from ..parts.spatial.bodies import Body
-from ..parts.spatial.forces import RotationalDamper
 from ..parts.spatial.frames import Frame
 from ..parts.spatial.joints import Fixed, Spherical
 from . import chains

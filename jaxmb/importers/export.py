@@ -62,9 +62,9 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
         k = system.body_names.index(node.body)
         elements[node.body] = _body(elements[node.parent], node, tree, mass[k], inertia[k])
     sections = {tag: ElementTree.Element(tag) for tag in ("equality", "tendon", "actuator")}
-    for loop in tree.loops:
-        loop.write(sections["equality"])
-        notes.say("Loops and couplings are held softly by MuJoCo: {}.", loop.name)
+    for name, tag, attributes in tree.loops:
+        ElementTree.SubElement(sections["equality"], tag, attributes)
+        notes.say("Loops and couplings are held softly by MuJoCo: {}.", name)
     write_forces(system, tree, elements, sections, notes)
     root.extend(section for section in sections.values() if len(section))
     ElementTree.indent(root)
@@ -74,8 +74,8 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
 
 
 def _body(parent, node: TreeBody, tree: Tree, mass, inertia):
-    above: Any = tree.place(node.parent)
-    own: Any = tree.place(node.body)
+    above: Any = tree.poses[node.parent]
+    own: Any = tree.poses[node.body]
     back = rotation_of(above[3:]).T
     element = ElementTree.SubElement(
         parent, "body", name=tree.bodies[node.body], pos=numbers(back @ (own[:3] - above[:3]))
@@ -84,11 +84,11 @@ def _body(parent, node: TreeBody, tree: Tree, mass, inertia):
     full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] if np.any(inertia) else np.array([mass] * 3 + [0.0] * 3)
     ElementTree.SubElement(element, "inertial", pos="0 0 0", mass=numbers(mass), fullinertia=numbers(full))
     for joint in node.joints:
-        written = ElementTree.SubElement(element, "joint", name=joint.name, type=joint.type)
+        written = ElementTree.SubElement(element, "joint", name=joint.name, type=joint.kind)
         turn = rotation_of(own[3:]).T
-        if joint.type != "free":
+        if joint.kind != "free":
             written.set("pos", numbers(turn @ (joint.point - own[:3])))
-        if joint.type in ("hinge", "slide"):
+        if joint.kind in ("hinge", "slide"):
             written.set("axis", numbers(turn @ joint.axis))
             written.set("ref", numbers(joint.value))
         tree.elements[joint.name] = written

@@ -7,11 +7,14 @@ import numpy as np
 
 from ..bodies import RigidBodySystem
 from ..linalg.rotations import from_matrix
+from ..parts.actuators import Actuator
 from ..parts.base import AbstractInertialConstraint
+from ..parts.combinations import FixedTendon, JointInertia, Tendon
+from ..parts.coordinate_parts import JointFriction, JointSpring, JointStop
+from ..parts.forces import RotationalDamper, SpringDamper
 from ..parts.spatial.kinematics import SPACE
-from ..parts.unilateral import AbstractUnilateralConstraint
 from .description import rotation_of
-from .export_tree import Tree, numbers, parts_of
+from .export_tree import Tree, numbers, of_class, parts_of
 from .notes import Notes
 
 # MuJoCo reads this free length of a tendon's spring as the length in the pose of the file.
@@ -24,21 +27,17 @@ def write_forces(
 ) -> None:
     """Write the forces, inertias of joints, tendons and frames of a system."""
     writer = _Writer(tree, elements, sections, notes)
-    for part in parts_of(system, system.bodies.tendons, tree):
-        writer.tendon(part)
-    for part in parts_of(system, system.forces.groups, tree):
-        if notes.leaves_out("forces", part.name):
-            continue
-        write = getattr(writer, f"write_{part.kind}", None)
-        if write is None or write(part) is False:
-            notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
-    for part in parts_of(system, system.constraints.position, tree):
-        if not isinstance(part.part, AbstractInertialConstraint) or notes.leaves_out("joints", part.name):
-            continue
-        if isinstance(part.part, AbstractUnilateralConstraint):
-            notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
-        else:
-            writer.inertia(part)
+    inertial = [
+        group for group in system.constraints.position if isinstance(group.group.part, AbstractInertialConstraint)
+    ]
+    sets = {"tendons": system.bodies.tendons, "forces": system.forces.groups, "joints": inertial}
+    for kind, groups in sets.items():
+        for part in parts_of(system, groups, tree):
+            if notes.leaves_out(kind, part.name):
+                continue
+            write = of_class(_WRITERS, part.part)
+            if write is None or write(writer, part) is False:
+                notes.refused.append(f"{part.label} cannot be expressed.")
     for turns in writer.turns.values():
         if len({*turns.values()}) > 1:
             notes.say(_COUNTS, *turns)
@@ -60,7 +59,7 @@ class _Writer:
 
     def site(self, name: str, body: str, position: np.ndarray, rotation: np.ndarray | None = None) -> None:
         """A site at a place and attitude in the world."""
-        place = self.tree.place(body)
+        place = self.tree.poses[body]
         back = rotation_of(place[3:]).T
         own = ElementTree.SubElement(self.elements[body], "site", name=name, pos=numbers(back @ (position - place[:3])))
         if rotation is not None:
@@ -81,52 +80,52 @@ class _Writer:
     def frame(self, name, group, k, system):
         number = group.group.bodies[k][0]
         body = system.body_names[number] if number < len(system.body_names) else "ground"
-        pose = np.asarray(group.group.single(k, 0.0).pose(SPACE, self.tree.place(body)))
+        pose = np.asarray(group.group.single(k, 0.0).pose(SPACE, self.tree.poses[body]))
         self.site(name, body, pose[:3], rotation_of(pose[3:7]))
 
     def tendon(self, part):
-        own = part.part
-        if part.kind == "Tendon":
-            element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
-            for k, (owner, point) in enumerate(zip(own.owners, np.asarray(own.points), strict=True)):
-                site = part.named(str(k))
-                self.site(site, part.bodies[owner], np.asarray(SPACE.point(part.poses[owner], point)))
-                ElementTree.SubElement(element, "site", site=site)
-        else:
-            element = ElementTree.SubElement(self.sections["tendon"], "fixed", name=part.name)
-            counts, ahead = iter(part.scalars), 0.0
-            for k, (name, coefficient) in enumerate(zip(part.acts_on, np.asarray(own.coefficients), strict=True)):
-                joint = self.tree.coordinates.get(name)
-                if joint is None:
-                    self.notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
-                    return
-                ElementTree.SubElement(element, "joint", joint=joint.name, coef=numbers(coefficient))
-                if part.is_periodic(k):
-                    ahead += float(coefficient) * part.turns(joint.value, next(counts), k)
-            self.lengths[f"{part.name}.length"] = ahead
+        element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
+        for k, (owner, point) in enumerate(zip(part.part.owners, np.asarray(part.part.points), strict=True)):
+            site = part.named(str(k))
+            self.site(site, part.bodies[owner], np.asarray(SPACE.point(part.poses[owner], point)))
+            ElementTree.SubElement(element, "site", site=site)
         self.tendons[f"{part.name}.length"] = element
+
+    def fixed_tendon(self, part):
+        joints: list[Any] = [self.tree.coordinates.get(name) for name in part.acts_on]
+        if None in joints:
+            return False
+        element = ElementTree.SubElement(self.sections["tendon"], "fixed", name=part.name)
+        counts, ahead = iter(part.scalars), 0.0
+        for k, (joint, coefficient) in enumerate(zip(joints, np.asarray(part.part.coefficients), strict=True)):
+            ElementTree.SubElement(element, "joint", joint=joint.name, coef=numbers(coefficient))
+            if part.part.is_periodic(k):
+                ahead += float(coefficient) * part.turns(joint.value, next(counts), k)
+        self.lengths[f"{part.name}.length"] = ahead
+        self.tendons[f"{part.name}.length"] = element
+        return None
 
     def inertia(self, part):
         (coordinate,) = part.acts_on
         tendon, joint = self.tendons.get(coordinate), self.tree.coordinates.get(coordinate)
         element: Any = tendon if joint is None else self.tree.elements[joint.name]
         if element is None:
-            self.notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed.")
-            return
+            return False
         _add(element, "armature", part.part.inertia)
+        return None
 
-    def write_JointSpring(self, part):
+    def spring(self, part):
         own = part.part
         (coordinate,) = part.acts_on
         tendon, joint = self.tendons.get(coordinate), self.tree.coordinates.get(coordinate)
-        if tendon is None and (joint is None or joint.type == "ball"):
+        if tendon is None and (joint is None or joint.kind == "ball"):
             return False
         element: Any = tendon if joint is None else self.tree.elements[joint.name]
         _add(element, "damping", own.damping)
         stiffness, free = float(own.stiffness), float(np.reshape(own.free, ()))
         if stiffness == 0:
             return None
-        if joint is not None and part.is_periodic() and own.middle is None:
+        if joint is not None and own.is_periodic() and own.middle is None:
             self.notes.say(_COUNTS, part.name)
         free += self.ahead(part, free if own.middle is None else own.middle)
         before, its_free = self.springs.get(coordinate, (0.0, 0.0))
@@ -139,7 +138,7 @@ class _Writer:
         element.set("springlength" if joint is None else "springref", numbers(free))
         return None
 
-    def write_SpringDamper(self, part):
+    def spring_damper(self, part):
         own = part.part
         element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
         for k, body in enumerate(part.bodies):
@@ -150,20 +149,20 @@ class _Writer:
         element.set("damping", numbers(own.damping))
         element.set("springlength", numbers(own.free_length))
 
-    def write_RotationalDamper(self, part):
+    def rotational_damper(self, part):
         balls = [
             joint
             for node in self.tree.nodes
             if {node.body, node.parent} == {*part.bodies}
             for joint in node.joints
-            if joint.type == "ball"
+            if joint.kind == "ball"
         ]
         if len(balls) != 1:
             return False
         _add(self.tree.elements[balls[0].name], "damping", part.part.damping)
         return None
 
-    def write_Actuator(self, part):
+    def actuator(self, part):
         own = part.part
         (coordinate,) = part.acts_on
         joint = self.tree.coordinates.get(coordinate)
@@ -189,7 +188,7 @@ class _Writer:
                 element.set(name, numbers(given))
         return None
 
-    def write_JointStop(self, part):
+    def stop(self, part):
         own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
         if joint is None:
             return False
@@ -204,7 +203,7 @@ class _Writer:
         self.notes.say("Stops are MuJoCo's limits, of its own stiffness: {}.", part.name)
         return None
 
-    def write_JointFriction(self, part):
+    def friction(self, part):
         own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
         if joint is None:
             return False
@@ -216,3 +215,16 @@ class _Writer:
 def _add(element, name, value):
     """Add to a number of an element, which several parts may give."""
     element.set(name, numbers(float(element.get(name, 0.0)) + float(value)))
+
+
+_WRITERS = {
+    Tendon: _Writer.tendon,
+    FixedTendon: _Writer.fixed_tendon,
+    JointInertia: _Writer.inertia,
+    JointSpring: _Writer.spring,
+    SpringDamper: _Writer.spring_damper,
+    RotationalDamper: _Writer.rotational_damper,
+    Actuator: _Writer.actuator,
+    JointStop: _Writer.stop,
+    JointFriction: _Writer.friction,
+}

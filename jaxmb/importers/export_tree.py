@@ -1,29 +1,42 @@
 """A spanning tree of a scene's joints, and the constraints that close loops."""
 
 import dataclasses
+import functools
 import itertools
+from collections.abc import Mapping
 from typing import Any
-from xml.etree import ElementTree
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._types import Coordinates
 from ..bodies import RigidBodySystem
-from ..parts.base import GROUND, AbstractInertialConstraint
-from ..parts.coordinate_parts import turns
-from ..parts.spatial.composite import coordinate_names
+from ..parts.base import GROUND, AbstractConstraint, AbstractInertialConstraint
+from ..parts.combinations import JointCoupling
+from ..parts.coordinate_parts import JointDriver, turns
+from ..parts.spatial.axes import ElementaryJoint
 from ..parts.spatial.kinematics import SPACE
-from .description import rotation_of, turn_about, unused
+from .description import rotation_of, unused
 from .notes import Notes
 
 # What MuJoCo calls the fixed world.
 _WORLD = "world"
+# The methods by which a class says what its parts do.
+_LAWS = {"residual", "coordinates", "wrenches", "energy", "state_rates", "length", "force"}
 
 
 def numbers(values: Any) -> str:
     """Numbers as text, to the last digit."""
     return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def of_class(table: Mapping[type, Any], part: Any) -> Any:
+    """The entry of a table for the class of a part, or for the one that its laws are from; None without one."""
+    for cls in type(part).__mro__:
+        if cls in table or _LAWS & vars(cls).keys():
+            return table.get(cls)
+    return None
 
 
 @dataclasses.dataclass
@@ -33,13 +46,23 @@ class PlacedPart:
     """
 
     name: str
-    kind: str
     part: Any
     bodies: tuple[str, ...]
     poses: np.ndarray
     acts_on: tuple[str, ...]
     scalars: tuple[float, ...]
     names: set[str]
+
+    @property
+    def label(self) -> str:
+        """The type and name of the part, for messages."""
+        return f"{self.part.kind} {self.name!r}"
+
+    @functools.cached_property
+    def joints(self) -> list[ElementaryJoint] | None:
+        """The hinges, slides and balls in succession that the part is; None if it is no such joint."""
+        is_known = isinstance(self.part, AbstractConstraint) and self.part.declares("elementary_joints", "coordinates")
+        return jax.device_get(self.part.elementary_joints(SPACE, self.poses)) if is_known else None
 
     def named(self, word: str) -> str:
         """A name for an element of the file that the part needs."""
@@ -50,62 +73,28 @@ class PlacedPart:
         pose, point = self.poses[k], np.asarray((self.part.point_a, self.part.point_b)[k])
         return pose[:3] + rotation_of(pose[3:7]) @ point
 
-    def direction(self, field: str, k: int = 0) -> np.ndarray:
-        """A direction of the part that is fixed in its k-th body, in the world."""
-        return rotation_of(self.poses[k][3:7]) @ np.asarray(getattr(self.part, field))
-
-    def is_periodic(self, k: int = 0) -> bool:
-        """Whether the k-th coordinate that the part acts on is an angle known up to full turns."""
-        return self.acts_on[k].partition(".")[2] in self.part.joints[str(k)].periodic
-
     def turns(self, value: float, about: Any, k: int = 0) -> float:
         """By how many full turns [rad] a value of its k-th coordinate is ahead of the one that the part sees, of an
         angle the one within half a turn of another.
         """
-        return float(turns(jnp.asarray(value - about).reshape(()))) if self.is_periodic(k) else 0.0
-
-    def coordinates(self) -> dict[str, np.ndarray]:
-        found = self.part.coordinates(SPACE, jnp.asarray(self.poses))
-        return {name: np.asarray(value) for name, value in found.items()}
-
-
-@dataclasses.dataclass
-class TreeJoint:
-    """A joint of MuJoCo: its name, type, point and axis in the world, and its value."""
-
-    name: str
-    type: str
-    point: np.ndarray
-    axis: np.ndarray
-    value: float = 0.0
+        return float(turns(jnp.asarray(value - about).reshape(()))) if self.part.is_periodic(k) else 0.0
 
 
 @dataclasses.dataclass
 class TreeBody:
-    """A body of the tree, with its joints from the parent on."""
+    """A body of the tree, with its joints from the parent on, which have the names that MuJoCo knows them by."""
 
     body: str
     parent: str
-    joints: list[TreeJoint]
-
-
-@dataclasses.dataclass
-class LoopEqualities:
-    """Equality constraints: tags, each with its attributes."""
-
-    name: str
-    equalities: Any
-
-    def write(self, section: Any) -> None:
-        for tag, attributes in self.equalities:
-            ElementTree.SubElement(section, tag, attrib=attributes)
+    joints: list[ElementaryJoint]
 
 
 @dataclasses.dataclass
 class Tree:
-    """The bodies in order, parents first; the constraints that close loops; and for each coordinate, `"hip.angle"`, the
-    name of MuJoCo's joint. `scalars`: the scalar coordinates of the scene; `names`: those of the scene and of elements
-    that have none there; `bodies`: what MuJoCo calls the bodies; `elements`: the XML elements of joints.
+    """The bodies in order, parents first; the constraints that close loops, each with the name of the part, a tag and
+    attributes; and for each coordinate, `"hip.angle"`, MuJoCo's joint. `scalars`: the scalar coordinates of the scene;
+    `names`: those of the scene and of elements that have none there; `bodies`: what MuJoCo calls the bodies;
+    `elements`: the XML elements of joints.
     """
 
     poses: dict[str, np.ndarray]
@@ -113,13 +102,9 @@ class Tree:
     names: set[str]
     bodies: dict[str, str]
     nodes: list[TreeBody] = dataclasses.field(default_factory=list)
-    loops: list[LoopEqualities] = dataclasses.field(default_factory=list)
-    coordinates: dict[str, TreeJoint] = dataclasses.field(default_factory=dict)
+    loops: list[Any] = dataclasses.field(default_factory=list)
+    coordinates: dict[str, ElementaryJoint] = dataclasses.field(default_factory=dict)
     elements: dict[str, Any] = dataclasses.field(default_factory=dict)
-
-    def place(self, body: str) -> np.ndarray:
-        """The pose of a body."""
-        return self.poses[body]
 
 
 def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPart]:
@@ -135,18 +120,14 @@ def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPar
             )
             places = np.stack([tree.poses[body] for body in bodies])
             places = np.asarray(own.seen_poses(SPACE, places))
-            out.append(
-                PlacedPart(name, own.kind, own, bodies, places, _acts_on(group.group, own, k), values, tree.names)
-            )
+            out.append(PlacedPart(name, own, bodies, places, _acts_on(group.group, own, k), values, tree.names))
     return out
 
 
 def _acts_on(group, part, k):
     """The coordinates that a part acts on: stacked parts know their joints by number only."""
-    within = getattr(part, "within", ())
-    within = (within,) if isinstance(within, str) else within
     names = [own[k] for keys, own in group.inner if len(keys) == 2 and keys[0] == "joints"]
-    return tuple(f"{name}.{own}" for name, own in zip(names, within, strict=False))
+    return tuple(f"{name}.{own}" for name, own in zip(names, getattr(part, "within", ()), strict=False))
 
 
 def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree:
@@ -163,9 +144,9 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
         if not isinstance(p.part, AbstractInertialConstraint) and not notes.leaves_out("joints", p.name)
     ]
     rotates = dict(zip(system.body_names, system.layout.rotates, strict=True))
-    waiting = [p for p in parts if p.kind in _JOINTS and all(rotates.get(body, True) for body in p.bodies)]
+    waiting = [p for p in parts if p.joints is not None and all(rotates.get(body, True) for body in p.bodies)]
     closing = [p for p in parts if p not in waiting]
-    waiting.sort(key=lambda part: part.kind in _CLOSING)
+    waiting.sort(key=lambda part: _closing(part) is not None)
     reached, left = {GROUND}, list(system.body_names)
     while left:
         part = next((p for p in waiting if len({*p.bodies} & reached) == 1), None)
@@ -184,11 +165,12 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
             if not notes.leaves_out("joints", name):
                 notes.refused.append(f"{velocity.group.part.kind} {name!r} cannot be expressed.")
     for part in (*waiting, *closing):
-        equalities = _CLOSING.get(part.kind, lambda *_: None)(part, tree)
+        close = _closing(part)
+        equalities = None if close is None else close(part, tree)
         if equalities is None:
-            notes.refused.append(f"{part.kind} {part.name!r} cannot be expressed where it closes a loop.")
+            notes.refused.append(f"{part.label} cannot be expressed where it closes a loop.")
         else:
-            tree.loops.append(LoopEqualities(part.name, equalities))
+            tree.loops += [(part.name, *equality) for equality in equalities]
     return tree
 
 
@@ -209,110 +191,22 @@ def _bodies(system, names, notes):
 
 
 def _free(body, tree, rotates):
-    place, named = tree.place(body), lambda word: _new(f"{body} {word}", tree.names)
+    place, named = tree.poses[body], lambda word: _new(f"{body} {word}", tree.names)
     if rotates:
-        return [TreeJoint(named("free"), "free", place[:3], np.zeros(3))]
-    return [TreeJoint(named(way), "slide", place[:3], axis) for way, axis in zip("xyz", np.eye(3), strict=True)]
+        return [ElementaryJoint("free", named("free"), place[:3], np.zeros(3), 0.0)]
+    ways = zip("xyz", np.eye(3), strict=True)
+    return [ElementaryJoint("slide", named(way), place[:3], axis, 0.0) for way, axis in ways]
 
 
 def _oriented(part, tree, child):
     """The joints of MuJoCo that a joint is, from the parent to the child."""
-    found = _JOINTS[part.kind](part)
-    for coordinate, joint in found:
-        tree.coordinates[coordinate] = joint
-    joints = [joint for _, joint in found]
-    if child == part.bodies[0]:
-        for joint in joints:
-            joint.axis = -joint.axis
-        joints.reverse()
-    return joints
-
-
-def _hinges(part, **axes):
-    """Joints by the names of their coordinates, each with its type and its axis in the world."""
-    values, out = part.coordinates(), []
-    for field, (kind, axis) in axes.items():
-        name = part.name if len(axes) == 1 else part.named(field)
-        joint = TreeJoint(name, kind, part.point(1), axis, float(values[field].reshape(-1)[0]))
-        out.append((f"{part.name}.{field}", joint))
-    return out
-
-
-# The types of the joints that a part has about axes of its own, by the names of its coordinates, each with the axis and
-# the number of the body that this is fixed in.
-_OWN_AXES = {
-    "Revolute": {"angle": ("hinge", "axis_a", 0)},
-    "Prismatic": {"displacement": ("slide", "axis_a", 0)},
-    "Cylindrical": {"displacement": ("slide", "axis_a", 0), "angle": ("hinge", "axis_a", 0)},
-    "Universal": {"angle_a": ("hinge", "axis_a", 0), "angle_b": ("hinge", "axis_b", 1)},
-}
-
-
-def _about_own_axes(part):
-    return _hinges(part, **{name: (kind, part.direction(*at)) for name, (kind, *at) in _OWN_AXES[part.kind].items()})
-
-
-def _gimbal(part):
-    own = part.part
-    values = part.coordinates()
-    first, second = np.asarray(own.axis_1), np.asarray(own.axis_2)
-    to_world, angle = rotation_of(part.poses[0][3:7]), float(values["angle_1"])
-    axis_2 = np.cos(angle) * second + np.sin(angle) * np.cross(first, second)
-    back = rotation_of(np.asarray(own.orientation)).T @ np.asarray(own.axis_3)
-    return _hinges(
-        part,
-        angle_1=("hinge", to_world @ first),
-        angle_2=("hinge", to_world @ axis_2),
-        angle_3=("hinge", rotation_of(part.poses[1][3:7]) @ back),
-    )
-
-
-def _composite(part):
-    """From the first joint on, which is fixed in A, each where the coordinates of those before it put it."""
-    own, values, out = part.part, part.coordinates(), []
-    start = np.asarray(own.point_a)
-    points = itertools.repeat(start) if own.points is None else iter(np.asarray(own.points))
-    place, turn = part.poses[0][:3], rotation_of(part.poses[0][3:7])
-    for word, axis, field in zip(own.sequence, np.asarray(own.axes), coordinate_names(own.sequence), strict=True):
-        value, point = values[field], next(points) if word == "hinge" else start
-        joint = TreeJoint(part.named(field), word, place + turn @ point, turn @ axis)
-        if word == "ball":
-            size = float(np.linalg.norm(value))
-            axis, angle = (value / size, size) if size > 0 else (axis, 0.0)
-        else:
-            joint.value = angle = float(value)
-        if word == "slide":
-            place = place + turn @ (joint.value * axis)
-        else:
-            own_turn = turn_about(axis, angle)
-            place, turn = place + turn @ (point - own_turn @ point), turn @ own_turn
-        out.append((f"{part.name}.{field}", joint))
-    return out
-
-
-def _spherical(part):
-    return [(f"{part.name}.rotation", TreeJoint(part.name, "ball", part.point(1), np.zeros(3)))]
-
-
-def _planar(part):
-    axis, x = part.direction("axis_a"), part.direction("x_a")
-    values = part.coordinates()
-    ways = zip("xy", (x, np.cross(axis, x)), values["displacement"], strict=True)
-    slides = [TreeJoint(part.named(w), "slide", part.point(1), a, float(v)) for w, a, v in ways]
-    hinge = TreeJoint(part.named("angle"), "hinge", part.point(1), axis, float(values["angle"]))
-    # Nothing acts on one of the two displacements.
-    own = {f"{part.name}.displacement {way}": slide for way, slide in zip("xy", slides, strict=True)}
-    return [*own.items(), (f"{part.name}.angle", hinge)]
-
-
-_JOINTS = {
-    **dict.fromkeys(_OWN_AXES, _about_own_axes),
-    "Gimbal": _gimbal,
-    "Composite": _composite,
-    "Spherical": _spherical,
-    "Planar": _planar,
-    "Fixed": lambda part: [],
-}
+    back, single = child == part.bodies[0], len(part.joints) == 1
+    joints = []
+    for own in part.joints:
+        joint = own._replace(name=part.name if single else part.named(own.name), axis=-own.axis if back else own.axis)
+        tree.coordinates[f"{part.name}.{own.name}"] = joint
+        joints.append(joint)
+    return joints[::-1] if back else joints
 
 
 # Loops
@@ -327,23 +221,23 @@ def _ends(part, tree):
 
 def _connect(part, tree, name, point):
     bodies, k = _ends(part, tree)
-    place = tree.place(part.bodies[k])
+    place = tree.poses[part.bodies[k]]
     anchor = rotation_of(place[3:]).T @ (point - place[:3])
     return "connect", {"name": name, **bodies, "anchor": numbers(anchor)}
 
 
-def _close_spherical(part, tree):
+def _close_ball(part, tree):
     return [_connect(part, tree, part.name, part.point(1))]
 
 
-def _close_revolute(part, tree):
+def _close_hinge(part, tree):
     """Two points of the axis coincide."""
-    point = part.point(1)
-    second = point + part.direction("axis_a")
-    return [_connect(part, tree, part.name, point), _connect(part, tree, part.named("axis"), second)]
+    (hinge,) = part.joints
+    second = _connect(part, tree, part.named("axis"), hinge.point + hinge.axis)
+    return [_connect(part, tree, part.name, hinge.point), second]
 
 
-def _close_fixed(part, tree):
+def _close_weld(part, tree):
     bodies, _ = _ends(part, tree)
     return [("weld", {"name": part.name, **bodies})]
 
@@ -367,17 +261,20 @@ def _close_coupling(part, tree):
 def _close_driver(part, tree):
     own = part.part
     joint = tree.coordinates.get(part.acts_on[0])
-    if joint is None or joint.type == "ball" or np.any(np.asarray(own.rate)):
+    if joint is None or joint.kind == "ball" or np.any(np.asarray(own.rate)):
         return None
     off = float(np.reshape(own.value, -1)[0]) - joint.value
     constant = [off - part.turns(off, 0.0), *itertools.repeat(0.0, 4)]
     return [("joint", {"name": part.name, "joint1": joint.name, "polycoef": numbers(constant)})]
 
 
-_CLOSING = {
-    "Spherical": _close_spherical,
-    "Revolute": _close_revolute,
-    "Fixed": _close_fixed,
-    "JointCoupling": _close_coupling,
-    "JointDriver": _close_driver,
-}
+# How loops are closed, by the kinds of the joints in succession, and by the classes of parts on their coordinates.
+_CLOSING_JOINTS = {("ball",): _close_ball, ("hinge",): _close_hinge, (): _close_weld}
+_CLOSING_PARTS = {JointCoupling: _close_coupling, JointDriver: _close_driver}
+
+
+def _closing(part):
+    """What writes a part as equality constraints; None if there is nothing."""
+    if part.joints is None:
+        return of_class(_CLOSING_PARTS, part.part)
+    return _CLOSING_JOINTS.get(tuple(joint.kind for joint in part.joints))

@@ -10,6 +10,7 @@ from .. import planar
 from .._types import State, VectorLike
 from ..bodies.scene import Scene
 from ..parts import contact
+from ..parts.coordinate_parts import JointStop
 from ..parts.forces import Gravity
 from ..parts.functions import Force
 from ..parts.terrain import AbstractTerrain, Bump
@@ -135,7 +136,7 @@ def tracked_vehicle(
             stop = {"stiffness": stop_stiffness, "lower": design - stop_angle, "upper": design + stop_angle}
             forces += [
                 planar.TorsionalSpringDamper(f"{p}bar{k}", *pair, **bar),
-                planar.BumpStop(f"{p}stop{k}", *pair, **stop),
+                JointStop(f"{p}stop{k}", f"{p}pivot{k}.angle", exponent=3.0, **stop),
             ]
         if shoes is None:
             path = [(hull, sprocket), (hull, idler), *((f"{p}wheel{k}", (0.0, 0.0)) for k in reversed(wheels))]

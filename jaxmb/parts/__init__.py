@@ -4,12 +4,10 @@
 ```python
 from jaxmb import parts
 
-class Maxwell(parts.AbstractPair, parts.AbstractDynamicForce):
+class Maxwell(parts.AbstractPointPair, parts.AbstractDynamicForce):
     stiffness: parts.Number = parts.parameter(unit="N/m", sign="positive")
     damping: parts.Number = parts.parameter(unit="N s/m", sign="positive")
     tension: parts.Number = parts.internal_state(unit="N")
-    point_a: parts.Number = parts.point(body=0, default="origin")
-    point_b: parts.Number = parts.point(body=1, default="origin")
 
     def wrenches(self, space, poses, velocities, t):
         d = parts.separation(space, self, poses)
@@ -40,6 +38,8 @@ from .base import (
     AbstractSpatialPart as AbstractSpatialPart,
     AbstractLink as AbstractLink,
     AbstractPair as AbstractPair,
+    AbstractPointPair as AbstractPointPair,
+    AbstractAxisJoint as AbstractAxisJoint,
     AbstractBody as AbstractBody,
     AbstractConstraint as AbstractConstraint,
     AbstractVelocityConstraint as AbstractVelocityConstraint,

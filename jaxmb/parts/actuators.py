@@ -32,26 +32,20 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     with a limit F it becomes `F tanh(demand / F)`. The force of the motor, an internal state, follows it as
     `lag · d(force)/dt = demand − force`.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `command` of the coordinate's shape, [N m, N], [rad/s, m/s] or
-    [rad, m]; as an input of `simulate`, `"motor.command"` is a function of time; `gain` and `damping` ≥ 0, of a force
-    over the command's unit and over a speed; the modes `"speed"` and `"position"` need a gain; `lag` [s] > 0; `limit`
-    [N m, N] > 0 of the demand, default none; `force` [N m, N], its initial value. Positive forces increase the
-    coordinate, with the reaction on the joint's other body.
+    **Arguments:** `command` of the coordinate's shape, [N m, N], [rad/s, m/s] or [rad, m]; as an input of `simulate`,
+    `"motor.command"` is a function of time; `gain` and `damping` ≥ 0, of a force over the command's unit and over a
+    speed; the modes `"speed"` and `"position"` need a gain; `lag` [s] > 0; `limit` [N m, N] > 0 of the demand, default
+    none; `force` [N m, N], its initial value. Positive forces increase the coordinate, with the reaction on the joint's
+    other body.
     """
 
     mode: Literal["force", "speed", "position"] = fields.choice("force", "speed", "position", default="force")
-    command: fields.Number = fields.parameter(shape=None, unit="N m, rad/s, rad or N, m/s, m")
+    command: fields.Number = fields.parameter(shape=None)
     lag: fields.Number = fields.parameter(unit="s", sign="positive")
     gain: fields.Number = fields.parameter(sign="non-negative", optional=True)
-    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
-    limit: fields.Number = fields.parameter(unit="N m or N", sign="positive", optional=True)
-    force: fields.Number = fields.internal_state(shape=None, unit="N m or N")
-
-    def unit(self, field, alternatives):
-        known = super().unit(field, alternatives)
-        if known is None or field != "command":
-            return known
-        return known.split(", ")[("force", "speed", "position").index(self.mode)]
+    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
+    limit: fields.Number = fields.parameter(unit=("N m", "N"), sign="positive", optional=True)
+    force: fields.Number = fields.internal_state(shape=None, unit=("N m", "N"))
 
     def validate(self):
         if self.mode == "force" and (np.any(self.gain) or np.any(self.damping)):
@@ -105,18 +99,17 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     With a `lag` an internal state, the `activation`, takes the place of the control and follows it,
     `lag · d(activation)/dt = control − activation`. Of a `Motor` it is the force that follows.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; an angle in space counts in (−π, π] about `middle` [rad],
-    default zero, and other coordinates have no middle; `control`, default zero, as an input of `simulate`,
-    `"motor.control"`, a function of time; `gain` and `bias`, shape (3,); `gear`; `control_range` and `force_range`,
-    shape (2,): the control and f are clipped to them, by default they are not; `lag` [s] > 0, default none;
-    `activation`, its initial value, default zero.
+    **Arguments:** `control`, default zero, as an input of `simulate`, `"motor.control"`, a function of time; `gain` and
+    `bias`, shape (3,); `gear`; `middle` [rad], default zero, about which an angle in space counts in (−π, π], and which
+    other coordinates have not; `control_range` and `force_range`, shape (2,): the control and f are clipped to them, by
+    default they are not; `lag` [s] > 0, default none; `activation`, its initial value, default zero.
     """
 
     control: fields.Number = fields.parameter(default=0.0)
     gear: fields.Number = fields.parameter(unit="1", default=1.0)
     gain: fields.Number = fields.parameter(shape=(3,), default=(1.0, 0.0, 0.0))
     bias: fields.Number = fields.parameter(shape=(3,), default=(0.0, 0.0, 0.0))
-    middle: fields.Number = fields.parameter(unit="rad or m", default=0.0)
+    middle: fields.Number = fields.parameter(unit=("rad", "m"), default=0.0)
     control_range: fields.Number = fields.parameter(shape=(2,), optional=True)
     force_range: fields.Number = fields.parameter(shape=(2,), optional=True)
     lag: fields.Number = fields.parameter(unit="s", sign="positive", optional=True)

@@ -26,9 +26,10 @@ from .._types import Scalar
 from ..linalg.arrays import namespace
 from ..linalg.rotations import norm
 from . import fields
+from .inherited import with_inherited_arguments
 from .names import check_arguments
 from .shapes import AbstractShape
-from .space import AbstractSpace
+from .space import AbstractSpace, both_points
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -43,6 +44,8 @@ GROUND = "ground"
 
 # How a picture draws the line of a part.
 PathKind = Literal["rod", "coil", "belt"]
+# What coordinates are, by their names: an angle [rad], a rotation vector [rad] or a length [m].
+Quantities = Mapping[str, Literal["angle", "rotation", "length"]]
 
 
 class ScalarCoordinate(NamedTuple):
@@ -85,6 +88,10 @@ class AbstractPart(eqx.Module):
     name: AbstractVar[str]
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
 
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        cls.__doc__ = with_inherited_arguments(cls)
+
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         check_arguments(cls.__name__, _signature(cls), len(args), kwargs)
         return super().__new__(cls)
@@ -117,9 +124,11 @@ class AbstractPart(eqx.Module):
         """Hook: whether the numbers are as `validate` asks, which it cannot tell of those that are traced."""
         return True
 
-    def unit(self, field: str, alternatives: str) -> str | None:
-        """Hook: of the units that a number is declared with, `"N m or N"`, the one that it has; None if not known."""
-        del field, alternatives
+    def is_of_length(self, field: str) -> Any:
+        """Hook: of a number with a unit for an angle and one for a length, whether it has the second one, or which of
+        its components have; None if it is not known.
+        """
+        del field
 
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
@@ -284,16 +293,26 @@ class AbstractLink(AbstractActor):
     """A part that acts between bodies, `bodies`."""
 
     bodies = _Bodies()
-    path_kind: ClassVar[PathKind] = "rod"
+    # How a picture draws the line between its points A and B; none by default.
+    path_kind: ClassVar[PathKind | None] = None
 
     # From which of its bodies on several may be one, on which the part has several places; None where all must differ.
     several_from: ClassVar[int | None] = None
     # Whether it has a function of time, in which steps look for pulses, by `given_in_time`.
     of_time: ClassVar[bool] = False
-    # Names of the coordinates that are angles.
-    angles: ClassVar[frozenset[str]] = frozenset()
+    # What its coordinates are; not known without an entry.
+    quantities: ClassVar[Quantities] = {}
     # Names of the coordinates that measure how the bodies slide over each other, where they do in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
+
+    def is_length(self, coordinate: str) -> bool | None:
+        """Whether a coordinate is a length, otherwise an angle; None if it is not known."""
+        return None if coordinate not in self.quantities else self.quantities[coordinate] == "length"
+
+    @property
+    def angles(self) -> frozenset[str]:
+        """Names of the coordinates that are angles."""
+        return frozenset(name for name, quantity in self.quantities.items() if quantity == "angle")
 
     @property
     def periodic(self) -> frozenset[str]:
@@ -387,19 +406,36 @@ class AbstractLink(AbstractActor):
         return ()
 
     def path(self, space: AbstractSpace, poses: Poses) -> Float[Array, "points d"] | None:
-        """Hook: the world points [m] through which a picture draws the part, as `path_kind` says: `"rod"` and `"coil"`
-        between two points, `"belt"` a closed line through any number; None if it shows no line.
+        """Hook: the world points [m] through which a picture draws the part, as `path_kind` says: `"rod"`, the default,
+        and `"coil"` between two points, `"belt"` a closed line through any number; None if it shows no line.
         """
-        del space, poses
-        return None
+        return None if self.path_kind is None else both_points(space, self, poses)
 
 
 class AbstractPair(AbstractLink):
-    """A part that acts between two bodies, either of which may be `"ground"`."""
+    """A part that acts between two bodies.
+
+    **Arguments:**
+
+    - `name`, of the part; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
+        `"ground"`.
+    """
 
     name: str = fields.name()
     body_a: str = fields.body_name()
     body_b: str = fields.body_name()
+
+
+class AbstractPointPair(AbstractPair):
+    """A part that acts between a point of one body and a point of another one.
+
+    **Arguments:**
+
+    - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`, default the origins of the frames.
+    """
+
+    point_a: fields.Number = fields.point(body=0, default="origin")
+    point_b: fields.Number = fields.point(body=1, default="origin")
 
 
 class AbstractConstraint(AbstractLink):
@@ -425,11 +461,18 @@ class AbstractConstraint(AbstractLink):
         """
         return None
 
+    def elementary_joints(self, space: AbstractSpace, poses: Any) -> Any:
+        """Hook: the hinges, slides and balls in succession, from `body_a` to `body_b`, that a spatial joint is: an
+        `ElementaryJoint` for each of its coordinates at these poses. None for a joint that is no such succession.
+        """
+        del space, poses
+        return None
+
     @classmethod
-    def declares_elements(cls) -> bool:
-        """Whether the class declares `elements`, and has no `residual` of its own that is newer than these."""
+    def declares(cls, hook: str, *laws: str) -> bool:
+        """Whether the class defines a hook, and neither its `residual` nor other laws of the hook are newer."""
         where = lambda name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind))
-        return cls.elements is not AbstractConstraint.elements and where("elements") <= where("residual")
+        return all(where(hook) <= where(law) for law in ("residual", *laws))
 
 
 class AbstractInertialConstraint(AbstractConstraint):
@@ -441,16 +484,31 @@ class AbstractInertialConstraint(AbstractConstraint):
 
 
 class AbstractJoint(AbstractPair, AbstractConstraint):
-    """A constraint between a point of `body_a` and one of `body_b`.
+    """A constraint between a point of `body_a` and a point of `body_b`.
 
-    The points [m] are given in the body frames (`point_a`, `point_b`), or both by one world point at the given poses
-    (`point`).
+    **Arguments:**
+
+    - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`; or `point` [m]: both, at this place of the
+        world at the given poses. In the plane they have shape (2,), in space (3,).
     """
 
     point_a: fields.Number = fields.point(body=0, optional=True)
     point_b: fields.Number = fields.point(body=1, optional=True)
     point: fields.Number = fields.point(body=None, gives=("point_a", "point_b"))
     rheonomic: ClassVar[bool] = False
+
+
+class AbstractAxisJoint(AbstractJoint):
+    """A joint with an axis in `body_a`.
+
+    **Arguments:**
+
+    - `axis_a`, unit, shape (2,) in the plane and (3,) in space: the axis fixed in `body_a`; or `axis`, unit: the axis
+        in the world at the given poses.
+    """
+
+    axis_a: fields.Number = fields.axis(body=0, optional=True)
+    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
 
 
 class AbstractTendon(AbstractLink):
@@ -460,6 +518,7 @@ class AbstractTendon(AbstractLink):
     """
 
     rheonomic: ClassVar[bool] = False
+    quantities: ClassVar[Quantities] = {"length": "length"}
 
     @property
     def rows(self) -> int:

@@ -51,7 +51,7 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
             _check_state_rates(part, kernel, given)
         else:
             check_returns(part.label, name, shape, kernel, *given)
-    if isinstance(part, AbstractConstraint) and part.declares_elements():
+    if isinstance(part, AbstractConstraint) and part.declares("elements"):
         rows = sum(element.rows(space.dimension) for element in part.elements)
         if rows != part.rows:
             raise ValueError(f"{part.label}: its elements have {rows} rows, but rows = {part.rows}.")
@@ -86,7 +86,7 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         yield "inertia", (lambda part: part.inertia, [])
     for name, _, given in _kernels(part, space, bodies):
         yield name, (lambda part, *own, name=name: getattr(part, name)(space, *own), given)
-    if isinstance(part, AbstractConstraint) and part.declares_elements():
+    if isinstance(part, AbstractConstraint) and part.declares("elements"):
         yield "elements", (lambda part: part.elements, [])
     if isinstance(part, AbstractLink):
         poses, velocities, t = _arguments(space, bodies)

@@ -1,6 +1,5 @@
 """Couplings between coordinates of joints, tendons along them, and inertias that move with them."""
 
-import abc
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -14,32 +13,14 @@ from .._types import VectorLike
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
-from .coordinate_parts import AbstractOfJoints, is_length, shortest, turns, unit_of
+from .coordinate_parts import AbstractOfCoordinates, shortest, turns
 
 # Points of a tendon coincide if they are no farther apart than this share of its length.
 _APART = 1e-9
 
 
-class AbstractCombination(AbstractOfJoints):
-    """A part that acts on several coordinates of joints or tendons, each a number.
-
-    **Fields:** a scene fills in the names of the coordinates `within` their joints.
-    """
-
-    within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
-
-    @property
-    @abc.abstractmethod
-    def combined(self) -> tuple[str, ...]:
-        """The names of the coordinates, `"hip.angle"`."""
-
-    @property
-    def sources(self):
-        return tuple(name.split(".")[0] for name in self.combined)
-
-    def of_sources(self, parts, places):
-        within = tuple(name.partition(".")[2] for name in self.combined)
-        return super().of_sources(parts, places).with_fields(within=within)
+class AbstractCombination(AbstractOfCoordinates):
+    """A part that acts on several coordinates of joints or tendons, each a number."""
 
     def complete(self, space, poses):
         given = []
@@ -50,9 +31,6 @@ class AbstractCombination(AbstractOfJoints):
             given.append(float(value.reshape(())))
         return self.with_given(np.array(given))
 
-    def unit(self, field, alternatives):
-        return unit_of(self.within, alternatives)
-
     def with_given(self, given: np.ndarray) -> Any:
         """Hook: a checked copy with omitted numbers filled in, from the coordinates at the given poses."""
         del given
@@ -61,10 +39,6 @@ class AbstractCombination(AbstractOfJoints):
     def values(self, space, poses) -> list[Float[Array, ""]]:
         """The coordinates."""
         return [self.coordinates_of(k, space, poses)[own].reshape(()) for k, own in enumerate(self.within)]
-
-    def is_periodic(self, k: int) -> bool:
-        """Whether a coordinate is an angle known up to full turns."""
-        return self.within[k] in self.joints[str(k)].periodic
 
 
 class JointCoupling(AbstractCombination, AbstractConstraint):
@@ -90,8 +64,8 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
     coordinate: str = fields.name()
     other: fields.Names = fields.names()
     coefficients: fields.Number = fields.parameter(shape=None)
-    zero: fields.Number = fields.parameter(unit="rad or m", optional=True)
-    other_zero: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    zero: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
+    other_zero: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -111,8 +85,8 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
         if twice:
             raise ValueError(f"{self.label} couples {twice[0]!r} with itself.")
 
-    def unit(self, field, alternatives):
-        return unit_of(self.within[:1] if field == "zero" else self.within[1:], alternatives)
+    def is_of_length(self, field):
+        return self.are_lengths([0] if field == "zero" else range(1, len(self.within)))
 
     def with_given(self, given):
         return self.filled(zero=given[0], other_zero=given[1] if len(given) == 2 else given[1:])
@@ -153,7 +127,7 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
     """
 
     coordinate: str = fields.name()
-    inertia: fields.Number = fields.parameter(unit="kg m² or kg", sign="positive", constant=True)
+    inertia: fields.Number = fields.parameter(unit=("kg m²", "kg"), sign="positive", constant=True)
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
 
@@ -162,10 +136,16 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
         return (self.coordinate,)
 
     def scalar_coordinates(self, space, parts):
-        del space, parts
-        length = is_length(self.coordinate.partition(".")[2])
-        name = f"{self.name}.{'displacement' if length else 'angle'}"
-        return (ScalarCoordinate(name, is_length=length, moves=True),)
+        del space
+        joint, _, within = self.coordinate.partition(".")
+        is_length = joint in parts and bool(parts[joint].is_length(within))
+        name = f"{self.name}.{'displacement' if is_length else 'angle'}"
+        return (ScalarCoordinate(name, is_length=is_length, moves=True),)
+
+    def with_given(self, given):
+        del given
+        self.source_is_length(0, self.within[0])
+        return self
 
     def residual(self, space, poses, t):
         (value,) = self.values(space, poses[:-1])
@@ -195,7 +175,7 @@ class FixedTendon(AbstractCombination, AbstractTendon):
 
     along: fields.Names = fields.names()
     stage: ClassVar[int] = 1
-    coefficients: fields.Number = fields.parameter(shape=None, unit="m/rad or 1")
+    coefficients: fields.Number = fields.parameter(shape=None, unit=("m/rad", "1"))
 
     @property
     def combined(self):

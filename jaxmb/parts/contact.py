@@ -17,6 +17,7 @@ penetration depth, so contact adds no constraint and no event.
 """
 
 import abc
+import itertools
 from typing import ClassVar
 
 import jax
@@ -29,8 +30,9 @@ from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
 from .forces import over_ground
-from .shapes import Ground, marked_ball, wheel
+from .shapes import Ground
 from .smooth import dry_friction, ramp, step
+from .space import round_shapes
 from .terrain import AbstractTerrain, distance, outward, pace_over
 
 __all__ = ["AbstractFrictionLaw", "AbstractNormalLaw", "Bekker", "Contact", "Coulomb", "Hertz", "Janosi", "Linear"]
@@ -94,8 +96,8 @@ class Bekker(AbstractNormalLaw):
     `width` b [m], the smaller side of the contact patch; `area` [m²] of the patch.
     """
 
-    cohesive_modulus: fields.Number = fields.parameter(unit="N/m^(n+1)", sign="non-negative")
-    frictional_modulus: fields.Number = fields.parameter(unit="N/m^(n+2)", sign="non-negative")
+    cohesive_modulus: fields.Number = fields.parameter(sign="non-negative")
+    frictional_modulus: fields.Number = fields.parameter(sign="non-negative")
     exponent: fields.Number = fields.parameter(unit="1", sign="positive")
     width: fields.Number = fields.parameter(unit="m", sign="positive")
     area: fields.Number = fields.parameter(unit="m²", sign="positive")
@@ -237,13 +239,10 @@ class AbstractContact(AbstractPotentialForce):
         return jnp.maximum(turning, jnp.max(self._each(space, passing, poses, velocities)))
 
     def shapes(self, space, size):
-        n, solid = len(self.bodies), wheel if space.dimension == 2 else marked_ball
-        centres = np.broadcast_to(self.centres, (n, space.dimension))
-        out = [(None, Ground(height=self.terrain.height))]
-        for k, (centre, radius) in enumerate(zip(centres, np.broadcast_to(self.radius, n), strict=True)):
-            if radius > 0:
-                out += [(k, shape) for shape in solid(radius, position=space.in_space(centre))]
-        return tuple(out)
+        n = len(self.bodies)
+        radii, centres = np.broadcast_to(self.radius, n), np.broadcast_to(self.centres, (n, space.dimension))
+        own = (round_shapes(space, k, radii[k], centres[k]) for k in range(n))
+        return (None, Ground(height=self.terrain.height)), *itertools.chain(*own)
 
     def _each(self, space, single, *of_bodies):
         """`single(…, point, radius)` of every body."""

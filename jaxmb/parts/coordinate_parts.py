@@ -3,7 +3,7 @@ prescribed motions.
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -63,6 +63,19 @@ class AbstractOfJoints(AbstractLink):
         held = {str(k): part for k, part in enumerate(parts) if part is not None}
         return self.with_fields(joints=held, places=tuple(places))
 
+    def source_is_length(self, k: int, within: str) -> bool:
+        """Whether a coordinate of a source is a length, otherwise an angle.
+
+        **Raises:** `ValueError` if its class does not say so.
+        """
+        joint = self.joints[str(k)]
+        if (known := joint.is_length(within)) is None:
+            raise ValueError(
+                f"{self.label}: {joint.label} does not say whether its coordinate {within!r} is an angle or a length; "
+                f"declare quantities = {{{within!r}: 'angle'}} or 'length' in the class {joint.kind}."
+            )
+        return known
+
     def coordinates_of(self, k: int, space, poses) -> dict[str, Array]:
         """The coordinates of a source, by their names within it."""
         at = self.places[k]
@@ -85,33 +98,62 @@ class AbstractOfJoints(AbstractLink):
         return np.asarray(known[within])
 
 
-class AbstractCoordinatePart(AbstractOfJoints):
+class AbstractOfCoordinates(AbstractOfJoints):
+    """A part that acts on coordinates of joints or tendons.
+
+    **Fields:** a scene fills in the names of the coordinates `within` their joints.
+    """
+
+    within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
+
+    @property
+    @abc.abstractmethod
+    def combined(self) -> tuple[str, ...]:
+        """The names of the coordinates, `"hip.angle"`."""
+
+    @property
+    def sources(self):
+        return tuple(name.split(".")[0] for name in self.combined)
+
+    def of_sources(self, parts, places):
+        within = tuple(name.partition(".")[2] for name in self.combined)
+        return super().of_sources(parts, places).with_fields(within=within)
+
+    def is_of_length(self, field):
+        return self.are_lengths(range(len(self.within)))
+
+    def are_lengths(self, numbers: Iterable[int]) -> Any:
+        """Which of the coordinates with these numbers are lengths; None if it is not known."""
+        known = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
+        return None if None in known else np.array(known if len(known) > 1 else known[0])
+
+    def is_periodic(self, k: int = 0) -> bool:
+        """Whether a coordinate is an angle known up to full turns."""
+        return self.within[k] in self.joints[str(k)].periodic
+
+
+class AbstractCoordinatePart(AbstractOfCoordinates):
     """A part that acts on a coordinate of a joint or tendon, in the plane or in space.
 
-    **Fields:** `coordinate`: `"joint.coordinate"`, a coordinate that the joint's class documents. A scene fills in its
-    name `within` the joint.
+    **Arguments:**
+
+    - `name`, of the part; `coordinate` of a joint or tendon, which its class documents, such as `"hip.angle"` or
+        `"cord.length"`.
     """
 
     coordinate: str = fields.name()
-    within: str = eqx.field(static=True, default_factory=str, init=False)
 
     @property
-    def sources(self) -> tuple[str, ...]:
-        return (self.coordinate.split(".")[0],)
+    def combined(self):
+        return (self.coordinate,)
 
     @property
     def joint(self) -> AbstractLink:
         """The joint or tendon."""
         return self.joints["0"]
 
-    def of_sources(self, parts, places):
-        return super().of_sources(parts, places).with_fields(within=self.coordinate.partition(".")[2])
-
     def complete(self, space, poses):
         return self.with_numbers(self.given_coordinate(0, self.coordinate, space, poses))
-
-    def unit(self, field, alternatives):
-        return unit_of([self.within], alternatives)
 
     @abc.abstractmethod
     def with_numbers(self, given: np.ndarray) -> Any:
@@ -119,7 +161,7 @@ class AbstractCoordinatePart(AbstractOfJoints):
 
     def measured(self, space, poses) -> Float[Array, "n"]:
         """The coordinate, raveled."""
-        return self.coordinates_of(0, space, poses)[self.within].reshape(-1)
+        return self.coordinates_of(0, space, poses)[self.within[0]].reshape(-1)
 
     def measured_with_rate(self, space, poses, velocities) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """The coordinate and its rate, raveled."""
@@ -132,16 +174,16 @@ class AbstractCoordinatePart(AbstractOfJoints):
     def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`; of angles that are known up to full turns the smallest such difference."""
         out = value - target.reshape(-1)
-        return shortest(out) if self.within in self.joint.periodic else out
+        return shortest(out) if self.is_periodic() else out
 
     def shortest_difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`; of an angle less full turns, in [−π, π]."""
         out = value - target.reshape(-1)
-        return shortest(out) if self.within in self.joint.angles else out
+        return shortest(out) if self.within[0] in self.joint.angles else out
 
     def near(self, value: Float[Array, "n"], middle: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """The value; of angles that are known up to full turns the one within half a turn of `middle`."""
-        return middle.reshape(-1) + self.difference(value, middle) if self.within in self.joint.periodic else value
+        return middle.reshape(-1) + self.difference(value, middle) if self.is_periodic() else value
 
     def _check_shape(self, field: str, given: np.ndarray) -> None:
         shape = np.shape(getattr(self, field))
@@ -151,24 +193,10 @@ class AbstractCoordinatePart(AbstractOfJoints):
             )
 
     def _check_middle(self) -> None:
-        if self.within not in self.joint.periodic:
+        if not self.is_periodic():
             raise ValueError(
                 f"{self.label}: middle is that of an angle in space, which {self.coordinate!r} is not; leave it out."
             )
-
-
-def is_length(within: str) -> bool:
-    """Whether the coordinate of this name within its joint is a length, otherwise an angle."""
-    return within.startswith(("displacement", "length", "gap"))
-
-
-def unit_of(coordinates: Sequence[str], alternatives: str) -> str | None:
-    """Of the units for an angle and for a displacement, `"N m or N"`, the one for coordinates with these names in
-    their joints; None if some are angles and others are displacements.
-    """
-    kinds = {is_length(name) for name in coordinates}
-    of_angle, _, of_displacement = alternatives.partition(" or ")
-    return None if len(kinds) > 1 else of_displacement if kinds.pop() else of_angle
 
 
 def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -189,16 +217,16 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[spring]).compile()
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m]
-    ≥ 0; `free` [rad, m], where the spring exerts no force, default the coordinate at the given poses. In space the
-    spring of an angle takes the shortest way to it, up to half a turn; with `middle` [rad], of the range in which the
-    angle stays, it takes the way within half a turn of that.
+    **Arguments:** `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m] ≥ 0; `free` [rad, m], where the spring
+    exerts no force, default the coordinate at the given poses. In space the spring of an angle takes the shortest way
+    to it, up to half a turn; with `middle` [rad], of the range in which the angle stays, it takes the way within half a
+    turn of that.
     """
 
-    stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
-    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
-    free: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
-    middle: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
+    stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
+    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
+    free: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
+    middle: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
 
     def with_numbers(self, given):
         part = self.filled(free=given)
@@ -229,12 +257,11 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m of an angle, N of a displacement], of the
-    coordinate's shape, positive where it increases the coordinate. As an input of `simulate`, `"motor.force"` is a
-    function of time.
+    **Arguments:** `force` [N m, N], of the coordinate's shape, positive where it increases the coordinate. As an input
+    of `simulate`, `"motor.force"` is a function of time.
     """
 
-    force: fields.Number = fields.parameter(shape=None, unit="N m or N")
+    force: fields.Number = fields.parameter(shape=None, unit=("N m", "N"))
 
     def with_numbers(self, given):
         self._check_shape("force", given)
@@ -253,13 +280,12 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
     system = jaxmb.Scene([bar], joints=[pin, turn]).compile()
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `value` [rad, m], default that at the given poses; `rate`
-    [rad/s, m/s], default zero; both of the coordinate's shape. As an input of `simulate`, `"drive.value"` is any
-    function of time.
+    **Arguments:** `value` [rad, m], default that at the given poses; `rate` [rad/s, m/s], default zero; both of the
+    coordinate's shape. As an input of `simulate`, `"drive.value"` is any function of time.
     """
 
-    value: fields.Number = fields.parameter(shape=None, unit="rad or m", optional=True)
-    rate: fields.Number = fields.parameter(shape=None, unit="rad/s or m/s", optional=True)
+    value: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
+    rate: fields.Number = fields.parameter(shape=None, unit=("rad/s", "m/s"), optional=True)
     rows: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
     rheonomic: ClassVar[bool] = True
 
@@ -291,18 +317,21 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     ```
 
     The depth δ beyond a stop is that of a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or
-    value − upper. The stop has the potential `½ stiffness δ²` and the dissipation `damping δ̇²`.
+    value − upper. The stop has the potential `½ stiffness δ²`, so that its force is `stiffness δ`, and the dissipation
+    `damping δ̇²`. With an `exponent` the stop is progressive: its potential is `stiffness δ^(exponent + 1) /
+    (exponent + 1)`, and its force nearly `stiffness d^exponent`.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0;
-    `damping` [N m s/rad, N s/m] ≥ 0; `smoothing` [rad, m] > 0, in which the ramp bends. In space the range of an
-    angle must be less than a full turn.
+    **Arguments:** `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0, or over this power of an angle or length;
+    `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, where the ramp bends.
+    In space the range of an angle must be less than a full turn.
     """
 
-    lower: fields.Number = fields.parameter(unit="rad or m")
-    upper: fields.Number = fields.parameter(unit="rad or m")
-    stiffness: fields.Number = fields.parameter(unit="N m/rad or N/m", sign="non-negative")
-    damping: fields.Number = fields.parameter(unit="N m s/rad or N s/m", sign="non-negative", default=0.0)
-    smoothing: fields.Number = fields.parameter(unit="rad or m", sign="positive", default=1e-3)
+    lower: fields.Number = fields.parameter(unit=("rad", "m"))
+    upper: fields.Number = fields.parameter(unit=("rad", "m"))
+    stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
+    exponent: fields.Number = fields.parameter(unit="1", sign="positive", optional=True)
+    damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", optional=True)
+    smoothing: fields.Number = fields.parameter(unit=("rad", "m"), sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("lower", "upper")
     has_gaps: ClassVar[bool] = True
 
@@ -314,12 +343,15 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
         return self.lower < self.upper
 
     def with_numbers(self, given):
-        if self.within in self.joint.periodic and self.upper - self.lower >= 2 * np.pi:
+        if self.is_periodic() and self.upper - self.lower >= 2 * np.pi:
             raise ValueError(
                 f"{self.label}: the range of an angle in space must be less than a full turn, got {self.lower} to "
                 f"{self.upper}."
             )
         return super().with_numbers(given)
+
+    def is_of_length(self, field):
+        return None if field == "stiffness" and self.exponent is not None else super().is_of_length(field)
 
     def gaps(self, space, poses, t):
         return self._gaps(self.measured(space, poses))
@@ -337,15 +369,20 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         def law(x, v):
-            depth, rate = jax.jvp(self._depths, (x,), (v,))
-            rate = with_drift(self, rate, lambda part: part._depths(x))
-            (force,) = jax.vjp(self._depths, x)[1](self.stiffness * depth + self.damping * rate)
-            return -force
+            depth, pull = jax.vjp(self._depths, x)
+            push = self.stiffness * (depth if self.exponent is None else depth**self.exponent)
+            if self.damping is not None:
+                _, rate = jax.jvp(self._depths, (x,), (v,))
+                push += self.damping * with_drift(self, rate, lambda part: part._depths(x))
+            return -pull(push)[0]
 
         return self.force_along(space, poses, velocities, law)
 
     def energy(self, space, poses, t):
-        return 0.5 * self.stiffness * jnp.sum(self._depths(self.measured(space, poses)) ** 2)
+        depths = self._depths(self.measured(space, poses))
+        if self.exponent is None:
+            return 0.5 * self.stiffness * jnp.sum(depths**2)
+        return self.stiffness * jnp.sum(depths ** (self.exponent + 1)) / (self.exponent + 1)
 
 
 class JointFriction(AbstractScalarPart, AbstractForce):
@@ -356,14 +393,13 @@ class JointFriction(AbstractScalarPart, AbstractForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[rub]).compile()
     ```
 
-    Unlike `Friction` it does not depend on the reaction of the joint.
+    It does not depend on the reaction of the joint; `Friction` lists the ways in which a joint rubs.
 
-    **Arguments:** `coordinate`, such as `"hip.angle"`; `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0,
-    below which friction is viscous.
+    **Arguments:** `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0, below which friction is viscous.
     """
 
-    force: fields.Number = fields.parameter(unit="N m or N", sign="non-negative")
-    transition_speed: fields.Number = fields.parameter(unit="rad/s or m/s", sign="positive", default=1e-2)
+    force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative")
+    transition_speed: fields.Number = fields.parameter(unit=("rad/s", "m/s"), sign="positive", default=1e-2)
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.force * jnp.tanh(v / self.transition_speed)

@@ -22,7 +22,7 @@ from .base import (
     Velocities,
     Wrenches,
 )
-from .coordinate_parts import AbstractOfJoints, is_length
+from .coordinate_parts import AbstractOfJoints
 from .modes import STICK, kind_of, slip_direction
 from .space import AbstractSpace, rate_of
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
@@ -175,7 +175,7 @@ class DryFriction(AbstractDryFriction):
     `Trajectory.reactions["rub"]` is its force on the last body, of stick and of slip.
 
     If the normal force does not exist, or more than one does (Painlevé's paradox), the run ends with a failure that
-    names the friction. `Friction` is smooth instead: it creeps where this one sticks.
+    names the friction. `Friction` lists the ways in which a joint rubs.
 
     **Arguments:**
 
@@ -208,7 +208,7 @@ class DryFriction(AbstractDryFriction):
         if isinstance(held, AbstractUnilateralConstraint):
             return part._of_contact(space, held, poses)
         within = part._own_coordinates(space, held, poses)
-        if all(map(is_length, within)) != (self.radius is None):
+        if all(self.source_is_length(0, name) for name in within) != (self.radius is None):
             needs = "slides and has no radius" if self.radius is not None else "turns: give the radius of its pin"
             raise ValueError(f"{self.label}: {held.label} {needs}.")
         return part.with_fields(within=within)
@@ -274,4 +274,4 @@ class DryFriction(AbstractDryFriction):
         return jnp.concatenate([self._length(name, own[name].reshape(-1)) for name in self.within])
 
     def _length(self, name, value):
-        return value if self.radius is None or is_length(name) else self.radius * value
+        return value if self.radius is None or self.joints["0"].is_length(name) else self.radius * value

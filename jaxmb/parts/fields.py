@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 from .._compat import default_float, is_weakly_typed, with_values
 from ..linalg.arrays import is_traced
 from .module_weights import ModuleWeights, as_weights
+from .units import Unit, power_of_length
 
 # Types of fields. A number may be given as any array-like value and is stored as an array; type checkers do not see the
 # converters of these helpers.
@@ -38,7 +39,7 @@ else:
     Number, Numbers, Names, Module = Array, dict[str, Array | ModuleWeights], tuple[str, ...], ModuleWeights
 
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
-Size = int | Literal["d"] | None
+Size = int | Literal["d", "v"] | None
 
 # A direction counts as a unit vector if its length differs from one by no more than this.
 _UNIT = 1e-6
@@ -56,7 +57,7 @@ class Declaration:
         another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
         `"internal"` for an internal state (`"internals"` for a dictionary of them); these are not parameters.
     - `shape`: of a number, None for any, and None in it for any size; `sign`; `unit`, `"1"` for a number without one,
-        `""` where it is not known, and `"N m or N"` where it is the first for an angle, the second for a displacement.
+        None where it is not known, and `("N m", "N")` where it is the first for an angle, the second for a length.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters; of
         several points or unit vectors each row is one.
@@ -67,12 +68,13 @@ class Declaration:
         be given.
     - `of`: the type of a law, or the words of a choice; `what`: a description of the law, for messages.
     - `constant`: whether a number cannot be a function of time.
+    - `dimension`: 2 or 3, of the scenes that the field is for; None for both.
     """
 
     kind: str
     shape: tuple[Size, ...] | None = None
     sign: Sign | None = None
-    unit: str = ""
+    unit: Unit = None
     body: int | None = None
     is_point: bool = False
     is_direction: bool = False
@@ -85,6 +87,11 @@ class Declaration:
     of: Any = None
     what: str = ""
     constant: bool = False
+    dimension: int | None = None
+
+    def __post_init__(self):
+        for unit in (self.unit,) if isinstance(self.unit, str) else self.unit or ():
+            power_of_length(unit)
 
     @property
     def is_number(self) -> bool:
@@ -248,7 +255,7 @@ def function(*, default: Any = dataclasses.MISSING, kw_only: bool = False) -> An
 def parameter(
     *,
     shape: tuple[Size, ...] | None = (),
-    unit: str = "",
+    unit: Unit = None,
     sign: Sign | None = None,
     default: Any = dataclasses.MISSING,
     optional: bool = False,
@@ -256,6 +263,7 @@ def parameter(
     kw_only: bool = True,
     converter: Callable[[Any], Any] | None = None,
     constant: bool = False,
+    dimension: int | None = None,
 ) -> Any:
     """A number or an array of numbers.
 
@@ -263,15 +271,22 @@ def parameter(
     stiffness: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N/m", sign="positive")
     ```
 
-    **Arguments:** `shape`, in which `"d"` is the dimension of the space and None any size, None for any; `unit`, `"1"`
-    of a number without one, which `report.stress_test` needs to know of lengths; `sign` of every component:
-    `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix; `default`; `optional`: default
-    None, which the part's `complete` replaces; `sizes`: whether the scene's size is computed from this length;
-    `converter`, applied before the checks; `constant`: whether it cannot be a function of time.
+    **Arguments:**
+
+    - `shape`, in which `"d"` is the dimension of the space, `"v"` the size of a velocity and None any size; None for
+        any shape.
+    - `unit`: a product of powers of SI units, `"1"` of a number without one; of a number that belongs to a coordinate
+        the unit for an angle and for a length, `("N m/rad", "N/m")`; None, the default, where it is not known, so that
+        `report.stress_test` cannot scale lengths.
+    - `sign` of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix.
+    - `default`; `optional`: default None, which the part's `complete` replaces.
+    - `sizes`: whether the scene's size is computed from this length; `constant`: whether it cannot be a function of
+        time; `dimension`, 2 or 3, of the scenes that it is for, default both; `converter`, applied before the checks.
+
+    **Raises:** `ValueError` for a unit that cannot be read.
     """
-    declaration = Declaration(
-        "number", shape=shape, sign=sign, unit=unit, optional=optional, sizes=sizes, constant=constant
-    )
+    options = {"optional": optional, "sizes": sizes, "constant": constant, "dimension": dimension}
+    declaration = Declaration("number", shape=shape, sign=sign, unit=unit, **options)
     default = None if optional else default
     convert = _NUMBER if converter is None else _lenient(converter)
     return _field(declaration, converter=_optional(convert), default=default, kw_only=kw_only)
@@ -338,6 +353,7 @@ def axis(
     optional: bool = False,
     gives: tuple[str, ...] = (),
     needed: bool = True,
+    dimension: int | None = None,
 ) -> Any:
     """A unit vector, fixed in a body, or in the world with `body=None`; arguments as in `point`.
 
@@ -345,7 +361,7 @@ def axis(
     axis_a: jaxmb.parts.Number = jaxmb.parts.axis(body=0, default=(0.0, 0.0, 1.0))
     ```
 
-    `needed=False`: both the world axis and the body-fixed ones may be omitted.
+    `needed=False`: both the world axis and the body-fixed ones may be omitted; `dimension` as in `parameter`.
     """
     declaration = Declaration(
         "number",
@@ -356,25 +372,26 @@ def axis(
         optional=optional or bool(gives),
         gives=gives,
         needed=needed,
+        dimension=dimension,
     )
     default = None if declaration.optional else default
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
 
 
 def attitude(*, default: Any = dataclasses.MISSING, optional: bool = False, state: bool = False) -> Any:
-    """Unit Euler parameters, scalar first.
+    """Unit Euler parameters, scalar first, for spatial scenes.
 
     ```python
     orientation: jaxmb.parts.Number = jaxmb.parts.attitude(default=(1.0, 0.0, 0.0, 0.0))
     ```
     """
     kind = "state" if state else "number"
-    declaration = Declaration(kind, shape=(4,), unit="1", is_attitude=True, optional=optional)
+    declaration = Declaration(kind, shape=(4,), unit="1", is_attitude=True, optional=optional, dimension=3)
     default = None if optional else default
     return _field(declaration, converter=_optional(_NUMBER), default=default, kw_only=True)
 
 
-def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
+def guess(*, shape: tuple[Size, ...] = (), unit: Unit, default: Any) -> Any:
     """A number of a body's initial guess, which `assemble` improves; not a parameter.
 
     ```python
@@ -385,7 +402,7 @@ def guess(*, shape: tuple[Size, ...] = (), unit: str, default: Any) -> Any:
 
 
 def internal_state(
-    *, shape: tuple[Size, ...] | None = (), unit: str = "", default: Any = 0.0, optional: bool = False
+    *, shape: tuple[Size, ...] | None = (), unit: Unit = None, default: Any = 0.0, optional: bool = False
 ) -> Any:
     """An internal state, a number that changes by an equation of first order; see `AbstractDynamicForce`.
 
@@ -550,8 +567,12 @@ def _check_finite(value: Any, label: str, shown: str) -> None:
 
 
 def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarray, dimension: int) -> None:
+    if declared.dimension not in (None, dimension):
+        scenes = "planar" if declared.dimension == 2 else "spatial"
+        raise ValueError(f"{label}: {shown} belongs to {scenes} scenes; leave it out.")
     if declared.shape is not None:
-        shape = tuple(dimension if size == "d" else size for size in declared.shape)
+        sizes: dict[Any, int] = {"d": dimension, "v": 3 * (dimension - 1)}
+        shape = tuple(sizes.get(size, size) for size in declared.shape)
         any_size = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
         if not any_size:
             wanted = str(shape).replace("None", "any")

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPotentialForce, PathKind
-from .space import both_points, force_pair, rate_of, separation, separation_rate, with_drift
+from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPointPair, AbstractPotentialForce, PathKind
+from .space import force_pair, moment_pair, rate_of, separation, separation_rate, with_drift
 
 
 class Gravity(AbstractPart):
@@ -47,7 +47,7 @@ def generalized_force(space, part, coordinates, poses, velocities, law):
     return jax.vmap(space.pull_back)(poses, gradient)
 
 
-class SpringDamper(AbstractPair, AbstractPotentialForce):
+class SpringDamper(AbstractPointPair, AbstractPotentialForce):
     """A linear spring and damper along the line between two points: tension `stiffness (l − free_length) + damping l̇`.
 
     ```python
@@ -62,14 +62,12 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
     that comes to zero length.
 
     **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
-    given poses; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
+    given poses.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative")
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
     path_kind: ClassVar[PathKind] = "coil"
 
     def complete(self, space, poses):
@@ -89,11 +87,8 @@ class SpringDamper(AbstractPair, AbstractPotentialForce):
         # ½ k (l − l0)², written so that its derivative at l = 0 is finite.
         return 0.5 * self.stiffness * (jnp.dot(d, d) - 2 * self.free_length * norm(d) + self.free_length**2)
 
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
-
-class Damper(AbstractPair, AbstractForce):
+class Damper(AbstractPointPair, AbstractForce):
     """A linear damper on the relative velocity of two points, in every direction: force `−damping (v_B − v_A)` on B.
 
     ```python
@@ -103,12 +98,10 @@ class Damper(AbstractPair, AbstractForce):
 
     The two points should coincide or `body_a` be the ground; otherwise the pair of forces has a moment.
 
-    **Arguments:** `damping` [N s/m] ≥ 0; `point_a`, `point_b` [m], body-fixed, default the origins of the frames.
+    **Arguments:** `damping` [N s/m] ≥ 0.
     """
 
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative")
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
 
     def wrenches(self, space, poses, velocities, t):
         rate = separation_rate(space, self, poses, velocities)
@@ -136,3 +129,55 @@ class PointForce(AbstractForce):
     def wrenches(self, space, poses, velocities, t):
         force_W = self.force if self.frame == "world" else space.direction(poses[0], self.force)
         return space.point_force(poses[0], self.point, force_W)[None]
+
+
+class Torque(AbstractForce):
+    """A constant moment on `body`, with its reaction on another one.
+
+    ```python
+    motor = planar.Torque("motor", "bar", torque=2.0)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
+    ```
+
+    In `Trajectory.forces` the reaction is the first row, and the moment on `body` the second.
+
+    **Arguments:** `torque` [N m], a number in the plane; in space shape (3,), in world axes or, with `frame="body"`,
+    turning with the body; `reaction`, the body that bears the reaction, default ground.
+    """
+
+    name: str = fields.name()
+    reaction: str = fields.body_name(default="ground")
+    body: str = fields.body_name()
+    torque: fields.Number = fields.parameter(shape=None, unit="N m")
+    frame: Literal["world", "body"] = fields.choice("world", "body", default="world")
+
+    def complete(self, space, poses):
+        shape = () if space.dimension == 2 else (3,)
+        if self.torque.shape != shape:
+            raise ValueError(f"{self.label}: torque must have shape {shape}, got {self.torque.shape}.")
+        return self
+
+    def wrenches(self, space, poses, velocities, t):
+        turns_along = self.frame == "body" and space.dimension == 3
+        torque_W = space.direction(poses[1], self.torque) if turns_along else self.torque.reshape(-1)
+        return moment_pair(space, poses, torque_W)
+
+
+class RotationalDamper(AbstractPair, AbstractForce):
+    """A linear damper on the relative angular velocity, about every axis: moment `−damping (ω_B − ω_A)` on B.
+
+    ```python
+    ball = spatial.Body("ball", mass=1.0, inertia=spatial.sphere(1.0, 0.1), angular_velocity=(0.0, 0.0, 10.0))
+    oil = spatial.RotationalDamper("oil", "ground", "ball", damping=0.01)
+    socket = spatial.Spherical("socket", "ground", "ball", point=(0.0, 0.0, 0.0))
+    system = jaxmb.Scene([ball], joints=[socket], forces=[oil]).compile()
+    ```
+
+    **Arguments:** `damping` [N m s/rad] ≥ 0.
+    """
+
+    damping: fields.Number = fields.parameter(unit="N m s/rad", sign="non-negative")
+
+    def wrenches(self, space, poses, velocities, t):
+        omega_a, omega_b = (space.turning(x, v) for x, v in zip(poses, velocities, strict=True))
+        return moment_pair(space, poses, -self.damping * (omega_b - omega_a))

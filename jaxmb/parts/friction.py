@@ -13,6 +13,15 @@ from .smooth import dry_friction
 class Friction(AbstractNonIdeal):
     """Coulomb friction in a joint: `coefficient` times the joint's reaction force, opposing its slip.
 
+    | friction of | size | at rest |
+    |---|---|---|
+    | `DryFriction`, in a joint or a rigid contact | `coefficient` times the reaction | sticks, with events |
+    | `Friction`, in a joint | `coefficient` times the reaction | creeps, smooth |
+    | `JointFriction`, on a coordinate | a given `force` or moment | creeps, smooth |
+    | `JointSpring(stiffness=0.0)`, on a coordinate | `damping` times the rate | viscous |
+    | `NonIdeal`, in a joint | a function of the reaction | as the function is |
+    | `contact.Coulomb`, in a compliant `Contact` | `coefficient` times the load | creeps, smooth |
+
     ```python
     rub = planar.Friction("rub", "pin", coefficient=0.2, radius=0.01)
     system = jaxmb.Scene([bar], joints=[pin], forces=[rub, jaxmb.Gravity((0.0, -9.81))]).compile()
@@ -20,8 +29,7 @@ class Friction(AbstractNonIdeal):
 
     The slip s combines the relative velocity of the bodies at the joint's point (of a single body: relative to the
     ground) with `radius` times their relative angular velocity, so that one law serves pins, slides and cylinders. The
-    force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest, so that it creeps where
-    `DryFriction` sticks. N is the magnitude of
+    force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest. N is the magnitude of
     the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If no
     such N exists, or more than one (Painlevé's paradox), the simulation ends with `friction_undetermined`.
 
@@ -66,14 +74,12 @@ class Friction(AbstractNonIdeal):
 
     def slip(self, space, poses, velocities):
         """Velocity of slip [m/s]: at the point, world axes, then `radius` times the relative angular velocity."""
-        d = space.dimension
-        turn = (lambda pose, v: space.direction(pose, v[d:])) if d == 3 else (lambda pose, v: v[d:])
         sliding = space.point_velocity(poses[-1], velocities[-1], self.point)
-        turning = turn(poses[-1], velocities[-1])
+        turning = space.turning(poses[-1], velocities[-1])
         if poses.shape[0] == 2:
             point_a = space.body_point(poses[0], space.point(poses[-1], self.point))
             sliding = sliding - space.point_velocity(poses[0], velocities[0], point_a)
-            turning = turning - turn(poses[0], velocities[0])
+            turning = turning - space.turning(poses[0], velocities[0])
         return jnp.concatenate([sliding, self.radius * turning])
 
     def wrenches(self, space, poses, velocities, reactions, t):

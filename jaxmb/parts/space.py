@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import namespace
+from .shapes import AbstractShape, marked_ball, wheel
 
 Pose = Float[Array, "p"]
 Velocity = Float[Array, "v"]
@@ -51,6 +52,14 @@ class AbstractSpace(abc.ABC):
     @abc.abstractmethod
     def point_force(self, pose: Pose, s: Point, force_W: Point) -> Wrench:
         """Wrench of a force [N], in world axes, at the body-fixed point `s` [m]."""
+
+    @abc.abstractmethod
+    def turning(self, pose: Pose, velocity: Velocity) -> Float[Array, "r"]:
+        """The angular velocity [rad/s], in world axes; one number in the plane."""
+
+    @abc.abstractmethod
+    def moment(self, pose: Pose, moment_W: Float[Array, "r"]) -> Wrench:
+        """Wrench of a moment [N m] in world axes, one number in the plane."""
 
     @abc.abstractmethod
     def direction(self, pose: Pose, v: Point) -> Point:
@@ -139,10 +148,8 @@ def rate_of(
     """The value and the rate of `function(part, poses)`, which contains those of numbers of the part that are inputs.
 
     ```python
-    class Rope(jaxmb.parts.AbstractPair, jaxmb.parts.AbstractForce):
+    class Rope(jaxmb.parts.AbstractPointPair, jaxmb.parts.AbstractForce):
         drag: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N s/m", sign="positive")
-        point_a: jaxmb.parts.Number = jaxmb.parts.point(body=0, default="origin")
-        point_b: jaxmb.parts.Number = jaxmb.parts.point(body=1, default="origin")
 
         def length(self, space, poses):
             return jaxmb.rotations.norm(jaxmb.parts.separation(space, self, poses))
@@ -176,3 +183,14 @@ def force_pair(space: AbstractSpace, part: Any, poses: Float[Array, "k p"], forc
     """Wrenches of `force_W` [N] on B at point B and of its reaction on A at point A."""
     forces = jnp.stack([-force_W, force_W])
     return _of_both(lambda pose, force, s: space.point_force(pose, s, force), part, poses[:2], forces)
+
+
+def moment_pair(space: AbstractSpace, poses: Float[Array, "2 p"], moment_W: Float[Array, "r"]) -> Float[Array, "2 v"]:
+    """Wrenches of `moment_W` [N m] on the second body and of its reaction on the first."""
+    return jnp.stack([space.moment(poses[0], -moment_W), space.moment(poses[1], moment_W)])
+
+
+def round_shapes(space: AbstractSpace, body: int, radius: Any, centre: Any) -> tuple[tuple[int, AbstractShape], ...]:
+    """The shapes of a disc, in space of a ball, each with the number of its body; none of a point."""
+    solid = wheel if space.dimension == 2 else marked_ball
+    return tuple((body, shape) for shape in solid(radius, position=space.in_space(centre))) if radius > 0 else ()

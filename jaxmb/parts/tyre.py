@@ -4,14 +4,13 @@ Source: H. B. Pacejka, "Tyre and Vehicle Dynamics", 3rd ed., Butterworth-Heinema
 transient models).
 """
 
-import abc
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
+from ..linalg.rotations import cross, norm
 from . import fields
 from .base import AbstractDynamicForce, AbstractPotentialForce
 from .boundary import check_returns
@@ -19,18 +18,31 @@ from .contact import AbstractNormalLaw
 from .forces import over_ground
 from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step
-from .space import AbstractSpace, Point, Pose
 from .terrain import AbstractTerrain, distance, outward, pace_over
 
 
-class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
-    """A tyre on a wheel, on one terrain. Subclasses know the directions of the wheel; the laws are those of
-    `planar.Tyre` and `spatial.Tyre`.
+class Tyre(AbstractDynamicForce, AbstractPotentialForce):
+    """A tyre on a thin wheel, with relaxation, and with slip lengthwise and in space sideways.
 
-    **Fields:**
+    ```python
+    wheel = planar.Body("wheel", mass=10.0, inertia=planar.disc(10.0, 0.3), position=(0.0, 0.3), velocity=(5.0, 0.0))
+    ground = {"terrain": jaxmb.terrain.Flat(), "normal": jaxmb.contact.Linear(2e5)}
+    grip = {"coefficient": 0.9, "slip_stiffness": 15.0, "relaxation_length": 0.2}
+    system = jaxmb.Scene([wheel], forces=[planar.Tyre("tyre", "wheel", radius=0.3, **ground, **grip)]).compile()
+    ```
 
-    - `body`: the wheel, or a frame fixed in it; `radius` [m] > 0; `centre` [m], default the
-        origin of the frame.
+    The tread deflects in each direction as `ḋ = −v_s − (V/σ) d`, with the slip velocity v_s of the wheel's lowest point
+    and the rolling speed `V = √(v² + transition_speed²)` of its centre, so that in steady rolling the slips `d/σ` are
+    `−v_s/V`, the lateral one the tangent of the slip angle. With `s = c d/(σ μ)`, the force on the wheel at its lowest
+    point is `μ N tanh(|s|) s/|s|`, with the load N: `c N d/σ` for small slips, and friction for large ones. The wheel's
+    inclination only moves the contact; there are no aligning torque and no rolling resistance.
+
+    **Arguments:**
+
+    - `name`, of the tyre; `body`: the wheel, or a frame fixed in it.
+    - `radius` [m] > 0; `centre` [m], default the origin of the frame.
+    - `axis`, unit, shape (3,), in space: the axle fixed in the body, pointing to the left of a wheel that rolls
+        forwards, default the y axis. The wheel must not lie flat.
     - `terrain`, from `jaxmb.terrain`; `normal`: the load [N] as a function of the depth, from `jaxmb.contact`;
         `damping` [N s/m] ≥ 0 against the rate of the depth, fully from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
         of the depth, `½ (δ + √(δ² + smoothing²))`.
@@ -46,6 +58,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     body: str = fields.body_name()
     radius: fields.Number = fields.length(sign="positive")
     centre: fields.Number = fields.point(body=0, default="origin")
+    axis: fields.Number = fields.axis(body=0, optional=True, dimension=3)
     terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
     normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     coefficient: fields.Number = fields.parameter(unit="1", sign="positive")
@@ -59,18 +72,6 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
     has_gaps: ClassVar[bool] = True
 
-    @abc.abstractmethod
-    def axle(self, space: AbstractSpace) -> Float[Array, "3"]:
-        """The direction of the axle, fixed in the body, for pictures; in the plane it points to the viewer."""
-
-    @abc.abstractmethod
-    def lowest(self, space: AbstractSpace, pose: Pose, normal_W: Point) -> Point:
-        """World vector [m] from the wheel's centre to the point of its rim that is lowest over the ground."""
-
-    @abc.abstractmethod
-    def directions(self, space: AbstractSpace, pose: Pose, normal_W: Point) -> Float[Array, "h d"]:
-        """Unit vectors along the ground: forwards and, in space, to the left; world axes."""
-
     def complete(self, space, poses):
         count = space.dimension - 1
         for name in ("slip_stiffness", "relaxation_length", "deflection"):
@@ -79,7 +80,8 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
                 raise ValueError(f"{self.label}: {name} must have shape () or ({count},), got {shape}.")
         place = np.zeros(count, np.asarray(self.radius).dtype)
         check_returns(self.label, "terrain.height", (), self.terrain.height, place)
-        return self.with_fields(deflection=fields.as_parameter(np.broadcast_to(self.deflection, (count,))))
+        part = self if space.dimension == 2 else self.filled(axis=np.eye(3)[1])
+        return part.with_fields(deflection=fields.as_parameter(np.broadcast_to(self.deflection, (count,))))
 
     def may_vary(self, keys):
         return keys[0] not in ("radius", "centre", "axis")
@@ -121,12 +123,30 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         return {"deflection": 0.1 * jnp.max(self.relaxation_length)}
 
     def shapes(self, space, size):
-        tyre = wheel(self.radius, axis=self.axle(space), position=space.in_space(self.centre))
+        # In the plane the axle points to the viewer.
+        axle = np.eye(3)[2] if space.dimension == 2 else self.axis
+        tyre = wheel(self.radius, axis=axle, position=space.in_space(self.centre))
         return (None, Ground(height=self.terrain.height)), *((0, shape) for shape in tyre)
+
+    def _lowest(self, space, pose, normal_W):
+        """World vector [m] from the wheel's centre to the point of its rim that is lowest over the ground."""
+        if space.dimension == 2:
+            return -self.radius * normal_W
+        axle = space.direction(pose, self.axis)
+        up = cross(axle, cross(normal_W, axle))
+        return -self.radius * up / norm(up)
+
+    def _directions(self, space, pose, normal_W):
+        """Unit vectors along the ground: forwards and, in space, to the left; world axes."""
+        if space.dimension == 2:
+            return jnp.stack([normal_W[1], -normal_W[0]])[None]
+        forwards = cross(space.direction(pose, self.axis), normal_W)
+        forwards = forwards / norm(forwards)
+        return jnp.stack([forwards, cross(normal_W, forwards)])
 
     def _gap(self, space, pose):
         centre = space.point(pose, self.centre)
-        rim = centre + self.lowest(space, pose, outward(self.terrain, centre))
+        rim = centre + self._lowest(space, pose, outward(self.terrain, centre))
         return distance(self.terrain, rim)
 
     def _depth(self, space, pose):
@@ -142,8 +162,8 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         """
         centre = space.point(pose, self.centre)
         normal = outward(self.terrain, centre)
-        point = space.body_point(pose, centre + self.lowest(space, pose, normal))
-        along = self.directions(space, pose, normal)
+        point = space.body_point(pose, centre + self._lowest(space, pose, normal))
+        along = self._directions(space, pose, normal)
         slip = along @ self._velocity(space, pose, velocity, point)
         rolling = jnp.dot(along[0], self._velocity(space, pose, velocity, self.centre))
         return normal, point, along, slip, jnp.sqrt(rolling**2 + self.transition_speed**2)

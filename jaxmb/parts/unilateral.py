@@ -15,12 +15,20 @@ from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractInertialConstraint, AbstractPair, Poses, ScalarCoordinate, Velocities
+from .base import (
+    AbstractInertialConstraint,
+    AbstractPointPair,
+    PathKind,
+    Poses,
+    Quantities,
+    ScalarCoordinate,
+    Velocities,
+)
 from .coordinate_parts import AbstractScalarPart
 from .forces import over_ground
 from .modes import CLOSED, kind_of
-from .shapes import Box, Ground, marked_ball, wheel
-from .space import AbstractSpace, both_points, separation
+from .shapes import Box, Ground
+from .space import AbstractSpace, round_shapes, separation
 from .terrain import AbstractTerrain, distance
 
 
@@ -38,7 +46,10 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     energy back (T. R. Kane and D. A. Levinson, "Dynamics", McGraw-Hill, 1985, §5.9): the rebounds of such an impact are
     all less, by the share at which no energy is gained.
 
-    **Fields:** `restitution` from 0 to 1, default 0; `impact_law`: `"newton"`, the default, or `"poisson"`.
+    **Arguments:**
+
+    - `restitution` from 0 to 1, default 0: the rate after an impact over that before; `impact_law`, `"newton"`
+        (default) or `"poisson"`.
     """
 
     restitution: fields.Number = fields.parameter(unit="1", sign="non-negative", default=0.0, constant=True)
@@ -90,14 +101,14 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
     scene = jaxmb.Scene([bar], joints=[pin, buffer], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    **Arguments:** `coordinate`, such as `"hip.angle"` or `"rope.length"`, a number; `lower` < `upper` [rad, m], of
-    which one may be left out; `restitution` from 0 to 1, default 0: the rate after an impact over that before;
-    `impact_law`, `"newton"` (default) or `"poisson"`. In space the range of an angle must be less than a full turn, and
-    has both ends. `JointStop` is a compliant one.
+    `JointStop` is a compliant one.
+
+    **Arguments:** `lower` < `upper` [rad, m], of which one may be left out. In space the range of an angle must be less
+    than a full turn, and has both ends.
     """
 
-    lower: fields.Number = fields.parameter(unit="rad or m", optional=True)
-    upper: fields.Number = fields.parameter(unit="rad or m", optional=True)
+    lower: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
+    upper: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
 
     def validate(self):
         super().validate()
@@ -111,7 +122,7 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
         return agree if self.lower is None or self.upper is None else agree & (self.lower < self.upper)
 
     def with_numbers(self, given):
-        if self.within in self.joint.periodic:
+        if self.is_periodic():
             if self.lower is None or self.upper is None:
                 raise ValueError(
                     f"{self.label}: an angle in space is known up to full turns; give lower and upper of its range."
@@ -140,6 +151,8 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
 
 class AbstractGeometricContact(AbstractUnilateralConstraint):
     """A unilateral constraint of lengths; its coordinate is the `gap` [m], `"floor.gap"`."""
+
+    quantities: ClassVar[Quantities] = {"gap": "length"}
 
     def coordinates(self, space, poses):
         return {"gap": self.gap(space, poses[:-1])}
@@ -216,9 +229,11 @@ class RigidContact(AbstractRigidContact):
     The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is a
     compliant one.
 
-    **Arguments:** `body`; `terrain`, from `jaxmb.terrain`, fixed in the world; `radius` [m] ≥ 0, 0 for a point;
-    `centre` [m], body-fixed, default the origin of the frame; `restitution` from 0 to 1, default 0; `impact_law`,
-    `"newton"` (default) or `"poisson"`.
+    **Arguments:**
+
+    - `name`, of the contact; `body`: the body that touches, or a frame in it, by name.
+    - `terrain`, from `jaxmb.terrain`, fixed in the world.
+    - `radius` [m] ≥ 0, 0 for a point; `centre` [m], body-fixed, default the origin of the frame.
     """
 
     name: str = fields.name()
@@ -237,14 +252,10 @@ class RigidContact(AbstractRigidContact):
         return over_ground(self, point, velocity)
 
     def shapes(self, space, size):
-        solid = wheel if space.dimension == 2 else marked_ball
-        out = [(None, Ground(height=self.terrain.height))]
-        if self.radius > 0:
-            out += [(0, shape) for shape in solid(self.radius, position=space.in_space(self.centre))]
-        return tuple(out)
+        return (None, Ground(height=self.terrain.height)), *round_shapes(space, 0, self.radius, self.centre)
 
 
-class RigidBallContact(AbstractRigidContact, AbstractPair):
+class RigidBallContact(AbstractRigidContact, AbstractPointPair):
     """Rigid contact of two discs (in the plane) or balls (in space) of different bodies; frictionless without a
     `DryFriction`.
 
@@ -255,15 +266,12 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
     scene = jaxmb.Scene(discs, joints=[meet])
     ```
 
-    **Arguments:** `radius_a`, `radius_b` [m] ≥ 0, of which one may be zero, of a point; `point_a`, `point_b` [m], the
-    centres, body-fixed, default the origins of the frames; `restitution` from 0 to 1, default 0; `impact_law`,
-    `"newton"` (default) or `"poisson"`. The centres must not coincide.
+    **Arguments:** `radius_a`, `radius_b` [m] ≥ 0 about the points, of which one may be zero. The points must not
+    coincide.
     """
 
     radius_a: fields.Number = fields.length(sign="non-negative")
     radius_b: fields.Number = fields.length(sign="non-negative")
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
 
     def validate(self):
         super().validate()
@@ -280,12 +288,11 @@ class RigidBallContact(AbstractRigidContact, AbstractPair):
         return space.point(poses[1], self.point_b) - self.radius_b * self.outward(space, poses)
 
     def shapes(self, space, size):
-        solid = wheel if space.dimension == 2 else marked_ball
-        both = ((0, self.radius_a, self.point_a), (1, self.radius_b, self.point_b))
-        return tuple((k, shape) for k, r, at in both if r > 0 for shape in solid(r, position=space.in_space(at)))
+        own = round_shapes(space, 0, self.radius_a, self.point_a)
+        return own + round_shapes(space, 1, self.radius_b, self.point_b)
 
 
-class RigidPlaneContact(AbstractRigidContact, AbstractPair):
+class RigidPlaneContact(AbstractRigidContact, AbstractPointPair):
     """Rigid contact of a disc or ball of `body_b`, or of a point, with a plane (a line in planar scenes) of `body_a`;
     frictionless without a `DryFriction`.
 
@@ -297,13 +304,10 @@ class RigidPlaneContact(AbstractRigidContact, AbstractPair):
 
     The plane has no end, and the ball is always on the side to which the normal points.
 
-    **Arguments:** `point_a` [m] of the plane and `point_b` [m], the centre, body-fixed, default the origins of the
-    frames; `normal_a`, the plane's normal, fixed in `body_a`, or `normal` in the world at the given poses; `radius` [m]
-    ≥ 0, default 0; `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`.
+    **Arguments:** `normal_a`, fixed in `body_a`, or `normal` in the world at the given poses: the normal of the plane,
+    which contains point A; `radius` [m] ≥ 0 about point B, default 0.
     """
 
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
     normal_a: fields.Number = fields.axis(body=0, optional=True)
     normal: fields.Number = fields.axis(body=None, gives=("normal_a",))
     radius: fields.Number = fields.length(sign="non-negative", default=0.0)
@@ -316,7 +320,7 @@ class RigidPlaneContact(AbstractRigidContact, AbstractPair):
         return space.point(poses[1], self.point_b) - self.radius * self.outward(space, poses)
 
 
-class RigidBoxContact(AbstractRigidContact, AbstractPair):
+class RigidBoxContact(AbstractRigidContact, AbstractPointPair):
     """Rigid contact of a disc or ball of `body_b` with a rectangle (in the plane) or a box of `body_a`, at its faces,
     edges and corners; frictionless without a `DryFriction`.
 
@@ -328,16 +332,12 @@ class RigidBoxContact(AbstractRigidContact, AbstractPair):
 
     The ball rolls or slides from a face over an edge without an event; where it does, its acceleration jumps.
 
-    **Arguments:** `size` [m], the lengths of the box along the axes of the frame of `body_a`; `radius` [m] > 0;
-    `point_a` and `point_b` [m], the centres of the box and of the ball, body-fixed, default the origins of the frames;
-    `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`. The ball's centre stays
-    outside of the box.
+    **Arguments:** `size` [m], the lengths of the box about point A along the axes of the frame of `body_a`; `radius`
+    [m] > 0 about point B, which stays outside of the box.
     """
 
     size: fields.Number = fields.parameter(shape=("d",), unit="m", sign="positive")
     radius: fields.Number = fields.length(sign="positive")
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
 
     def gap(self, space, poses):
         return norm(self._outside(space, poses)) - self.radius
@@ -351,15 +351,14 @@ class RigidBoxContact(AbstractRigidContact, AbstractPair):
         return centre - jnp.clip(centre, -0.5 * self.size, 0.5 * self.size)
 
     def shapes(self, space, size):
-        solid = wheel if space.dimension == 2 else marked_ball
         extent = space.in_space(self.size)
         # A rectangle is as thick as a disc.
         extent = np.where(np.arange(3) < space.dimension, extent, self.radius / 3)
         box = Box(extent, position=space.in_space(self.point_a))
-        return ((0, box), *((1, shape) for shape in solid(self.radius, position=space.in_space(self.point_b))))
+        return (0, box), *round_shapes(space, 1, self.radius, self.point_b)
 
 
-class Slack(AbstractGeometricContact, AbstractPair):
+class Slack(AbstractGeometricContact, AbstractPointPair):
     """A rope between two points, or a coupling with slack: the points are at most `length` apart.
 
     ```python
@@ -368,18 +367,13 @@ class Slack(AbstractGeometricContact, AbstractPair):
     scene = jaxmb.Scene([bob], joints=[rope], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    **Arguments:** `point_a`, `point_b` [m], body-fixed, default the origins of the frames; `length` [m] > 0;
-    `restitution` from 0 to 1, default 0; `impact_law`, `"newton"` (default) or `"poisson"`.
+    **Arguments:** `length` [m] > 0.
     """
 
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
     length: fields.Number = fields.length(sign="positive")
+    path_kind: ClassVar[PathKind] = "rod"
 
     def gap(self, space, poses):
         d = separation(space, self, poses)
         # Smooth where the points coincide.
         return (self.length**2 - jnp.dot(d, d)) / (2 * self.length)
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)

@@ -5,8 +5,11 @@ Units are SI and radians; y is up by convention. Joints have their own coordinat
 `"slide.displacement"`, which `assemble` takes and `trajectory["hip"]` shows with rates and accelerations. Parts of
 `jaxmb` act on them, such as `JointSpring` and `Motor` on one coordinate, `Tendon` on several. So do `RigidContact` and
 other unilateral constraints, `DryFriction`, `Servo`, `Controller`, and `Force` and other functions of the user's.
-`jaxmb help` lists them. Classes of one's own derive from those of `jaxmb.parts`.
+`jaxmb help` lists them. Parts may name a `Frame`, fixed in a body, in place of the body. Classes of your own derive
+from those of `jaxmb.parts`.
 """
+
+from .._moved import tell_of_moved as _tell_of_moved
 
 ## Bodies
 from ..parts.planar.bodies import Body as Body, PointMass as PointMass, AbstractRigidBody as AbstractRigidBody
@@ -18,28 +21,27 @@ from ..parts.planar.joints import (
     Revolute as Revolute,
     Prismatic as Prismatic,
     Fixed as Fixed,
-    Distance as Distance,
     PointOnLine as PointOnLine,
     PointOnCurve as PointOnCurve,
     Gear as Gear,
     RackAndPinion as RackAndPinion,
 )
-from ..parts.planar.knife_edge import KnifeEdge as KnifeEdge
-from ..parts.planar.drivers import Driver as Driver
+from ..parts.distance import Distance as Distance
+from ..parts.knife_edge import KnifeEdge as KnifeEdge
+from ..parts.drivers import Driver as Driver
 
 ## Forces
 from ..parts.forces import SpringDamper as SpringDamper, Damper as Damper, PointForce as PointForce
-from ..parts.planar.forces import (
-    TorsionalSpringDamper as TorsionalSpringDamper,
-    Bushing as Bushing,
-    Torque as Torque,
-    BumpStop as BumpStop,
-)
+from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torque
+from ..parts.planar.torsion import TorsionalSpringDamper as TorsionalSpringDamper
+from ..parts.bushing import Bushing as Bushing
 from ..parts.planar.draft_gear import DraftGear as DraftGear
 from ..parts.friction import Friction as Friction
 
 ## Ground and contact
 from ..parts.contact import Contact as Contact
-from ..parts.planar.tyre import Tyre as Tyre
+from ..parts.tyre import Tyre as Tyre
 from ..parts.planar.track import Track as Track
 from ..parts.planar.body_contact import PlateContact as PlateContact, DiscContact as DiscContact
+
+_tell_of_moved(__name__, BumpStop="jaxmb.JointStop(..., exponent=3.0) on the angle of a joint")

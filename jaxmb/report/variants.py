@@ -1,7 +1,6 @@
 """Variants of a system whose exact motion is known."""
 
 import dataclasses
-import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,24 +14,29 @@ from ..bodies.constraint_set import ConstraintSet
 from ..bodies.groups import Group
 from ..bodies.structure import with_structure
 from ..parts.base import AbstractConstraint
-from ..parts.fields import field_names, paths
+from ..parts.fields import Declaration, field_names, paths
+from ..parts.units import power_of_length
 from ..system import AbstractSystem, parameters, with_parameters
-
-# Powers of the length in the units of parameters.
-_LENGTH = {"m": 1, "N": 1, "Pa": -1, "kg": 0, "s": 0, "1": 0}
 
 
 def units(system: Any) -> dict[str, str | None]:
-    """The units of all parameters by name; None where it is not declared, or a user's function gives it."""
+    """The units of all parameters by name, `"N/m, N m/rad"` of components with several; None where it is not declared,
+    or a user's function gives it.
+    """
     out: dict[str, str | None] = dict.fromkeys(parameters(system))
     for g in _groups(system):
         for _, shown, declared in paths(g.group.part):
-            known, field = declared.unit, ".".join(shown)
-            if " or " in known:
-                known = g.group.part.unit(field, known)
-            out |= {f"{name}.{field}": known or None for name in g.group.names}
+            field = ".".join(shown)
+            out |= dict.fromkeys((f"{name}.{field}" for name in g.group.names), _unit(g.group.part, field, declared))
     weights = system.forces.gravity_part if system.body_names else ()
     return out | {f"{weight.name}.acceleration": "m/s²" for weight in weights}
+
+
+def _unit(part: Any, field: str, declared: Declaration) -> str | None:
+    if not isinstance(declared.unit, tuple):
+        return declared.unit
+    (of_angle, of_length), which = declared.unit, part.is_of_length(field)
+    return None if which is None else ", ".join(np.ravel(np.where(which, of_length, of_angle)))
 
 
 def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State]:
@@ -45,41 +49,19 @@ def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State
     if system.nz:
         raise ValueError(f"the internal states {', '.join(system.state_names())} are of no known power of a length.")
     functions = [name for g in _groups(system) if _has_function(g.group.part) for name in g.group.names]
-    powers = {name: _powers(unit) for name, unit in units(system).items()}
-    unknown = [*functions, *(name for name, own in powers.items() if own is None)]
+    known = units(system)
+    unknown = [*functions, *(name for name, unit in known.items() if unit is None)]
     if unknown or not system.body_names:
         raise ValueError(f"the units of {', '.join(unknown[:3]) or 'a Lagrangian'} are not known")
     values = {}
     for name, value in parameters(system).items():
-        own = np.array(powers[name])
-        # With two units, that of translations and that of rotations.
-        repeats = (1,) if own.size == 1 else (value.size - value.size // 2, value.size // 2)
-        exponents = np.repeat(own, repeats) if own.size > 1 else own[0]
-        values[name] = np.asarray(value) * float(factor) ** exponents
+        exponents = np.array([power_of_length(unit) for unit in (known[name] or "").split(", ")])
+        values[name] = np.asarray(value) * float(factor) ** np.squeeze(exponents)
     scaled = with_parameters(system, values)
     scaled = eqx.tree_at(lambda s: s.length, scaled, system.length * factor)
     natural = lambda s: (s.coordinate_scale(), s.velocity_scale())
     own = [new / old for new, old in zip(natural(scaled), natural(system), strict=True)]
     return scaled, State(state.q * own[0], state.u * own[1])
-
-
-def _powers(unit: str | None) -> tuple[float, ...] | None:
-    """The power of the length in a unit, or in two of them; None where it is not known."""
-    if unit is None:
-        return None
-    out = []
-    for one in unit.replace(" (3)", "").split(", "):
-        power = 0.0
-        for sign, side in zip((1, -1), one.split("/"), strict=False):
-            for word in side.split():
-                base, _, exponent = word.replace("²", "^2").partition("^")
-                if base == "rad":
-                    continue
-                if base not in _LENGTH or re.fullmatch(r"[\d.]*", exponent) is None:
-                    return None
-                power += sign * _LENGTH[base] * float(exponent or 1)
-        out.append(power)
-    return tuple(out)
 
 
 def _has_function(part: Any) -> bool:

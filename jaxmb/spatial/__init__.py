@@ -5,9 +5,11 @@ Units are SI and radians; Euler parameters are scalar first, and angular velocit
 their own coordinates by name, `"hip.angle"` or `"slide.displacement"`, which `assemble` takes and `trajectory["hip"]`
 shows with rates and accelerations. Parts of `jaxmb` act on them, such as `JointSpring` and `Motor` on one coordinate,
 `Tendon` on several. So do `RigidContact` and other unilateral constraints, `DryFriction`, `Servo`, `Controller`, and
-`Force` and other functions of the user's. `jaxmb help` lists them. Classes of one's own derive from those of
-`jaxmb.parts`.
+`Force` and other functions of the user's. `jaxmb help` lists them. Parts may name a `Frame`, fixed in a body, in place
+of the body. Classes of your own derive from those of `jaxmb.parts`.
 """
+
+from .._moved import tell_of_moved as _tell_of_moved
 
 ## Bodies
 from ..parts.spatial.bodies import (
@@ -34,21 +36,21 @@ from ..parts.spatial.joints import (
     Planar as Planar,
     Fixed as Fixed,
 )
-from ..parts.spatial.point_joints import Distance as Distance, PointOnLine as PointOnLine, PointOnPlane as PointOnPlane
+from ..parts.distance import Distance as Distance
+from ..parts.spatial.point_joints import PointOnLine as PointOnLine, PointOnPlane as PointOnPlane
 from ..parts.spatial.composite import Composite as Composite
-from ..parts.spatial.rolling import KnifeEdge as KnifeEdge, RollingDisc as RollingDisc, RollingSphere as RollingSphere
-from ..parts.spatial.drivers import Driver as Driver
+from ..parts.knife_edge import KnifeEdge as KnifeEdge
+from ..parts.spatial.rolling import RollingDisc as RollingDisc, RollingSphere as RollingSphere
+from ..parts.drivers import Driver as Driver
 
 ## Forces
 from ..parts.forces import SpringDamper as SpringDamper, Damper as Damper, PointForce as PointForce
-from ..parts.spatial.forces import (
-    TorsionalSpringDamper as TorsionalSpringDamper,
-    RotationalDamper as RotationalDamper,
-    Bushing as Bushing,
-    Torque as Torque,
-)
+from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torque
+from ..parts.bushing import Bushing as Bushing
 from ..parts.friction import Friction as Friction
 
 ## Ground and contact
 from ..parts.contact import Contact as Contact
-from ..parts.spatial.tyre import Tyre as Tyre
+from ..parts.tyre import Tyre as Tyre
+
+_tell_of_moved(__name__, TorsionalSpringDamper="jaxmb.JointSpring on the angle of a joint")

@@ -46,7 +46,6 @@ def turning(poses, velocities, t, parameters):
     [
         (FLAT, planar.TorsionalSpringDamper("part", "ground", "mass", **BOTH)),
         (FLAT, planar.TorsionalSpringDamper(*PAIR, stiffness=0.0, damping=1.0)),
-        (DEEP, spatial.TorsionalSpringDamper(*PAIR, stiffness=10.0, axis=(0.0, 0.0, 1.0))),
         (DEEP, spatial.RotationalDamper("part", "ground", "mass", damping=1.0)),
         (FLAT, planar.Bushing(*PAIR, stiffness=(1.0, 1.0, 1.0), point=(0.0, 0.0))),
         (DEEP, spatial.Bushing(*PAIR, stiffness=(1.0,) * 6, point=(0.3, 0.2, 0.1))),

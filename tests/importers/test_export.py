@@ -1,13 +1,17 @@
 """Scenes as MJCF, read back."""
 
+from typing import ClassVar
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from model_files import check_dynamics, random_states
 
 import jaxmb as mb
-from jaxmb import importers, spatial
+from jaxmb import importers, parts, spatial
 from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.importers.description import rotation_of
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -272,3 +276,115 @@ def test_what_mujoco_cannot_express(joints, forces, message):
     with pytest.raises(ValueError, match=message):
         importers.to_mjcf(system)
     assert "<body" in importers.to_mjcf(system, ignore=[part.name for part in (*joints, *forces)]).text
+
+
+class Revolute(parts.AbstractSpatialPart, parts.AbstractJoint):
+    """A ball joint of a user's with the name of a hinge."""
+
+    rows: ClassVar[int] = 3
+
+    def residual(self, space, poses, t):
+        return parts.separation(space, self, poses)
+
+
+class Hinge(spatial.Revolute):
+    """A hinge of a user's with a damping of its own, which nothing reads here."""
+
+    damping: parts.Number = parts.parameter(unit="N m s/rad", default=0.1)
+
+
+class Loose(Hinge):
+    """A hinge whose axes may tilt."""
+
+    rows: ClassVar[int] = 3
+
+    def residual(self, space, poses, t):
+        return parts.separation(space, self, poses)
+
+
+class Stiffening(mb.JointSpring):
+    """A spring with another law."""
+
+    def wrenches(self, space, poses, velocities, t):
+        return self.force_along(space, poses, velocities, lambda x, v: -self.stiffness * x**3)
+
+
+def exported(joint, *forces):
+    body = spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 1.0))
+    return importers.to_mjcf(mb.Scene([body], joints=[joint], forces=forces).compile()).text
+
+
+AT, ABOUT = {"point": (0.0, 0.0, 0.2)}, {"axis": (0.0, 1.0, 0.0)}
+
+
+def test_what_a_joint_says_of_itself_is_written_and_not_what_its_class_is_called():
+    model = mujoco.MjModel.from_xml_string(exported(Hinge("joint", "ground", "body", **AT, **ABOUT)))
+    assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_HINGE
+    np.testing.assert_allclose((model.jnt_axis[0], model.jnt_pos[0]), ((0, 1, 0), (0, 0, 0.2)), atol=1e-15)
+    for joint in (Revolute("joint", "ground", "body", **AT), Loose("joint", "ground", "body", **AT, **ABOUT)):
+        with pytest.raises(ValueError, match=f"{joint.kind} 'joint' cannot be expressed"):
+            exported(joint)
+
+
+def test_a_force_with_a_law_of_its_own_is_refused():
+    hinge = spatial.Revolute("joint", "ground", "body", **AT, **ABOUT)
+    with pytest.raises(ValueError, match="Stiffening 'spring' cannot be expressed"):
+        exported(hinge, Stiffening("spring", "joint.angle", stiffness=1.0))
+
+
+# Joints in succession that turn the body by these angles, in the order of their axes.
+SUCCESSIONS = {
+    "universal": spatial.Universal("j", "ground", "body", **AT, axis_a_W=(1.0, 0.0, 0.0), axis_b_W=(0.0, 1.0, 0.0)),
+    "gimbal": spatial.Gimbal(
+        "j",
+        "ground",
+        "body",
+        **AT,
+        axis_1_W=(0.0, 0.0, 1.0),
+        axis_2_W=(0.0, 1.0, 0.0),
+        axis_3_W=(-1.0, 0.0, 0.0),
+    ),
+    "cylinder": spatial.Cylindrical("j", "ground", "body", **AT, **ABOUT),
+    "face": spatial.Planar("j", "ground", "body", **AT, **ABOUT),
+    "composite": spatial.Composite(
+        "j",
+        "body",
+        "ground",
+        point=(0.1, 0.2, 0.3),
+        sequence=("slide", "hinge", "slide", "hinge"),
+        axes_W=[(0.0, 0.6, 0.8), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)],
+        points_W=[(0.0, 0.1, 0.2), (0.3, 0.0, 0.0)],
+    ),
+    "ball": spatial.Composite(
+        "j", "ground", "body", **AT, sequence=("ball", "slide"), axes_W=[(0, 0, 1), (0.6, 0, 0.8)]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SUCCESSIONS)
+def test_elementary_joints_place_the_body(name):
+    """From where all coordinates are zero, turns and shifts about the axes of MuJoCo lead to the given pose."""
+    body = spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 1.0))
+    system = mb.Scene([body], joints=[SUCCESSIONS[name]]).compile()
+    random = np.random.default_rng(1)
+    near = mb.State(system.guess.q + 0.3 * random.normal(size=7), system.guess.u)
+    state = mb.assemble(system, near)
+    model = mujoco.MjModel.from_xml_string(importers.to_mjcf(system, state).text)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.body("body").xpos, state.q[:3], atol=1e-12)
+    coordinates = {key.split(".")[1] for key in system.joint_coordinates()}
+    free = model.nv
+    assert free == 6 - system.velocity_rank and len(coordinates) <= model.njnt
+    # The rates that the joints of MuJoCo leave are those that the joint here does.
+    columns = np.zeros((free, 6))
+    for k in range(free):
+        data.qvel[:] = np.eye(free)[k]
+        mujoco.mj_forward(model, data)
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body("body").id, velocity, 0)
+        turning = rotation_of(state.q[3:]).T @ velocity[:3]
+        columns[k] = np.concatenate([velocity[3:], turning])
+    for column in columns:
+        rate = system.velocity_residual(0.0, state.q, jnp.asarray(column))
+        np.testing.assert_allclose(rate, 0.0, atol=1e-10)

@@ -92,7 +92,7 @@ REFUSED = {
             [bar()],
             joints=[planar.Driver("d", "ground", "bar", quantity="angle", motion=lambda t, p: t, point_b=(1, 0))],
         ).compile(),
-        "'d'.*has no points",
+        "'d': point_b has no meaning for quantity='angle'",
     ),
     "turning a point mass": (
         lambda: mb.Scene(

@@ -292,7 +292,7 @@ def test_examples_of_joints(module, name):
         assert f"`{field}`" in text
     expected = (PLANAR if module is planar else SPATIAL)[name]
     own = {key: at for key, at in system.joint_coordinates().items() if key.split(".")[0] == joint.name}
-    assert {key.split(".")[1] for key in own} == expected.keys()
+    assert {key.split(".")[1] for key in own} == expected.keys() == joint.quantities.keys()
     assert expected or "no coordinates" in text
     for field, value in expected.items():
         assert f"`{field}`" in text

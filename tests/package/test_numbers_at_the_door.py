@@ -16,7 +16,7 @@ SIZE = (0.1, 0.2, 0.25)
 
 @pytest.fixture(scope="module")
 def rod():
-    """A rod of 2 m on a pin at the origin, with a bump stop and a servo-driven second rod."""
+    """A rod of 2 m on a pin at the origin, with a stop and a servo-driven second rod."""
     bodies = [
         planar.Body("rod", mass=3.0, inertia=1.0, position=(1.0, 0.0)),
         planar.Body("other", mass=1.0, inertia=1.0, position=(5.0, 0.0)),
@@ -25,7 +25,7 @@ def rod():
         "drive", "ground", "other", quantity="angle", motion=lambda t, p: p["w"] * t, parameters={"w": 1.0}
     )
     joints = [planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0)), mb.Servo(program, 1.0, 1.0)]
-    stop = planar.BumpStop("stop", "ground", "rod", stiffness=1.0, lower=-1.0, upper=1.0)
+    stop = mb.JointStop("stop", "pin.angle", stiffness=1.0, lower=-1.0, upper=1.0)
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81)), stop]).compile()
 
 
@@ -43,7 +43,7 @@ PLANAR = {
     "endless gravity": ({"gravity.acceleration": [0.0, -np.inf]}, "Gravity 'gravity': acceleration must be finite"),
     "negative gain": ({"drive.damping": -1.0}, "Servo 'drive': damping must be non-negative"),
     "number of a user's function": ({"drive.w": np.nan}, "Servo 'drive': program.w must be finite"),
-    "limits in the wrong order": ({"stop.lower": 2.0}, "BumpStop 'stop': lower must be less than upper"),
+    "limits in the wrong order": ({"stop.lower": 2.0}, "JointStop 'stop': lower must be less than upper"),
 }
 SPATIAL = {
     "flat body": ({"top.inertia": np.diag([1.0, 1.0, 3.0])}, "Body 'top': inertia violates the triangle inequality"),

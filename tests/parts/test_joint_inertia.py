@@ -1,5 +1,7 @@
 """Inertias of joints themselves: accelerations, energy and momentum by all formulations, motions and derivatives."""
 
+from typing import ClassVar
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ import pytest
 from every_formulation import FORMULATIONS
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import parts, planar, spatial
 from jaxmb.formulations import accelerations
 from jaxmb.solvers import Hermite
 
@@ -288,3 +290,34 @@ def test_inertias_that_cannot_be(part, message):
 def test_an_inertia_is_no_function_of_time():
     with pytest.raises(ValueError, match=r"'rotor\.inertia' must be constant: masses, moments of inertia"):
         mb.with_inputs(wheel(), {"rotor.inertia": lambda t: jnp.asarray(1.0 + t)})
+
+
+class Slot(parts.AbstractPlanarPart, parts.AbstractAxisJoint):
+    """A slot along which a pin goes, whose coordinate has a name of its own."""
+
+    rows: ClassVar[int] = 1
+
+    def residual(self, space, poses, t):
+        d, along = parts.separation(space, self, poses), space.direction(poses[0], self.axis_a)
+        return (along[0] * d[1] - along[1] * d[0])[None]
+
+    def coordinates(self, space, poses):
+        return {"stroke": jnp.dot(space.direction(poses[0], self.axis_a), parts.separation(space, self, poses))}
+
+
+class Stroke(Slot):
+    quantities: ClassVar = {"stroke": "length"}
+
+
+def test_a_joint_declares_what_its_coordinates_are():
+    """A rotor on a coordinate that is a length is one of a displacement, and a radius goes with an angle only."""
+    block = planar.Body("block", mass=1.0, inertia=0.1, position=(0.3, 0.0))
+    rotor = mb.JointInertia("rotor", "slot.stroke", inertia=2.0)
+    way = {"point": (0.0, 0.0), "axis": (1.0, 0.0)}
+    system = mb.Scene([block], joints=[Stroke("slot", "ground", "block", **way), rotor]).compile()
+    assert "rotor.displacement" in system.coordinate_names()
+    rub = mb.DryFriction("rub", "slot.stroke", coefficient=0.1, radius=0.2)
+    for joints, forces, what in (((rotor,), (), "JointInertia 'rotor'"), ((), (rub,), "DryFriction 'rub'")):
+        scene = mb.Scene([block], joints=[Slot("slot", "ground", "block", **way), *joints], forces=forces)
+        with pytest.raises(ValueError, match=f"{what}: Slot 'slot' does not say whether its coordinate 'stroke' is an"):
+            scene.compile()

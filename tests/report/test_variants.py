@@ -10,7 +10,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import parts, planar
 from jaxmb.parts.fields import declarations
-from jaxmb.report.variants import _powers, doubled, scaled_lengths, units
+from jaxmb.report.variants import _unit, doubled, scaled_lengths, units
 
 
 @eqx.filter_jit
@@ -59,6 +59,10 @@ def test_numbers_on_a_joint_have_the_units_of_its_coordinate():
     np.testing.assert_allclose(udot(scaled, start), size * udot(system, system.guess), rtol=1e-9, atol=1e-9)
 
 
+def stop(**own):
+    return mb.JointStop("s", "a.angle", lower=0.0, upper=1.0, stiffness=1.0, **own)
+
+
 ON_ANGLE, ON_BOTH = ("angle", "displacement"), ("angle", "angle", "displacement")
 
 
@@ -69,15 +73,24 @@ ON_ANGLE, ON_BOTH = ("angle", "displacement"), ("angle", "angle", "displacement"
         (mb.JointInertia("j", "a.displacement", inertia=0.2), ("displacement",), "inertia", "kg"),
         (mb.JointCoupling("j", "a.angle", "b.displacement", coefficients=(0.0, 1.0)), ON_ANGLE, "zero", "rad"),
         (mb.JointCoupling("j", "a.angle", "b.displacement", coefficients=(0.0, 1.0)), ON_ANGLE, "other_zero", "m"),
-        (mb.JointCoupling("j", "a.angle", ("b", "c"), coefficients=[(0.0, 1.0)] * 2), ON_BOTH, "other_zero", None),
-        (mb.Motor("m", "a.angle", command=1.0, lag=0.1), "angle", "command", "N m"),
-        (mb.Motor("m", "a.angle", mode="speed", gain=1.0, command=1.0, lag=0.1), "displacement", "command", "m/s"),
-        (mb.Motor("m", "a.angle", command=1.0, lag=0.1), "displacement", "limit", "N"),
+        (
+            mb.JointCoupling("j", "a.angle", ("b", "c"), coefficients=[(0.0, 1.0)] * 2),
+            ON_BOTH,
+            "other_zero",
+            "rad, m",
+        ),
+        (mb.Motor("m", "a.angle", command=1.0, lag=0.1), ("displacement",), "limit", "N"),
+        (stop(), ("angle",), "stiffness", "N m/rad"),
+        (stop(exponent=3.0), ("angle",), "stiffness", None),
+        (stop(exponent=3.0), ("angle",), "upper", "rad"),
+        (mb.FixedTendon("t", ("a.angle", "b"), coefficients=(1.0, 1.0)), ON_ANGLE, "coefficients", "m/rad, 1"),
+        (mb.JointInertia("j", "a.stroke", inertia=0.2), ("stroke",), "inertia", None),
     ],
 )
 def test_units_by_the_coordinates_that_a_part_acts_on(part, within, field, expected):
-    declared = declarations(type(part))[field].unit
-    assert part.with_fields(within=within).unit(field, declared) == expected
+    joints = {str(k): planar.PointOnLine("a", "ground", "rod", point=(0.0, 0.0)) for k in range(len(within))}
+    own = part.with_fields(within=within, joints=joints)
+    assert _unit(own, field, declarations(type(part))[field]) == expected
 
 
 def test_every_unit_of_the_library_is_known():
@@ -93,10 +106,19 @@ def test_every_unit_of_the_library_is_known():
         for name, declared in declarations(cls).items()
         if declared.kind == "number"
     }
-    unknown = {own for own, unit in numbers.items() if not unit or None in map(_powers, unit.split(" or "))}
+    unknown = {own for own, unit in numbers.items() if unit is None}
     of_actuator = {("Actuator", name) for name in ("control", "gain", "bias", "control_range", "force_range")}
     of_bekker = {("Bekker", "cohesive_modulus"), ("Bekker", "frictional_modulus")}
-    assert unknown == of_actuator | of_bekker | {("JointCoupling", "coefficients"), ("Motor", "gain")}
+    of_motor = {("Motor", "gain"), ("Motor", "command")}
+    assert unknown == of_actuator | of_bekker | of_motor | {("JointCoupling", "coefficients")}
+
+
+@pytest.mark.parametrize("unit", ["N m or N", "N/m^(n+1)", "", "Nm", "N  m"])
+def test_units_are_read_when_a_class_is_made(unit):
+    with pytest.raises(ValueError, match=r"in the unit .* write a unit as in 'N m/rad'"):
+        parts.parameter(unit=unit)
+    with pytest.raises(ValueError, match="in the unit"):
+        parts.parameter(unit=("N m", unit))
 
 
 class Rub(parts.AbstractForce):
@@ -104,7 +126,7 @@ class Rub(parts.AbstractForce):
 
     name: str = parts.name()
     body: str = parts.body_name()
-    force: parts.Number = parts.parameter(unit="N m or N", default=1.0)
+    force: parts.Number = parts.parameter(unit=("N m", "N"), default=1.0)
     share: parts.Number = parts.parameter(default=0.5)
 
     def wrenches(self, space, poses, velocities, t):

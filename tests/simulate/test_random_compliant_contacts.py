@@ -150,7 +150,7 @@ def bump_stop():
     """A bar on a spring that just reaches its stops."""
     bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
-    stop = planar.BumpStop("stop", "ground", "bar", stiffness=1e3, lower=-0.5, upper=0.5, exponent=1.0)
+    stop = mb.JointStop("stop", "pin.angle", stiffness=1e3, lower=-0.5, upper=0.5, exponent=1.0)
     spring = planar.TorsionalSpringDamper("spring", "ground", "bar", stiffness=1.0, free_angle=0.0)
 
     def case(draw):

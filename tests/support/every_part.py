@@ -152,7 +152,7 @@ PLANAR = [
     on_body_2d(planar.PointForce, "force", force=(2.0, 1.0), point=(0.1, 0.2)),
     on_body_2d(planar.Torque, "torque", torque=0.5),
     of_ground_2d(planar.TorsionalSpringDamper, "stiffness", stiffness=5.0, damping=0.2, free_angle=0.8),
-    of_ground_2d(planar.BumpStop, "stiffness", stiffness=300.0, lower=-0.1, upper=0.1),
+    of_ground_2d(planar.RotationalDamper, "damping", damping=0.3),
     of_ground_2d(planar.Bushing, "stiffness", stiffness=(30.0, 20.0, 3.0), damping=(1.0, 1.0, 0.1), point=(0.0, 0.0)),
     of_ground_2d(
         planar.DraftGear,
@@ -250,6 +250,15 @@ def coupled():
 
 FUNCTIONS = [
     of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1, smoothing=0.05),
+    of_joint(
+        mb.JointStop,
+        "exponent",
+        name="JointStop with an exponent",
+        stiffness=300.0,
+        exponent=3.0,
+        lower=-0.1,
+        upper=0.1,
+    ),
     of_joint(mb.JointFriction, "force", force=0.3, transition_speed=0.5),
     of_joint(mb.Actuator, "gain", control=0.3, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -0.2)),
     of_joint(
@@ -430,7 +439,6 @@ SPATIAL = [
     of_ground_3d(spatial.Damper, "damping", damping=3.0, point_b=(0.1, 0.2, 0.0)),
     on_body_3d(spatial.PointForce, "force", force=(2.0, 1.0, 0.5), point=(0.1, 0.2, 0.0)),
     on_body_3d(spatial.Torque, "torque", torque=(0.2, 0.1, 0.0)),
-    of_ground_3d(spatial.TorsionalSpringDamper, "stiffness", stiffness=5.0, damping=0.2, axis=AXIS, free_angle=0.5),
     of_ground_3d(
         spatial.Bushing, "stiffness", stiffness=(30.0, 20.0, 25.0, 3.0, 4.0, 5.0), damping=np.full(6, 0.3), point=O
     ),

@@ -14,9 +14,12 @@ from ..base import AbstractBody, AbstractPlanarPart
 class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
     """A planar rigid body with its initial guess; subclasses define mass and inertia.
 
-    **Arguments:** `position` [m], shape (2,), of the origin of the body's frame, and `angle` [rad], a guess that
-    `assemble` improves; `velocity` [m/s], shape (2,), of the origin, and `angular_velocity` [rad/s], a guess as well:
-    where joints contradict them `assemble` changes both, and `assemble(rates=)` prescribes one.
+    **Arguments:**
+
+    - `name`, of the body.
+    - `position` [m], shape (2,), of the origin of the frame, and `angle` [rad]: a guess that `assemble` improves.
+    - `velocity` [m/s], shape (2,), of the origin, and `angular_velocity` [rad/s]: a guess as well. Where joints
+        contradict them `assemble` changes both, and `assemble(rates=)` prescribes one.
     """
 
     name: str = fields.name()
@@ -51,11 +54,9 @@ class Body(AbstractRigidBody):
     `Trajectory["name"]`, and the moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body
     shows the motion of the origin.
 
-    **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `position` [m], shape (2,), of the
-    origin of the frame, and `angle` [rad], a guess that `assemble` improves; `velocity` [m/s], shape (2,), of the
-    origin, and `angular_velocity` [rad/s], a guess as well: where joints contradict them `assemble` changes both, and
-    `assemble(rates=)` prescribes one; `centre` [m], shape (2,), the mass centre in the frame, default
-    its origin. Where a changed `"name.centre"` moves the mass centre, the guess of the frame stays.
+    **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `centre` [m], shape (2,), the mass
+    centre in the frame, default its origin. Where a changed `"name.centre"` moves the mass centre, the guess of the
+    frame stays.
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")

@@ -5,6 +5,7 @@ body, so contact adds no constraint and no event.
 """
 
 import abc
+import itertools
 from typing import ClassVar
 
 import equinox as eqx
@@ -17,8 +18,8 @@ from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce
 from ..contact import AbstractFrictionLaw, AbstractNormalLaw
-from ..shapes import wheel
 from ..smooth import ramp, step
+from ..space import round_shapes
 
 Number = Float[Array, ""]
 Vector = Float[Array, "2"]
@@ -46,6 +47,17 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     """Base class of contacts of one disc with other bodies. Subclasses define the numbers of each of the others
     (`surfaces`), and with these the distance of the disc's centre from its surface (`distance`) and how much of the
     force acts (`share`), as functions of the place of that centre in the other body's frame.
+
+    The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
+
+    **Arguments:**
+
+    - `name`, of the contact; `bodies`: names, first that of the body of the disc, then those of the others, one that is
+        touched at several places for each of them.
+    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
+    - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
+    - `smoothing` [m] > 0. At a distance d a depth of `smoothing² / (4 d)` remains.
     """
 
     name: str = fields.name()
@@ -103,7 +115,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         return self.distance(place, surface) - self.radius
 
     def shapes(self, space, size):
-        return tuple((0, shape) for shape in wheel(self.radius, position=space.in_space(self.centre)))
+        return round_shapes(space, 0, self.radius, self.centre)
 
     def _depth(self, place, surface):
         """Depth of the disc's deepest point, smoothed."""
@@ -186,20 +198,12 @@ class PlateContact(AbstractBodyContact):
     the depth is measured from the point between the two ends, the potential is that of `normal` times the share that
     both plates leave, and each of them takes half of the force.
 
-    The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
-
     **Arguments:**
 
-    - `bodies`: names, first that of the disc's body, then those of the plates' bodies; one of several plates is named
-        for each of them.
-    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
-    - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
     - `start`, `end` [m] of the plates, fixed in their bodies, shape (2,) or (plates, 2).
     - `edge` [m] > 0, at most half as long as a plate.
     - `chain`: whether the plates, in the order of `bodies`, are those of a closed chain, three at least. Their ends
         meet at the given poses, within `edge`.
-    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
-    - `smoothing` [m] > 0. At a distance d a depth of `smoothing² / (4 d)` remains.
     """
 
     start: fields.Number = fields.parameter(shape=None, unit="m")
@@ -333,13 +337,8 @@ class DiscContact(AbstractBodyContact):
     system = jaxmb.Scene(discs, forces=[meet]).compile()
     ```
 
-    The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
-
     **Arguments:**
 
-    - `bodies`: names, first that of the body of `radius` and `centre`, then those of the others, one of several discs
-        for each of them.
-    - `normal`, `friction`, `radius`, `centre`, `damping`, `damping_depth`, `smoothing`: as in `PlateContact`.
     - `radii` [m] ≥ 0 of the other discs, shape () or (others,), 0 for points.
     - `centres` [m] of the other discs, fixed in their bodies, shape (2,) or (others, 2), default the
         origins of the frames.
@@ -354,13 +353,8 @@ class DiscContact(AbstractBodyContact):
     def shapes(self, space, size):
         n = len(self.bodies) - 1
         centres, radii = np.broadcast_to(self.centres, (n, 2)), np.broadcast_to(self.radii, n)
-        others = [
-            (k, shape)
-            for k, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1)
-            if radius > 0
-            for shape in wheel(radius, position=space.in_space(centre))
-        ]
-        return (*super().shapes(space, size), *others)
+        others = (round_shapes(space, k + 1, radii[k], centres[k]) for k in range(n))
+        return (*super().shapes(space, size), *itertools.chain(*others))
 
     def surfaces(self):
         return self._rows(self.radii, ()), self._rows(self.centres, (2,))

@@ -7,12 +7,12 @@ from jaxtyping import Array, Float
 
 from ...linalg.rotations import norm
 from .. import fields
-from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce, PathKind
+from ..base import AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce, PathKind
 from ..smooth import quintic, sign
-from ..space import both_points, force_pair, separation, separation_rate
+from ..space import force_pair, separation, separation_rate
 
 
-class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
+class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
     r"""A friction draft gear: slack, then a preloaded spring with dry friction, then a solid stop; in both directions.
 
     ```python
@@ -44,8 +44,7 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     - `damping` c [N s/m] ≥ 0, acting outside the slack.
     - `transition_speed` v₀ [m/s] > 0, the speed at which 76 % of the friction acts; `smoothing` [m] > 0. The smaller
         they are, the shorter the steps.
-    - `free_length` [m], default the length at the given poses; `point_a`, `point_b` [m], body-fixed, default the
-        origins of the frames.
+    - `free_length` [m], default the length at the given poses.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="non-negative", default=1e7)
@@ -58,8 +57,6 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
     transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=0.005)
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
-    point_a: fields.Number = fields.point(body=0, default="origin")
-    point_b: fields.Number = fields.point(body=1, default="origin")
     path_kind: ClassVar[PathKind] = "coil"
     has_gaps: ClassVar[bool] = True
 
@@ -100,9 +97,6 @@ class DraftGear(AbstractPlanarPart, AbstractPair, AbstractPotentialForce):
         strokes = jnp.stack([extension - self.slack, -extension - self.slack])
         # The ramps begin half their width before.
         return -jnp.concatenate([strokes, strokes - self.travel]) - 0.5 * self.smoothing
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def _against(self, stroke, rate):
         engaged, ramp, _ = self._engaged(stroke)

@@ -1,12 +1,6 @@
 """Planar joints.
 
-Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
-the body frames (`point_a`, `point_b`, `axis_a`), or all at once by a world point and axis at the given poses (`point`,
-`axis`). Below, `A` and `B` are the world positions of the two points, `d = B − A`, `n` the normal of the axis.
-
-Their own coordinates are `angle` [rad], that of `body_b` less that of `body_a`, and `displacement` [m], the component
-of d along the axis, zero where B is next to A. Points given by a world `point` coincide at the given poses, so that the
-displacement counts from there.
+In their classes `A` and `B` are the world positions of the two points, `d = B − A`, and `n` is the normal of the axis.
 """
 
 from collections.abc import Callable
@@ -18,12 +12,20 @@ from jaxtyping import Array, Float
 
 from ..._types import Scalar
 from ...linalg.arrays import namespace
-from ...linalg.rotations import norm, rotate_2d
+from ...linalg.rotations import rotate_2d
 from .. import fields
-from ..base import AbstractConstraint, AbstractJoint, AbstractPair, AbstractPlanarPart
-from ..elements import apart, coincident, in_planes, perpendicular
+from ..base import (
+    AbstractAxisJoint,
+    AbstractConstraint,
+    AbstractJoint,
+    AbstractPair,
+    AbstractPlanarPart,
+    PathKind,
+    Quantities,
+)
+from ..elements import coincident, in_planes, perpendicular
 from ..shapes import pin, sleeve, wheel
-from ..space import both_points, nearest_to_origin, separation
+from ..space import nearest_to_origin, separation
 
 
 def relative_angle(poses: Float[Array, "k p"]) -> Float[Array, ""]:
@@ -41,17 +43,10 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
     ```
 
     Its coordinate is `angle` [rad], that of `body_b` less that of `body_a`: zero where both bodies have the same angle.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
-        at this place of the world at the given poses.
     """
 
     rows: ClassVar[int] = 2
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"angle": "angle"}
 
     @property
     def elements(self):
@@ -81,10 +76,6 @@ class Fixed(AbstractPlanarPart, AbstractJoint):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
-        at this place of the world at the given poses.
     - `angle` [rad]: that of `body_b` less that of `body_a`, default that of the given poses.
     """
 
@@ -102,7 +93,7 @@ class Fixed(AbstractPlanarPart, AbstractJoint):
         return jnp.concatenate([separation(space, self, poses), (relative_angle(poses) - self.angle)[None]])
 
 
-class PointOnLine(AbstractPlanarPart, AbstractJoint):
+class PointOnLine(AbstractPlanarPart, AbstractAxisJoint):
     """A pin in a straight slot: point B stays on the line through A. Rows 1: `n·d = 0`, with d from A to B and n the
     normal of the slot.
 
@@ -115,21 +106,11 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     Its coordinates are `displacement` [m], how far B is from A along the slot, zero where they coincide, and `angle`
     [rad], that of `body_b` less that of `body_a`, zero where both bodies have the same angle. If the points are given
     by a world `point`, where they coincide, the displacement is zero at the given poses.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, unit, shape (2,): the direction of the slot, fixed in `body_a`; or `axis`, unit, shape (2,): that in the
-        world at the given poses.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 1
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"displacement": "length", "angle": "angle"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     @property
     def elements(self):
@@ -141,14 +122,11 @@ class PointOnLine(AbstractPlanarPart, AbstractJoint):
     def coordinates(self, space, poses):
         return {"displacement": _displacement(space, self, poses), "angle": relative_angle(poses)}
 
-    def path(self, space, poses):
-        return both_points(space, self, poses)
-
     def shapes(self, space, size):
         return ((1, pin(space.in_space(self.point_b), size)),)
 
 
-class Prismatic(AbstractPlanarPart, AbstractJoint):
+class Prismatic(AbstractPlanarPart, AbstractAxisJoint):
     """A slide: point B stays on the line through A and the relative angle is constant. Rows 2: `n·d = 0`, with d from A
     to B and n the normal of the line, and `angle_b − angle_a = angle`.
 
@@ -165,19 +143,13 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (2,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, unit, shape (2,): the direction of the slide, fixed in `body_a`; or `axis`, unit, shape (2,): that in
-        the world at the given poses.
     - `angle` [rad]: that of `body_b` less that of `body_a`, default that of the given poses.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     angle: fields.Number = fields.parameter(unit="rad", optional=True)
     rows: ClassVar[int] = 2
+    quantities: ClassVar[Quantities] = {"displacement": "length"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     def complete(self, space, poses):
         return self.filled(angle=relative_angle(poses))
@@ -198,9 +170,6 @@ class Prismatic(AbstractPlanarPart, AbstractJoint):
 
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, self._axis_b))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, sleeve(space.in_space(self.point_b), size, space.in_space(self._axis_b))),)
@@ -228,47 +197,6 @@ def _displacement(space, part, poses):
     return jnp.dot(space.direction(poses[0], part.axis_a), separation(space, part, poses))
 
 
-class Distance(AbstractPlanarPart, AbstractPair, AbstractConstraint):
-    """A massless rod: points A and B of two bodies keep their distance. Rows 1: `(d·d − length²) / (2 length) = 0`,
-    with d from A to B; the multiplier is the rod force [N].
-
-    ```python
-    bob = planar.Body("bob", mass=1.0, inertia=0.1, position=(0.6, 0.0))
-    rod = planar.Distance("rod", "ground", "bob", point_b=(-0.1, 0.0))
-    system = jaxmb.Scene([bob], joints=[rod]).compile()
-    ```
-
-    It has no coordinates of its own.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (2,): A fixed in `body_a`, B fixed in `body_b`, default the origins of the frames.
-    - `length` [m] > 0, default that of the given poses.
-    """
-
-    point_a: fields.Number = fields.point(body=0, default=(0.0, 0.0))
-    point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0))
-    length: fields.Number = fields.length(sign="positive", optional=True)
-    rows: ClassVar[int] = 1
-    rheonomic: ClassVar[bool] = False
-
-    def complete(self, space, poses):
-        return self.filled(length=norm(separation(space, self, poses)))
-
-    @property
-    def elements(self):
-        return (apart(self),)
-
-    def residual(self, space, poses, t):
-        d = separation(space, self, poses)
-        return ((jnp.dot(d, d) - self.length**2) / (2 * self.length))[None]
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
-
-
 class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     """A pin in a curved slot: point B stays on a curve fixed in `body_a`. Rows 1: `curve(B in the frame of body_a,
     parameters) = 0`.
@@ -284,8 +212,6 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
     - `curve(point, parameters) -> scalar`: zero on the curve and with a gradient there; the point has shape (2,).
     - `point_b` [m], shape (2,): B fixed in `body_b`, default the origin of its frame.
     - `parameters`: numbers of the curve by name; they become parameters of the system, `"name.key"`.
@@ -295,7 +221,7 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     point_b: fields.Number = fields.point(body=1, default=(0.0, 0.0))
     parameters: fields.Numbers = fields.numbers()
     rows: ClassVar[int] = 1
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"angle": "angle"}
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):

@@ -29,6 +29,12 @@ class PlanarSpace(AbstractSpace):
         arm = _turned(pose, s)
         return jnp.concatenate([force_W, (arm[0] * force_W[1] - arm[1] * force_W[0])[None]])
 
+    def turning(self, pose, velocity):
+        return velocity[2:]
+
+    def moment(self, pose, moment_W):
+        return jnp.concatenate([jnp.zeros(2, moment_W.dtype), moment_W])
+
     def direction(self, pose, v):
         return _turned(pose, v)
 

@@ -1,5 +1,6 @@
 """Tracks and belts: a closed elastic loop around wheels."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -15,7 +16,7 @@ from ...linalg.rotations import norm
 from ...linalg.sums import placed_sums
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce, PathKind
-from ..shapes import wheel
+from ..space import round_shapes
 
 
 class Track(AbstractPlanarPart, AbstractPotentialForce):
@@ -152,13 +153,8 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
     def shapes(self, space, size):
         if self.radii is None:
             return ()
-        circles = zip(self.owners, self.points, self.radii, strict=True)
-        return tuple(
-            (k, shape)
-            for k, point, radius in circles
-            if radius > 0
-            for shape in wheel(radius, position=space.in_space(point))
-        )
+        circles = zip(self.owners, self.radii, self.points, strict=True)
+        return tuple(itertools.chain(*(round_shapes(space, *circle) for circle in circles)))
 
     def tension(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
         """Tension [N]."""

@@ -3,6 +3,8 @@
 Quantities "in A" are components in the axes of the first body of the part.
 """
 
+from typing import Any, NamedTuple
+
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,9 +15,32 @@ from ...linalg.roots import reciprocal_root
 from ..elements import Product, perpendicular
 
 Vector3 = Float[Array, "3"]
+# The elementary joints that coordinates belong to, by what these are.
+_KINDS = {"angle": "hinge", "length": "slide", "rotation": "ball"}
 
 # Angles nearer to half a turn than 0.1 rad count as opposite, by their cosine plus one.
 _OPPOSITE = 0.005
+
+
+class ElementaryJoint(NamedTuple):
+    """A `"hinge"`, `"slide"` or `"ball"` that a joint consists of: the `name` and the `value` of its coordinate, and a
+    `point` [m] and its `axis` in the world, zero for a ball.
+    """
+
+    kind: str
+    name: str
+    point: Any
+    axis: Any
+    value: Any
+
+
+def joints_through_b(space, part, poses: Float[Array, "2 p"], **axes: Any) -> list[ElementaryJoint]:
+    """The elementary joints of a joint through its point B, by the names of its coordinates, about `axes` in the
+    world.
+    """
+    values, point = part.coordinates(space, jax.numpy.asarray(poses)), space.point(poses[1], part.point_b)
+    kinds = {name: _KINDS[part.quantities[name]] for name in axes}
+    return [ElementaryJoint(kinds[name], name, point, axis, values[name]) for name, axis in axes.items()]
 
 
 def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:

@@ -23,10 +23,14 @@ def inertia_matrix(value: Any) -> Array:
 class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
     """A spatial rigid body with its initial guess; subclasses define mass and inertia.
 
-    **Arguments:** `position` [m], shape (3,), of the origin of the body's frame, and `orientation`, shape (4,), unit
-    Euler parameters (scalar first) from body to world: a guess that `assemble` improves; `velocity` [m/s], shape (3,),
-    of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the body frame, a guess as well:
-    where joints contradict them `assemble` changes both, and `assemble(rates=)` prescribes one.
+    **Arguments:**
+
+    - `name`, of the body.
+    - `position` [m], shape (3,), of the origin of the frame, and `orientation`, shape (4,), unit Euler parameters
+        (scalar first) from body to world: a guess that `assemble` improves.
+    - `velocity` [m/s], shape (3,), of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the
+        body frame: a guess as well. Where joints contradict them `assemble` changes both, and `assemble(rates=)`
+        prescribes one.
     """
 
     name: str = fields.name()
@@ -65,11 +69,6 @@ class Body(AbstractRigidBody):
     - `mass` [kg] > 0.
     - `inertia` [kg m²], shape (3, 3), about the mass centre in body axes, symmetric and positive definite (products of
         inertia enter as `−∫ x y dm`); or shape (3,), its diagonal, in principal axes.
-    - `position` [m], shape (3,), of the origin of the frame, and `orientation`, shape (4,), unit Euler parameters
-        (scalar first) from body to world: a guess that `assemble` improves.
-    - `velocity` [m/s], shape (3,), of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the
-        body frame, a guess as well: where joints contradict them `assemble` changes both, and `assemble(rates=)`
-        prescribes one.
     - `centre` [m], shape (3,), the mass centre in the frame, default its origin. Where a changed `"name.centre"` moves
         the mass centre, the guess of the frame stays.
     """

@@ -3,7 +3,6 @@
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,6 +18,7 @@ from ..coordinate_parts import shortest
 from ..shapes import ball, pin, sleeve
 from ..space import both_points
 from .axes import (
+    ElementaryJoint,
     Vector3,
     across,
     direction_in_a,
@@ -57,11 +57,7 @@ class Composite(AbstractSpatialPart, AbstractJoint):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
     - `sequence`: the words `"hinge"`, `"slide"` and `"ball"` from A to B.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
     - `axes`, shape (n, 3), unit, one for each word (that of a ball has no effect), in the axes of `body_a`; or in the
         world at the given poses, `axes_W`.
     - `points` [m], shape (hinges, 3), one on each hinge, in the frame of `body_a`, or in the world, `points_W`; by
@@ -82,7 +78,11 @@ class Composite(AbstractSpatialPart, AbstractJoint):
     points_W: fields.Number = fields.point(body=None, shape=(None, "d"), gives=("points",), needed=False)
     orientation: fields.Number = fields.attitude(optional=True)
     middle: fields.Number = fields.parameter(unit="rad", optional=True)
-    angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
+
+    @property
+    def quantities(self):
+        kinds = {"hinge": "angle", "slide": "length", "ball": "rotation"}
+        return {name: kinds[word] for name, word in zip(coordinate_names(self.sequence), self.sequence, strict=True)}
 
     @property
     def rows(self):
@@ -132,6 +132,25 @@ class Composite(AbstractSpatialPart, AbstractJoint):
             values["ball"] = iter([rotation_vector(self, poses)])
         own = zip(coordinate_names(self.sequence), self.sequence, strict=True)
         return {name: next(values[word]) for name, word in own}
+
+    def elementary_joints(self, space, poses):
+        """The first one is fixed in A, each other one where the coordinates of those before it put it."""
+        values, out = self.coordinates(space, jnp.asarray(poses)), []
+        points = itertools.repeat(self.point_a) if self.points is None else iter(self.points)
+        place, turn = poses[0][:3], rot.normalize(poses[0][3:7])
+        for word, axis, name in zip(self.sequence, self.axes, values, strict=True):
+            value, point = values[name], next(points) if word == "hinge" else self.point_a
+            at = place + rot.rotate(turn, point)
+            out.append(ElementaryJoint(word, name, at, rot.rotate(turn, axis), value))
+            if word == "slide":
+                place = place + rot.rotate(turn, value * axis)
+                continue
+            if word == "ball":
+                angle = rot.norm(value)
+                axis, value = value / np.where(angle > 0, angle, 1.0), angle
+            turn = rot.multiply(turn, rot.from_axis_angle(axis, value))
+            place = at - rot.rotate(turn, point)
+        return out
 
     def path(self, space, poses):
         return both_points(space, self, poses) if "slide" in self.sequence else None

@@ -1,18 +1,11 @@
 """Spatial joints.
 
-Every joint connects body-fixed points and axes of `body_a` and `body_b` (either may be `"ground"`). They are given in
-the body frames (`point_a`, `point_b`, `axis_a`, `axis_b`), or all at once by a world point and axis at the given poses
-(`point`, `axis`). Axes are unit vectors. Below, `A` and `B` are the world positions of the two points, `d = B − A`, `a`
-and `b` the two axes, `u` and `v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
+In their classes `A` and `B` are the world positions of the two points, `d = B − A`, `a` and `b` the two axes, `u` and
+`v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
 
 Where axes are parallel, they point the same way. Their rows are those of the tilt, the components along u and v of
 `2 sin(θ/2)` times the unit vector of `b` across `a`, with the angle θ between the axes: they vanish only where the axes
 agree, and not where they point against each other.
-
-Their own coordinates are `angle` [rad], the turn of `body_b` about the axis, and `displacement` [m], the component of d
-along it. An angle is zero at the given poses, or where the directions `x_a` and `x_b` that are given with the joint
-coincide. A displacement is zero where B is next to A; points given by a world `point` coincide at the given poses, so
-that it counts from there.
 """
 
 from typing import ClassVar
@@ -20,12 +13,12 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ...linalg.rotations import conjugate, cross, dot, multiply, rotate, unrotate
+from ...linalg.rotations import conjugate, cross, dot, from_axis_angle, multiply, rotate, unrotate
 from .. import fields
-from ..base import AbstractJoint, AbstractSpatialPart
+from ..base import AbstractAxisJoint, AbstractJoint, AbstractSpatialPart, PathKind, Quantities
 from ..elements import coincident, in_planes, perpendicular
 from ..shapes import ball, pin, sleeve
-from ..space import both_points, nearest_to_origin, separation
+from ..space import nearest_to_origin, separation
 from .axes import (
     across,
     aligned,
@@ -34,6 +27,7 @@ from .axes import (
     direction_in_a,
     displacement_along,
     half_sine,
+    joints_through_b,
     measured_from_given_poses,
     offset_in_a,
     parallel,
@@ -52,7 +46,13 @@ def _parallel(space, part, poses):
 
 
 class AbstractOriented(AbstractSpatialPart, AbstractJoint):
-    """A joint that knows the relative attitude at which its rotation is zero, `orientation`, as in `Spherical`."""
+    """A joint that knows a relative attitude.
+
+    **Arguments:**
+
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` that is kept, or
+        where the coordinates are zero; default the attitude at the given poses.
+    """
 
     orientation: fields.Number = fields.attitude(optional=True)
 
@@ -72,18 +72,10 @@ class Spherical(AbstractOriented):
     Its coordinate is `rotation` [rad], shape (3,): the rotation vector, in the axes of `body_a`, of the shortest turn
     from `orientation` to the relative attitude; zero at the given poses, unless `orientation` is given. It is not
     smooth at half a turn.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where the rotation
-        is zero, default that of the given poses.
     """
 
     rows: ClassVar[int] = 3
+    quantities: ClassVar[Quantities] = {"rotation": "rotation"}
 
     @property
     def elements(self):
@@ -95,19 +87,30 @@ class Spherical(AbstractOriented):
     def coordinates(self, space, poses):
         return {"rotation": rotation_vector(self, poses)}
 
+    def elementary_joints(self, space, poses):
+        return joints_through_b(space, self, poses, rotation=np.zeros(3))
+
     def shapes(self, space, size):
         return ((0, ball(self.point_a, size)),)
 
 
 class AbstractAxial(AbstractSpatialPart, AbstractJoint):
-    """A joint with an axis in each body, about which one turns in the other; arguments as in `Revolute`."""
+    """A joint with an axis in each body, about which one turns in the other.
+
+    **Arguments:**
+
+    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
+        both in the world at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
+        between which the angle is measured; default two that coincide at the given poses.
+    """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
     axis_b: fields.Number = fields.axis(body=1, optional=True)
     axis: fields.Number = fields.axis(body=None, gives=("axis_a", "axis_b"))
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
-    angles: ClassVar[frozenset[str]] = frozenset({"angle"})
+    quantities: ClassVar[Quantities] = {"angle": "angle"}
 
     def complete(self, space, poses):
         return measured_from_given_poses(self, space, poses)
@@ -126,17 +129,6 @@ class Revolute(AbstractAxial):
 
     Its coordinate is `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
     given poses, unless these are given.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
-        that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 5
@@ -150,6 +142,9 @@ class Revolute(AbstractAxial):
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses)}
+
+    def elementary_joints(self, space, poses):
+        return joints_through_b(space, self, poses, angle=space.direction(poses[0], self.axis_a))
 
     def shapes(self, space, size):
         return ((0, pin(self.point_a, size, self.axis_a)),)
@@ -172,10 +167,6 @@ class Universal(AbstractSpatialPart, AbstractJoint):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
     - `axis_a`, `axis_b`, unit, shape (3,): the arms of the cross, fixed in `body_a` and in `body_b`; each may be given
         in the world at the given poses instead, as `axis_a_W` and `axis_b_W`.
     - `x_a`, `x_b`, unit, shape (3,): where both angles are zero, the direction in `body_a` of `axis_b`, and that in
@@ -189,7 +180,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     x_a: fields.Number = fields.axis(body=0, optional=True)
     x_b: fields.Number = fields.axis(body=1, optional=True)
     rows: ClassVar[int] = 4
-    angles: ClassVar[frozenset[str]] = frozenset({"angle_a", "angle_b"})
+    quantities: ClassVar[Quantities] = {"angle_a": "angle", "angle_b": "angle"}
 
     def validate(self):
         if self.axis_a_W is not None and self.axis_b_W is not None:
@@ -220,6 +211,10 @@ class Universal(AbstractSpatialPart, AbstractJoint):
             "angle_b": -turn_about(self.axis_b, self.x_b, arm_a),
         }
 
+    def elementary_joints(self, space, poses):
+        first, last = space.direction(poses[0], self.axis_a), space.direction(poses[1], self.axis_b)
+        return joints_through_b(space, self, poses, angle_a=first, angle_b=last)
+
     def shapes(self, space, size):
         return (0, pin(self.point_a, size, self.axis_a)), (1, pin(self.point_b, size, self.axis_b))
 
@@ -240,14 +235,8 @@ class Gimbal(AbstractOriented):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
     - `axis_1`, `axis_2`, `axis_3`, unit, shape (3,), perpendicular to each other: the axes where all angles are zero,
         in the axes of `body_a`; or in the world at the given poses, `axis_1_W`, `axis_2_W`, `axis_3_W`.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where all angles
-        are zero, default that of the given poses.
     """
 
     axis_1: fields.Number = fields.axis(body=0, optional=True)
@@ -257,7 +246,7 @@ class Gimbal(AbstractOriented):
     axis_2_W: fields.Number = fields.axis(body=None, gives=("axis_2",))
     axis_3_W: fields.Number = fields.axis(body=None, gives=("axis_3",))
     rows: ClassVar[int] = 3
-    angles: ClassVar[frozenset[str]] = frozenset({"angle_1", "angle_2", "angle_3"})
+    quantities: ClassVar[Quantities] = {"angle_1": "angle", "angle_2": "angle", "angle_3": "angle"}
 
     def complete(self, space, poses):
         triad = np.stack([self.axis_1, self.axis_2, self.axis_3])
@@ -286,18 +275,28 @@ class Gimbal(AbstractOriented):
             "angle_3": jnp.arctan2(-hand * c[0, 1], c[0, 0]),
         }
 
+    def elementary_joints(self, space, poses):
+        first = from_axis_angle(self.axis_1, self.coordinates(space, jnp.asarray(poses))["angle_1"])
+        axes = (
+            self.axis_1,
+            rotate(first, self.axis_2),
+            direction_in_a(space, poses, unrotate(self.orientation, self.axis_3)),
+        )
+        own = {f"angle_{k}": space.direction(poses[0], axis) for k, axis in enumerate(axes, 1)}
+        return joints_through_b(space, self, poses, **own)
+
 
 class AbstractSliding(AbstractAxial):
     """A joint whose two axes stay on one line, along which one body also slides."""
+
+    quantities: ClassVar[Quantities] = {"angle": "angle", "displacement": "length"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, self.axis_b))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, sleeve(self.point_b, size, self.axis_b)),)
@@ -316,17 +315,6 @@ class Cylindrical(AbstractSliding):
     Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
     given poses, unless these are given; and `displacement` [m], how far B is from A along the axis: zero where they
     coincide, so at the given poses if both are given by a world `point`.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
-        that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 4
@@ -339,6 +327,10 @@ class Cylindrical(AbstractSliding):
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
+
+    def elementary_joints(self, space, poses):
+        axis = space.direction(poses[0], self.axis_a)
+        return joints_through_b(space, self, poses, displacement=axis, angle=axis)
 
 
 class Screw(AbstractSliding):
@@ -361,14 +353,6 @@ class Screw(AbstractSliding):
 
     **Arguments:**
 
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the axis fixed in `body_a` and in `body_b`; or `axis`, unit, shape (3,):
-        that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     - `pitch` [m], not zero: the advance of B along the axis per turn, positive for a right-handed screw.
     - `offset` [m]: the displacement where the angle is zero, default that which the given poses ask for.
     """
@@ -392,7 +376,7 @@ class Screw(AbstractSliding):
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift), thread])
 
 
-class Prismatic(AbstractOriented):
+class Prismatic(AbstractOriented, AbstractAxisJoint):
     """A slide: point B stays on the line through A without turning. Rows 5: the components across the axis (2) of d
     from A to B, and the rotation (3).
 
@@ -409,22 +393,11 @@ class Prismatic(AbstractOriented):
     are given by a world `point`, where they coincide, the displacement is zero at the given poses, wherever the body
     then is; give `point_a` and `point_b` to count from a place of your own. Where B is along the axis has no effect on
     the motion, and a picture shows the slide next to the mass centre of `body_b`.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, unit, shape (3,): the direction of the slide fixed in `body_a`; or `axis`, unit, shape (3,): that in the
-        world at the given poses.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` along the motion,
-        default that of the given poses.
     """
 
-    axis_a: fields.Number = fields.axis(body=0, optional=True)
-    axis: fields.Number = fields.axis(body=None, gives=("axis_a",))
     rows: ClassVar[int] = 5
+    quantities: ClassVar[Quantities] = {"displacement": "length"}
+    path_kind: ClassVar[PathKind] = "rod"
 
     @property
     def elements(self):
@@ -436,11 +409,11 @@ class Prismatic(AbstractOriented):
     def coordinates(self, space, poses):
         return {"displacement": displacement_along(space, self, poses)}
 
+    def elementary_joints(self, space, poses):
+        return joints_through_b(space, self, poses, displacement=space.direction(poses[0], self.axis_a))
+
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, unrotate(self.orientation, self.axis_a)))
-
-    def path(self, space, poses):
-        return both_points(space, self, poses)
 
     def shapes(self, space, size):
         return ((1, sleeve(self.point_b, size, unrotate(self.orientation, self.axis_a))),)
@@ -460,20 +433,10 @@ class Planar(AbstractAxial):
     given poses, unless these are given; and `displacement` [m], shape (2,), the components of d along `x_a` and along
     the cross product of `axis_a` and `x_a`: zero where B is next to A, so at the given poses if both are given by a
     world `point`.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `axis_a`, `axis_b`, unit, shape (3,): the normal of the face fixed in `body_a` and in `body_b`; or `axis`, unit,
-        shape (3,): that of both in the world at the given poses.
-    - `x_a`, `x_b`, unit, shape (3,), fixed in `body_a` and in `body_b` and perpendicular to the axis: the directions
-        between which the angle is measured; default two that coincide at the given poses.
     """
 
     rows: ClassVar[int] = 3
+    quantities: ClassVar[Quantities] = {"displacement": "length", "angle": "angle"}
     slides: ClassVar[tuple[str, ...]] = ("displacement",)
 
     @property
@@ -489,6 +452,16 @@ class Planar(AbstractAxial):
         displacement = jnp.stack([dot(self.x_a, shift), dot(y_a, shift)])
         return {"displacement": displacement, "angle": angle(space, self, poses)}
 
+    def elementary_joints(self, space, poses):
+        ways = {"x": self.x_a, "y": cross(self.axis_a, self.x_a)}
+        (turn,) = joints_through_b(space, self, poses, angle=space.direction(poses[0], self.axis_a))
+        shift = offset_in_a(space, self, poses)
+        slides = (
+            turn._replace(kind="slide", name=name, axis=space.direction(poses[0], way), value=dot(way, shift))
+            for name, way in ways.items()
+        )
+        return [*slides, turn]
+
 
 class Fixed(AbstractOriented):
     """A weld: points A and B of two bodies coincide and B does not turn in A. Rows 6: d from A to B (3), and the
@@ -501,15 +474,6 @@ class Fixed(AbstractOriented):
     ```
 
     It leaves no motion and has no coordinates.
-
-    **Arguments:**
-
-    - `name`, of the joint; `body_a`, `body_b`: the bodies that it connects, or frames in them, by name. Either may be
-        `"ground"`.
-    - `point_a`, `point_b` [m], shape (3,): A fixed in `body_a`, B fixed in `body_b`; or `point` [m], shape (3,): both,
-        at this place of the world at the given poses.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` that is kept,
-        default that of the given poses.
     """
 
     rows: ClassVar[int] = 6
@@ -520,3 +484,6 @@ class Fixed(AbstractOriented):
 
     def residual(self, space, poses, t):
         return jnp.concatenate([separation(space, self, poses), rotation_error(self, poses)])
+
+    def elementary_joints(self, space, poses):
+        return []

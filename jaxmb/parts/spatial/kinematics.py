@@ -54,6 +54,12 @@ class SpatialSpace(AbstractSpace):
     def point_force(self, pose, s, force_W):
         return jnp.concatenate([force_W, rot.cross(s, _turned_back(pose, force_W))])
 
+    def turning(self, pose, velocity):
+        return _turned(pose, velocity[3:])
+
+    def moment(self, pose, moment_W):
+        return jnp.concatenate([jnp.zeros_like(moment_W), _turned_back(pose, moment_W)])
+
     def direction(self, pose, v):
         return _turned(pose, v)
 

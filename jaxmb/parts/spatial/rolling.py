@@ -1,4 +1,4 @@
-"""Spatial velocity constraints: blades, and wheels and balls that roll on a plane.
+"""Wheels and balls that roll on a plane in space.
 
 The plane is fixed in the world, given by a point and its normal `e`, which points to the side of the body.
 """
@@ -10,61 +10,38 @@ import jax.numpy as jnp
 from ...linalg.rotations import cross, dot, norm
 from .. import fields
 from ..base import AbstractCompound, AbstractConstraint, AbstractSpatialPart, AbstractVelocityConstraint
-from ..shapes import Ground, along, marked_ball, sleeve, wheel
+from ..shapes import Ground, along, marked_ball, wheel
 from ..space import with_drift
 from .axes import perpendiculars
 
 
-class KnifeEdge(AbstractSpatialPart, AbstractVelocityConstraint):
-    """A blade, skate or wheel on a plane that does not slip sideways. Rows 1: `(e × h)·v = 0`, with the normal e of the
-    plane, the direction h of the blade and the velocity v of the contact point.
-
-    ```python
-    sled = spatial.Body("sled", mass=1.0, inertia=spatial.box(1.0, 0.5, 0.2, 0.1), velocity=(1.0, 0.0, 0.0))
-    ice = spatial.Planar("ice", "ground", "sled", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
-    blade = spatial.KnifeEdge("blade", "sled", point=(0.2, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
-    system = jaxmb.Scene([sled], joints=[ice, blade]).compile()
-    ```
-
-    The constraint does not hold the body on the plane; add a `Planar` or `PointOnPlane` joint. It has no coordinates of
-    its own.
+class AbstractRolling(AbstractSpatialPart):
+    """Fields of bodies that roll on a plane.
 
     **Arguments:**
 
-    - `name`, of the blade; `body`: that it is fixed in, or a frame in it, by name.
-    - `point` [m], shape (3,): the contact point fixed in the body, default the origin of its frame.
-    - `axis`, unit, shape (3,): the direction of the blade fixed in the body, default its x axis.
-    - `normal`, unit, shape (3,): that of the plane in the world, default z.
+    - `name`; `body`: the body that rolls, or a frame in it, by name.
+    - `radius` [m] > 0; `centre` [m], shape (3,), of the disc or sphere, fixed in the body, default the origin of its
+        frame.
+    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0. As an input,
+        `"rolling.point"` is that of a plane that moves.
     """
 
     name: str = fields.name()
     body: str = fields.body_name()
-    point: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0))
-    axis: fields.Number = fields.axis(body=0, default=(1.0, 0.0, 0.0))
-    normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
-    rows: ClassVar[int] = 1
-    linear: ClassVar[bool] = True
-    homogeneous: ClassVar[bool] = True
-
-    def residual(self, space, poses, velocities, t):
-        v = space.point_velocity(poses[0], velocities[0], self.point)
-        v = with_drift(self, v, lambda part: space.point(poses[0], part.point))
-        return dot(cross(self.normal, space.direction(poses[0], self.axis)), v)[None]
-
-    def shapes(self, space, size):
-        return (0, sleeve(self.point, size, self.axis)), (None, Ground(orientation=along(self.normal)))
-
-
-class AbstractDisc(AbstractSpatialPart):
-    """Fields of `RollingDisc` and its components."""
-
-    name: str = fields.name()
-    body: str = fields.body_name()
     radius: fields.Number = fields.length(sign="positive")
-    axis: fields.Number = fields.axis(body=0, default=(0.0, 0.0, 1.0))
     centre: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
     normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
     point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
+
+
+class AbstractDisc(AbstractRolling):
+    """A thin disc that rolls on a plane.
+
+    **Arguments:** `axis`, unit, shape (3,): the axle fixed in the body, default its z axis.
+    """
+
+    axis: fields.Number = fields.axis(body=0, default=(0.0, 0.0, 1.0))
 
 
 def _uphill(space, part, pose):
@@ -105,14 +82,6 @@ class RollingDisc(AbstractDisc, AbstractCompound):
 
     The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, with
     the normal e of the plane and the axle n. The disc must never lie flat. It has no coordinates of its own.
-
-    **Arguments:**
-
-    - `name`; `body`: that the disc is fixed in, or a frame in it, by name.
-    - `radius` [m] > 0; `axis`, unit, shape (3,): the axle fixed in the body, default its z axis; `centre` [m], shape
-        (3,), of the disc, fixed in the body, default the origin of its frame.
-    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0. As an input,
-        `"rolling.point"` is that of a plane that moves.
     """
 
     def components(self):
@@ -122,7 +91,7 @@ class RollingDisc(AbstractDisc, AbstractCompound):
 
 
 class DiscContact(AbstractDisc, AbstractConstraint):
-    """A disc that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre; arguments as in `RollingDisc`."""
+    """A disc that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre."""
 
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
@@ -138,7 +107,7 @@ class DiscContact(AbstractDisc, AbstractConstraint):
 
 
 class DiscRolling(AbstractDisc, AbstractVelocityConstraint):
-    """A disc whose contact point does not slip. Rows 2: `Ċ + ω × ρ` in the plane; arguments as in `RollingDisc`."""
+    """A disc whose contact point does not slip. Rows 2: `Ċ + ω × ρ` in the plane."""
 
     rows: ClassVar[int] = 2
     linear: ClassVar[bool] = True
@@ -153,18 +122,7 @@ class DiscRolling(AbstractDisc, AbstractVelocityConstraint):
         return _tangential(self.normal, with_drift(self, slip, lambda part: _from_plane(space, part, poses[0])))
 
 
-class AbstractBall(AbstractSpatialPart):
-    """Fields of `RollingSphere` and its components."""
-
-    name: str = fields.name()
-    body: str = fields.body_name()
-    radius: fields.Number = fields.length(sign="positive")
-    centre: fields.Number = fields.point(body=0, sizes=False, default=(0.0, 0.0, 0.0))
-    point: fields.Number = fields.point(body=None, default=(0.0, 0.0, 0.0))
-    normal: fields.Number = fields.axis(body=None, default=(0.0, 0.0, 1.0))
-
-
-class RollingSphere(AbstractBall, AbstractCompound):
+class RollingSphere(AbstractRolling, AbstractCompound):
     """A sphere that rolls on a plane without slipping: contact (1 row on positions), rolling (2 on velocities).
 
     ```python
@@ -175,14 +133,8 @@ class RollingSphere(AbstractBall, AbstractCompound):
 
     It has no coordinates of its own.
 
-    **Arguments:**
-
-    - `name`; `body`: that the sphere is fixed in, or a frame in it, by name.
-    - `radius` [m] > 0; `centre` [m], shape (3,), of the sphere, fixed in the body, default the origin of its frame.
-    - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0. As an input,
-        `"rolling.point"` is that of a plane that moves.
-    - `spin` [rad/s], of a turntable: the rate at which the plane turns about its normal through `point`, default a
-        plane at rest.
+    **Arguments:** `spin` [rad/s], of a turntable: the rate at which the plane turns about its normal through `point`,
+    default a plane at rest.
     """
 
     spin: fields.Number = fields.parameter(unit="rad/s", optional=True)
@@ -195,8 +147,8 @@ class RollingSphere(AbstractBall, AbstractCompound):
         )
 
 
-class SphereContact(AbstractBall, AbstractConstraint):
-    """A sphere that touches a plane. Rows 1: `e·(C − point) = radius`, C the centre; arguments of `RollingSphere`."""
+class SphereContact(AbstractRolling, AbstractConstraint):
+    """A sphere that touches a plane. Rows 1: `e·(C − point) = radius`, C the centre."""
 
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
@@ -210,10 +162,10 @@ class SphereContact(AbstractBall, AbstractConstraint):
         return *((0, shape) for shape in marked_ball(self.radius, self.centre)), (None, ground)
 
 
-class SphereRolling(AbstractBall, AbstractVelocityConstraint):
+class SphereRolling(AbstractRolling, AbstractVelocityConstraint):
     """A sphere that moves with the plane where they touch. Rows 2: `Ċ − r ω × e − spin e × (C − point)` in the plane.
 
-    Arguments as in `RollingSphere`; with a turntable the rows do not vanish at rest.
+    With a turntable the rows do not vanish at rest.
     """
 
     spin: fields.Number = fields.parameter(unit="rad/s", optional=True)

@@ -304,7 +304,7 @@ def springs(damping):
 def pairs():
     return springs(1.0) | {
         "Torque": planar.Torque("F", "b", torque=2.0, reaction="a"),
-        "BumpStop": planar.BumpStop("F", "a", "b", stiffness=30.0, lower=-0.4, upper=0.3),
+        "RotationalDamper": planar.RotationalDamper("F", "a", "b", damping=2.0),
     }
 
 
@@ -519,7 +519,9 @@ def test_part_errors(part, message):
 
 def test_errors_of_choices():
     with pytest.raises(ValueError, match="'drive': quantity must be one of"):
-        driver("z")
+        driver("w")
+    with pytest.raises(ValueError, match="'drive': quantity='z' belongs to spatial scenes"):
+        driver("z").resolve(PLANE, jnp.zeros((2, 3)))
     with pytest.raises(ValueError, match="'F': frame must be"):
         planar.PointForce("F", "a", force=X, frame="space")
 

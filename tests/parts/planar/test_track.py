@@ -7,6 +7,7 @@ import pytest
 from oracles import tracked_vehicle as oracle
 from scipy.spatial import ConvexHull
 
+import jaxmb as mb
 from jaxmb import planar
 from jaxmb.bodies.groups import stack
 from jaxmb.bodies.layout import Layout
@@ -117,10 +118,11 @@ def test_bad_tracks(options, message):
         track(**options).resolve(PLANE, poses())
 
 
-def test_bump_stop():
+def test_progressive_stop():
     """The model's moment on both sides, the more so the farther in, and next to none between."""
-    stop = planar.BumpStop("stop", "hull", "arm", stiffness=2e6, lower=-0.5, upper=0.7)
-    stop = stop.resolve(PLANE, jnp.zeros((2, 3)))
+    stop = mb.JointStop("stop", "pivot.angle", stiffness=2e6, lower=-0.5, upper=0.7, exponent=3.0)
+    pivot = planar.Revolute("pivot", "hull", "arm", point=(0.0, 0.0)).resolve(PLANE, jnp.zeros((2, 3)))
+    stop = stop.of_sources([pivot], [(0, 1)])
     for angle in (-0.7, -0.5, 0.0, 0.7, 0.9):
         q = jnp.zeros((2, 3)).at[:, 2].set(jnp.array([0.3, 0.3 + angle]))
         (low, low_slope), (high, high_slope) = oracle.plus(-0.5 - angle), oracle.plus(angle - 0.7)
@@ -129,4 +131,6 @@ def test_bump_stop():
         np.testing.assert_allclose(wrenches[:, 2], [-moment, moment], rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(stop.energy(PLANE, q, 0.0), 5e5 * (low**4 + high**4), rtol=1e-8, atol=1e-12)
     with pytest.raises(ValueError, match="'stop': lower must be less than upper"):
-        planar.BumpStop("stop", "a", "b", stiffness=1.0, lower=0.1, upper=-0.1).resolve(PLANE, jnp.zeros((2, 3)))
+        mb.JointStop("stop", "pivot.angle", stiffness=1.0, lower=0.1, upper=-0.1).check()
+    with pytest.raises(AttributeError, match=r"planar\.BumpStop is jaxmb\.JointStop\(\.\.\., exponent=3\.0\)"):
+        planar.BumpStop  # noqa: B018

@@ -469,14 +469,10 @@ def test_knife_edge():
 
 
 def springs(damping):
-    axis = random_unit(np.random.default_rng(8))
     points = {"point_a": POINT_A, "point_b": POINT_B}
     return {
         "SpringDamper": spatial.SpringDamper(
             "F", "a", "b", stiffness=30.0, damping=2.0 * damping, free_length=0.4, **points
-        ),
-        "TorsionalSpringDamper": spatial.TorsionalSpringDamper(
-            "F", "a", "b", stiffness=30.0, damping=2.0 * damping, axis=axis, free_angle=0.3
         ),
         "Bushing": spatial.Bushing(
             "F",
@@ -615,27 +611,6 @@ def test_spring_of_zero_length(free_length):
     np.testing.assert_allclose(jacobian[1, :3, 1, :3], -30.0 * np.eye(3), rtol=0, atol=1e-13)
     by_velocity = jax.jacfwd(lambda v: part.wrenches(SPACE, poses, v, 0.0))(velocities)
     np.testing.assert_allclose(by_velocity[1, :3, 1, :3], -2.0 * np.eye(3), rtol=0, atol=1e-13)
-
-
-def test_torsional_spring_moment():
-    given, _, _ = force_state()
-    rng = np.random.default_rng(11)
-    axis, point = random_unit(rng), jnp.asarray(rng.normal(size=3))
-    part = spatial.TorsionalSpringDamper("F", "a", "b", stiffness=30.0, damping=2.0, axis=axis).resolve(SPACE, given)
-    for angle in (-3.0, -0.5, 0.0, 1.0, 3.0):
-        poses = given.at[1].set(move(given[1], turn(axis, jnp.array(angle)), point, STILL))
-        moment = rot.unrotate(poses[1, 3:], axis)
-        velocities = jnp.zeros((2, 6)).at[1, 3:].set(0.7 * moment)
-        wrenches = part.wrenches(SPACE, poses, velocities, 0.0)
-        np.testing.assert_allclose(wrenches[1, 3:], (-30.0 * angle - 2.0 * 0.7) * moment, rtol=0, atol=1e-11)
-        np.testing.assert_allclose(part.energy(SPACE, poses, 0.0), 15.0 * angle**2, rtol=0, atol=1e-11)
-
-
-def test_torsional_spring_is_finite_where_its_angle_is_undefined():
-    poses = jnp.stack([jnp.array(SPACE.ground)] * 2)
-    part = spatial.TorsionalSpringDamper("F", "a", "b", stiffness=30.0, axis=(0.0, 0.0, 1.0)).resolve(SPACE, poses)
-    part = eqx.tree_at(lambda p: p.x_b, part, jnp.array([0.0, 0.0, 1.0]))
-    assert jnp.all(jnp.isfinite(part.wrenches(SPACE, poses, jnp.ones((2, 6)), 0.0)))
 
 
 def test_bushing_law():
@@ -792,7 +767,6 @@ TWO = ("J", "a", "b")
         (spatial.RollingSphere("J", "a", radius=1.0, normal=O), "normal must be a unit vector"),
         (spatial.RollingSphere("J", "a", radius=1.0, spin=np.nan), "spin must be finite"),
         (spatial.SpringDamper(*TWO, stiffness=-1.0), "stiffness must be non-negative"),
-        (spatial.TorsionalSpringDamper(*TWO, stiffness=1.0), "give axis_a"),
         (spatial.Bushing(*TWO, stiffness=(1.0, 1.0, 1.0), point=O), r"stiffness must have shape \(6,\)"),
         (spatial.Torque("J", "b", torque=(1.0, 2.0)), r"torque must have shape \(3,\)"),
     ],

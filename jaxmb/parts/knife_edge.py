@@ -1,0 +1,59 @@
+"""A blade that does not slip sideways."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from ..linalg.rotations import cross, dot
+from . import fields
+from .base import AbstractVelocityConstraint
+from .shapes import Ground, along, sleeve
+from .space import with_drift
+
+
+class KnifeEdge(AbstractVelocityConstraint):
+    """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, v the velocity of the contact point, n
+    the normal of the blade in its plane, in space `n = e × h` of the direction h of the blade and the plane's normal e.
+
+    ```python
+    sled = planar.Body("sled", mass=1.0, inertia=0.1, velocity=(1.0, 0.0))
+    blade = planar.KnifeEdge("blade", "sled", point=(0.3, 0.0), axis=(1.0, 0.0))
+    system = jaxmb.Scene([sled], joints=[blade]).compile()
+    ```
+
+    It has no coordinates of its own. In space it does not hold the body on the plane; add a `spatial.Planar` or
+    `PointOnPlane` joint.
+
+    **Arguments:**
+
+    - `name`, of the blade; `body`: the body that it is fixed in, or a frame in it, by name.
+    - `point` [m]: the contact point fixed in the body, default the origin of its frame.
+    - `axis`, unit: the direction of the blade fixed in the body, default its x axis.
+    - `normal`, unit, shape (3,), in space: that of the plane in the world, default z.
+    """
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    point: fields.Number = fields.point(body=0, default="origin")
+    axis: fields.Number = fields.axis(body=0, optional=True)
+    normal: fields.Number = fields.axis(body=None, optional=True, dimension=3)
+    rows: ClassVar[int] = 1
+    linear: ClassVar[bool] = True
+    homogeneous: ClassVar[bool] = True
+
+    def complete(self, space, poses):
+        axes = np.eye(space.dimension)
+        part = self.filled(axis=axes[0])
+        return part if space.dimension == 2 else part.filled(normal=axes[2])
+
+    def residual(self, space, poses, velocities, t):
+        ahead = space.direction(poses[0], self.axis)
+        v = space.point_velocity(poses[0], velocities[0], self.point)
+        v = with_drift(self, v, lambda part: space.point(poses[0], part.point))
+        if space.dimension == 2:
+            return (ahead[0] * v[1] - ahead[1] * v[0])[None]
+        return dot(cross(self.normal, ahead), v)[None]
+
+    def shapes(self, space, size):
+        blade = (0, sleeve(space.in_space(self.point), size, space.in_space(self.axis)))
+        return (blade,) if space.dimension == 2 else (blade, (None, Ground(orientation=along(self.normal))))

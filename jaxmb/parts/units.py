@@ -1,0 +1,41 @@
+"""Units of numbers, and the power of a length in them."""
+
+import re
+from typing import TypeAlias
+
+# The unit of a number; of a number that belongs to a coordinate the unit for an angle and the unit for a length; None
+# where it is not known.
+Unit: TypeAlias = str | tuple[str, str] | None
+
+_POWERS = {
+    **dict.fromkeys(("1", "rad", "kg", "s", "Hz", "A", "C", "T", "K", "mol", "cd"), 0),
+    "m": 1,
+    "N": 1,
+    "Pa": -1,
+    "J": 2,
+    "W": 2,
+    "V": 2,
+    "Ω": 2,
+    "Wb": 2,
+    "H": 2,
+    "F": -2,
+}
+
+
+def power_of_length(unit: str) -> float:
+    """The power of the metre in a unit such as `"N m/rad"` or `"kg m²"`, written in metres, kilograms, seconds and
+    amperes.
+
+    **Raises:** `ValueError` for anything but a product of powers of SI units over another one.
+    """
+    power = 0.0
+    for sign, side in zip((1, -1), unit.split("/", 1), strict=False):
+        for word in side.replace("²", "^2").replace("³", "^3").split(" "):
+            base, _, exponent = word.partition("^")
+            if base not in _POWERS or not re.fullmatch(r"(-?\d+(\.\d+)?)?", exponent):
+                raise ValueError(
+                    f"{word!r} in the unit {unit!r} is no power of one of {', '.join(_POWERS)}; write a unit as in "
+                    "'N m/rad' or 'kg m²', '1' for a number without one, and leave it out where it is not known."
+                )
+            power += sign * _POWERS[base] * float(exponent or 1)
+    return power
