@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from execute_notebooks import readme_example
+from execute_notebooks import readme_machine
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -132,7 +132,7 @@ def test_gradients_in_a_batch():
 
 def test_the_example_of_the_readme_without_an_option():
     """First and second derivatives by a length of the loop, and differences of it."""
-    angle, length, h = readme_example()["angle"], 2.0, 1e-3
+    angle, length, h = readme_machine()["angle"], 2.0, 1e-3
     first, along, second = jax.grad(angle)(length), jax.jacfwd(angle)(length), jax.hessian(angle)(length)
     np.testing.assert_allclose(along, first, rtol=1e-11)
     low2, low, high, high2 = (angle(length + k * h) for k in (-2, -1, 1, 2))
