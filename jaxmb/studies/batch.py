@@ -24,8 +24,9 @@ _CARRIED, _MOST = 2**20, 64
 # Ratio of the bytes that the equations of a loop body write to the bytes that its fused kernels read and write (rule of
 # thumb).
 _FUSED = 3
-# Members that stand side by side fill a vector register with their numbers in double precision.
-_SIDE_BY_SIDE = 8
+# Members that stand side by side fill a vector register with their numbers in double precision. Loops that carry more
+# bytes than these for a member, as of Bricard's mechanism, would compile for minutes.
+_SIDE_BY_SIDE, _MOST_SIDE_BY_SIDE = 8, 2**14
 # An array of several axes with at least so many rows is a table; a step writes one row of it.
 _LONG = 1024
 
@@ -101,22 +102,27 @@ class Member:
 
     def block_size(self, members: int) -> int:
         """The number of members, a power of two or all, that are computed at once on the default device."""
-        loops = list(_loops(self._program))
-        carried = max((own for own, _ in loops), default=0)
+        carried = self._carried()
         if carried == 0 or jax.default_backend() != "cpu":
             return members
-        if computes_side_by_side():
+        if self._stand_side_by_side():
             return min(_SIDE_BY_SIDE, members)
-        if max(written for _, written in loops) < _FUSED * bytes_of_kernel_loops():
+        if max(written for _, written in _loops(self._program)) < _FUSED * bytes_of_kernel_loops():
             return 1
         return min(2 ** int(math.log2(max(_CARRIED / carried, 1))), _MOST)
+
+    def _carried(self) -> int:
+        return max((carried for carried, _ in _loops(self._program)), default=0)
+
+    def _stand_side_by_side(self) -> bool:
+        return computes_side_by_side() and self._carried() <= _MOST_SIDE_BY_SIDE
 
     def block(self, size: int) -> Callable[..., Any]:
         """The function of several members at once; of one, without `vmap`."""
         if size == 1:
             alone = lambda x: jax.tree.map(lambda x: x[0], x)
             return lambda own: jax.tree.map(lambda x: x[None], self._function(alone(own)))
-        if computes_side_by_side():
+        if self._stand_side_by_side():
             program, like = jax.make_jaxpr(self._function, return_shape=True)(self._like)
             evaluated, structure = side_by_side(program), jax.tree.structure(like)
             return lambda own: jax.tree.unflatten(structure, evaluated(*jax.tree.leaves(own)))

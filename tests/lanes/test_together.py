@@ -37,6 +37,7 @@ def test_members_end_where_each_alone_does():
     assert np.all(np.abs(steps - np.array([count for _, count in alone])) <= 2)
 
 
+@pytest.mark.long
 def test_derivatives_are_those_of_vmap():
     end = machine(jaxmb.mechanisms.four_bar, t1=0.1, rtol=1e-9)
 

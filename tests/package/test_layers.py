@@ -23,7 +23,7 @@ LAYERS = [
         "_results",
         "_version",
     ],
-    ["linalg"],
+    ["linalg", "lanes"],
     ["_arguments"],
     ["solvers"],
     ["_captured", "_jaxpr_digest", "_traced_functions"],

@@ -177,3 +177,36 @@ def test_motions_in_blocks():
         one = alone(mass)
         np.testing.assert_array_equal([found[1][k], found[2][k]], one[1:])
         np.testing.assert_allclose(found[0].q[k], one[0].q, rtol=1e-9)
+
+
+@pytest.fixture
+def side_by_side(monkeypatch):
+    """As after `setup(compile="for batches")`, with any options of the compiler."""
+    monkeypatch.setattr("jaxmb.studies.batch.computes_side_by_side", lambda: True)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8, 19])
+def test_members_side_by_side_have_the_numbers_of_a_batch(count, side_by_side):
+    x = members(count)
+    found, together = mb.batch(halved)(x), jax.vmap(halved)(x)
+    jax.tree.map(np.testing.assert_array_equal, found, together)
+    jax.tree.map(lambda a, b: np.testing.assert_equal(a.dtype, b.dtype), found, together)
+
+
+def test_members_side_by_side_have_the_derivatives_of_a_batch(side_by_side):
+    def last(x, factor):
+        return jax.lax.fori_loop(0, 3, lambda k, y: jnp.sin(factor * y) + k, x) ** 2
+
+    total = lambda factor, x, at_once: jnp.sum(at_once(lambda x: last(x, factor))(x) ** 2)
+    x = np.linspace(0.1, 1.0, 10)
+    for derivative in (jax.grad, jax.jacfwd, jax.hessian):
+        found, expected = (derivative(total)(0.7, x, at_once) for at_once in (mb.batch, jax.vmap))
+        np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_members_of_large_loops_do_not_stand_side_by_side(side_by_side):
+    def iterated(x, size):
+        return jax.lax.fori_loop(0, 2, lambda k, y: y + k, jnp.full(size, x))
+
+    small, large = (Member(lambda x, size=size: iterated(x, size), np.zeros(())) for size in (1000, 4000))
+    assert (small.block_size(100), large.block_size(100)) == (8, 32)

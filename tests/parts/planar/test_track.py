@@ -132,5 +132,5 @@ def test_progressive_stop():
         np.testing.assert_allclose(stop.energy(PLANE, q, 0.0), 5e5 * (low**4 + high**4), rtol=1e-8, atol=1e-12)
     with pytest.raises(ValueError, match="'stop': lower must be less than upper"):
         mb.JointStop("stop", "pivot.angle", stiffness=1.0, lower=0.1, upper=-0.1).check()
-    with pytest.raises(AttributeError, match=r"planar\.BumpStop is jaxmb\.JointStop\(\.\.\., exponent=3\.0\)"):
+    with pytest.raises(AttributeError, match=r"planar\.BumpStop is now jaxmb\.JointStop\(\.\.\., exponent=3\.0\)"):
         planar.BumpStop  # noqa: B018
