@@ -66,6 +66,17 @@ def bound(equation: Any, operands: Any) -> Any:
     return equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
 
 
+def sizes_of_scan(params: Mapping[str, Any]) -> tuple[int, int]:
+    """The numbers of constants of a `scan`, and of values that it carries from step to step, from its parameters.
+
+    (`num_consts` and `num_carry` up to jax 0.10, `ft_in` in 0.12.)
+    """
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    constants, carried, _ = params["ft_in"].unpack()
+    return len(constants), len(carried)
+
+
 def is_of_jax(primitive: Primitive) -> bool:
     """Whether an operation is one of JAX, and not one that is made of others.
 

@@ -60,11 +60,10 @@ class _Digest:
             return _joined(kind.__name__, [repr(value).encode()])
         name = f"{kind.__module__}.{kind.__qualname__}"
         if isinstance(value, ClosedJaxpr):
-            return _joined("closed", [self.of(value.jaxpr), *map(self._array, value.consts)])
+            # From jax 0.12 on, every program is closed.
+            return _joined("closed", [self._program_once(value.jaxpr), *map(self._array, value.consts)])
         if isinstance(value, Jaxpr):
-            if id(value) not in self._done:
-                self._done[id(value)] = value, self._program(value)
-            return self._done[id(value)][1]
+            return self._program_once(value)
         if isinstance(value, np.ndarray | np.generic | jax.Array):
             return self._array(value)
         if isinstance(value, Mapping):
@@ -88,6 +87,11 @@ class _Digest:
         if (wrapped := getattr(value, "__wrapped__", None)) is not None:
             return _joined(name, [self.of(wrapped)])
         return _joined(name, [self._shown(value)])
+
+    def _program_once(self, program: Any) -> bytes:
+        if id(program) not in self._done:
+            self._done[id(program)] = program, self._program(program)
+        return self._done[id(program)][1]
 
     def _program(self, program: Any) -> bytes:
         numbers: dict[Any, int] = {}

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import lax
 
-from .._compat import jaxpr_as_function
+from .._compat import jaxpr_as_function, sizes_of_scan
 from .evaluate import Value, rule
 from .varying import varying, varying_in_scan, varying_in_while
 
@@ -76,7 +76,7 @@ def _while(lanes, equation, values):
 def _scan(lanes, equation, values):
     params, lanes = equation.params, lanes._replace(rare=False)
     varies, of_outputs = varying_in_scan(params, [value.varies for value in values])
-    constants, carried = params["num_consts"], params["num_carry"]
+    constants, carried = sizes_of_scan(params)
     fixed, start = values[:constants], values[constants : constants + carried]
     scanned = values[constants + carried :]
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .._compat import Literal
+from .._compat import Literal, sizes_of_scan
 from .calls import called
 
 
@@ -49,7 +49,7 @@ def varying_in_while(params: Any, given: list[bool]) -> tuple[bool, list[bool]]:
 
 def varying_in_scan(params: Any, given: list[bool]) -> tuple[list[bool], list[bool]]:
     """Which numbers that a scan carries differ, and which of all its outputs do."""
-    constants, carried = params["num_consts"], params["num_carry"]
+    constants, carried = sizes_of_scan(params)
     fixed, carry, scanned = given[:constants], given[constants : constants + carried], given[constants + carried :]
     while True:
         after = varying(params["jaxpr"].jaxpr, fixed + carry + scanned)

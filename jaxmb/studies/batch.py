@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._arguments import whole_number
-from .._compat import ClosedJaxpr, Jaxpr
+from .._compat import ClosedJaxpr, Jaxpr, sizes_of_scan
 from .._setup import bytes_of_kernel_loops, computes_side_by_side
 from .._traced_functions import NEED_NUMBERS
 from ..lanes import together as side_by_side
@@ -144,9 +144,15 @@ def _loops(program: Any) -> Iterator[tuple[int, int]]:
         inner = _inner(equation)
         if equation.primitive.name in ("while", "scan"):
             # A scan does not carry the results of single steps.
-            yield _bytes(equation.outvars[: equation.params.get("num_carry")]), sum(map(_written, inner))
+            yield _bytes(equation.outvars[: _carried(equation)]), sum(map(_written, inner))
         for own in inner:
             yield from _loops(own)
+
+
+def _carried(equation: Any) -> int:
+    """How many outputs of a loop it carries from step to step."""
+    scans = equation.primitive.name == "scan"
+    return sizes_of_scan(equation.params)[1] if scans else len(equation.outvars)
 
 
 def _written(program: Any) -> int:

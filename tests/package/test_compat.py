@@ -188,6 +188,15 @@ def test_equations_are_evaluated_again(compat):
     assert not compat.is_of_jax(equation.primitive)
 
 
+def test_sizes_of_scans(compat):
+    step = lambda carry, row: ((carry[0] + row, carry[1]), row * carry[1] + y)
+    x, y = jnp.ones((4, 3)), jnp.array(2.0)
+    program = jax.make_jaxpr(lambda x, y: lax.scan(lambda c, row: step(c, row * y), (x[0], y), x))(x, y)
+    (equation,) = [equation for equation in program.jaxpr.eqns if equation.primitive.name == "scan"]
+    constants, carried = compat.sizes_of_scan(equation.params)
+    assert (constants + carried + 1, carried) == (len(equation.invars), 2)
+
+
 def test_calls_that_are_not_inlined(compat):
     def program(separate):
         called = jax.jit(lambda x: jnp.cos(x) + 1)

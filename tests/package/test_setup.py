@@ -136,6 +136,7 @@ def test_names_of_the_last_release_tell_the_new_one(name):
 
 
 @pytest.mark.always
+@pytest.mark.skipif(not takes_option("xla_cpu_use_fusion_emitters"), reason="XLA leaves loops to its new emitters")
 def test_the_loop_over_steps_is_one_kernel():
     code = """
 import dataclasses
