@@ -189,7 +189,7 @@ def test_equations_are_evaluated_again(compat):
 
 
 def test_sizes_of_scans(compat):
-    step = lambda carry, row: ((carry[0] + row, carry[1]), row * carry[1] + y)
+    step = lambda carry, row: ((carry[0] + row, 2 * carry[1]), row * carry[1] + y)
     x, y = jnp.ones((4, 3)), jnp.array(2.0)
     program = jax.make_jaxpr(lambda x, y: lax.scan(lambda c, row: step(c, row * y), (x[0], y), x))(x, y)
     (equation,) = [equation for equation in program.jaxpr.eqns if equation.primitive.name == "scan"]
