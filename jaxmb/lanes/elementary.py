@@ -1,4 +1,4 @@
-"""Sine, cosine, logarithm and exponential by operations that the compiler vectorises, in double precision.
+"""Sine, cosine and powers by operations that the compiler vectorises, in double precision.
 
 The library's functions are called for one number after the other.
 """
@@ -27,6 +27,8 @@ def _in_parts(number: Fraction, bits: tuple[int, ...]) -> tuple[float, ...]:
 
 # Multiples of the first two parts by integers below 2²⁰ are exact.
 _PARTS = _in_parts(_HALF_PI, (32, 65))
+# Powers of e beyond this exponent, to either side, are left to the library: the error grows with the exponent.
+_LARGEST_EXPONENT = 32.0
 _LOG_2 = (0.693147180369123816490, 1.90821492927058770002e-10)
 
 
@@ -58,8 +60,16 @@ def _sin_cos(x):
     return jnp.where(turn >= 2, -sine, sine), jnp.where((turn == 1) | (turn == 2), -cosine, cosine)
 
 
-def log(x: Any) -> Any:
-    """The natural logarithm: minus infinity at zero, NaN below."""
+def power(x: Any, y: Any) -> Any:
+    """`x ** y`, to 1e-14 of it."""
+    normal = (x >= jnp.finfo(x.dtype).tiny) & jnp.isfinite(x)
+    exponent = y * _log(jnp.where(normal, x, 1.0))
+    plain = jnp.all(normal & (jnp.abs(exponent) < _LARGEST_EXPONENT))
+    return lax.cond(plain, lambda x, y, exponent: _exp(exponent), lambda x, y, exponent: lax.pow(x, y), x, y, exponent)
+
+
+def _log(x):
+    """The natural logarithm of normal numbers."""
     bits = lax.bitcast_convert_type(x, jnp.int64)
     exponent = (bits >> 52) - 1023
     mantissa = lax.bitcast_convert_type((bits & ((1 << 52) - 1)) | (1023 << 52), jnp.float64)
@@ -67,23 +77,15 @@ def log(x: Any) -> Any:
     mantissa = jnp.where(large, 0.5 * mantissa, mantissa)
     exponent = jnp.where(large, exponent + 1, exponent).astype(jnp.float64)
     z = (mantissa - 1) / (mantissa + 1)
-    out = exponent * math.log(2) + 2 * z * _polynomial(z * z, [1 / k for k in range(1, 22, 2)])
-    out = jnp.where(x > 0, out, jnp.where(x == 0, -jnp.inf, jnp.nan))
-    return jnp.where(x == jnp.inf, jnp.inf, out)
+    return exponent * math.log(2) + 2 * z * _polynomial(z * z, [1 / k for k in range(1, 22, 2)])
 
 
-def exp(x: Any) -> Any:
-    n = jnp.clip(lax.round(x / math.log(2), lax.RoundingMethod.TO_NEAREST_EVEN), -1000.0, 1000.0)
+def _exp(x):
+    """The exponential of numbers that leave it far from overflow."""
+    n = lax.round(x / math.log(2), lax.RoundingMethod.TO_NEAREST_EVEN)
     rest = (x - n * _LOG_2[0]) - n * _LOG_2[1]
-    out = _polynomial(rest, [1 / math.factorial(k) for k in range(14)])
-    out = out * lax.bitcast_convert_type((n.astype(jnp.int64) + 1023) << 52, jnp.float64)
-    return jnp.where(x > 700, jnp.inf, jnp.where(x < -690, 0.0, jnp.where(jnp.isnan(x), x, out)))
-
-
-def power(x: Any, y: Any) -> Any:
-    """`x ** y`."""
-    plain = jnp.all((x > 0) & jnp.isfinite(y))
-    return lax.cond(plain, lambda x, y: exp(y * log(x)), lax.pow, x, y)
+    scale = lax.bitcast_convert_type((n.astype(jnp.int64) + 1023) << 52, jnp.float64)
+    return _polynomial(rest, [1 / math.factorial(k) for k in range(14)]) * scale
 
 
 def _polynomial(x, coefficients):

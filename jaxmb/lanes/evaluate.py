@@ -80,7 +80,7 @@ class Lanes(NamedTuple):
         if not any(value.varies for value in values) and equation.primitive.name not in _LOOPS:
             out = bound(equation, [value.array for value in values])
             return [Value(x, False) for x in (out if equation.primitive.multiple_results else [out])]
-        found = RULES.get(equation.primitive.name, _by_vmap)(self, equation, values)
+        found = RULES.get(equation.primitive.name, by_vmap)(self, equation, values)
         return found if isinstance(found, list) else [Value(found, True)]
 
 
@@ -88,7 +88,7 @@ class Lanes(NamedTuple):
 _LOOPS = ("while", "scan", "cond")
 
 
-def _by_vmap(lanes, equation, values):
+def by_vmap(lanes, equation, values):
     """An equation without a rule: a primitive of ours by its equations, one of JAX by its rule for batches."""
     if not is_of_jax(equation.primitive):
         like = [like_of(atom.aval) for atom in equation.invars]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .evaluate import _by_vmap, apart, rule
+from .evaluate import apart, by_vmap, rule
 
 # Of a table of up to so many rows a row is selected; of a larger one it is gathered.
 _SELECTED = 8
@@ -26,7 +26,7 @@ def _dynamic_slice(lanes, equation, values):
         return apart(lambda array, *start: lax.dynamic_slice(array, start, (*sizes, lanes.size)))(table.array, *start)
     shape = equation.invars[0].aval.shape
     if max(n - k + 1 for n, k in zip(shape, sizes, strict=True)) > _SELECTED:
-        return _by_vmap(lanes, equation, values)
+        return by_vmap(lanes, equation, values)
     array = lanes.spread(table)
     for axis, (index, n, k) in enumerate(zip(indices, shape, sizes, strict=True)):
         if n == k:
@@ -114,7 +114,7 @@ def _gather(lanes, equation, values):
         if mode == _MODE.CLIP:
             places = [_in_range(place, n - 1) for place, n in zip(places, shape, strict=True)]
         return apart(_entries_of_members)(lanes.spread(table), *places)
-    return _by_vmap(lanes, equation, values)
+    return by_vmap(lanes, equation, values)
 
 
 def _entries_of_members(table, *places):
@@ -173,10 +173,10 @@ def _scatter(lanes, equation, values):
         and sorted(map(int, numbers.inserted_window_dims)) == sorted(axes)
     )
     if not one_row:
-        return _by_vmap(lanes, equation, values)
+        return by_vmap(lanes, equation, values)
     if math.prod(np.array(shape)[axes]) > 4 * _SELECTED:
         if name != "scatter":
-            return _by_vmap(lanes, equation, values)
+            return by_vmap(lanes, equation, values)
         zero = jnp.zeros((), index.array.dtype)
         places = [index.array[axes.index(axis)] if axis in axes else zero for axis in range(len(shape))]
         if params["mode"] == _MODE.CLIP:

@@ -100,42 +100,49 @@ class Member:
                 f"Use jnp.where or jax.lax.cond for `if`, and jax.numpy for NumPy. ({error})"
             ) from error
 
+    @functools.cached_property
+    def _loops(self) -> list[tuple[int, int]]:
+        return list(_loops(self._program))
+
+    @property
+    def _carried(self) -> int:
+        """The bytes that the largest loop carries for a member."""
+        return max((carried for carried, _ in self._loops), default=0)
+
+    @property
+    def _side_by_side(self) -> bool:
+        return computes_side_by_side() and self._carried <= _MOST_SIDE_BY_SIDE
+
     def block_size(self, members: int) -> int:
         """The number of members, a power of two or all, that are computed at once on the default device."""
-        carried = self._carried()
-        if carried == 0 or jax.default_backend() != "cpu":
+        if self._carried == 0 or jax.default_backend() != "cpu":
             return members
-        if self._stand_side_by_side():
+        if self._side_by_side:
             return min(_SIDE_BY_SIDE, members)
-        if max(written for _, written in _loops(self._program)) < _FUSED * bytes_of_kernel_loops():
+        if max(written for _, written in self._loops) < _FUSED * bytes_of_kernel_loops():
             return 1
-        return min(2 ** int(math.log2(max(_CARRIED / carried, 1))), _MOST)
-
-    def _carried(self) -> int:
-        return max((carried for carried, _ in _loops(self._program)), default=0)
-
-    def _stand_side_by_side(self) -> bool:
-        return computes_side_by_side() and self._carried() <= _MOST_SIDE_BY_SIDE
+        return min(2 ** int(math.log2(max(_CARRIED / self._carried, 1))), _MOST)
 
     def block(self, size: int) -> Callable[..., Any]:
         """The function of several members at once; of one, without `vmap`."""
         if size == 1:
             alone = lambda x: jax.tree.map(lambda x: x[0], x)
             return lambda own: jax.tree.map(lambda x: x[None], self._function(alone(own)))
-        if self._stand_side_by_side():
-            program, like = jax.make_jaxpr(self._function, return_shape=True)(self._like)
-            evaluated, structure = side_by_side(program), jax.tree.structure(like)
-            return lambda own: jax.tree.unflatten(structure, evaluated(*jax.tree.leaves(own)))
+        at_once = self._in_lanes if self._side_by_side else jax.vmap(self._function)
 
-        def together(own):
+        def together(members):
             try:
-                return jax.vmap(self._function)(own)
+                return at_once(members)
             except NotImplementedError as error:
                 raise ValueError(
                     f"The function cannot be batched ({error}); size=1 computes one member after the other."
                 ) from error
 
         return together
+
+    def _in_lanes(self, members: PyTree) -> PyTree:
+        program, like = jax.make_jaxpr(self._function, return_shape=True)(self._like)
+        return jax.tree.unflatten(jax.tree.structure(like), side_by_side(program)(*jax.tree.leaves(members)))
 
 
 def _loops(program: Any) -> Iterator[tuple[int, int]]:
@@ -144,13 +151,13 @@ def _loops(program: Any) -> Iterator[tuple[int, int]]:
         inner = _inner(equation)
         if equation.primitive.name in ("while", "scan"):
             # A scan does not carry the results of single steps.
-            yield _bytes(equation.outvars[: _carried(equation)]), sum(map(_written, inner))
+            yield _bytes(equation.outvars[: _loop_values(equation)]), sum(map(_written, inner))
         for own in inner:
             yield from _loops(own)
 
 
-def _carried(equation: Any) -> int:
-    """How many outputs of a loop it carries from step to step."""
+def _loop_values(equation: Any) -> int:
+    """The number of outputs that a loop carries from step to step."""
     scans = equation.primitive.name == "scan"
     return sizes_of_scan(equation.params)[1] if scans else len(equation.outvars)
 

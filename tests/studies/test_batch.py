@@ -10,6 +10,7 @@ import pytest
 from compiling import compiled
 
 import jaxmb as mb
+from jaxmb.lanes.evaluate import RULES
 from jaxmb.studies.batch import Member
 
 
@@ -202,6 +203,15 @@ def test_members_side_by_side_have_the_derivatives_of_a_batch(side_by_side):
     for derivative in (jax.grad, jax.jacfwd, jax.hessian):
         found, expected = (derivative(total)(0.7, x, at_once) for at_once in (mb.batch, jax.vmap))
         np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_an_operation_without_a_rule_is_refused_side_by_side_as_well(side_by_side, monkeypatch):
+    def lacks(lanes, equation, values):
+        raise NotImplementedError("no rule")
+
+    monkeypatch.setitem(RULES, "sin", lacks)
+    with pytest.raises(ValueError, match=r"cannot be batched \(no rule\); size=1 computes"):
+        mb.batch(lambda x: jax.lax.fori_loop(0, 2, lambda k, y: jnp.sin(y), x))(np.ones(10))
 
 
 def test_members_of_large_loops_do_not_stand_side_by_side(side_by_side):
