@@ -1,30 +1,18 @@
 """Costs of features that a scene does not use, and of methods: what is measured is the same motion."""
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
+import reported_machines
 from left_out import in_time, left_out, nonholonomic, with_damper
 from method_costs import method_costs
+from reported_machines import udot
 
 import jaxmb as mb
-from jaxmb import planar
 
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A rod on a pin, with a torsion spring."""
-    rod = planar.Body("rod", mass=2.0, inertia=0.3, position=(0.5, 0.0), angular_velocity=1.0)
-    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
-    spring = planar.TorsionalSpringDamper("spring", "ground", "rod", stiffness=3.0)
-    system = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -9.81)), spring]).compile()
-    return system, mb.assemble(system, rates={"rod.angle": 1.0})
-
-
-@eqx.filter_jit
-def udot(system, y):
-    """Accelerations at t = 0."""
-    return mb.formulations.accelerations(system, mb.formulations.Multipliers(), jnp.zeros(()), y.q, y.u)[0]
+    return reported_machines.pendulum()
 
 
 @pytest.mark.long

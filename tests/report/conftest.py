@@ -1,14 +1,7 @@
 import pytest
-
-import jaxmb as mb
-from jaxmb import planar
+import reported_machines
 
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A rod on a pin, with a torsion spring."""
-    rod = planar.Body("rod", mass=2.0, inertia=0.3, position=(0.5, 0.0), angular_velocity=1.0)
-    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
-    spring = planar.TorsionalSpringDamper("spring", "ground", "rod", stiffness=3.0)
-    system = mb.Scene([rod], joints=[pin], forces=[mb.Gravity((0.0, -9.81)), spring]).compile()
-    return system, mb.assemble(system, rates={"rod.angle": 1.0})
+    return reported_machines.pendulum()

@@ -6,17 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reported_machines import udot
 
 import jaxmb as mb
 from jaxmb import parts, planar
 from jaxmb.parts.fields import declarations
 from jaxmb.report.variants import _unit, doubled, scaled_lengths, units
-
-
-@eqx.filter_jit
-def udot(system, y):
-    """Accelerations at t = 0."""
-    return mb.formulations.accelerations(system, mb.formulations.Multipliers(), jnp.zeros(()), y.q, y.u)[0]
 
 
 @pytest.mark.parametrize("factor", [1e-9, 1e6])
