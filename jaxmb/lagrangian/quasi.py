@@ -1,7 +1,7 @@
 """Nonlinear quasi-velocities, and the forces that hold the dependent ones at zero."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -53,7 +53,8 @@ class QuasiVelocities(AbstractKinematics):
     """
 
     omega: Callable[..., Array] = eqx.field(static=True)
-    near: Any
+    near: Float[Array, "nq"] | None
+    near_at: Callable[..., Array] | None = eqx.field(static=True)
     dependent: tuple[int, ...] = eqx.field(static=True)
     identity: ClassVar[bool] = False
     linear: ClassVar[bool] = False
@@ -66,7 +67,8 @@ class QuasiVelocities(AbstractKinematics):
         dependent: tuple[int, ...] = (),
     ):
         self.omega = omega
-        self.near = near if callable(near) else jnp.asarray(near, jnp.result_type(float))
+        self.near = None if callable(near) else jnp.asarray(near, jnp.result_type(float))
+        self.near_at = near if callable(near) else None
         self.dependent = tuple(dependent)
 
     def count(self, nq):
@@ -85,10 +87,7 @@ class QuasiVelocities(AbstractKinematics):
         self, t: Scalar, q: Coordinates, omega: Float[Array, "nq"], parameters: Parameters
     ) -> Float[Array, "nq"]:
         """`q̇(t, q, ω)`; NaN where Newton's method does not converge."""
-        if callable(self.near):
-            near = self.near(t, q, omega, parameters)
-        else:
-            near = self.near
+        near = self.near if self.near_at is None else self.near_at(t, q, omega, parameters)
         return _inverse(self.omega, jnp.asarray(t, q.dtype), q, omega, parameters, lax.stop_gradient(near))
 
 

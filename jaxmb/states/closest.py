@@ -69,6 +69,13 @@ def tolerance(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.64
 
 
+def independent_above(dtype) -> float:
+    """The pivot or singular value, relative to the largest, below which rows depend on each other: 9e-8 in double
+    precision. A search reaches a singular configuration to the root of eps only, so its pivots there are a few of it.
+    """
+    return float(jnp.finfo(dtype).eps) ** 0.45
+
+
 def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) -> Float[Array, ""]:
     """The largest residual, with each row divided by the norm of its scaled gradient."""
     xp, precision = namespace(residual, row_norms), jnp.finfo(residual.dtype)
@@ -201,7 +208,7 @@ def closest_configuration(
     ok = residual_size(frozen, t, q, jacobian) <= tolerance(q.dtype)
 
     # Newton's method on the optimality conditions of the independent rows makes the minimiser exact.
-    pivots = full_pivot(jacobian, scale=scale)
+    pivots = full_pivot(jacobian, scale=scale, tol=independent_above(q.dtype))
     ok = ok & (pivots.rank == rank)
     rows = pivots.order.rows[:rank]
     square = jnp.where(fixed, 1.0, scale) ** 2

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .closest import largest_residual, tolerance
+from .closest import independent_above, largest_residual, tolerance
 
 # The largest numbers of rows and coordinates whose dense matrices are cheap.
 MOST = 150
@@ -19,8 +19,8 @@ MOST = 150
 _STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.999, 0.75
 # A full step is not shortened if it reduces the squared residuals below this share.
 _WHOLE = 0.01
-# Largest rounding error of residuals, in units of eps; singular values below this fraction of the largest are zero.
-_ROUNDING, _ZERO = 4.0, 1e-9
+# Largest rounding error of residuals, in units of eps.
+_ROUNDING = 4.0
 
 
 class AbstractHost(abc.ABC):
@@ -156,4 +156,4 @@ class AbstractHost(abc.ABC):
 
 def _rank(matrix):
     sizes = np.linalg.svd(matrix, compute_uv=False)
-    return int(np.sum(sizes > _ZERO * np.max(sizes, initial=0.0)))
+    return int(np.sum(sizes > independent_above(matrix.dtype) * np.max(sizes, initial=0.0)))

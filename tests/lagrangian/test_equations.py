@@ -2,6 +2,7 @@
 
 import functools
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -309,6 +310,19 @@ def test_quasi_velocities_and_the_constraint_give_one_motion():
     np.testing.assert_allclose(np.hypot(*speed), 3.0, rtol=0, atol=1e-11)
     np.testing.assert_allclose(run.ys.q[-1], references.values[-1, :2], rtol=0, atol=1e-10)
     np.testing.assert_allclose(run.ys.u[-1, 0], -1.319751601680, rtol=0, atol=1e-10)
+
+
+def test_quasi_velocities_of_a_traced_system():
+    """The start of Newton's method is a function, which is not a value of the system."""
+    quasi = library("constant_speed_particle", form="quasi")
+    options = {"t1": 0.1, "solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection(), "throw": False}
+
+    @jax.jit
+    def end(speed):
+        return mb.simulate(mb.with_parameters(quasi.system, {"speed": speed}), quasi.state, **options).ys.q[-1]
+
+    alone = mb.simulate(quasi.system, quasi.state, **options).ys.q[-1]
+    np.testing.assert_allclose(end(3.0), alone, rtol=0, atol=1e-12)
 
 
 # Singular states
