@@ -1,8 +1,6 @@
 import collections
 import gc
-import json
 import os
-import shutil
 from pathlib import Path
 
 import equinox as eqx
@@ -14,57 +12,47 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# A test that took longer runs with `--all` only [s].
-LONG = 2.5
-# How long tests took [s], by their ids, but for quick ones; null where one is long and has not been timed yet.
-DURATIONS = Path(__file__).parent / "durations.json"
-KEPT = 0.5
 # Where Linux lists the memory maps of this process, and with how many of them compiled programs are given back.
 MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
 
 
 def pytest_addoption(parser):
-    parser.addoption("--all", action="store_true", help="run the long tests as well, some of them as users compile")
-    record = "write into durations.json how long the tests of this run took, with all programs compiled anew"
-    parser.addoption("--record-durations", action="store_true", help=record)
+    parser.addoption("--all", action="store_true", help="run slow tests as well, some of them as users compile")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Leave out long tests without `--all`: those marked so, and those that took long when they were timed."""
-    if config.getoption("--all"):
-        return
-    recorded = json.loads(DURATIONS.read_text())
-
-    def is_long(item):
-        seconds = recorded.get(item.nodeid, 0.0)
-        took_long = seconds is None or seconds > LONG
-        return item.get_closest_marker("long") or (took_long and not item.get_closest_marker("always"))
-
-    left_out = [item for item in items if is_long(item)]
-    config.hook.pytest_deselected(items=left_out)
-    items[:] = [item for item in items if not is_long(item)]
+    """Leave out slow tests without `--all`."""
+    if not any("::" in argument for argument in config.args):
+        check_cases(items)
+    if not config.getoption("--all"):
+        config.hook.pytest_deselected(items=[item for item in items if is_slow(item)])
+        items[:] = [item for item in items if not is_slow(item)]
 
 
-class Stopwatch:
-    """Durations of the tests of this run, in the process that sees the reports of all workers."""
+def is_slow(item):
+    """`slow` marks a test or a case, `slow("a", "b")` two cases of a test, `slow(but=("c",))` all cases but one."""
+    return any(
+        (case_of(item) in mark.args if mark.args else case_of(item) not in mark.kwargs.get("but", ()))
+        for mark in item.iter_markers("slow")
+    )
 
-    def __init__(self):
-        self.seconds = collections.Counter()
-        self.not_passed = set()
 
-    def pytest_runtest_logreport(self, report):
-        self.seconds[report.nodeid] += report.duration
-        if not report.passed:
-            self.not_passed.add(report.nodeid)
+def case_of(item):
+    """The name of a case of a test, as pytest prints it in brackets."""
+    return item.callspec.id if hasattr(item, "callspec") else None
 
-    def pytest_sessionfinish(self):
-        """Those of other tests stay, and so do those of tests that failed or were skipped."""
-        recorded = json.loads(DURATIONS.read_text())
-        for name in self.seconds.keys() - self.not_passed:
-            recorded.pop(name, None)
-            if self.seconds[name] > KEPT:
-                recorded[name] = round(self.seconds[name], 1)
-        DURATIONS.write_text(json.dumps(dict(sorted(recorded.items())), indent=1, ensure_ascii=False) + "\n")
+
+def check_cases(items):
+    """Refuse a mark with a case that its test does not have."""
+    cases = collections.defaultdict(set)
+    for item in items:
+        cases[item.nodeid.split("[")[0]].add(case_of(item))
+    for item in items:
+        for mark in item.iter_markers("slow"):
+            unknown = {*mark.args, *mark.kwargs.get("but", ())} - cases[item.nodeid.split("[")[0]]
+            if unknown:
+                raise pytest.UsageError(f"{item.nodeid}: slow names cases that do not exist, {sorted(unknown)}")
 
 
 def pytest_configure(config):
@@ -75,9 +63,6 @@ def pytest_configure(config):
     if config.getoption("numprocesses", default=None):
         compile_for_tests()
     programs = config.cache.mkdir("programs")
-    if config.getoption("--record-durations") and not hasattr(config, "workerinput"):
-        config.pluginmanager.register(Stopwatch())
-        shutil.rmtree(programs)
     # Tracing makes and drops many objects, few of them in cycles: to collect as often as usual takes a tenth of it.
     gc.set_threshold(100_000, 20, 20)
     settings = {

@@ -6,8 +6,9 @@ from formulation_costs import every_formulation, formulation_costs
 from jaxmb import mechanisms
 from jaxmb.formulations import Multipliers, Partitioned
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.long
+
 def test_costs_of_formulations():
     table = formulation_costs(mechanisms.get("pendulum"), {"one": Partitioned(), "other": Multipliers()}, repeats=1)
     assert table["formulation"] == ["one", "other"]
@@ -15,7 +16,6 @@ def test_costs_of_formulations():
         assert min(times) > 0 and 0 < lines < min(forward, reverse) and deviation < 1e-13
 
 
-@pytest.mark.long
 def test_formulations_that_a_mechanism_does_not_allow():
     with pytest.raises(ValueError, match="no constraints"):
         formulation_costs(mechanisms.get("free_body"))

@@ -9,13 +9,14 @@ from reported_machines import udot
 
 import jaxmb as mb
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def pendulum():
     return reported_machines.pendulum()
 
 
-@pytest.mark.long
 def test_variants_do_not_change_the_motion(pendulum):
     system, state = pendulum
     driven, rolling = in_time(system, state), nonholonomic(system, state)
@@ -25,7 +26,6 @@ def test_variants_do_not_change_the_motion(pendulum):
         np.testing.assert_allclose(udot(variant, state), udot(system, state), rtol=0, atol=1e-12)
 
 
-@pytest.mark.long
 def test_what_a_pendulum_leaves_out(pendulum):
     system, state = pendulum
     table = left_out(system, state, t1=1.0, repeats=1)
@@ -40,7 +40,6 @@ def test_what_a_pendulum_leaves_out(pendulum):
     assert "not needed: derivatives of constraints" in str(table) and "charts, a dense Jacobian: " in str(table)
 
 
-@pytest.mark.long
 def test_costs_of_methods():
     """What partitioning costs, and the same with all coordinates."""
     table = method_costs(mb.mechanisms.get("pendulum").until(1.0), repeats=1)

@@ -103,7 +103,7 @@ def assert_agree(system, state, acceleration, tol=1e-13):
         assert largest(own - exact[what]) < tol * (1 + largest(exact[what])), what
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["bodies", "centre", "frame", "ground"])
 def test_rows_of_every_joint_are_those_of_its_residual(where):
     pairs = [bodies(k, **({"centre": (0.1, 0.2, -0.1)} if where == "centre" else {})) for k in range(len(JOINTS))]
@@ -121,6 +121,7 @@ def test_rows_of_every_joint_are_those_of_its_residual(where):
         check_elements(system, state)
 
 
+@pytest.mark.slow
 def test_rows_of_planar_joints_are_those_of_their_residuals():
     point, axis = {"point": (0.5, 0.2)}, {"axis": (0.6, 0.8)}
     places = [{"position": (0.3 * k, 0.1 * k * k), "angle": 0.4 * k - 1.0} for k in range(10)]
@@ -162,7 +163,7 @@ def many():
     return mb.Scene(chain, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_elementary_joints_stand_among_others():
     system = many().compile()
     assert not all(map(is_elementary, system.constraints.position))
@@ -217,6 +218,7 @@ def system_with(kind):
     return mb.Scene(bodies(), joints=[kind("joint", "a", "b", **PLACE, **AXIS)]).compile()
 
 
+@pytest.mark.slow
 def test_a_joint_of_the_users_may_have_elements():
     system = system_with(Hinge)
     assert all(map(is_elementary, system.constraints.position))
@@ -225,6 +227,7 @@ def test_a_joint_of_the_users_may_have_elements():
     check_elements(system, state)
 
 
+@pytest.mark.slow
 def test_elements_that_differ_from_the_residual_are_refused():
     system = system_with(WrongHinge)
     ((state, _),) = states_of(system, 1)
@@ -239,7 +242,7 @@ def test_a_newer_residual_counts_alone():
     assert not any(map(is_elementary, system.constraints.position)) and system.prepared().constraints.elements is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_hinge_half_a_turn_away_is_not_consistent():
     # With a joint without elements, whose rows stand before.
     joints = [Loose("before", "ground", "a", **PLACE, **AXIS), spatial.Revolute("hinge", "a", "b", **PLACE, **AXIS)]
@@ -273,7 +276,7 @@ def test_a_weld_a_third_of_a_turn_away_is_not_consistent(signs):
         assert bool(is_consistent(system, 0.0, state)) == holds
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name, t1", [("spatial_slider_crank", 0.2), ("double_wishbone", 0.2), ("slider_crank", 0.05)])
 def test_motions_and_gradients_are_those_of_the_residuals(name, t1, monkeypatch):
     built = mb.mechanisms.get(name)

@@ -153,7 +153,7 @@ def sparse(monkeypatch):
     monkeypatch.setattr(JointBlocks, "subsets", functools.partialmethod(JointBlocks.subsets, dense=-1))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_implied_rows_are_those_of_dense_matrices(monkeypatch):
     n = 4
     systems = [ladder(n).compile()]
@@ -174,7 +174,7 @@ def test_implied_rows_are_those_of_dense_matrices(monkeypatch):
             assert names == set(own.by)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_long_ladder_has_no_dense_matrix(monkeypatch):
     n, largest = 300, 0
 
@@ -196,14 +196,14 @@ def test_a_long_ladder_has_no_dense_matrix(monkeypatch):
     assert largest <= 1000
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in SINGULAR if "bar" in case])
 def test_singular_poses_are_refused_without_dense_matrices(sparse, case):
     with pytest.raises(ValueError, match=r"is singular: row \d of .* implied by .* there, but not near it"):
         SINGULAR[case][0]()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_motions_that_contradict_are_refused_without_dense_matrices(sparse):
     with pytest.raises(ValueError, match=r"row 0 of \w+ is implied by \w+ at t = 0, but no more at t = "):
         crank(driver("first", lambda t: t), driver("second", lambda t: t + t**3)).compile()
@@ -219,6 +219,7 @@ def test_drivers_that_agree_now_only_are_refused():
         crank(driver("first", lambda t: t), driver("second", lambda t: t + t**3)).compile()
 
 
+@pytest.mark.slow
 def test_drivers_that_agree_are_accepted():
     system = crank(driver("first", jnp.sin), driver("second", lambda t: jnp.sin(t))).compile()
     (implied,) = system.implied
@@ -232,6 +233,7 @@ def parting(t):
     return t + jnp.maximum(t - 0.5, 0.0) ** 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, diffrax.Tsit5()])
 def test_drivers_that_part_later_end_the_motion(solver):
     system = crank(driver("first", lambda t: t), driver("second", parting)).compile()
@@ -242,6 +244,7 @@ def test_drivers_that_part_later_end_the_motion(solver):
     assert motion.result == mb.RESULTS.inconsistent_constraints
 
 
+@pytest.mark.slow
 def test_the_motion_that_is_kept_ends_where_the_drivers_part():
     system = crank(driver("first", lambda t: t), driver("second", parting)).compile()
     saveat = diffrax.SaveAt(steps=True)
@@ -251,7 +254,7 @@ def test_the_motion_that_is_kept_ends_where_the_drivers_part():
     assert abs(motion["crank"].angle[-1] - parting(motion.ts[-1])) <= 1.2e-7
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_member_of_a_batch_whose_drivers_part_spoils_no_other():
     late = lambda t, p: t + p["rate"] * jnp.maximum(t - 0.5, 0.0) ** 3
     second = planar.Driver("second", "ground", "crank", quantity="angle", motion=late, parameters={"rate": 0.0})
@@ -267,7 +270,7 @@ def test_a_member_of_a_batch_whose_drivers_part_spoils_no_other():
     np.testing.assert_allclose(angle[0], 1.0, atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_redundancy_at_a_coarse_tolerance_is_no_singularity():
     bricard = mechanisms.get("bricard")
     motion = mb.simulate(bricard.system, bricard.state, t1=0.5, rtol=1e-4)
@@ -282,6 +285,7 @@ def four_bar():
     return mechanisms.get("four_bar")
 
 
+@pytest.mark.slow
 def test_a_moved_pin_needs_another_state(four_bar):
     moved = mb.with_parameters(four_bar.system, {"D.point_a": jnp.array([2.6, 0.0])})
     with pytest.raises(ValueError, match=r"state violates the constraints D \(0\.1\) at t0 = 0\..*jaxmb\.assemble"):
@@ -289,12 +293,14 @@ def test_a_moved_pin_needs_another_state(four_bar):
     mb.simulate(moved, mb.assemble(moved, four_bar.state), t1=0.1)
 
 
+@pytest.mark.slow
 def test_the_state_of_another_system_is_refused(four_bar):
     other = mechanisms.get("four_bar", base=2.4)
     with pytest.raises(ValueError, match=r"state violates the constraints .*D \("):
         mb.simulate(four_bar.system, other.state, t1=0.1)
 
 
+@pytest.mark.slow
 def test_wrong_velocities_are_refused(four_bar):
     state = four_bar.state
     with pytest.raises(ValueError, match=r"velocities of the state violate the constraints .*B \("):
@@ -309,12 +315,14 @@ def test_wrong_velocities_are_refused(four_bar):
     )
 
 
+@pytest.mark.slow
 def test_the_state_of_another_time_is_refused():
     system = crank(driver("drive", lambda t: t)).compile()
     with pytest.raises(ValueError, match=r"state violates the constraints drive \(1\) at t0 = 1\."):
         mb.simulate(system, mb.assemble(system), t0=1.0, t1=1.1)
 
 
+@pytest.mark.slow
 def test_traced_parameters_with_an_old_state_fail(four_bar):
     def run(x):
         system = mb.with_parameters(four_bar.system, {"D.point_a": jnp.stack([x, jnp.zeros_like(x)])})
@@ -326,7 +334,7 @@ def test_traced_parameters_with_an_old_state_fail(four_bar):
     assert np.isfinite(ends[0]) and np.isnan(ends[1])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_through_a_state_that_is_assembled_again(four_bar):
     def end(x, rtol):
         system = mb.with_parameters(four_bar.system, {"D.point_a": jnp.stack([x, jnp.zeros_like(x)])})
@@ -339,12 +347,13 @@ def test_derivatives_through_a_state_that_is_assembled_again(four_bar):
     np.testing.assert_allclose(slope, (tight(2.6 + 1e-4) - tight(2.6 - 1e-4)) / 2e-4, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"),
     [
         ("four_bar", {}),
-        pytest.param("spatial_slider_crank", {}, marks=pytest.mark.long),
-        pytest.param("spatial_slider_crank", {"solver": diffrax.Tsit5()}, marks=pytest.mark.long),
+        pytest.param("spatial_slider_crank", {}, marks=pytest.mark.slow),
+        pytest.param("spatial_slider_crank", {"solver": diffrax.Tsit5()}, marks=pytest.mark.slow),
     ],
 )
 def test_a_motion_at_a_coarse_tolerance_can_be_continued(name, options):
@@ -356,7 +365,7 @@ def test_a_motion_at_a_coarse_tolerance_can_be_continued(name, options):
         mb.simulate(mechanism.system, state, t0=saveat[k], t1=saveat[k] + 1e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_single_precision_states_are_accepted():
     """In a program of its own: the precision is chosen before anything else."""
     code = """

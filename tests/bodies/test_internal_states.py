@@ -66,6 +66,7 @@ def leaning(system, angle=0.1, **options):
     return mb.assemble(system, fix={"hinge.angle": angle, "slide.displacement": 0.0}, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_controlled_pole_moves_as_its_own_equations(method):
     system, times = cart_and_pole(), np.array([0.7, 2.0])
@@ -78,6 +79,7 @@ def test_a_controlled_pole_moves_as_its_own_equations(method):
     assert np.max(sol.constraint_violation.position) < (1e-6 if "Baumgarte" in method else 1e-11)
 
 
+@pytest.mark.slow
 def test_error_control_sees_internal_states():
     """A filter that nothing depends on is followed as accurately as the motion."""
     system = filtered()
@@ -88,7 +90,7 @@ def test_error_control_sees_internal_states():
     np.testing.assert_allclose(coarse["filter"].value[-1], expected, rtol=0, atol=1e-7)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["Adams", "Hermite", "Dopri8"])
 def test_small_states_that_start_at_zero_are_as_accurate(method):
     """A motor of nanonewton metres on a rotor as small moves it like one of newton metres a large one, to some `rtol`,
@@ -159,7 +161,7 @@ def test_energy_may_depend_on_internal_states():
     np.testing.assert_allclose(sol.energy, 5.0 * (x - creep) ** 2, rtol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_failure_of_friction_is_named_beside_internal_states():
     """A rod that slides on the floor swings up to Painlevé's angle, with a motor that stays without force."""
     rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
@@ -173,7 +175,7 @@ def test_a_failure_of_friction_is_named_beside_internal_states():
         mb.simulate(system, state, t1=1.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_rate_that_is_not_finite_is_named():
     bad = lambda t, measured, states, p: (0.0, {"integral": jnp.sqrt(0.5 - t)})
     system = cart_and_pole_with(bad)
@@ -189,6 +191,7 @@ def end(system, gains, angle, integral, rtol=1e-10):
     return jnp.stack([sol["hinge"].angle[-1], sol["pid"].integral[-1]])
 
 
+@pytest.mark.slow
 def test_derivatives_forward_reverse_and_differences():
     system = cart_and_pole()
     x = jnp.array([-160.0, 10.0, 0.1, 0.02])
@@ -203,6 +206,7 @@ def test_derivatives_forward_reverse_and_differences():
     np.testing.assert_allclose(reverse.T / sizes, differences / sizes, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_linear_equations_of_a_controlled_machine():
     system = cart_and_pole()
     at_rest = mb.equilibrium(system, fix={"hinge.angle": 0.0, "slide.displacement": 0.0})
@@ -236,6 +240,7 @@ def with_forces(mechanism, *forces):
     return mb.Scene(scene.bodies, joints=scene.joints, forces=[*scene.forces, *forces]).compile(), own.state
 
 
+@pytest.mark.slow
 def test_a_motor_with_lag_drives_a_four_bar():
     system, start = motor_on_four_bar()
     times = np.array([0.4, 1.5])
@@ -249,6 +254,7 @@ def test_a_motor_with_lag_drives_a_four_bar():
     np.testing.assert_allclose(sol.to_dict()["motor.force"], sol.ys.z[:, 0])
 
 
+@pytest.mark.slow
 def test_modes_of_an_actuator():
     """The force approaches what the mode demands."""
     rod = planar.Body("rod", mass=1.0, inertia=0.1, angular_velocity=0.5)
@@ -293,6 +299,7 @@ def car(p=driven.CAR):
     return mb.Scene([chassis, *wheels], joints=axles, forces=[mb.Gravity((0.0, 0.0, -9.81)), *tyres]).compile()
 
 
+@pytest.mark.slow
 def test_a_car_on_four_tyres_passes_a_bump():
     system, times = car(), np.array([0.5, 1.0])
     rates = {"chassis.velocity": (6.0, 0.0, 0.0), "chassis.angular_velocity": (0.0, 0.0, 0.1)}
@@ -306,6 +313,7 @@ def test_a_car_on_four_tyres_passes_a_bump():
     np.testing.assert_allclose(np.concatenate(found, axis=1), expected, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_tyre_in_the_plane_is_one_in_space():
     """A wheel that is pulled rolls in the plane as it does in space, where it is held upright."""
     own = {
@@ -354,6 +362,7 @@ def chain_of_motors(n):
     return mb.Scene(rods, joints=pins, forces=forces).compile()
 
 
+@pytest.mark.slow
 def test_sparse_elimination_serves_machines_with_states():
     system = chain_of_motors(20)
     assert system.elimination is not None and system.nz == 20
@@ -373,6 +382,7 @@ def test_a_jump_keeps_internal_states():
     np.testing.assert_allclose(after.u, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_program_does_not_grow_with_the_number_of_motors():
     lines = []
     for n in (20, 40):
@@ -382,6 +392,7 @@ def test_program_does_not_grow_with_the_number_of_motors():
     assert lines[1] < 1.1 * lines[0]
 
 
+@pytest.mark.slow
 def test_equal_controllers_are_computed_together():
     hold = lambda t, measured, states, p: (-p["gain"] * measured["angle"], {})
     rods = [planar.Body(f"rod{k}", mass=1.0, inertia=1 / 12, position=(2.0 * k + 0.5, 0.0)) for k in range(3)]
@@ -398,6 +409,7 @@ def test_equal_controllers_are_computed_together():
     np.testing.assert_allclose(found[2::3], -np.arange(1.0, 4.0) * angles / (1 / 12 + 1 / 4), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_frames_carry_parts_with_states():
     """A tyre on a frame in the wheel is one with another centre."""
     wheel = planar.Body("wheel", mass=20.0, inertia=0.9, position=(0.0, 0.3), velocity=(3.0, 0.0))
@@ -420,6 +432,7 @@ def test_frames_carry_parts_with_states():
     np.testing.assert_allclose(a.potential_energy(0.0, q), b.potential_energy(0.0, q), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_controller_sees_frames_bodies_and_joints_on_frames():
     """What the function is given is what the trajectory shows."""
     record = lambda t, measured, states, p: (0.0, measured)
@@ -438,6 +451,7 @@ def test_a_controller_sees_frames_bodies_and_joints_on_frames():
         np.testing.assert_allclose(rates[np.array(index)], np.ravel(sol.quantity(quantity)[0]), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_events_dense_output_and_batches():
     system = cart_and_pole()
     low = diffrax.Event(lambda t, y, args, **_: y.z[0] + 0.01)
@@ -459,6 +473,7 @@ def test_events_dense_output_and_batches():
         np.testing.assert_allclose(batch.z[k], run(jnp.array([0.0, 0.0, 0.05])[k]).z, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_error_is_estimated_for_internal_states():
     system = cart_and_pole()
     sol = mb.simulate(system, leaning(system), t1=2.0, rtol=1e-6, error=True)
@@ -467,6 +482,7 @@ def test_an_error_is_estimated_for_internal_states():
     assert 0.1 < true / float(sol.error.quantity("pid.integral")[-1]) < 10
 
 
+@pytest.mark.slow
 def test_nothing_is_traced_without_internal_states():
     mechanism = mechanisms.four_bar()
     system, state = mechanism.system, mechanism.state
@@ -587,6 +603,7 @@ def cart_and_pole_with(function):
     return mb.Scene([cart], joints=[slide], forces=[controller]).compile()
 
 
+@pytest.mark.slow("equilibrium")
 @pytest.mark.parametrize("case", REFUSED)
 def test_bad_input_is_named(case):
     call, message = REFUSED[case]

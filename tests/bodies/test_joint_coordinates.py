@@ -29,6 +29,7 @@ def turn(axis, angle):
     return rotations.from_axis_angle(jnp.array(axis), angle)
 
 
+@pytest.mark.slow
 def test_attitudes_follow_from_the_angles_that_are_given(arm):
     hip, first, second = 0.7, 1.9, -2.4
     state = mb.assemble(arm, fix={"hip.angle": hip, "knee.angle_a": first, "knee.angle_b": second})
@@ -39,6 +40,7 @@ def test_attitudes_follow_from_the_angles_that_are_given(arm):
     np.testing.assert_allclose(jnp.abs(shank @ rotations.multiply(expected, relative)), 1.0, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_coordinates_along_a_motion_are_continuous_and_have_their_derivatives(arm):
     rates = {"hip.angle": 9.0, "knee.angle_a": 0.3, "knee.angle_b": 0.2}
     start = mb.assemble(arm, fix={"hip.angle": 0.1}, rates=rates)
@@ -61,6 +63,7 @@ def test_coordinates_along_a_motion_are_continuous_and_have_their_derivatives(ar
     np.testing.assert_allclose(few["hip"].angle, hip.angle[::20], rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("near", [np.pi, -np.pi, 0.0])
 def test_an_angle_and_another_by_two_full_turns_are_one_position(arm, near):
     angle = near + 0.01
@@ -79,6 +82,7 @@ SHIFT, ANGLE, VECTOR = 0.3, 0.4, np.array([0.3, -0.5, 0.2])
 AXIS = {"point": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0)}
 
 
+@pytest.mark.slow(but=("Spherical-options5-values5",))
 @pytest.mark.parametrize(
     ("kind", "options", "values"),
     [
@@ -126,7 +130,7 @@ def test_a_joint_that_leaves_all_motions_free_has_coordinates_and_no_reaction():
         floating(rubs)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_state_from_the_coordinates_of_a_joint_that_leaves_all_motions_free():
     system = floating()
     place = {"root.displacement_2": 0.4, "root.angle_1": 0.3, "root.angle_2": -0.5, "root.angle_3": 2.0}
@@ -138,6 +142,7 @@ def test_a_state_from_the_coordinates_of_a_joint_that_leaves_all_motions_free():
     np.testing.assert_allclose(state.u[:3], [0.0, 0.0, 0.7], rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_state_with_respect_to_an_angle_that_is_given(arm):
     def entries(angle):
         state = mb.assemble(arm, fix={"hip.angle": angle}, rates={"hip.angle": 2.0}, throw=False)
@@ -149,6 +154,7 @@ def test_derivatives_of_a_state_with_respect_to_an_angle_that_is_given(arm):
     np.testing.assert_allclose(forward, (both[0] - both[1]) / 2e-4, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_equilibrium_with_an_angle_that_is_held():
     """Two rods hang from a pin; the first is held, the second hangs straight down."""
     rod = lambda name, x: planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0))
@@ -176,6 +182,7 @@ def test_coordinates_of_joints_that_are_not_there(arm, options, message):
         mb.assemble(arm, **options)
 
 
+@pytest.mark.slow
 def test_a_joint_says_which_coordinates_it_has(arm):
     motion = mb.simulate(arm, mb.assemble(arm), t1=0.01)
     with pytest.raises(AttributeError, match="'knee' has angle_a, angle_a_acceleration"):

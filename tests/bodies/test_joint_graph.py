@@ -68,7 +68,7 @@ SCENES = [
 ]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_mechanisms_of_the_library(name):
     mechanism = mb.mechanisms.get(name)
@@ -118,12 +118,13 @@ def two_stars():
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "hubs"),
     [
         (lambda: star(9, 2), 1),
         (lambda: star(8, 1, ground=True), 1),
-        pytest.param(two_stars, 2, marks=pytest.mark.long),
+        pytest.param(two_stars, 2, marks=pytest.mark.slow),
     ],
 )
 def test_bodies_of_many_joints(build, hubs):
@@ -158,7 +159,7 @@ def hanging_cable():
     return mb.mechanisms.get("cable", n=12).system
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "varied", "implied"),
     [
@@ -307,12 +308,13 @@ def check_random(seed):
     assert np.max(np.abs(system.velocity_residual(0.0, y.q, y.u))) <= 1e-11
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_random_scenes(seed):
     check_random(seed)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(20))
 def test_two_hundred_random_scenes(part):
     for seed in range(10 * part, 10 * part + 10):
@@ -321,7 +323,7 @@ def test_two_hundred_random_scenes(part):
     jax.clear_caches()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_redundant_loops_of_many_bodies_move_as_by_partitioning():
     """A row of parallelograms: every third rocker is implied."""
     bodies, joints = [], []

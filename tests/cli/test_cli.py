@@ -17,6 +17,7 @@ def test_mechanisms(capsys):
     assert all(len(line.split()) > 3 for line in lines)
 
 
+@pytest.mark.slow
 def test_run(capsys, tmp_path):
     """A run prints errors against reference values and a fit next to the truth, and writes its files."""
     words = ["run", "pendulum", "--t1", "1", "--rtol", "1e-8", "--tolerances", "1e-6", "--out", str(tmp_path)]
@@ -30,6 +31,7 @@ def test_run(capsys, tmp_path):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_run_of_a_lagrangian_system(capsys, tmp_path):
     """Coordinates take the place of positions, and of the picture of the mechanism."""
     assert main(["run", "roller_racer", "--rtol", "1e-8", "--tolerances", "1e-6", "--out", str(tmp_path)]) == 0
@@ -180,6 +182,7 @@ def test_parameters_of_a_mechanism():
         parse(["run", "pendulum", "--set", "mass"])
 
 
+@pytest.mark.slow
 def test_as_a_module():
     """It is no error if the program that reads the output ends before it has read all."""
     command = f"{sys.executable} -m jaxmb help | head -1"

@@ -83,6 +83,7 @@ def test_the_extras_are_those_of_the_package():
     assert {extra: names[extra] for extra in ("docs", "plot", "view", "import", "studies")} == doctor._OPTIONAL
 
 
+@pytest.mark.slow
 def test_measurements(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_FIRST_CALLS", NUMBERS)
     monkeypatch.setattr(doctor, "_STEPPED", ("pendulum",))
@@ -113,6 +114,7 @@ def test_a_motion_that_fails(monkeypatch):
         doctor._steps()
 
 
+@pytest.mark.slow
 def test_the_second_process_waits_less():
     """Without what this process has told JAX of kept programs."""
     _, *rows = doctor._first_calls()

@@ -10,6 +10,7 @@ from jaxmb.contacts.friction import SlipSearch, frictional, with_implied
 from jaxmb.linalg.pairs import of_pairs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contacts", [1, 2])
 def test_friction_in_two_directions(contacts):
     """Of random problems: contacts push or open; the force of slip is on the cone, against the slip, and that of stick
@@ -55,6 +56,7 @@ def searched(W, b):
     return SlipSearch.of(jnp.asarray(W), jnp.asarray(b), dry, jnp.ones(3, bool))
 
 
+@pytest.mark.slow
 def test_slip_goes_where_it_goes_without_forces():
     """At first; and with forces where the nearest ones in the cone do not end it."""
     search = searched(np.eye(3), np.array([-1.0, 3.0, -4.0]))
@@ -64,6 +66,7 @@ def test_slip_goes_where_it_goes_without_forces():
     assert not search.misses(search.answers(), x)
 
 
+@pytest.mark.slow
 def test_equations_of_slip_hold_at_a_solution():
     """Also where the matrix turns the slip, so that its direction is not that of the start."""
     rng = np.random.default_rng(1)

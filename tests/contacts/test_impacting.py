@@ -38,6 +38,7 @@ def when(event):
     return event.at_event(udot, curve)
 
 
+@pytest.mark.slow("falls")
 @pytest.mark.parametrize("rise, hits", [(-1.0, True), (1.0, False)], ids=["falls", "rises"])
 def test_the_time_of_an_event_is_that_of_a_parabola(rise, hits):
     height = 50 * TOUCH
@@ -52,6 +53,7 @@ def test_a_gap_that_is_far_does_not_close_here():
     assert not when(impacting(ball(), 200 * TOUCH, -1.0)).hits
 
 
+@pytest.mark.slow
 def test_an_impact_opens_the_gap_at_its_share_of_the_rebound():
     event = impacting(ball(), 0.0, -2.0)
     start = event.start()
@@ -80,6 +82,7 @@ def test_low_bounces_and_how_long_they_take(speed):
     np.testing.assert_allclose(rest, 2 * (2 * 0.5 * speed / G) if low else 0.0, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_slip_that_is_not_to_be_seen_has_ended():
     event = impacting(ball(coefficient=0.2), 0.0, -1.0, along=1.0, modes=jnp.array([0.0, 1.0]))
     ended, slips = jax.vmap(event.slips_left, (0, None))(jnp.array([[1.0], [-1.0], [10 * TOUCH]]), jnp.ones(1))
@@ -87,6 +90,7 @@ def test_slip_that_is_not_to_be_seen_has_ended():
     np.testing.assert_array_equal(slips[:, 0], [1, -1, 0])
 
 
+@pytest.mark.slow
 def test_the_share_of_the_rebounds_is_found_by_trials():
     """That at which no energy is gained, of a gain that is a parabola; a gain that is none needs no trial."""
     one, zero = jnp.ones(()), jnp.zeros(())

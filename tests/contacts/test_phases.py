@@ -16,6 +16,7 @@ from jaxmb.parts import terrain
 RADIUS = 0.1
 
 
+@pytest.mark.slow(but=("newton-slip goes on",))
 @pytest.mark.parametrize("spin", [0.0, -40.0], ids=["slip ends", "slip goes on"])
 @pytest.mark.parametrize("law", ["newton", "poisson"])
 def test_changes_are_those_of_another_impact(law, spin):

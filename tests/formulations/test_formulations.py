@@ -56,6 +56,7 @@ def dense():
     return jax.jit(lambda M, F, A, gamma, order: solve_by_all(DenseInertia(M), F, A, gamma, order))
 
 
+@pytest.mark.slow
 def test_equal_to_numpy_whichever_rows_and_columns_are_chosen(dense):
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -75,6 +76,7 @@ def test_equal_to_numpy_whichever_rows_and_columns_are_chosen(dense):
                 )
 
 
+@pytest.mark.slow
 def test_vmap_equals_the_loop(dense):
     rng = np.random.default_rng(1)
     equations = [random_equation(rng) for _ in range(3)]
@@ -85,6 +87,7 @@ def test_vmap_equals_the_loop(dense):
             np.testing.assert_allclose(batched[k], alone, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_singular_mass():
     """A velocity without mass, held by a constraint."""
     rng = np.random.default_rng(2)
@@ -104,6 +107,7 @@ def test_singular_mass():
         )
 
 
+@pytest.mark.slow
 def test_forces_that_do_virtual_work():
     """A rigid body's rotation with one non-ideal constraint."""
     moments, spin = np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.5, 0.8])
@@ -125,6 +129,7 @@ def test_forces_that_do_virtual_work():
         np.testing.assert_allclose(same, ideal, rtol=0, atol=1e-14, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("redundant", [False, True])
 def test_derivatives(redundant):
     """Of accelerations and constraint forces to all entries of M, F, A and γ, an implied row following the others."""
@@ -162,6 +167,7 @@ def test_derivatives(redundant):
         )
 
 
+@pytest.mark.slow
 def test_roots_of_mass_matrices():
     """`L Lᵀ` by products and by solves, and derivatives of what no choice of root can change."""
     rng = np.random.default_rng(4)
@@ -264,6 +270,7 @@ def gauss_function(system, y, udot):
     return jnp.vdot(deviation, at.inertia.product(deviation))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LIBRARY)
 def test_formulations_agree(name):
     """Accelerations and multipliers by every formulation, at random states on the constraints, are those of least
@@ -332,6 +339,7 @@ def motions():
     return [(way, way(Partitioned())) for way in ways]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", [name for name in FORMULATIONS if name not in ("partitioned", "multipliers")])
 def test_motions_by_every_formulation(formulation, motions):
     for way, expected in motions:
@@ -364,11 +372,13 @@ class SaddlePoint(AbstractFormulation):
         return solution[:n], jacobian.scatter_rows(solution[n:])
 
 
+@pytest.mark.slow
 def test_a_formulation_of_ones_own(motions):
     for way, expected in motions:
         np.testing.assert_allclose(way(SaddlePoint()).q, expected.q, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_formulations_that_need_the_inverse_of_a_singular_mass_matrix_are_refused():
     mechanism = mb.mechanisms.get("spherical_four_bar")
     for formulation in (Multipliers(), Poincare(), UdwadiaKalaba()):

@@ -102,6 +102,7 @@ def rod(law="Friction", mu=0.3):
 STATES = [(1.0, 2.0, 0.3), (0.7, -1.5, 8.0), (2.0, 1e-4, -1.0), (1.4, -3.0, -6.5), (0.6, 0.0, 7.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["Friction", "NonIdeal", "Lagrangian"])
 def test_friction_is_the_coefficient_times_the_normal_force(law):
     """Of a rod on a floor, pressed on it and held down to it, by every formulation."""
@@ -121,7 +122,7 @@ def test_friction_is_the_coefficient_times_the_normal_force(law):
     assert signs == {-1.0, 1.0}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_sliding_rod():
     """Its motion, with a slip that turns round, against an integration in its own coordinates."""
     times = np.linspace(0.0, 0.5, 6)
@@ -154,7 +155,8 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("solver", [pytest.param(s, marks=[pytest.mark.long][: s != "Adams"]) for s in SOLVERS])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [pytest.param(s, marks=[pytest.mark.slow][: s != "Adams"]) for s in SOLVERS])
 def test_a_motion_ends_where_friction_is_no_longer_unique(solver):
     system, start = into_the_paradox()
     options = {"t1": 1.0, "saveat": diffrax.SaveAt(steps=True), "throw": False} | SOLVERS[solver]
@@ -165,6 +167,7 @@ def test_a_motion_ends_where_friction_is_no_longer_unique(solver):
     assert run.reactions["floor"].force[-1, 1] < 0
 
 
+@pytest.mark.slow
 def test_the_error_names_the_joint():
     system, start = into_the_paradox()
     with pytest.raises(RuntimeError, match=r"friction of 'floor' came to a singular configuration.*Painlevé"):
@@ -175,6 +178,7 @@ def test_the_error_names_the_joint():
         mb.simulate(system, rod_state(1.1, 2.0, 0.3), t1=1.0)
 
 
+@pytest.mark.slow
 def test_no_solution_is_nan():
     """Just beyond a coupling of 1, in one member of a batch only."""
     critical = 1 / coupling(1.0, 1.1)
@@ -190,6 +194,7 @@ def test_no_solution_is_nan():
     np.testing.assert_array_equal(np.isfinite(solve(systems[1], batch)), finite)
 
 
+@pytest.mark.slow
 def test_equation_of_several_multipliers():
     """Of laws that couple at random: solved wherever their coupling contracts, and refused elsewhere."""
     rng = np.random.default_rng(0)
@@ -210,6 +215,7 @@ def test_equation_of_several_multipliers():
 # Other joints
 
 
+@pytest.mark.slow
 def test_a_pin_rubs_in_proportion_to_its_whole_reaction():
     """`J θ̈ = −m g l cos θ − μ r |R|`, where the reaction R has the inertia of the motion that friction leaves."""
     mass, inertia, length, mu, radius = 1.5, 0.1, 0.5, 0.4, 0.2
@@ -235,6 +241,7 @@ def test_a_pin_rubs_in_proportion_to_its_whole_reaction():
         np.testing.assert_allclose(np.linalg.norm(multipliers), pull(turn), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_ladder_rubs_on_floor_and_wall():
     """Both reactions depend on both frictions: three equations with three unknowns, in the ladder's angle."""
     mu_f, mu_w, angle, rate = 0.3, 0.5, 1.0, -0.8
@@ -269,7 +276,7 @@ def test_a_ladder_rubs_on_floor_and_wall():
     np.testing.assert_allclose(np.abs(multipliers), [floor, wall], rtol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_bead_in_a_rough_loop():
     """With the angle φ from the lowest point, `dv²/dφ = −2 g R sin φ − 2 μ (v² + g R cos φ)` has a closed form."""
     mu, start = 0.3, 12.0
@@ -284,7 +291,7 @@ def test_a_bead_in_a_rough_loop():
     np.testing.assert_allclose(np.sum(np.square(run["bead"].velocity[-1])), expected, rtol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_bead_on_a_turning_wire():
     """Pressed on it by Coriolis' force, `r̈ = ω² r − 2 μ ω ṙ`."""
     mu, omega, start = 0.4, 3.0, 0.2
@@ -314,7 +321,7 @@ def test_a_bead_on_a_turning_wire():
 # Derivatives
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_accelerations():
     """Of the implicit equation, to second order: forward, reverse and differences."""
     system, y = rod(), rod_state(0.7, -1.5, 8.0)
@@ -336,7 +343,7 @@ def test_derivatives_of_accelerations():
     np.testing.assert_allclose(second, central, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_a_motion():
     system, y = rod(), rod_state(1.2, 2.0, 0.0)
     names = ["rub.coefficient", "rod.mass"]

@@ -14,6 +14,8 @@ from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.manifold import Partition
 from jaxmb.manifold.impulse import after_impulse
 
+pytestmark = pytest.mark.slow
+
 
 def swing(t, p):
     return p["amplitude"] * jnp.sin(5.0 * t)
@@ -69,7 +71,7 @@ def dense(system):
     return dataclasses.replace(system, elimination=None)
 
 
-@pytest.mark.parametrize("build", [planar_chain, pytest.param(spatial_chain, marks=pytest.mark.long)])
+@pytest.mark.parametrize("build", [planar_chain, pytest.param(spatial_chain, marks=pytest.mark.slow)])
 def test_accelerations_and_multipliers(build):
     system = build()
     assert system.elimination is not None
@@ -95,7 +97,6 @@ def test_accelerations_and_multipliers(build):
     assert np.max(np.abs(system.velocity_residual(0.0, state.q, after))) < 1e-11
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("build", "varied"),
     [
@@ -123,7 +124,6 @@ def test_motion_and_its_derivatives(build, varied):
     np.testing.assert_allclose(push, difference, rtol=1e-6)
 
 
-@pytest.mark.long
 def test_friction_without_a_solution_is_named():
     """A rod slides on a floor beside a chain of many joints, and swings up to Painlevé's angle, where
     `3 μ sin θ cos θ = 1 + 3 cos² θ`.

@@ -12,6 +12,8 @@ from jaxmb import manifold, planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.report import stress_test
 
+pytestmark = pytest.mark.slow
+
 
 def planar_chain(n, closed=False):
     """Rods in a zigzag, which hang on a pin, or between two."""
@@ -86,9 +88,9 @@ def exact(system, state):
         ("planar chain", 5),
         ("planar chain", 16),
         ("planar loop", 5),
-        pytest.param("planar loop", 17, marks=pytest.mark.long),
-        pytest.param("spatial chain", 5, marks=pytest.mark.long),
-        pytest.param("spatial chain", 16, marks=pytest.mark.long),
+        pytest.param("planar loop", 17, marks=pytest.mark.slow),
+        pytest.param("spatial chain", 5, marks=pytest.mark.slow),
+        pytest.param("spatial chain", 16, marks=pytest.mark.slow),
     ],
 )
 def test_accelerations(name, n):
@@ -102,7 +104,7 @@ def test_accelerations(name, n):
         np.testing.assert_allclose(solve(own), expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("n", [5, pytest.param(16, marks=pytest.mark.long)])
+@pytest.mark.parametrize("n", [5, pytest.param(16, marks=pytest.mark.slow)])
 def test_derivatives_of_accelerations(n):
     """Forward, reverse and central differences by a light and a heavy mass, several at once."""
     system = alternating(planar_chain(n).compile(), 1e-8)
@@ -128,7 +130,6 @@ def run(system, state, policy, rtol, **options):
     return mb.simulate(system, state, t1=0.3, rtol=rtol, manifold=policy, max_steps=1000, **options)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("ratio", [1e-8, 1e8])
 def test_steps_are_those_of_partitioning(ratio):
     """Sparse elimination takes as many steps as partitioning with the same accelerations, but for some at the start,
@@ -143,7 +144,6 @@ def test_steps_are_those_of_partitioning(ratio):
         np.testing.assert_allclose(projected.ys.q[-1], partitioned.ys.q[-1], rtol=0, atol=100 * rtol)
 
 
-@pytest.mark.long
 def test_derivatives_of_a_motion():
     system = alternating(planar_chain(16).compile(), 1e8)
     state = mb.assemble(system, rates={f"rod{i}.angle": 1.0 for i in range(16)})
@@ -161,7 +161,6 @@ def test_derivatives_of_a_motion():
     np.testing.assert_allclose(reverse, differences, rtol=1e-5)
 
 
-@pytest.mark.long
 def test_report():
     """The report has variants whose masses alternate, and each is right."""
     system = planar_chain(16).compile()

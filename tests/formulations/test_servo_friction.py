@@ -17,6 +17,8 @@ from jaxmb.manifold import Partition
 from jaxmb.manifold.partition import acceleration
 from jaxmb.system.instant import Instant
 
+pytestmark = pytest.mark.slow
+
 
 def random_state(system, seed):
     rng = np.random.default_rng(seed)
@@ -167,7 +169,7 @@ LAWS_OF = {
 
 
 @pytest.mark.parametrize(
-    "name", ["pendulum", *(pytest.param(name, marks=pytest.mark.long) for name in ("manipulator", "carriage"))]
+    "name", ["pendulum", *(pytest.param(name, marks=pytest.mark.slow) for name in ("manipulator", "carriage"))]
 )
 def test_the_laws_of_newton_and_euler_close_for_every_body(name):
     """With the applied forces, friction among them, and the reactions."""

@@ -14,7 +14,8 @@ import jaxmb as mb
 from jaxmb import contact, importers, spatial, terrain
 from jaxmb.importers.description import rotation_of
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
+
 mujoco = pytest.importorskip("mujoco")
 
 PLAYGROUND = "mujoco_playground/_src/"

@@ -30,12 +30,13 @@ def small_tree():
     return file(bodies, more, '<option gravity="0 1 -9"/>')
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_small_tree_moves_as_in_mujoco():
     """Hinge, slide and free joints, springs, dampers, armature, reference values, tendons and actuators."""
     check_dynamics(importers.mjcf(small_tree()))
 
 
+@pytest.mark.slow
 def test_armature_moves_as_in_mujoco():
     """Of a hinge, of a slide, of a tendon along both, and of one between points; with it a machine has its mass.
 
@@ -102,6 +103,7 @@ def successions(names):
     return importers.mjcf(file(bodies, f"<actuator>{motors}{servo}</actuator>"), ignore="limits")
 
 
+@pytest.mark.slow
 def test_joints_in_succession_move_as_in_mujoco():
     """With motors, a servo, a spring and a damper on their coordinates."""
     model = successions(["three skew hinges apart"])
@@ -111,7 +113,7 @@ def test_joints_in_succession_move_as_in_mujoco():
     assert not any("counts in half a turn" in note for note in model.notes)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [list(SUCCESSIONS)[1:6], list(SUCCESSIONS)[6:]])
 def test_all_joints_in_succession_move_as_in_mujoco(names):
     check_dynamics(successions(names), scale=0.5)
@@ -370,6 +372,7 @@ def rotors(gravity):
     )
 
 
+@pytest.mark.slow
 def test_armature_of_free_joints_and_of_balls_on_the_ground():
     model = rotors("0 0 0")
     system = check_dynamics(model, 5)
@@ -393,6 +396,7 @@ def test_armature_of_free_joints_and_of_balls_on_the_ground():
     np.testing.assert_allclose(light.scene.compile().mass, light.locate.model.body_mass[1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_adhesion_does_nothing_without_contacts():
     text = file(
         rod("a", HINGE),
@@ -559,7 +563,7 @@ def test_a_loop_that_is_open_as_drawn(equality, pos, said):
     assert notes == ([] if said is None else [expected])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_loop_that_cannot_be_closed():
     """Two sites that no position brings together, and two couplings that contradict each other."""
     apart = '<site name="far" pos="5 0 0"/>' + rod("a", HINGE, '<site name="tip" pos=".3 0 0"/>')
@@ -570,7 +574,7 @@ def test_a_loop_that_cannot_be_closed():
             mb.assemble(importers.mjcf(text).scene.compile())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("limits, angle", [("", 9.0), ('range="-60 220"', 3.5), ('range="-200 200"', -3.4)])
 def test_springs_and_servos_of_hinges_count_through_full_turns(limits, angle):
     joint = f'<joint name="hip" axis="0 1 0" stiffness="2" damping=".1" ref="20" springref="-70" {limits}/>'
@@ -586,7 +590,7 @@ def test_springs_and_servos_of_hinges_count_through_full_turns(limits, angle):
     assert not any("turn" in note for note in imported.notes)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_servo_whose_control_is_filtered_moves_as_in_mujoco():
     """MuJoCo's accelerations and rates of the activation, integrated by SciPy."""
     servo = (

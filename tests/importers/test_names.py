@@ -217,6 +217,7 @@ def test_joints_of_one_name_are_refused(read, text):
 # Names in MuJoCo's file
 
 
+@pytest.mark.slow
 def test_a_scene_with_names_that_mujoco_has():
     """Of a body that MuJoCo would take for the world, and of elements that the file needs beside those of the scene."""
     balls = [spatial.Spherical(f"ball {k}", "ground", "world", point=(float(k), 0.0, 0.0)) for k in range(2)]
@@ -234,7 +235,7 @@ def test_a_scene_with_names_that_mujoco_has():
     assert {own.name: own.body for own in back.scene.frames} == own
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_joints_that_are_called_as_those_that_mujoco_needs_besides():
     bodies = [spatial.Body(name, mass=1.0, inertia=(0.1, 0.1, 0.1)) for name in ("arm", "plate", "bob z")]
     bodies.append(spatial.PointMass("bob", mass=1.0))
@@ -252,7 +253,7 @@ def test_joints_that_are_called_as_those_that_mujoco_needs_besides():
     assert there.joint("table x").stiffness[0] == 2.0 and there.joint("table x 2").stiffness[0] == 0.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_link_called_ground_through_a_scene_and_back():
     found = importers.urdf(ROBOTS["with a welded link"], base="free")
     back = importers.mjcf(importers.to_mjcf(found.scene.compile()).text)

@@ -54,7 +54,7 @@ MORE = """<tendon><fixed name="j8" stiffness="2" damping=".1"><joint joint="j8" 
   <motor name="off" joint="j4" gear="9" group="3"/></actuator>"""
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_unusual_machines_move_as_in_mujoco():
     """Accelerations, energies and the rates of activations, with a group of actuators that is switched off."""
     head = HEAD.replace("<option ", '<option actuatorgroupdisable="3" ')
@@ -155,6 +155,7 @@ def test_a_limit_of_the_force_at_a_joint_holds_behind_a_gear():
 # URDF
 
 
+@pytest.mark.slow
 def test_a_mimic_with_an_offset_is_an_equality_of_mujoco():
     """The same row, for a joint along a negative axis that is not normalised."""
     text = robot(
@@ -237,7 +238,7 @@ def test_axes_of_sdf_in_other_frames():
         np.testing.assert_allclose(part(found, "j").axis_a, axis, atol=1e-15)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_link_without_weight():
     text = model(body("a", inside="<gravity>0</gravity>" + body("x").partition("</pose>")[2].removesuffix("</link>")))
     found = importers.sdf(text)

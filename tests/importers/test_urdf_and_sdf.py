@@ -67,7 +67,7 @@ def test_a_free_base_and_a_mimic():
     np.testing.assert_array_equal(coupling.coefficients, [0.1, 2.0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_mimic_holds_exactly():
     text = robot(
         link("base"),
@@ -187,7 +187,7 @@ def test_a_link_with_two_parents_closes_a_loop():
     assert any("multiples of π/12" in note for note in found.notes)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_loop_is_closed_and_its_redundancy_named():
     system = importers.sdf(FOUR_BAR).scene.compile()
     assert system.velocity_rank == 17 and len(system.implied) == 3
@@ -402,6 +402,7 @@ def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
         importers.urdf(path, package_dirs=[tmp_path / "nowhere"])
 
 
+@pytest.mark.slow
 def test_several_models_of_sdf_are_one_machine():
     """Each moves as it does alone, and the names of links are those of their models and their own."""
     arm = FOUR_BAR.partition("<sdf version='1.6'>")[2].replace("</sdf>", "")

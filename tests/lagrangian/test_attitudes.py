@@ -19,6 +19,8 @@ from jaxmb.formulations import Multipliers, NullSpace, Partitioned, Poincare, Ud
 from jaxmb.lagrangian import Holonomic, LagrangianSystem, QuasiVelocityFrame, ServoConstraint
 from jaxmb.linalg import rotations
 
+pytestmark = pytest.mark.slow
+
 ROADS = [Partitioned(), Multipliers(), NullSpace(), Poincare(), UdwadiaKalaba()]
 INERTIAS = np.array([np.diag([1.0, 2.0, 3.0]), [[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [-0.1, 0.2, 1.8]]])
 GAINS = DAMPING, STIFFNESS = 6.0, 9.0

@@ -46,6 +46,7 @@ def circle(t):
     return jnp.stack([0.9 + 0.3 * jnp.cos(t), 0.2 + 0.3 * jnp.sin(t)])
 
 
+@pytest.mark.slow
 def test_a_closed_path_of_shapes_moves_the_snake():
     mechanism = library("three_platform_snake", gait=circle)
     system, state = mechanism.system, mechanism.state
@@ -70,6 +71,7 @@ def deviation(t, q):
     return np.array([q[0] - 0.5 * np.sin(t), q[2] - q[0] - 0.2 * np.cos(2 * t)])
 
 
+@pytest.mark.slow
 def test_the_desired_motion_is_kept_and_found():
     mechanism = library("tracking_chain")
     run = mb.simulate(mechanism.system, mechanism.state, t1=20.0, rtol=1e-12, atol=1e-13)
@@ -82,6 +84,7 @@ def test_the_desired_motion_is_kept_and_found():
     assert np.max(np.abs(deviation(10.0, found.ys.q[-1]))) < 1e-11
 
 
+@pytest.mark.slow
 def test_the_control_force_is_the_least_one():
     """Any other force with the same effect on the deviations has a part that they do not feel."""
     system = library("tracking_chain").system
@@ -94,6 +97,7 @@ def test_the_control_force_is_the_least_one():
     np.testing.assert_allclose(unfelt @ inverse @ force, 0.0, atol=1e-13 * np.linalg.norm(force))
 
 
+@pytest.mark.slow
 def test_a_servo_beside_constraints_that_are_kept():
     """A pendulum in Cartesian coordinates whose height follows: one chart for the bar, its force and the control's."""
     bar = Holonomic("bar", lambda t, q, p: jnp.dot(q, q) - 1.0)
@@ -112,6 +116,7 @@ def test_a_servo_beside_constraints_that_are_kept():
     np.testing.assert_allclose(run.ys.q[-1, 1], -0.8 + 0.1 * np.sin(18.0), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_acceleration_constraints_are_what_their_rows_say():
     rows = AccelerationConstraint(
         "rows", lambda t, q, v, p: jnp.array([[1.0, 2.0]]), lambda t, q, v, p: jnp.cos(t) - v[:1]
@@ -131,6 +136,7 @@ def ring(*laws, extra=(), **kwargs):
     return LagrangianSystem(kinetic=free, constraints=[rows, *extra], nonideal=laws, **kwargs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", [Partitioned(), Multipliers()])
 def test_work_of_constraint_forces(formulation):
     """`w · (M u̇ − F) = w · C` in every displacement w that is allowed, and the constraint holds whatever C is."""
@@ -149,6 +155,7 @@ def test_work_of_constraint_forces(formulation):
     np.testing.assert_allclose(accelerations(normal, formulation, ZERO, q, u)[0], ideal, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_energy_goes_into_friction():
     """Of both kinds, by their power."""
     system = ring(CoulombFriction("ring", "mu"), Viscous("ring", "c"))
@@ -164,6 +171,7 @@ def test_energy_goes_into_friction():
 # The spherical four-bar
 
 
+@pytest.mark.slow
 def test_the_spherical_four_bar():
     mechanism = library("spherical_four_bar")
     system, state = mechanism.system, mechanism.state
@@ -177,6 +185,7 @@ def test_the_spherical_four_bar():
     np.testing.assert_allclose(balance, balance[0], rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_limit_of_small_arcs_is_the_planar_four_bar():
     """By the square of their size."""
     a, b, c, d = np.radians([30.0, 75.0, 60.0, 80.0])
@@ -229,6 +238,7 @@ ROADS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("road", ROADS)
 def test_forward_reverse_and_central_differences(road):
     run, name, parameters = ROADS[road]
@@ -355,6 +365,7 @@ def test_contradicting_rows_leave_a_residual():
         system(constraints=[belt("slow", 1.0), belt("fast", 2.0)])
 
 
+@pytest.mark.slow
 def test_pfaffian_with_a_drift():
     moving = Pfaffian("belt", lambda t, q, p: jnp.array([[0.0, 1.0]]), lambda t, q, p: -p["speed"])
     belt = system(constraints=[moving], parameters={"speed": 0.3})

@@ -23,6 +23,8 @@ from jaxmb.lagrangian import (
 )
 from jaxmb.linalg import rotations
 
+pytestmark = pytest.mark.slow
+
 ZERO = jnp.zeros(())
 
 

@@ -133,6 +133,7 @@ def test_quasi_velocities_are_fixed_by_number(framed):
         mb.assemble(framed, rates={"z": 3.0})
 
 
+@pytest.mark.slow
 def test_derivatives_of_assembly(system):
     """Of y and its rate, where the length and x are given: `y = −√(l² − x²)`."""
 
@@ -170,11 +171,13 @@ def test_description(system, framed):
     assert "2, of a QuasiVelocityFrame" in str(framed) and "no constraints" in str(framed)
 
 
+@pytest.mark.slow
 def test_rates_are_those_of_the_coordinates(framed, motion):
     expected = [turning(t, y, framed.parameters) @ u for t, y, u in zip(TS, motion.ys.q, motion.ys.u, strict=True)]
     np.testing.assert_allclose(motion.rates, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_saved_motion(motion, tmp_path):
     motion.save(tmp_path / "motion.npz")
     saved = mb.load(tmp_path / "motion.npz")
@@ -199,6 +202,7 @@ def test_plots(motion):
 # Projection
 
 
+@pytest.mark.slow
 def test_projection_keeps_wheels_from_slipping():
     """All coordinates of a cart, projected on its constraints, against its quasi-velocities without any."""
     free, held = (mechanisms.nonholonomic_cart(form=form) for form in ("frame", "constraints"))
@@ -211,6 +215,7 @@ def test_projection_keeps_wheels_from_slipping():
         assert eqx.filter_eval_shape(mb.Trajectory.quantity, projected, name).shape == (1, *own.shape)
 
 
+@pytest.mark.slow
 def test_a_network_is_a_parameter():
     """It is called in the user's functions, and its weights have derivatives."""
     network = eqx.nn.MLP(1, 1, 4, 1, activation=jnp.tanh, key=jax.random.key(0))

@@ -100,6 +100,7 @@ def test_functions_by_operations_are_exact_to_three_units(name):
     assert np.all(np.abs(found[differs] - exact[differs]) <= 3 * np.spacing(size))
 
 
+@pytest.mark.slow
 def test_powers_are_exact_over_the_whole_range():
     bases, exponents = np.geomspace(1e-200, 1e200, 401)[:, None], np.linspace(-0.06, 0.06, 25)[None]
     x, y = np.broadcast_arrays(bases, exponents)

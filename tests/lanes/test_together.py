@@ -37,7 +37,7 @@ def test_members_end_where_each_alone_does():
     assert np.all(np.abs(steps - np.array([count for _, count in alone])) <= 2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_are_those_of_vmap():
     end = machine(jaxmb.mechanisms.four_bar, t1=0.1, rtol=1e-9)
 
@@ -52,7 +52,7 @@ def test_derivatives_are_those_of_vmap():
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), *both)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gradients_of_members_are_those_of_each_alone():
     end = machine(jaxmb.mechanisms.four_bar, t1=0.3, rtol=1e-9)
     slope = jax.value_and_grad(lambda mass: jnp.sum(end(mass)[0]))
@@ -61,7 +61,7 @@ def test_gradients_of_members_are_those_of_each_alone():
     np.testing.assert_allclose(found, np.transpose(alone), rtol=1e-7)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_members_bounce_at_their_own_times():
     ball = jaxmb.planar.Body("ball", mass=1.0, inertia=0.004, position=(0.0, 1.0))
     floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)
@@ -77,6 +77,7 @@ def test_members_bounce_at_their_own_times():
     np.testing.assert_allclose(found, [height(x) for x in heights], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_member_that_fails_spoils_no_other():
     end = machine(jaxmb.mechanisms.four_bar, t1=0.1, rtol=1e-9)
     masses = jnp.array([1.0, jnp.nan, 1.05])

@@ -29,6 +29,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow(but=("empty blocks",))
 @pytest.mark.parametrize("name", CASES)
 def test_values_derivatives_and_batches(name):
     own, expected, *shapes = CASES[name]

@@ -64,8 +64,9 @@ SOON = {*((name, 2) for name in GRAPHS), ("a grid", 1), ("many edges at random",
 EVERY = [(name, b) for name in GRAPHS for b in (1, 2, 3)]
 
 
+@pytest.mark.slow("many edges at random-3")
 @pytest.mark.parametrize(
-    ("name", "b"), [pytest.param(*own, marks=[] if own in SOON else [pytest.mark.long]) for own in EVERY]
+    ("name", "b"), [pytest.param(*own, marks=[] if own in SOON else [pytest.mark.slow]) for own in EVERY]
 )
 def test_solutions_and_pivots(name, b):
     rng = np.random.default_rng(b)
@@ -98,6 +99,7 @@ def test_a_batch_of_matrices():
     np.testing.assert_allclose(found.reshape(5, -1), expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_nodes_wait_for_those_they_come_after():
     """A quasi-definite matrix: its negative node must not come before the others."""
     neighbours = GRAPHS["a star"]
@@ -142,6 +144,7 @@ def test_sums_of_places(entries, places):
     assert sum(index.size for index in sums.passes) <= 2 * entries + 4 * places
 
 
+@pytest.mark.slow("4")
 @pytest.mark.parametrize("n", [1, 4])
 def test_dense_matrices(n):
     rng = np.random.default_rng(n)

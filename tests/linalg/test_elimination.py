@@ -83,6 +83,7 @@ def test_jit_vmap_equal_loop():
         np.testing.assert_array_equal(together.order.packed[k], alone.order.packed)
 
 
+@pytest.mark.slow("3-5", "20-22")
 @pytest.mark.parametrize(("m", "n"), [(8, 9), (3, 5), (1, 2), (20, 22)])
 def test_batches_are_eliminated_as_their_members_are(m, n):
     """With derivatives; each member in an order of its own, and batches of batches."""
@@ -172,6 +173,7 @@ def test_solve_leaves_the_residual_of_an_elimination():
         assert np.max(np.abs(A @ x - A @ np.ones(n))) < 1e-14 * n * np.max(np.abs(x))
 
 
+@pytest.mark.slow
 def test_solve_has_derivatives_of_every_order():
     A, b = jnp.asarray(RNG.normal(size=(4, 4))), jnp.asarray(RNG.normal(size=4))
     by = jax.jit(lambda A, b: jnp.sum(jnp.sin(elimination.solve(A, b))))

@@ -8,6 +8,7 @@ from jaxmb.linalg.inertia import DiagonalInertia
 from jaxmb.linalg.jacobian import DenseJacobian
 
 
+@pytest.mark.slow("True")
 @pytest.mark.parametrize("redundant", [False, True])
 def test_a_projector_on_some_rows(redundant):
     """Others bind nothing, and have no multipliers."""

@@ -34,6 +34,7 @@ def test_states_of_large_matrices_are_computed_in_blocks(monkeypatch):
     assert loops(100_000) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["andrews", "tree"])
 def test_saved_states_and_their_derivatives_do_not_depend_on_blocks(name, monkeypatch):
     mechanism = mb.mechanisms.get(name, **({"n": 5} if name == "tree" else {}))

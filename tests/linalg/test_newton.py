@@ -21,6 +21,7 @@ def square_root(c):
     return root(lambda x: x * x - c, jnp.ones_like(c), solve)
 
 
+@pytest.mark.slow
 def test_root_and_its_derivatives():
     c = jnp.array([0.5, 2.0, 9.0])
     np.testing.assert_allclose(square_root(c), np.sqrt(c), rtol=1e-14)

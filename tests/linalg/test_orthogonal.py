@@ -29,6 +29,7 @@ def test_badly_scaled_columns_stay_orthonormal():
     assert np.all(np.isfinite(basis.inverse))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "r"), [(4, 4), (6, 3)])
 def test_derivatives_of_what_does_not_depend_on_the_choice(n, r):
     """Projections and pseudo-inverses, against the same from normal equations, to the third order."""

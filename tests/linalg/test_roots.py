@@ -3,10 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxmb.linalg.roots import reciprocal_root
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_reciprocal_root():
     function, factor = reciprocal_root, 1.0
     x = jnp.array([0.3, 2.0, 1e6])

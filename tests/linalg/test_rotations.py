@@ -65,6 +65,7 @@ def test_from_matrix_where_a_formula_degenerates(angles):
     np.testing.assert_allclose(rot.rotation_matrix(rot.from_matrix(R)), R, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow("0-from_matrix")
 @pytest.mark.parametrize("function", [rot.from_matrix, lambda x: rot.from_axis_angle(x[0], x[1, 0])])
 @pytest.mark.parametrize("largest", range(4))
 def test_derivatives_of_euler_parameters(function, largest):

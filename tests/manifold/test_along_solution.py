@@ -15,6 +15,8 @@ from jaxmb.manifold import Partition, Projection
 from jaxmb.solvers import Hermite
 from jaxmb.solvers.manifold_term import AbstractManifoldTerm
 
+pytestmark = pytest.mark.slow
+
 
 def total(of, term, t, y, f, kept):
     """The rate along the field itself, and that along a rate whose derivative is that of the field."""
@@ -22,7 +24,6 @@ def total(of, term, t, y, f, kept):
     return g, of(term, t, y, f, own, kept, None)[2]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "manifold, formulation", [(Partition(), Partitioned()), (Projection(), Multipliers())], ids=["chart", "projection"]
 )

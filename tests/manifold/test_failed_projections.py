@@ -13,6 +13,8 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.bodies.joint_graph import joint_order
 
+pytestmark = pytest.mark.slow
+
 METHOD: dict[str, Any] = {"solver": diffrax.Tsit5(), "manifold": mb.manifold.Projection(), "max_steps": 3000}
 FIXED: dict[str, Any] = METHOD | {"stepsize_controller": diffrax.ConstantStepSize()}
 
@@ -35,7 +37,7 @@ def as_it_is(system):
     return system
 
 
-STRUCTURES = [as_it_is, pytest.param(by_blocks, marks=pytest.mark.long)]
+STRUCTURES = [as_it_is, pytest.param(by_blocks, marks=pytest.mark.slow)]
 
 
 def in_long_steps(pendulum, structure, dt, **options):
@@ -54,7 +56,6 @@ def test_steps_that_are_too_long_fail(pendulum, structure):
     assert fine.result == mb.RESULTS.successful and np.all(fine.constraint_violation.position < 1e-12)
 
 
-@pytest.mark.long
 def test_a_step_that_fails_in_a_batch(pendulum):
     batch = jax.jit(jax.vmap(lambda dt: in_long_steps(pendulum, as_it_is, dt)))(jnp.array([0.05, 0.4]))
     np.testing.assert_array_equal(batch.result == mb.RESULTS.newton_failed, [False, True])
@@ -63,7 +64,6 @@ def test_a_step_that_fails_in_a_batch(pendulum):
     assert np.all(np.isnan(batch.ys.q[1]))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("structure", STRUCTURES, ids=["dense", "sparse"])
 def test_derivatives_of_a_run_whose_first_steps_fail(pendulum, structure):
     system = structure(pendulum[0])
@@ -120,7 +120,6 @@ def gear_past_its_end():
     )
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("case", [crank_beyond_reach, gear_past_its_end])
 def test_a_motion_ends_where_constraints_cannot_be_met(case):
     system, rates, when, result, why = case()
@@ -161,7 +160,6 @@ class Losing(mb.manifold.Projection):
         return lambda system, t, y: mb.State(jnp.where(t > 0.5, jnp.nan, y.q), y.u)
 
 
-@pytest.mark.long
 def test_a_saved_state_that_cannot_be_returned_is_a_failure(pendulum):
     method: Any = METHOD | {"manifold": Losing(), "saveat": [0.3, 1.0], "rtol": 1e-4}
     found = mb.simulate(*pendulum, t1=1.0, throw=False, **method)

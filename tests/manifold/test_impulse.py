@@ -45,13 +45,14 @@ def run(arm, values=None, **options):
     return mb.simulate(system, start, t1=END, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
         {},
-        pytest.param({"manifold": mb.manifold.Projection()}, marks=pytest.mark.long),
-        pytest.param({"solver": mb.solvers.Hermite()}, marks=pytest.mark.long),
-        pytest.param({"solver": diffrax.Dopri8()}, marks=pytest.mark.long),
+        pytest.param({"manifold": mb.manifold.Projection()}, marks=pytest.mark.slow),
+        pytest.param({"solver": mb.solvers.Hermite()}, marks=pytest.mark.slow),
+        pytest.param({"solver": diffrax.Dopri8()}, marks=pytest.mark.slow),
     ],
 )
 def test_a_jump_of_a_driver_is_an_impulse(arm, options):
@@ -62,7 +63,7 @@ def test_a_jump_of_a_driver_is_an_impulse(arm, options):
     assert np.all(motion.constraint_violation.velocity < 1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_over_a_jump(arm):
     def end(x):
         values = {"drive.before": x[0], "drive.after": x[1]}
@@ -78,6 +79,7 @@ def test_derivatives_over_a_jump(arm):
     np.testing.assert_allclose(forward, [before, after], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_force_that_is_switched_on():
     """Exact in few steps, where a jump that nobody announces is found by steps that are too long."""
     law = lambda poses, velocities, t, p: jnp.stack([jnp.where(t < 0.3, 0.0, 2.0), 0.0 * t, 0.0 * t])[None]
@@ -87,7 +89,7 @@ def test_a_force_that_is_switched_on():
     assert ends[0].stats["num_steps"] < 0.5 * ends[1].stats["num_steps"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_members_of_a_batch_jump_each_at_its_time(arm):
     def end(when):
         return run(arm, {"drive.when": when}, jumps=when[None], saveat=None, rtol=1e-8, max_steps=256)["rod"].angle[-1]
@@ -105,6 +107,7 @@ PROGRAMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", PROGRAMS)
 def test_a_jump_that_is_not_announced_is_warned_of(case):
     body = planar.Body("arm", mass=1.0, inertia=0.1)
@@ -137,7 +140,7 @@ def test_jumps_that_are_refused(arm, case):
 # States between steps
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_states_at_a_jump_are_those_after_it(arm):
     """Of a run over the jump, and of one back to its start, saved and between steps."""
     start = mb.assemble(arm, rates={"rod.angle": 0.0})
@@ -160,7 +163,7 @@ def test_states_at_a_jump_are_those_after_it(arm):
         assert np.all(np.isnan(motion.at(2 * END).q)) and np.all(np.isfinite(motion.at(jnp.array([0.0, END])).q))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_at_a_jump(arm):
     def rate(x):
         values, dense = {"drive.before": x[0], "drive.after": x[1]}, diffrax.SaveAt(dense=True)
@@ -244,6 +247,7 @@ def test_every_row_is_searched_between_all_restarts(two_driven, case):
         assert found == [(when, name) for name, when in expected]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns, kinks", [(1.2, []), (8.0, []), (60.0, []), (300.0, []), (1.2, [0.7]), (8.0, [0.7])])
 def test_only_the_kink_of_turns_in_space_is_found(turns, kinks):
     """Rows of angles in space wrap half a turn away, in rapid turns within each interval that is looked at."""
@@ -258,12 +262,13 @@ def test_only_the_kink_of_turns_in_space_is_found(turns, kinks):
     assert sorted({float(jump.t) for jump in find_jumps(system, system.guess.q, 0.0, 1.0, [])}) == kinks
 
 
+@pytest.mark.slow
 def test_a_jump_between_announced_ones_is_warned_of(arm):
     with pytest.warns(UserWarning, match=r"'drive' prescribes.* t = 0.6, .*jumps=\[0.3, 0.6\]"):
         run(arm, jumps=[0.3])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_jump_between_restarts_of_an_input_is_warned_of():
     system = driven_arm(planar.Torque("push", "rod", torque=0.0))
     system = mb.with_inputs(system, {"push.torque": mb.Series([0.0, 0.2, 2.0], [0.0, 1.0, 1.0], "held")})
@@ -271,7 +276,7 @@ def test_a_jump_between_restarts_of_an_input_is_warned_of():
         run(system, jumps=None)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_pendulum_on_a_driven_cart_beside_a_fast_driver():
     """The cart starts at once beside a shaft that swings fast: unannounced, its impulse on the pendulum is lost."""
     start = lambda t, p: jnp.where(t < 0.5, 0.2 * t, 0.1 + 1.2 * (t - 0.5))
@@ -301,6 +306,7 @@ def test_a_pendulum_on_a_driven_cart_beside_a_fast_driver():
     assert abs(missed["pendulum"].angle[-1] - after) > 0.1
 
 
+@pytest.mark.slow
 def test_jumps_are_looked_for_once_a_system_and_interval(arm, monkeypatch):
     """And again where parameters, the interval or the times that are announced change; the warning comes each time."""
     searches, known = [], outcome.find_jumps

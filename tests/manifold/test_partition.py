@@ -9,6 +9,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folding():
@@ -80,7 +82,6 @@ def _errors(name, in_space, count, finest, **options):
     return out
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", flat_linkages.LINKAGES)
 @pytest.mark.parametrize("in_space", [False, True], ids=["plane", "space"])
 def test_random_linkages_go_on_after_flat_positions(name, in_space):
@@ -91,7 +92,6 @@ def test_random_linkages_go_on_after_flat_positions(name, in_space):
         assert result == "successful" and error < 300 * rtol + 1e-8, (rtol, result, error)
 
 
-@pytest.mark.long
 def test_derivatives_beyond_a_flat_position(folding):
     """Forward, reverse, and central differences of a tighter solution."""
 

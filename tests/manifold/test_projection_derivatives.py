@@ -11,6 +11,8 @@ from jaxmb import spatial
 from jaxmb.formulations import Multipliers
 from jaxmb.manifold.projection import ProjectionTerm
 
+pytestmark = pytest.mark.slow
+
 J = np.diag([0.01, 0.018, 0.014])
 
 

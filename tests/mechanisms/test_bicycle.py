@@ -115,6 +115,7 @@ def test_the_equations_of_the_source_give_its_eigenvalues():
         np.testing.assert_allclose(np.sort_complex(published(speed)), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_bicycle_has_its_published_eigenvalues():
     for speed, (weave, *others) in PUBLISHED.items():
         linear = mb.linearise(*running(speed), coordinates=COORDINATES)
@@ -129,6 +130,7 @@ def locus():
     return mb.root_locus(running, "speed [m/s]", speeds, coordinates=COORDINATES)
 
 
+@pytest.mark.slow
 def test_the_locus_follows_weave_capsize_and_castering():
     found = locus()
     for speed, values in zip(found.values, found.eigenvalues, strict=True):
@@ -154,6 +156,7 @@ def test_the_locus_follows_weave_capsize_and_castering():
         viz.plot_root_locus(found, labels=["weave"])
 
 
+@pytest.mark.slow
 def test_the_weave_speed_changes_with_the_trail():
     bicycle()
 

@@ -46,7 +46,7 @@ def net(*, n, m):
     return np.concatenate([places[:, -1, -1], places.reshape(len(TIMES), -1)], axis=1), observe, drift
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case, size, free",
     [
@@ -75,7 +75,7 @@ def test_motions_are_those_of_other_equations(case, size, free):
     assert np.all(sol.constraint_violation.velocity <= 1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_dense_matrix_and_programs_of_one_size():
     """The largest array of any program grows with the number of bodies, and its number of lines hardly at all: the
     elimination has at most three loops.
@@ -97,7 +97,7 @@ def test_no_dense_matrix_and_programs_of_one_size():
     assert np.all(np.array(lines[1]) <= 1.25 * np.array(lines[0]))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_long_row_of_four_bars_is_assembled():
     """One crank determines all angles, which makes the last pivot of the elimination as small as 1 / n³."""
     system = mb.mechanisms.get("n_four_bar", n=150).system
@@ -133,7 +133,7 @@ def test_what_cannot_be_built_is_refused(name, parameters, message):
         mb.mechanisms.get(name, **parameters)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_states_between_steps():
     """Interpolated states are projected on the constraints by sparse elimination: forward mode, reverse mode and
     differences, under `jit` and `vmap`.

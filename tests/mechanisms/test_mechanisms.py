@@ -44,7 +44,7 @@ CASES = [
     ("rod_chain", {"n": 2}, 1e-6),
     ("rod_chain", {"n": 5}, 1e-6),
     ("rod_chain", {"n": 10}, 1e-6),
-    pytest.param("rod_chain", {"n": 50}, 1e-5, marks=pytest.mark.long),
+    pytest.param("rod_chain", {"n": 50}, 1e-5, marks=pytest.mark.slow),
     ("train", {}, 1e-5),
     ("four_bar", {}, 1e-7),
     ("slider_crank", {}, 1e-7),
@@ -58,8 +58,8 @@ CASES = [
     ("free_body", {}, 1e-7),
     ("heavy_top", {}, 1e-7),
     ("rolling_disc", {}, 1e-8),
-    pytest.param("spatial_slider_crank", {}, 1e-7, marks=pytest.mark.long),
-    pytest.param("bricard", {}, 1e-6, marks=pytest.mark.long),
+    pytest.param("spatial_slider_crank", {}, 1e-7, marks=pytest.mark.slow),
+    pytest.param("bricard", {}, 1e-6, marks=pytest.mark.slow),
     *((name, {}, 1e-8) for name in LINKAGES),
     ("roller_racer", {}, 1e-7),
     ("nonholonomic_cart", {}, 1e-7),
@@ -80,6 +80,7 @@ def test_every_file_of_reference_values_belongs_to_a_mechanism():
         assert known.source and 0 < known.tolerance < 1e-6 and np.all(np.diff(known.times) > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, parameters, bound", CASES)
 def test_motion_agrees_with_reference_values_on_the_constraints(name, parameters, bound):
     mechanism, trajectory = run(name, **parameters)
@@ -111,6 +112,7 @@ CONSERVATIVE = [
 ]
 
 
+@pytest.mark.slow(but=("roller_racer", "nonholonomic_cart"))
 @pytest.mark.parametrize("name", CONSERVATIVE)
 def test_energy_is_conserved(name):
     mechanism, trajectory = run(name)
@@ -120,6 +122,7 @@ def test_energy_is_conserved(name):
     np.testing.assert_allclose(trajectory.energy, start, rtol=0, atol=1e-9 * size)
 
 
+@pytest.mark.slow
 def test_work_of_the_torque_is_the_energy_of_andrews_mechanism():
     mechanism, trajectory = run("andrews")
     system, state = mechanism.system, mechanism.state
@@ -128,6 +131,7 @@ def test_work_of_the_torque_is_the_energy_of_andrews_mechanism():
     np.testing.assert_allclose(trajectory.energy - start, 0.033 * turned, rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [1, 3, 5])
 def test_a_hanging_chain_swings_in_its_classical_modes(mode):
     """After half a period of small oscillations every mass is on the other side."""
@@ -144,6 +148,7 @@ def test_free_body_keeps_its_angular_momentum():
     np.testing.assert_allclose(trajectory.angular_momentum, np.tile(start, (3, 1)), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_steady_precession():
     """Started on it, a top keeps its tilt, whichever of the two rates it precesses with; and its energy."""
     across, along, mass, distance, tilt, spin = 0.0045, 0.004, 1.0, 0.05, np.pi / 6, 30.0
@@ -160,6 +165,7 @@ def test_steady_precession():
         np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_linkages_lie_flat_in_passing_at_every_speed():
     """They keep their energy, and the level bars stay level: no step ends where round-off is larger than its error."""
     linkages = library("n_four_bar")
@@ -178,6 +184,7 @@ def test_linkages_lie_flat_in_passing_at_every_speed():
         np.testing.assert_allclose(level, 0.0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_values_of_the_train_are_those_of_an_independent_model():
     references = library("train").references
     q, u, forces = trains.Train(4).motion(references.times)
@@ -185,12 +192,14 @@ def test_values_of_the_train_are_those_of_an_independent_model():
     np.testing.assert_allclose(found / references.scales, references.values / references.scales, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow("four_bar")
 @pytest.mark.parametrize("name", ["four_bar", "slider_crank", "n_four_bar", "hanging_chain"])
 def test_carried_values_are_those_of_a_model_in_minimal_coordinates(name):
     references = library(name).references
     np.testing.assert_allclose(getattr(linkages, name)(references.times), references.values, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LINKAGES)
 def test_carried_values_are_those_of_a_model_of_where_the_bodies_are(name):
     references = library(name).references
@@ -212,6 +221,7 @@ def test_bricard_linkage_moves_although_counting_rows_forbids_it():
     assert {implied.name, *implied.by} == {"P0", "P1", "P2", "P3", "P4", "P5"}
 
 
+@pytest.mark.slow
 def test_bennetts_linkage_moves_by_his_relation_of_input_and_output():
     system = library("bennett").system
     assert (system.nu, system.velocity_rows, system.velocity_rank) == (18, 20, 17)
@@ -225,6 +235,7 @@ def test_bennetts_linkage_moves_by_his_relation_of_input_and_output():
     np.testing.assert_allclose(half("") * half("_out"), np.full(3, expected), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_coordinates_and_rows_of_the_compressor():
     """As its source counts them, with the ground as a body that six rows and its normalisation hold."""
     system = library("swash_plate").system
@@ -233,6 +244,7 @@ def test_coordinates_and_rows_of_the_compressor():
     assert (system.coordinate_rows + 7, system.coordinate_rank + 7) == (62, 62)
 
 
+@pytest.mark.slow
 def test_planar_loop_in_space_has_27_independent_rows_of_30():
     system = library("spatial_loop").system
     assert (system.nq, system.coordinate_rows, system.coordinate_rank) == (28, 30, 27)
@@ -250,6 +262,7 @@ def test_rolling_disc_has_five_coordinates_and_three_velocities():
 # Redundant rockers
 
 
+@pytest.mark.slow
 def test_a_redundant_rocker_does_not_change_the_motion():
     three, twin = library("parallelogram"), library("parallelogram", rockers=2, spacing=2.0)
     # Two rockers carry the share of the third.
@@ -272,6 +285,7 @@ def test_a_redundant_rocker_does_not_change_the_motion():
 PINS = {f"{end}{k}" for end in ("foot", "head") for k in (1, 2, 3)}
 
 
+@pytest.mark.slow("0.001-1.0471975511965976")
 @pytest.mark.parametrize("offset, angle", [(1e-3, np.pi / 3), (-1e-3, np.pi / 3), (1e-3, 1.5), (1e-2, 1.5)])
 def test_a_misplaced_pin_is_refused_with_the_names_of_the_joints(offset, angle):
     with pytest.raises(ValueError, match=r"cannot (move|be assembled)") as error:
@@ -279,6 +293,7 @@ def test_a_misplaced_pin_is_refused_with_the_names_of_the_joints(offset, angle):
     assert all(pin in str(error.value) for pin in PINS)
 
 
+@pytest.mark.slow
 def test_a_rigid_frame_with_a_load_is_not_refused():
     corner = (0.5, 0.8)
     angle = np.arctan2(corner[1], 0.5)
@@ -298,6 +313,7 @@ def test_a_rigid_frame_with_a_load_is_not_refused():
 # Charts
 
 
+@pytest.mark.slow
 def test_charts_change_without_a_restart():
     mechanism = library("free_body")
     saved = mb.simulate(
@@ -318,6 +334,7 @@ def test_charts_change_without_a_restart():
     assert stats["num_steps"] <= 1.1 * free.stats["num_steps"]
 
 
+@pytest.mark.slow
 def test_steps_do_not_shrink_where_the_chart_changes():
     mechanism = library("pendulum")
     steps = diffrax.SaveAt(steps=True, t0=True)
@@ -334,6 +351,7 @@ def test_steps_do_not_shrink_where_the_chart_changes():
 # The suspension
 
 
+@pytest.mark.slow
 def test_stiff_bushings_tend_to_hinges():
     """By the inverse of their stiffness."""
     exact, errors = library("double_wishbone").references.values[0], []
@@ -348,7 +366,7 @@ def test_stiff_bushings_tend_to_hinges():
 # The rolling disc beyond steady motion
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("spin, frequency", [(3.0, 2.429815), (5.0, 6.656125), (8.0, 11.743253)])
 def test_an_upright_rolling_disc_wobbles_at_the_frequency_of_small_oscillations(spin, frequency):
     mechanism = mechanisms.rolling_disc(radius=0.5, lean=1e-4, roll=spin, turn=0.0)
@@ -361,6 +379,7 @@ def test_an_upright_rolling_disc_wobbles_at_the_frequency_of_small_oscillations(
     assert omega == pytest.approx(frequency, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_wobbling_disc_ends_where_an_independent_model_does():
     lean, spin, yaw = 0.3, 5.0, 0.8
     mechanism = mechanisms.rolling_disc(radius=0.5, lean=lean, roll=-spin + yaw * np.sin(lean), turn=yaw * np.cos(lean))
@@ -374,6 +393,19 @@ def test_a_wobbling_disc_ends_where_an_independent_model_does():
 # The library itself
 
 
+@pytest.mark.slow(
+    "tree",
+    "tracked_vehicle",
+    "cable",
+    "net",
+    "spatial_slider_crank",
+    "spatial_loop",
+    "bennett",
+    "swash_plate",
+    "double_wishbone",
+    "flyball",
+    "spherical_four_bar",
+)
 @pytest.mark.parametrize("name", mechanisms.names())
 def test_every_mechanism_starts_on_its_constraints(name):
     mechanism = library(name)
@@ -412,6 +444,7 @@ def test_dimensions_are_checked(name, parameters, message):
         mechanisms.get(name, **parameters)
 
 
+@pytest.mark.slow
 def test_references_hold_for_the_published_parameters_only():
     assert mechanisms.pendulum(length=1.0).references is not None
     other = mechanisms.pendulum(length=0.5)
@@ -420,6 +453,7 @@ def test_references_hold_for_the_published_parameters_only():
         other.errors(run("pendulum")[1])
 
 
+@pytest.mark.slow
 def test_errors_need_a_trajectory_saved_at_the_times():
     mechanism, trajectory = run("pendulum")
     with pytest.raises(ValueError, match=r"references\.times"):
@@ -431,6 +465,7 @@ def test_references_of_the_wrong_shape_are_refused():
         mechanisms.References([0.0, 1.0], ("x",), [[1.0]], "nowhere", 1e-10)
 
 
+@pytest.mark.slow
 def test_mechanisms_are_rebuilt_with_other_parameters_under_jit():
     mechanism = library("four_bar")
     longer = mb.parameters(mechanism.system)["C.point_a"] * 1.01

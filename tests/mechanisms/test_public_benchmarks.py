@@ -15,6 +15,7 @@ from radau5 import motion_of
 import jaxmb as mb
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number, bound", [("A01", 1e-7), ("A02", 1e-7), ("A03", 1e-7), ("A04", 1e-7), ("A05", 1e-8)])
 def test_the_iftomm_library(number, bound):
     case = CASES[number]
@@ -25,11 +26,13 @@ def test_the_iftomm_library(number, bound):
     assert case.error(mechanism, motion) < bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", EIGENVALUES)
 def test_the_eigenvalues_of_a_four_bar_with_a_diagonal_spring(damping):
     assert eigenvalue_error(damping)[1] < 2e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, digits", [("andrews", 8.0), ("car_axis", 6.5), ("fekete", 9.0), ("wheelset", 5.0)])
 def test_the_test_set_for_initial_value_problem_solvers(name, digits):
     problem = PROBLEMS[name]()
@@ -39,6 +42,7 @@ def test_the_test_set_for_initial_value_problem_solvers(name, digits):
     assert scd(end, problem.published) > digits and relative(end, problem.exact) < 10.0**-digits
 
 
+@pytest.mark.slow
 def test_the_wheels_touch_where_the_source_says():
     q = jnp.asarray(np.append(wheelset.COORDINATES, 0.0))
     for side, known in zip(wheelset.SIDES.values(), wheelset.CONTACTS, strict=True):
@@ -49,6 +53,7 @@ def test_the_wheels_touch_where_the_source_says():
         assert abs(rate) < 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, bound", [("andrews", 1e-5), ("car_axis", 1e-4)])
 def test_radau5_solves_the_equations_in_the_coordinates_of_the_test_set(name, bound):
     pytest.importorskip("assimulo")

@@ -95,7 +95,7 @@ def test_views_of_a_track_without_shoes():
         ride.track_tension(types.SimpleNamespace(system=mechanisms.pendulum().system))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_statics():
     """At rest the ground bears the weight, the tensioner both strands around the idler, and where shoes hang freely
     they do so in a polygon whose slopes change from shoe to shoe by the weight of one over the tension.
@@ -146,7 +146,7 @@ def test_statics():
     assert 1e4 < hanging < 2e4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_energy_is_kept_without_losses():
     state, times = vehicle().state, jnp.linspace(0.0, 0.2, 21)
     sol = motion()(changed(0.0, start=2.0, without_losses=True), state, times, 1e-9)
@@ -155,7 +155,7 @@ def test_energy_is_kept_without_losses():
     np.testing.assert_allclose(sol.energy, sol.energy[0], rtol=0, atol=1e-8 * size)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_over_a_long_bump_as_with_an_elastic_track():
     """At one place the hull is about as high and as much inclined as that of the vehicle on elastic tracks; over a
     bump as short as the distance of two wheels shoes bridge the slopes and lift it higher.
@@ -186,7 +186,7 @@ def test_over_a_long_bump_as_with_an_elastic_track():
     assert tension == pytest.approx(1.5e4 + SHOE * 5.0**2 / PITCH, rel=0.1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_several_hundred_short_shoes_run_over_a_bump():
     """Two carriers on tracks of half the pitch, which turn sharply between wheels: no wheel sinks in at the corners
     between two shoes, and no track buckles.

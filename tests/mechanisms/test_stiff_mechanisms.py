@@ -30,6 +30,7 @@ def relative(values, expected):
 # Structure and start
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, counts", [("flyball", (28, 24, 20, 20)), ("stiff_four_bar", (9, 9, 6, 6))])
 def test_degrees_of_freedom(name, counts):
     """Two arms, the shaft and the cube; three angles of an open chain."""
@@ -39,6 +40,7 @@ def test_degrees_of_freedom(name, counts):
     assert not system.implied
 
 
+@pytest.mark.slow
 def test_flyball_starts_with_all_parts_turning_together():
     mechanism, model = library("flyball"), stiff.flyball(number=float)
     q, u = governor(mechanism.system, model.q, model.rates)
@@ -46,6 +48,7 @@ def test_flyball_starts_with_all_parts_turning_together():
     np.testing.assert_allclose(mechanism.state.u, u, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [1e2, 1e8, 1e14])
 def test_stiff_four_bar_starts_in_the_state_of_the_rigid_one(stiffness):
     rigid = mechanisms.four_bar()
@@ -61,6 +64,7 @@ def test_stiff_four_bar_starts_in_the_state_of_the_rigid_one(stiffness):
 # Carried values
 
 
+@pytest.mark.slow
 def test_carried_values_of_the_flyball_are_those_of_another_model():
     references = library("flyball").references
     values = stiff.implicit_motion(stiff.flyball(number=float), references.times, rtol=1e-11)
@@ -68,6 +72,7 @@ def test_carried_values_of_the_flyball_are_those_of_another_model():
     assert relative(references.values, expected) < 1e-11
 
 
+@pytest.mark.slow
 @extended
 def test_carried_values_of_the_flyball_in_extended_precision():
     references = library("flyball").references
@@ -76,6 +81,7 @@ def test_carried_values_of_the_flyball_in_extended_precision():
     np.testing.assert_allclose(references.values[0], expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @extended
 def test_carried_values_of_the_stiff_four_bar_are_those_of_an_open_chain():
     """At a coarser step to the end, at a finer one to 0.1 s, and by an implicit method to 0.01 s."""
@@ -144,6 +150,7 @@ def governor(system, q, rate):
     return placed(system, motions)
 
 
+@pytest.mark.slow
 def test_accelerations_of_the_stiff_four_bar():
     system, model = library("stiff_four_bar").system, stiff.four_bar()
     solve = jax.jit(lambda q, u: accelerations(system, Partitioned(), 0.0, q, u)[0])
@@ -158,6 +165,7 @@ def test_accelerations_of_the_stiff_four_bar():
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)) + floor)
 
 
+@pytest.mark.slow
 def test_accelerations_of_the_flyball():
     """Also where the arms move differently."""
     system, model = library("flyball").system, stiff.flyball()
@@ -176,6 +184,7 @@ def test_accelerations_of_the_flyball():
 # Motions
 
 
+@pytest.mark.slow
 def test_the_flyball_moves_as_its_references_say():
     mechanism = library("flyball")
     trajectory = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-10, saveat=np.array([0.0, 0.1]))
@@ -186,6 +195,7 @@ def test_the_flyball_moves_as_its_references_say():
     np.testing.assert_allclose(other, -trajectory["arm1"].angular_velocity[:, 1], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_stiff_four_bar_moves_as_the_open_chain_does():
     """With the oscillation of the bushing, of some 10⁻⁷ m."""
     mechanism, times = library("stiff_four_bar"), [0.001, 0.01, 0.1]

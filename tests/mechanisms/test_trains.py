@@ -59,6 +59,7 @@ def test_draft_gear_without_slack_and_friction_is_a_spring():
     np.testing.assert_allclose(LINEAR("c", "a", "b").tension(s, 3.0), 2e7 * s, rtol=1e-13, atol=1e-8)
 
 
+@pytest.mark.slow("0.0-0.0")
 @pytest.mark.parametrize("rate", [0.0, 1e-300, 1e-12, -1e3, 1e6])
 @pytest.mark.parametrize("extension", [0.0, 0.02, -0.02, 1e-300, 0.13, -1e3])
 def test_derivatives_of_the_tension_are_finite_everywhere(extension, rate):
@@ -100,6 +101,7 @@ def test_numbers_of_trains_are_checked(make, numbers, message):
 # Trains with draft gears
 
 
+@pytest.mark.slow
 def test_frequencies_of_a_free_chain():
     n, k, m = 20, 2e7, 8e4
     system = mb.mechanisms.train(n=n, coupler=LINEAR, **BARE).system
@@ -109,6 +111,7 @@ def test_frequencies_of_a_free_chain():
     np.testing.assert_allclose(found, 2 * np.sqrt(k / m) * np.sin(np.arange(1, n) * np.pi / (2 * n)), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_pull_at_the_head_runs_through_the_train_as_a_wave():
     n, k, m, pull = 100, 2e7, 8e4, 3e5
     mechanism = mb.mechanisms.train(n=n, coupler=LINEAR, pull=pull, **BARE)
@@ -121,6 +124,7 @@ def test_a_pull_at_the_head_runs_through_the_train_as_a_wave():
     np.testing.assert_allclose(sol.linear_momentum[:, 0], pull * times, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_relative_coordinates_are_the_straight_motion_of_the_train():
     rng = np.random.default_rng(0)
     n, mass = 5, 8e4 * (1 + 0.3 * rng.random(5))
@@ -141,6 +145,7 @@ def test_relative_coordinates_are_the_straight_motion_of_the_train():
     np.testing.assert_allclose(found[1:], own, rtol=0, atol=1e-12 * np.max(np.abs(own)))
 
 
+@pytest.mark.slow
 def test_slow_and_fast_collisions():
     """Vehicles that meet at a nanometre or a hundred metres a second, their slack open, shut or in between."""
     system = mb.mechanisms.longitudinal_train(n=4, brake=0.0, resistance=(0, 0, 0)).system
@@ -179,6 +184,7 @@ def collision():
     }
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_largest_force_in_a_collision(collision):
     peak, numbers = collision
     derivatives = jax.jit(jax.jacfwd(peak))
@@ -218,6 +224,7 @@ def random_state(system, rng, pitch=0.2):
     return jnp.asarray(q), jnp.asarray(rng.normal(size=system.nu))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 10, 50])
 def test_hinge_forces_are_those_of_one_matrix_of_all(n):
     system = by_blocks(hinged(n).system)
@@ -259,6 +266,7 @@ def hanging_spheres():
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [mixed_chains, hanging_spheres])
 def test_any_joints_in_chains(build):
     system = build()
@@ -284,6 +292,7 @@ def test_any_joints_in_chains(build):
                     np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
 
 
+@pytest.mark.slow
 def test_a_chain_in_space_moves_as_by_partitioning():
     system = hanging_spheres()
     cases = (system, Partition()), (system, Projection()), (by_blocks(system), Projection())
@@ -300,6 +309,7 @@ def undamped(coupler):
     return mb.mechanisms.train(n=6, coupler=coupler, suspension_damping=0.0, resistance=0.0, brake=0.0, speed=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("coupler", "manifold"), [(LINEAR, None), (planar.Revolute, Projection())])
 def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
     system = undamped(coupler).system
@@ -319,6 +329,7 @@ def long_chain():
     return mb.mechanisms.get("rod_chain", n=16)
 
 
+@pytest.mark.slow
 def test_long_chains_need_no_choice(long_chain):
     """The same motion by both solvers' defaults, by blocks."""
     assert "sparse elimination" in str(long_chain.system)
@@ -332,6 +343,7 @@ def test_long_chains_need_no_choice(long_chain):
     np.testing.assert_allclose(ends[0].u, ends[1].u, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_motion_of_a_long_chain(long_chain):
     names = ("link3.mass", "link9.inertia", "pin5.point_a", "pin16.point_b")
     numbers = {name: mb.parameters(long_chain.system)[name] for name in names}
@@ -394,6 +406,7 @@ def skater():
     return mb.mechanisms.get("appell_hamel").system
 
 
+@pytest.mark.slow("dry_friction-options2-Projection with Hermite takes constraints that are ideal")
 @pytest.mark.parametrize(
     ("build", "options", "message"),
     [
@@ -416,6 +429,7 @@ TWIN = planar.Distance("twin", "b0", "b1", point_a=(0.0, 1.0))
 FOOT = planar.Revolute("foot", "ground", "b1", point=(1.0, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "build",
     [
@@ -450,6 +464,7 @@ def test_other_joint_graphs_are_projected_with_a_dense_matrix(build):
     np.testing.assert_allclose(reverse, weights @ dfound, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_partitioning_of_a_long_chain_still_works(long_chain):
     """With either formulation when it is asked for."""
     run = lambda **options: mb.simulate(long_chain.system, long_chain.state, t1=0.02, rtol=1e-9, **options).ys
@@ -474,6 +489,7 @@ def largest(jaxpr):
     return max(sizes, default=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute, planar.Distance])
 def test_program_and_memory_of_long_trains(coupler):
     """As many instructions for any number of vehicles, and no array that grows faster than it."""
@@ -490,7 +506,7 @@ def test_program_and_memory_of_long_trains(coupler):
     assert large <= 4.2 * small
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="needs a machine for itself: no tests beside it")
 @pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute])
 def test_time_of_long_trains(coupler):

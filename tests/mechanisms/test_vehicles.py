@@ -15,6 +15,8 @@ import jaxmb as mb
 from jaxmb import mechanisms
 from jaxmb.mechanisms import ride
 
+pytestmark = pytest.mark.slow
+
 DESIGN = np.pi + np.arctan2(0.134, 0.288)
 
 
@@ -30,7 +32,7 @@ def poses(model, z):
     return np.concatenate([r, angles[..., None]], axis=-1).reshape(-1, 3)
 
 
-@pytest.mark.parametrize("units", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.parametrize("units", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_degrees_of_freedom_statics_and_motion(units):
     made, model = vehicle(units), oracle.Vehicle(units)
     system = made.system

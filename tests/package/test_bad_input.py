@@ -133,6 +133,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow("inconsistent redundant joints")
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused_with_the_name_and_the_fix(case):
     build, message = REFUSED[case]
@@ -145,6 +146,7 @@ def pendulum():
     return mb.Scene([bar()], joints=[pin()], forces=[mb.Gravity((0, -9.81))]).compile()
 
 
+@pytest.mark.slow
 def test_unknown_names(pendulum):
     with pytest.raises(ValueError, match=r"Unknown parameter 'bar.mas'; did you mean 'bar.mass'"):
         mb.with_parameters(pendulum, {"bar.mas": 1.0})
@@ -163,6 +165,7 @@ def test_unknown_names(pendulum):
         sol.at(0.05)
 
 
+@pytest.mark.slow
 def test_assembly_names_what_cannot_be_fixed(pendulum):
     with pytest.raises(ValueError, match=r"cannot be assembled with bar.x, bar.y fixed.*pin"):
         mb.assemble(pendulum, fix={"bar.x": 2.0, "bar.y": 2.0})
@@ -174,6 +177,7 @@ def test_assembly_names_what_cannot_be_fixed(pendulum):
     assert np.all(np.isnan(quiet.q))
 
 
+@pytest.mark.slow
 def test_more_rates_than_freedoms_may_be_given_if_they_agree(pendulum):
     # Along x the centre stands still in this position, whatever the other rates are.
     for name, why in (("bar.x", r"the constraints determine bar\.x"), ("bar.y", "these contradict each other")):
@@ -252,6 +256,7 @@ def test_nothing_to_solve_implicitly():
         mb.simulate(system, mb.assemble(system), t1=0.1, solver=mb.solvers.Hermite())
 
 
+@pytest.mark.slow
 def test_single_precision_warns(pendulum):
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, pendulum)
     for whose, options in (("^rtol=1e-10", {"rtol": 1e-10}), ("^The default rtol=1e-08", {})):
@@ -307,7 +312,7 @@ def lock_up(rod_length):
     return mb.Scene([crank, block], joints=joints).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_lock_up_ends_with_its_own_result():
     def turn(length, throw=False):
         system = lock_up(length)
@@ -420,6 +425,7 @@ def test_names_of_coordinates(case):
         mb.lagrangian.LagrangianSystem(lambda t, q, v, p: v @ v, q=[1.0, 2.0], coordinates=("y", name))
 
 
+@pytest.mark.slow
 def test_what_only_bodies_have():
     system = mb.lagrangian.LagrangianSystem(lambda t, q, v, p: v @ v, q=[1.0])
     motion = mb.simulate(system, system.guess, t1=0.1)

@@ -43,6 +43,7 @@ def check(place, way, first, second):
     return old, compute
 
 
+@pytest.mark.slow("terrain", "own_constraint", "own_terrain", "own_holonomic")
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)
 def test_each_place_of_a_function(place):
     check(place, changing_numbers.in_global, 1.5, 2.5)
@@ -53,7 +54,7 @@ def test_each_way_to_hold_a_number(way):
     check(changing_numbers.force, way, 1.5, 2.5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_places_ways_and_numbers():
     generator = np.random.default_rng(0)
     for case in range(200):
@@ -93,7 +94,7 @@ def test_scenes_without_functions_are_traced_by_nothing(monkeypatch):
     mb.Scene([BALL], joints=[PIN], forces=[mb.Gravity((0.0, -9.81))]).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_motions_and_their_views(monkeypatch):
     """A view that is first asked for after the change is that of its own motion."""
     numbers = {"k": 3.0}
@@ -113,7 +114,7 @@ def test_motions_and_their_views(monkeypatch):
         np.testing.assert_allclose(own.forces["law"][-1, 0, 0], -k * x, rtol=1e-14)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_functions_of_a_run():
     """Of events, of what is saved, of a sweep without a store, and in a gradient by what they close over."""
     numbers = {"k": 1.0}

@@ -60,6 +60,7 @@ def test_private_names_exist(module, name):
     assert name is None or hasattr(found, name), message
 
 
+@pytest.mark.slow
 def test_only_compat_uses_private_names():
     for path in set(ROOT.rglob("*.py")) - {COMPAT}:
         for module, name in imported(path):
@@ -234,6 +235,7 @@ def test_inputs_that_a_function_is_computed_from(compat):
     assert found == {"unused": False, "used": True, "without effect": True}
 
 
+@pytest.mark.slow
 def test_bilinear_operations(compat):
     outer = compat.define_bilinear(
         "outer_of_test",
@@ -284,6 +286,7 @@ def test_conditions_of_a_batch(compat):
     assert "cond" in names, "equinox.internal.unvmap_any no longer makes one condition of those of a batch"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes, at_once", [(1, None), (5, None), (5, 2), (5, 4096)])
 def test_conditions_of_lanes(compat, monkeypatch, lanes, at_once):
     """A branch that only the lanes that take it go through, with the values and derivatives of any other.
@@ -318,6 +321,7 @@ def test_conditions_of_lanes(compat, monkeypatch, lanes, at_once):
     assert kind in text, "a branch is computed for lanes that do not take it"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [1, 5])
 def test_loops_of_lanes(compat, lanes):
     """Each lane ends where it ends alone, and derivatives are zero."""
@@ -440,6 +444,7 @@ def solve(solver, rate=-1.0, t1=1.0, *, adjoint=None, controller=None, saveat=No
     )
 
 
+@pytest.mark.slow
 def test_terms_are_wrapped_once(compat):
     seen = []
 
@@ -500,6 +505,7 @@ def test_solvers_are_told_tolerances(compat):
     assert {(float(rtol), float(atol), norm) for rtol, atol, norm in seen} == {(0.25, 0.125, jnp.max)}, about
 
 
+@pytest.mark.slow(but=("ForwardMode-",))
 @pytest.mark.parametrize(
     "adjoint, kind",
     [

@@ -164,6 +164,49 @@ def motion(names):
     return scope["motion"]
 
 
+@pytest.mark.slow(
+    "shapes",
+    "mechanisms",
+    "mechanisms.ride",
+    "importers",
+    "manifold",
+    "simulate",
+    "Trajectory",
+    "load",
+    "ContactEvents",
+    "Event",
+    "RESULTS",
+    "identify",
+    "Identification",
+    "Experiment",
+    "optimise",
+    "Optimum",
+    "robust",
+    "linearise",
+    "Linearisation",
+    "root_locus",
+    "RootLocus",
+    "steady_motion",
+    "floquet",
+    "Floquet",
+    "sweep",
+    "mechanisms.Shoes",
+    "viz.show",
+    "viz.plot_root_locus",
+    "report.stress_test",
+    "report.work_precision",
+    "formulations.Multipliers",
+    "formulations.NullSpace",
+    "formulations.Poincare",
+    "formulations.UdwadiaKalaba",
+    "manifold.Baumgarte",
+    "manifold.Partition",
+    "manifold.Projection",
+    "solvers.Adams",
+    "solvers.MultistepController",
+    "solvers.Hermite",
+    "Trajectory.events",
+)
 @pytest.mark.parametrize("name", TOGETHER)
 def test_examples(name, names, request, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -201,6 +244,7 @@ def test_examples(name, names, request, tmp_path, monkeypatch):
             assert np.ptp(scope["motion"].energy) < 1e-7
 
 
+@pytest.mark.slow(but=("compiling",))
 @pytest.mark.parametrize("name", topics())
 def test_examples_of_topics(name, names, capsys, monkeypatch):
     monkeypatch.setattr(mb, "setup", lambda **_: None)
@@ -280,6 +324,14 @@ def test_every_joint_has_an_example():
     assert exported(planar, kinds) == PLANAR.keys() and exported(spatial, kinds) == SPATIAL.keys()
 
 
+@pytest.mark.slow(
+    "jaxmb.spatial-Screw",
+    "jaxmb.spatial-Composite",
+    "jaxmb.spatial-KnifeEdge",
+    "jaxmb.spatial-RollingDisc",
+    "jaxmb.spatial-RollingSphere",
+    "jaxmb.spatial-Driver",
+)
 @pytest.mark.parametrize(("module", "name"), JOINTS, ids=lambda own: getattr(own, "__name__", own))
 def test_examples_of_joints(module, name):
     """Their docstrings say what they connect, and which coordinates they have, with these values in the example."""

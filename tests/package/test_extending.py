@@ -249,7 +249,6 @@ def test_lines(cls, most):
     assert len(code) <= most
 
 
-@pytest.mark.always
 def test_a_joint():
     """A wheel rolls down a slope, and rubs and presses on it as the closed form says."""
     mass, inertia, slope, t1 = 2.0, 0.05, 0.3, 0.8
@@ -274,6 +273,7 @@ def test_a_joint():
         np.testing.assert_allclose(own, expected, rtol=0, atol=bound)
 
 
+@pytest.mark.slow
 def test_a_force_with_an_internal_state():
     """A mass on a spring and a damper in succession: linear equations of third order."""
     mass, k, c, t1 = 1.5, 40.0, 6.0, 1.2
@@ -288,7 +288,7 @@ def test_a_force_with_an_internal_state():
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-8)
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_a_one_step_solver():
     """Of its order in steps of one length, and as accurate as asked for where it chooses them."""
     pendulum = mechanisms.get("pendulum")
@@ -301,7 +301,7 @@ def test_a_one_step_solver():
     np.testing.assert_allclose(run(solver=Kutta(), rtol=1e-8), exact, rtol=0, atol=1e-6)
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_a_multistep_solver():
     """Errors in proportion to the tolerance, on a pendulum that is constrained and on a plain field; a derivative."""
     pendulum = mechanisms.get("pendulum")
@@ -324,6 +324,7 @@ def test_a_multistep_solver():
     np.testing.assert_allclose(slope, np.exp(-2.0), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_with_a_multistep_solver():
     """Forward mode = reverse mode, and both = differences of a tighter solution, on a pendulum that is constrained."""
     pendulum = mechanisms.get("pendulum")
@@ -341,6 +342,7 @@ def test_derivatives_with_a_multistep_solver():
     np.testing.assert_allclose(slope, central, rtol=0, atol=1e-4 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["four_bar", "parallelogram"])
 def test_a_formulation(name):
     """The same accelerations, constraint forces and motion as by multipliers; the parallelogram has a redundant row."""
@@ -355,7 +357,7 @@ def test_a_formulation(name):
     np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-9)
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_a_system_that_is_not_made_of_bodies():
     """A particle that goes around on a cone, with the period and the tension of the closed form."""
     mass, length, tilt, t1 = 0.7, 1.3, 0.6, 2.0

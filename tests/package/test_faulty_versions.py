@@ -27,6 +27,7 @@ def test_a_faulty_jaxlib_is_warned_of(faulty):
     assert len(caught) == 1
 
 
+@pytest.mark.slow
 def test_the_import_warns_once():
     code = "import importlib.metadata as m; own = m.version; m.version = lambda name: '0.10.2' if name == 'jaxlib' else"
     code += " own(name)\nimport jaxmb, jaxmb.spatial, jaxmb.planar"

@@ -34,6 +34,7 @@ def stub():
     return found
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_at_once():
     """But for what looks for names; what most motions need loads little besides JAX and diffrax."""
     code = "import sys, jax, diffrax; b = set(sys.modules); import jaxmb; {}; print(sorted(set(sys.modules) - b))"
@@ -54,7 +55,7 @@ def test_the_stub_has_all_names():
         assert getattr(mb, name) is getattr(module, name)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_names_may_be_used_first_in_a_function_that_jax_traces():
     """No array of a module is one of the trace."""
     code = """
@@ -67,6 +68,7 @@ print(bool(jaxmb.simulate(machine.system, machine.state, t1=1e-3).result == jaxm
     assert printed(code)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["import jaxmb", "import jaxmb.report", "from jaxmb.studies.sweep import sweep"])
 def test_every_name_is_found_whatever_is_imported_first(first):
     """`simulate` and others are functions with the names of modules."""

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import jaxmb
 
 ROOT = Path(jaxmb.__file__).parent
@@ -62,6 +64,7 @@ def imports(module: str):
                 yield whole if whole in FILES else source
 
 
+@pytest.mark.slow
 def test_imports_run_downward():
     level = {name: k for k, layer in enumerate(LAYERS) for name in layer}
     for module in FILES:
@@ -71,6 +74,7 @@ def test_imports_run_downward():
             assert level[other.split(".")[0]] <= level[own], f"{module} imports {other}"
 
 
+@pytest.mark.slow
 def test_imports_make_no_circle():
     known, open_ = set(), []
 
@@ -95,18 +99,21 @@ def test_solvers_know_nothing_of_mechanics():
             )
 
 
+@pytest.mark.slow
 def test_optional_packages_are_not_imported():
     code = "import sys, jaxmb; print([m for m in ('matplotlib', 'IPython', 'tqdm', 'mujoco') if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_double_precision_is_left_to_the_user():
     code = "import jax, jaxmb; print(jax.config.jax_enable_x64)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
 
 
+@pytest.mark.slow
 def test_concrete_classes_are_seldom_looked_for():
     """Behaviour is asked of objects; where a concrete class is looked for, a comment above says why."""
     trees = {module: ast.parse(path.read_text()) for module, path in FILES.items()}

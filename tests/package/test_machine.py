@@ -30,7 +30,7 @@ def test_a_number_of_threads_or_all_cores(given, monkeypatch):
     assert limit_of_threads() == GIVEN[given]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="Threads are counted where the system lists them.")
 @pytest.mark.parametrize("given", GIVEN)
 def test_xla_takes_as_many(given):

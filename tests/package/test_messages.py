@@ -131,6 +131,7 @@ def test_a_fixed_angle_in_degrees_is_warned_of(pendulum):
     assert caught[0].filename == __file__
 
 
+@pytest.mark.slow
 def test_views_list_what_they_have(motion):
     with pytest.raises(AttributeError, match="angular_velocity; got 'omega'"):
         getattr(motion["rod"], "omega")  # noqa: B009
@@ -145,6 +146,7 @@ def test_what_is_printed_of_a_joint_and_where_a_motion_is_saved(motion, tmp_path
         motion.save(tmp_path / "motion.csv")
 
 
+@pytest.mark.slow
 def test_what_is_printed_of_a_motion_and_of_its_forces(pendulum, motion):
     assert str(motion["rod"]).startswith("BodyMotion: position (1, 2) m, velocity (1, 2) m/s, angle (1,) rad, ")
     assert "orientation" not in str(motion["rod"]) and str(motion.reactions["pin"]).startswith(
@@ -263,6 +265,7 @@ def test_the_name_of_a_part_in_place_of_its_numbers(pendulum):
         mb.with_inputs(pendulum, {"pin": lambda t: t})
 
 
+@pytest.mark.slow
 def test_initial_states_that_cannot_be(pendulum):
     measured = {"measured": {"rod.angle": np.zeros(2)}, "ts": [0.01, 0.02], "free": {"rod.inertia": 0.1}}
     with pytest.raises(ValueError, match=r"coordinates of bodies, not of joints, and 'pin\.angle' is of a joint"):
@@ -283,6 +286,7 @@ def test_fixed_coordinates_that_depend_on_each_other(pendulum):
         mb.assemble(pendulum, fix={"rod.x": 0.3, "rod.angle": 1.0})
 
 
+@pytest.mark.slow
 def test_a_coordinate_of_a_joint_that_depends_on_another_fixed_one(pendulum):
     with pytest.raises(ValueError, match=r"with rod\.angle, pin\.angle fixed: rod\.angle and pin\.angle depend"):
         mb.assemble(pendulum, fix={"rod.angle": 0.3, "pin.angle": 1.0})
@@ -328,6 +332,7 @@ def test_modules_as_fields():
         mb.Scene([rod], forces=[Learned("net", "rod", network)]).compile()
 
 
+@pytest.mark.slow
 def test_a_rate_has_one_name_everywhere(pendulum):
     """`trajectory["pin"].angle_rate` is `"pin.angle_rate"` in `rates=`, quantities and states."""
     by_coordinate, by_rate, of_body = (

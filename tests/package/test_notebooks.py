@@ -57,7 +57,7 @@ def test_the_outputs_are_those_of_the_cells(path):
     assert all("execution" not in cell.metadata for cell in cells)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 # Of the kernel's own files, which this package does not touch.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
@@ -90,6 +90,7 @@ def test_what_counts_as_another_output():
         assert difference(shown, other) is not None
 
 
+@pytest.mark.slow
 def test_the_figure_of_the_readme_shows_what_is_computed():
     """After a change: `python tests/support/execute_notebooks.py work_precision`."""
     with Image.open(FOLDER / "work_precision.png") as image:
@@ -106,7 +107,6 @@ def test_the_figure_of_the_readme_shows_what_is_computed():
         assert before["error"] / 3 < run["error"] < 3 * before["error"]
 
 
-@pytest.mark.always
 def test_readme_example(capsys):
     examples = readme_examples()
     assert len(examples) == 2

@@ -74,6 +74,7 @@ def test_cars_of_a_train_weigh_something():
     assert inside(1.0) and not inside(-1.0)
 
 
+@pytest.mark.slow
 def test_a_traced_number_out_of_range_is_the_result(rod):
     start, names = mb.assemble(rod), ("rod.mass", "rod.inertia", "stop.smoothing")
 
@@ -141,7 +142,8 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("case", ["force", pytest.param("driver", marks=pytest.mark.long), "potential"])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["force", pytest.param("driver", marks=pytest.mark.slow), "potential"])
 def test_an_error_names_what_is_not_finite_in_one_line(case):
     build, end, message = WRONG[case]
     system = build(end)

@@ -59,6 +59,7 @@ def shown_of(kind):
     return two, "Floquet: 2 states", ("period 3 s",)
 
 
+@pytest.mark.slow("floquet")
 @pytest.mark.parametrize("kind", ["scene", "system", "optimum", "events", "floquet"])
 def test_a_line_in_lists_and_a_table_alone(kind):
     shown, begin, words = shown_of(kind)

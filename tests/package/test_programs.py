@@ -82,6 +82,7 @@ def test_unconstrained_body_has_nothing_of_constraints(monkeypatch):
         assert own[name] <= bare[name] + (name == "custom_jvp_call"), name
 
 
+@pytest.mark.slow
 def test_constrained_body_has_them():
     pin = planar.Revolute("pin", "ground", "body", point=(0.0, 0.0))
     pendulum = program(mb.Scene([planar_body(position=(1.0, 0.0))], joints=[pin]).compile())
@@ -100,6 +101,7 @@ def inside_loops(jaxpr, inside=False) -> Counter:
     return counts
 
 
+@pytest.mark.slow("options0")
 @pytest.mark.parametrize("options", [{}, {"jumps": [0.5]}, {"dt0": 0.01}])
 def test_charts_and_evaluations_stand_in_one_place(options):
     """The first step is the start, and a restart after a jump is a start: neither has its own search and evaluation."""
@@ -120,6 +122,7 @@ def test_free_body_in_space_has_no_charts(monkeypatch):
     assert program(system)["argmax"] == 0
 
 
+@pytest.mark.slow
 def test_ideal_scene_without_contact_tracks_or_couplers_has_nothing_of_them(monkeypatch):
     refuse(monkeypatch, contact.Contact, "wrenches", "energy", "resolve")
     refuse(monkeypatch, planar.Track, "wrenches", "length", "energy")
@@ -142,6 +145,7 @@ def test_planar_scene_has_no_euler_parameters(monkeypatch):
     assert "f64[4,7]" not in str(shapes) and "f64[4,4]" not in str(shapes)  # poses, frames of bodies and ground
 
 
+@pytest.mark.slow
 def test_scleronomic_scene_has_no_time_derivative():
     pin = planar.Revolute("pin", "ground", "body", point=(0.0, 0.0))
     turn = lambda t, p: jnp.exp(p["rate"] * t) - 1.0
@@ -154,6 +158,7 @@ def test_scleronomic_scene_has_no_time_derivative():
     assert "with respect to time" not in str(driven)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["forward", "reverse"])
 @pytest.mark.parametrize("manifold", [mb.manifold.Partition(), mb.manifold.Projection()])
 def test_program_does_not_grow_with_the_number_of_bodies(what, manifold):
@@ -198,6 +203,7 @@ def test_building_a_scene_compiles_nothing_but_its_analysis():
     assert set(names) == {"turned"}
 
 
+@pytest.mark.slow
 def test_forces_that_no_reaction_changes_are_not_solved_for(monkeypatch):
     refuse(monkeypatch, laws, "find_multipliers", "root")
     viscous = lagrangian.LagrangianSystem(
@@ -213,6 +219,7 @@ def test_forces_that_no_reaction_changes_are_not_solved_for(monkeypatch):
         program(mb.mechanisms.get("rough_ring").system)
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_short_motions_call_no_python():
     """JAX keeps such programs on disk."""
     four_bar = mb.mechanisms.get("four_bar")

@@ -14,7 +14,6 @@ COMMANDS = {
 }
 
 
-@pytest.mark.always
 @pytest.mark.parametrize("name", COMMANDS)
 def test_nothing_is_found(name):
     run = subprocess.run([sys.executable, "-m", *COMMANDS[name]], cwd=ROOT, capture_output=True, text=True)

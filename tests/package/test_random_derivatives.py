@@ -527,7 +527,7 @@ LEAST = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_forward_reverse_and_differences(name):
     build, options = CASES[name]
@@ -581,7 +581,7 @@ def test_every_method_is_used():
     assert left_out(manifold, manifold.AbstractManifold, found) == set()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_kind_of_lagrangian_system_is_there():
     systems = [build(**FIXED).system for build in LAGRANGIAN.values()]
     found = kinds_within([[s.constraints, s.nonideal, s.kinematics, s.equations] for s in systems])

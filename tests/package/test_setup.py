@@ -65,6 +65,7 @@ def options_of(code, flags=""):
     return process(f'import os\n{code}\nprint(repr(os.environ["XLA_FLAGS"]))', XLA_FLAGS=flags)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["quickly", "for speed", "for batches"])
 def test_options_of_the_compiler_are_set_before_jax_starts(way):
     flags = {option: value for option, value in _setup._OPTIONS[way].items() if takes_option(option)}
@@ -81,6 +82,7 @@ def test_options_of_the_compiler_are_set_before_jax_starts(way):
     assert late == "" and "JAX has computed something already" in said and said.count("UserWarning") == 3
 
 
+@pytest.mark.slow
 def test_the_last_way_to_compile_counts():
     quickly, fast = "mb.setup(keep=False)", "mb.setup(compile='for speed', keep=False)"
     for code, last in (
@@ -95,6 +97,7 @@ def test_the_last_way_to_compile_counts():
     assert "JAX has computed something already" in said
 
 
+@pytest.mark.slow
 def test_options_that_xla_does_not_know_are_left_out():
     code = """
 from jaxmb import _setup
@@ -116,6 +119,7 @@ def test_options_are_those_of_processors(platforms, on_processors, monkeypatch):
         jax.config.update("jax_platforms", before)
 
 
+@pytest.mark.slow
 def test_what_is_asked_for_alone_is_set():
     code = "mb.setup(x64=False, compile=None, keep=False)\nprint([float(jnp.pi), os.environ.get('XLA_FLAGS', '')])"
     (pi, flags), said = process("import os\njax.config.update('jax_enable_x64', False)\n" + code, XLA_FLAGS="")
@@ -135,7 +139,7 @@ def test_names_of_the_last_release_tell_the_new_one(name):
         getattr(mb, name)
 
 
-@pytest.mark.always
+@pytest.mark.slow
 @pytest.mark.skipif(not takes_option("xla_cpu_use_fusion_emitters"), reason="XLA leaves loops to its new emitters")
 def test_the_loop_over_steps_is_one_kernel():
     code = """
@@ -161,6 +165,7 @@ print(found)
         np.testing.assert_allclose(other[2], one[2], rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_python_looks_for_garbage_less_often():
     code = "import gc\nbefore = gc.get_threshold()\nmb.setup(keep=False)\nprint([before, gc.get_threshold()])"
     before, after = process(code)[0]
@@ -169,12 +174,14 @@ def test_python_looks_for_garbage_less_often():
         assert process(f"import gc\ngc.set_threshold({first})\n" + code)[0][1][0] == first
 
 
+@pytest.mark.slow
 def test_what_is_compiled_quickly_is_kept(tmp_path):
     code = "mb.setup()\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
     first, second = (process(code, JAXMB_CACHE=str(tmp_path), XLA_FLAGS="")[0] for _ in range(2))
     assert second == {"asked": first["asked"], "found": first["kept"], "kept": 0}
 
 
+@pytest.mark.slow
 def test_the_second_process_finds_what_the_first_compiled(tmp_path):
     code = "mb.setup(**KEEP)\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
     first, second = (process(code, JAXMB_CACHE=str(tmp_path))[0] for _ in range(2))
@@ -182,6 +189,7 @@ def test_the_second_process_finds_what_the_first_compiled(tmp_path):
     assert second == {"asked": first["asked"], "found": first["asked"], "kept": 0}
 
 
+@pytest.mark.slow
 def test_a_motion_and_its_gradient_are_compiled_once(tmp_path):
     code = """
 mb.setup(**KEEP)
@@ -200,7 +208,7 @@ print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts[
     assert second["hits"] == second["asked"] == first["asked"] > first["hits"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_programs_of_stiff_motions_are_found(tmp_path):
     code = """
 mb.setup(**KEEP)
@@ -222,12 +230,14 @@ print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts[
     assert second["hits"] == second["asked"] == first["asked"] > first["hits"]
 
 
+@pytest.mark.slow
 def test_a_program_that_was_compiled_before_is_not_kept(tmp_path):
     code = "f = jax.jit(lambda x: jnp.sin(x) + x)\nf(1.0)\nmb.setup(**KEEP)\nf(1.0)\nf(jnp.ones(3))" + REPORT
     found, _ = process(code, JAXMB_CACHE=str(tmp_path))
     assert 0 < found["kept"] < found["asked"]
 
 
+@pytest.mark.slow
 def test_the_import_switches_nothing_on(tmp_path):
     code = "import jaxmb.cli\nprint(repr(jax.config.jax_compilation_cache_dir))"
     assert process(code, XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path)) == (None, "")
@@ -255,6 +265,7 @@ def test_the_folder_of_a_system(system, folder, new_user, monkeypatch):
     assert kept() == new_user / folder / "jaxmb"
 
 
+@pytest.mark.slow
 def test_settings_of_jax_stay(new_user, tmp_path, monkeypatch):
     size = jax.config.jax_compilation_cache_max_size
     monkeypatch.setenv("JAXMB_CACHE", str(tmp_path / "not"))
@@ -270,6 +281,7 @@ def test_settings_of_jax_stay(new_user, tmp_path, monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_the_size_is_bounded(tmp_path):
     code = "mb.setup(**KEEP, max_bytes=20_000)\nfor n in range(2, 20): jnp.cumsum(jnp.ones(n)).block_until_ready()"
     counts, _ = process(code + REPORT, JAXMB_CACHE=str(tmp_path))
@@ -279,6 +291,7 @@ def test_the_size_is_bounded(tmp_path):
         mb.setup(max_bytes=0)
 
 
+@pytest.mark.slow
 def test_no_process_waits_for_another_one(tmp_path):
     """While another process of JAX holds its lock of the folder: nothing is said, and all is kept."""
     code = "mb.setup(**KEEP)\nprint(jax.jit(lambda x: jnp.sin(x) + x)(1.0))" + REPORT
@@ -299,6 +312,7 @@ def test_a_folder_that_cannot_be_written_to(new_user, tmp_path, monkeypatch):
         assert kept() is None
 
 
+@pytest.mark.slow
 def test_the_command_line_keeps_programs(tmp_path):
     """Where it cannot, one line says so."""
     code = """

@@ -75,6 +75,7 @@ TWINS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TWINS)
 def test_accelerations_and_motion(name):
     place, bound = TWINS[name]
@@ -114,6 +115,7 @@ def circle(t):
     return jnp.stack([0.9 + 0.3 * jnp.cos(t), 0.2 + 0.3 * jnp.sin(t)])
 
 
+@pytest.mark.slow
 def test_a_snake_of_bodies_is_driven_through_its_gait():
     snake = library("three_platform_snake", gait=circle, model="rigid_bodies")
     assert snake.system.velocity_rank == snake.system.nu

@@ -9,6 +9,8 @@ import jaxmb as mb
 from jaxmb import planar
 from jaxmb.lagrangian import LagrangianSystem
 
+pytestmark = pytest.mark.slow
+
 SOLVERS = {"Adams": mb.solvers.Adams(), "Dopri8": diffrax.Dopri8(), "Hermite": mb.solvers.Hermite()}
 
 
@@ -38,7 +40,7 @@ def swing(metre, kilogram, second, solver):
 
 
 @pytest.mark.parametrize(
-    "solver", ["Adams", *(pytest.param(name, marks=pytest.mark.long) for name in ("Dopri8", "Hermite"))]
+    "solver", ["Adams", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Dopri8", "Hermite"))]
 )
 def test_a_machine_in_other_units(solver):
     place, steps, _ = swing(1.0, 1.0, 1.0, solver)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 TESTS = Path(__file__).parents[1]
 MODULES = [
     "parts/planar/test_planar_parts.py",
@@ -16,7 +18,6 @@ MODULES = [
 ]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("module", MODULES)
 def test_as_users_compile(module):
     own = {name: value for name, value in os.environ.items() if not name.startswith(("XLA_", "NPROC", "PYTEST_"))}

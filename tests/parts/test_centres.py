@@ -120,7 +120,7 @@ LONG = ("Contact", "Tyre", "spatial")
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[pytest.mark.long] * any(own in name for own in LONG)) for name in WITHOUT_POINTS],
+    [pytest.param(name, marks=[pytest.mark.slow] * any(own in name for own in LONG)) for name in WITHOUT_POINTS],
 )
 def test_a_point_that_is_left_out_is_the_origin_of_the_frame(name):
     """On a body with its mass centre elsewhere the part is that with its points given where the origin is."""
@@ -176,7 +176,7 @@ def test_a_changed_centre_is_that_of_a_new_scene(dimension):
     np.testing.assert_allclose(changed.u, expected.u, rtol=0, atol=1e-15)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_derivatives_of_the_guess_with_respect_to_the_centre(dimension):
     system, new = mb.Scene([free(dimension, np.zeros(dimension))]).compile(), CENTRE[dimension]
@@ -189,7 +189,7 @@ def test_derivatives_of_the_guess_with_respect_to_the_centre(dimension):
     assert np.max(np.abs(forward)) > 0.1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_functions_see_and_act_on_the_frame():
     """A force at the end of a rod, whose frame has its origin there, and laws of the joint with the floor."""
     half, mu = 0.4, 0.3

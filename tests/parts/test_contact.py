@@ -72,6 +72,7 @@ def states(rng, space, k):
     return jnp.asarray(poses), jnp.asarray(rng.normal(size=(k, space.velocity_size)))
 
 
+@pytest.mark.slow
 def test_wheels_of_the_tracked_vehicle():
     """Spring with the slope's share, damping that sets in linearly, traction at the rim: as in the model's equations,
     deep in the ground, at its surface and far above.
@@ -96,6 +97,7 @@ def test_wheels_of_the_tracked_vehicle():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "space, kind, law",
     [(PLANE, planar.Contact, "soft soil"), (PLANE, WheelContact, "linear"), (SPACE, spatial.Contact, "hertz")],
@@ -116,6 +118,7 @@ def test_power_of_the_spring_is_loss_of_energy_and_the_rest_dissipates(space, ki
     assert power(rough) + rate < -1.0
 
 
+@pytest.mark.slow("coulomb-linear", "janosi-linear", "janosi-hertz")
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("friction", FRICTION)
 def test_derivatives_are_finite_where_laws_have_kinks(friction, law):
@@ -146,6 +149,7 @@ def test_one_terrain_for_all_bodies_is_one_parameter():
         mb.with_parameters(system, {"road.terrain.height": 0.2})
 
 
+@pytest.mark.slow
 def test_ball_rolls_down_a_slope():
     """After its slip has settled a ball gains 5/7 g sin α along the slope, and stays as deep in the ground."""
     angle, radius, mass = 0.2, 0.1, 2.0
@@ -175,6 +179,7 @@ def test_ball_rolls_down_a_slope():
         sol.forces["flor"]
 
 
+@pytest.mark.slow
 def test_point_bounces_without_loss():
     """It lands, leaves and lands again at the times of free fall and of half an oscillation on the spring."""
     mass, stiffness, height, g = 2.0, 1e5, 0.5, 9.81
@@ -199,7 +204,7 @@ def primitives(part):
     return str(jax.make_jaxpr(wrenches)(jnp.zeros((3, 3)), jnp.zeros((3, 3))))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_through_an_impact_converge():
     """A disc bounces off a floor whose level is a parameter: what it gains in height is twice that of the floor."""
     floor = planar.Contact(

@@ -12,6 +12,7 @@ from jaxmb.parts.modes import CLOSED, OPEN
 from jaxmb.system.instant import Instant
 
 
+@pytest.mark.slow(but=("a contact of a user",))
 @pytest.mark.parametrize("name", CONTACTS)
 def test_gap_and_its_derivatives(name):
     """Rates and second derivatives are those of the gap along a motion; the row of a closed contact is its gradient."""
@@ -39,6 +40,7 @@ def test_gap_and_its_derivatives(name):
     np.testing.assert_allclose(rows, gradient, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Stop in the plane", "RigidContact in space", "RigidBallContact"])
 def test_an_open_contact_does_nothing_and_a_closed_one_pushes_or_pulls(name):
     system = system_of(name)

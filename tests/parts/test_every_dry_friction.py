@@ -20,6 +20,7 @@ def state_of(system):
     return mb.assemble(system, fix={"joint.mode": 1} if system.contacts.n else {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FRICTIONS)
 def test_stick_is_a_constraint_and_slip_a_force(name):
     system = friction_scene(name)
@@ -66,6 +67,7 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     assert jnp.all(system.nonideal_force(t, at(FREE), u, multipliers) == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ball on a slope", "ball on an edge"])
 def test_the_direction_of_slip_has_a_sense_at_rest_and_beyond(name):
     """Slip that has begun has the direction of its modes; that of slip which has passed through zero does not jump."""
@@ -89,6 +91,7 @@ def test_the_direction_of_slip_has_a_sense_at_rest_and_beyond(name):
     np.testing.assert_allclose(np.abs(direction(along)), np.abs(along), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_words_and_numbers():
     system = friction_scene("pin")
     text = str(system.describe())
@@ -183,6 +186,9 @@ def test_bad_coordinates(joint, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow(
+    but=("a sleeve without radius", "a ball joint", "several angles", "one speed of two", "two speeds of one", "a stop")
+)
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input(name):
     body, joints, options, message = BAD[name]
@@ -191,6 +197,7 @@ def test_bad_input(name):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 def test_what_needs_smooth_forces_refuses_it():
     system = friction_scene("slide")
     with pytest.raises(ValueError, match="rub may stick or slip"):

@@ -33,7 +33,7 @@ CONSTRAINED = [
 AT_REST = [name for name, example in EXAMPLES.items() if example.rests and example.ideal]
 T1 = 0.2
 # Two thirds of the time are of space, whose parts share nearly all of their code with one another.
-SOON = [pytest.param(name, marks=[pytest.mark.long] * name.startswith("spatial")) for name in EXAMPLES]
+SOON = [pytest.param(name, marks=[pytest.mark.slow] * name.startswith("spatial")) for name in EXAMPLES]
 
 
 # What is tested
@@ -70,6 +70,7 @@ def programs(request):
     return forward, jax.jit(jax.grad(lambda share, rtol: end(share, rtol)[0])), finest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("programs", SOON, indirect=True)
 def test_motion_and_its_derivative(programs):
     """The state stays on the constraints, and the derivative is that of central differences."""
@@ -89,7 +90,7 @@ def test_motion_and_its_derivative(programs):
     np.testing.assert_allclose(derivative, difference, rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("programs", EXAMPLES, indirect=True)
 def test_reverse_derivative(programs):
     forward, reverse, _ = programs
@@ -101,6 +102,16 @@ def twin(part):
     return dataclasses.replace(part, name=f"{part.name} twin")
 
 
+@pytest.mark.slow(
+    but=(
+        "planar: Revolute",
+        "planar: Prismatic",
+        "planar: KnifeEdge",
+        "functions: JointCoupling",
+        "spatial: Universal",
+        "spatial: Gimbal",
+    )
+)
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_a_part_that_stands_twice_is_named(name):
     """As many rows are implied as the part has, each by its twin."""
@@ -114,8 +125,8 @@ def test_a_part_that_stands_twice_is_named(name):
 
 
 # Bodies are given velocities that some of the constraints contradict.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The velocities given with the bodies")
-@pytest.mark.long
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_a_part_that_stands_twice_moves_as_once(name):
     ends = []
@@ -126,7 +137,7 @@ def test_a_part_that_stands_twice_moves_as_once(name):
     np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-8)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AT_REST)
 def test_equilibrium(name):
     """Nothing starts to move from it."""
@@ -141,6 +152,7 @@ def test_equilibrium(name):
     np.testing.assert_allclose(broken, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_gives_the_same_motion(method):
     system = compiled(EXAMPLES["planar: Body" if method == "without constraints" else "planar: Revolute"])

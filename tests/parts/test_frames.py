@@ -34,6 +34,7 @@ def in_a(direction):
     return np.asarray(rotations.rotate(jnp.asarray(TURN), jnp.asarray(direction)))
 
 
+@pytest.mark.slow
 def test_a_joint_on_frames_is_that_joint_at_their_points_and_axes():
     y = (0.0, 1.0, 0.0)
     points = {"point_a": (0.1, 0.0, 0.0), "point_b": (0.0, 0.0, 0.0)}
@@ -55,6 +56,7 @@ def test_a_joint_on_frames_is_that_joint_at_their_points_and_axes():
     assert one.velocity_rank == other.velocity_rank == 5
 
 
+@pytest.mark.slow
 def test_a_frame_that_moves_takes_its_joint_along():
     """The joint's points follow the numbers of the frame, as in a scene that is compiled with them."""
     joint = spatial.Spherical("ball", "on a", "on b", point_a=(0.1, 0.0, 0.0), point_b=(0.0, 0.0, 0.0))
@@ -68,6 +70,7 @@ def test_a_frame_that_moves_takes_its_joint_along():
     assert float(jnp.max(jnp.abs(moved.velocity_residual(0.0, q, u) - system.velocity_residual(0.0, q, u)))) > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "force",
     [
@@ -112,6 +115,7 @@ def linked(centre=(0.4, -0.1, 0.05)):
     return mb.Scene([body], joints=[hinge], forces=[G], frames=[imu]).compile()
 
 
+@pytest.mark.slow
 def test_a_body_given_in_the_frame_of_its_link():
     centre = np.array([0.4, -0.1, 0.05])
     system = linked(centre)
@@ -127,6 +131,7 @@ def test_a_body_given_in_the_frame_of_its_link():
     np.testing.assert_allclose(mb.assemble(moved, fix={"hinge.angle": 0.0}).q[:3], [0.6, 0.0, 0.0], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_an_accelerometer_and_a_gyroscope_measure():
     system = linked()
     ts = np.linspace(0.0, 0.5, 501)
@@ -167,6 +172,7 @@ def test_frames_on_frames_and_on_the_ground():
     assert {"tool.position", "hand.angle", "bench.position"} < set(mb.parameters(system))
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_numbers_of_a_frame_and_of_a_mass_centre():
     system = linked()
     values = {name: mb.parameters(system)[name] for name in ("arm.centre", "imu.position")}

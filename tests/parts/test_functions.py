@@ -33,7 +33,7 @@ def test_a_force_on_one_body_may_return_a_vector(space):
     np.testing.assert_array_equal(vector.force(0.0, state.q, state.u), row.force(0.0, state.q, state.u))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("space", [planar, spatial])
 def test_the_motion_under_a_force_that_returns_a_vector(space):
     d, size = space_of(space), 3 if space is planar else 6

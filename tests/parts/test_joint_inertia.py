@@ -80,7 +80,7 @@ def by_mass_matrix(system, q, u):
     return np.linalg.lstsq(both, np.concatenate([force, gamma]))[0][: system.nu]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_accelerations_by_all_formulations_are_those_of_the_exact_mass_matrix():
     """With redundant rows, and inertias of an angle, of a displacement and of a tendon along both."""
     plain, system = arm(), arm(*inertias())
@@ -95,7 +95,7 @@ def test_accelerations_by_all_formulations_are_those_of_the_exact_mass_matrix():
         np.testing.assert_allclose(udot[:m], own, rtol=0, atol=1e-11 * np.max(np.abs(own)), err_msg=name)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_they_have_energy_but_neither_mass_nor_momentum():
     plain, system = arm(floats=True), arm(*inertias(), floats=True)
     state = moving(system)
@@ -110,7 +110,7 @@ def test_they_have_energy_but_neither_mass_nor_momentum():
         np.testing.assert_array_equal(getattr(system, name)(state.q, state.u), getattr(plain, name)(q, u))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_machine_that_floats_conserves_energy_and_momentum():
     system = arm(*inertias(), floats=True)
     motion = mb.simulate(system, moving(system), t1=2.0, rtol=1e-10, saveat=np.linspace(0.0, 2.0, 9))
@@ -162,7 +162,7 @@ def check_wheel(motion):
     assert np.max(motion.constraint_violation) < 1e-11
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_wheel_with_a_rotor_winds_up_a_cord():
     """Through full turns, which the angle of a hinge in space is known up to."""
     system = wheel()
@@ -177,7 +177,7 @@ def test_a_wheel_with_a_rotor_winds_up_a_cord():
     np.testing.assert_allclose(moment, J[1, 1] * acceleration, rtol=0, atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{"manifold": mb.manifold.Projection()}, {"solver": Hermite()}, {"solver": diffrax.Dopri8()}]
 )
@@ -186,7 +186,7 @@ def test_a_cord_is_wound_up_by_every_method(options):
     check_wheel(motion_of_wheel(system, start_of_wheel(system), **options))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_a_wheel_with_a_rotor_and_a_cord():
     system = wheel()
     start, inertias = start_of_wheel(system), jnp.array([0.2, INERTIA])
@@ -212,7 +212,7 @@ def geared(n):
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81)), *springs]).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sparse_elimination():
     """Of many links: the accelerations of dense matrices, and by two methods the same motion."""
     system = geared(8)
@@ -230,7 +230,7 @@ def test_sparse_elimination():
         assert np.max(motion.constraint_violation) < 1e-10
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_geared_flywheel_moves_the_same():
     """In the plane: a flywheel on a bearing beside the machine, coupled to the joint."""
     rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0))
@@ -251,7 +251,7 @@ def test_a_geared_flywheel_moves_the_same():
     np.testing.assert_allclose(angles[1], angles[0], rtol=0, atol=1e-8)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_linear_and_steady_motion():
     """Vibration of a hinge with a spring, and a wheel with a rotor that turns steadily."""
     rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.0, 0.0))
@@ -287,6 +287,7 @@ def test_inertias_that_cannot_be(part, message):
         mb.Scene(bodies, joints=[hip, ball, part]).compile()
 
 
+@pytest.mark.slow
 def test_an_inertia_is_no_function_of_time():
     with pytest.raises(ValueError, match=r"'rotor\.inertia' must be constant: masses, moments of inertia"):
         mb.with_inputs(wheel(), {"rotor.inertia": lambda t: jnp.asarray(1.0 + t)})

@@ -49,6 +49,7 @@ def test_a_spring_of_an_angle_is_a_torsional_spring_in_the_plane():
     assert not any(name.startswith("spring.joint") for name in mb.parameters(own))
 
 
+@pytest.mark.slow
 def test_a_spring_of_an_angle_in_space_has_a_moment_about_the_axis():
     system = hinged(mb.JointSpring("spring", "hip.angle", stiffness=3.0, damping=0.4, free=-0.3))
     free = hinged()
@@ -76,6 +77,7 @@ def test_a_change_of_the_joint_reaches_its_spring():
     np.testing.assert_allclose(change, [0.6, 0.0, -1.0], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_motor_on_a_hinge_does_its_work():
     """The power of a moment is that times the rate of the angle."""
     motor = mb.JointForce("motor", "knee.angle", force=0.0)
@@ -88,6 +90,7 @@ def test_a_motor_on_a_hinge_does_its_work():
     assert motion.energy[-1] - motion.energy[0] == pytest.approx(float(work), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_driven_joint_may_stand_before_the_joint_it_drives():
     drive = mb.JointDriver("drive", "knee.angle", rate=1.5)
     system = pendulums(joints=[drive])
@@ -99,13 +102,14 @@ def test_a_driven_joint_may_stand_before_the_joint_it_drives():
     assert system.rows[-1] == ("drive", 0)
 
 
+@pytest.mark.slow
 def test_a_hinge_that_is_driven_through_two_turns_in_space():
     system = hinged(joints=[mb.JointDriver("drive", "hip.angle", value=0.1, rate=8.0)])
     motion = mb.simulate(system, mb.assemble(system), t1=1.7, saveat=np.linspace(0.0, 1.7, 35))
     np.testing.assert_allclose(motion["hip"].angle, 0.1 + 8.0 * motion.ts, rtol=0, atol=1e-11)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_by_all_numbers_of_parts_of_joints():
     parts = [
         mb.JointSpring("spring", "hip.angle", stiffness=3.0, damping=0.2),

@@ -27,6 +27,7 @@ def modes_of(contacts, single, both):
     return Modes.of(jnp.array([*contacts, *single, *both], float), len(contacts), (len(single),))
 
 
+@pytest.mark.slow
 def test_modes_of_contacts_and_of_friction_in_one_direction():
     """Rounding errors of the numbers do not count."""
     modes = modes_of([OPEN + 1e-9, CLOSED - 1e-9, IMPLIED], [-FORWARD + 1e-9], [FREE, FREE])

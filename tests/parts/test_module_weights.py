@@ -77,6 +77,7 @@ def linkage():
     return mb.Scene(bodies, joints=joints, forces=forces).compile()
 
 
+@pytest.mark.slow
 def test_the_weights_are_one_vector_by_name(linkage):
     known = mb.parameters(linkage)
     assert {name: known[name].shape for name in NETS} == {"friction.net": (13,), "drag_b.net": (2,), "drag_c.net": (2,)}
@@ -100,6 +101,7 @@ def test_the_weights_are_one_vector_by_name(linkage):
         np.testing.assert_array_equal(value, mb.parameters(changed)[name])
 
 
+@pytest.mark.slow
 def test_the_law_acts(linkage):
     state = mb.assemble(linkage, rates={"crank.angle": 3.0})
     ys = jax.tree.map(lambda x: x[None], state)
@@ -111,6 +113,7 @@ def test_the_law_acts(linkage):
         np.testing.assert_allclose(of(name)[0, :2], -NETS[f"{name}.net"](v @ v) * v, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_with_respect_to_weights(linkage):
     """Forward mode, reverse mode and differences of a tighter solution, under `jit` and `vmap`."""
     state = mb.assemble(linkage, rates={"crank.angle": 4.0})
@@ -183,6 +186,7 @@ def test_wrong_weights_of_parts(linkage):
         mb.identify(linkage, data, ts=np.arange(1.0, 4.0), free={"drag_b.net": NETS["drag_b.net"]})
 
 
+@pytest.mark.slow
 def test_weights_are_identified():
     """A falling body tells both weights of its law of drag."""
     mass = planar.PointMass("drop", mass=1.0, position=(0.0, 0.0))

@@ -10,6 +10,7 @@ from oracles import tracked_vehicle as oracle
 from jaxmb.parts import terrain
 
 
+@pytest.mark.slow("bump", "spline")
 @pytest.mark.parametrize("name", TERRAINS)
 def test_heights_and_slopes_are_continuous(name):
     """And curvatures but for those of the bump at its ends."""
@@ -36,6 +37,7 @@ def test_bump_is_that_of_the_vehicle():
     np.testing.assert_allclose(jax.vmap(jax.grad(BUMP.height))(x[:, None])[:, 0], slope, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_spline_goes_through_its_points_and_follows_parabolas():
     x = np.array([-1.0, 0.0, 0.3, 1.0, 1.5, 2.5])
     at = lambda part, x: jax.vmap(part.height)(jnp.asarray(x)[:, None])

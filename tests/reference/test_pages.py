@@ -11,10 +11,11 @@ import pytest
 from jaxmb.reference.entries import entries
 from jaxmb.reference.topics import topics
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.long
 def test_pages(tmp_path):
     command = [
         sys.executable,

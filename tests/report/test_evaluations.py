@@ -9,6 +9,7 @@ from jaxmb.report.evaluations import evaluations
 from jaxmb.solvers import Adams, MultistepController
 
 
+@pytest.mark.slow("solver0")
 @pytest.mark.parametrize("solver", [Adams(), diffrax.Tsit5(), diffrax.Dopri8(), diffrax.Bosh3()])
 def test_evaluations_are_those_that_happen(solver):
     count = 0

@@ -20,6 +20,7 @@ def oscillator():
     return system, mb.assemble(system), 1.0
 
 
+@pytest.mark.slow
 def test_the_error_is_the_true_one(oscillator):
     """Against the closed form, x = 1 + cos 3t; and an error that the reference cannot tell is no number."""
     system, state, t1 = oscillator
@@ -51,6 +52,7 @@ def test_what_is_asked_of_a_report(oscillator):
         stress_test(system, state, t1=1.0, only=["length"])
 
 
+@pytest.mark.slow
 def test_stress_of_a_scene(oscillator, tmp_path):
     """Errors of known motions; a spring too stiff for the steps allowed, and what does not apply."""
     system, state, t1 = oscillator
@@ -69,7 +71,7 @@ def test_stress_of_a_scene(oscillator, tmp_path):
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_of_a_scene_with_internal_states():
     """A rod with a motor that lags: its force counts among the errors, and variants start with it."""
     rod = planar.Body("rod", mass=2.0, inertia=0.3)
@@ -90,7 +92,7 @@ def test_stress_of_a_scene_with_internal_states():
     assert coarse > 1e-8
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_of_a_pendulum(pendulum):
     """Every kind of variant of one body; the position below the pin is no singular one, but can be named."""
     system, state = pendulum
@@ -105,7 +107,7 @@ def test_stress_of_a_pendulum(pendulum):
     assert errors["stiffness", "× 1e+14"] == "refused" and "maximum number of solver steps" in str(report)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stress_of_a_machine_with_a_rotor_a_mimic_joint_and_a_servo():
     """Variants whose masses alone change, while numbers of no known unit leave out those of other lengths."""
     bodies = [planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0)) for name, x in (("rod", 0.5), ("tip", 1.5))]

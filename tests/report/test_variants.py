@@ -36,6 +36,7 @@ def test_lengths_in_functions_are_not_scaled():
         scaled_lengths(system, system.guess, 2.0)
 
 
+@pytest.mark.slow
 def test_numbers_on_a_joint_have_the_units_of_its_coordinate():
     """A spring on a slide and a motor on a hinge: the same accelerations in units of the system's size."""
     cart = planar.Body("cart", mass=5.0, inertia=0.5, position=(0.1, 0.0))
@@ -135,6 +136,7 @@ def test_units_of_a_part_of_a_user():
         scaled_lengths(system, system.guess, 2.0)
 
 
+@pytest.mark.slow
 def test_laws_of_contact_and_rotors_are_scaled_by_dimension():
     """A ball on elastic ground, and a rod with a rotor: the same accelerations in units of the system's size."""
     ball = planar.Body("ball", mass=1.0, inertia=0.1, position=(0.0, 0.099))

@@ -32,6 +32,7 @@ def precision(pendulum):
     return work_precision(pendulum, solvers=solvers, tolerances=(1e-5, 1e-9), repeats=3)
 
 
+@pytest.mark.slow
 def test_errors_fall_with_the_tolerance(precision):
     runs = {(run["solver"], run["rtol"]): run for run in precision.to_dict()["rows"]}
     for solver in ("Adams", "Dopri8"):
@@ -43,6 +44,7 @@ def test_errors_fall_with_the_tolerance(precision):
             assert 0 <= run["rejected"] < run["steps"]
 
 
+@pytest.mark.slow
 def test_forms(precision, tmp_path):
     """A table for a terminal and for a notebook, plain data, and a picture with these."""
     assert len(str(precision).splitlines()) == 1 + 1 + 4 + 1
@@ -68,6 +70,7 @@ def test_a_table_in_words():
         table.figure("figure.png")
 
 
+@pytest.mark.slow
 def test_computed_reference(pendulum):
     """Without published values: two methods two orders tighter, which agree with each other and with those."""
     known = reference(dataclasses.replace(pendulum, references=None), 1e-9)
@@ -78,6 +81,7 @@ def test_computed_reference(pendulum):
         np.testing.assert_allclose(value, published[label], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_failed_run_keeps_its_row(pendulum):
     lost = dataclasses.replace(pendulum, state=jax.tree.map(lambda x: x * jnp.nan, pendulum.state))
     failed = work_precision(lost, solvers={"Tsit5": diffrax.Tsit5()}, tolerances=(1e-5,), repeats=1)
@@ -90,6 +94,7 @@ def test_no_arguments_to_work_with(pendulum):
             work_precision(pendulum, **arguments)
 
 
+@pytest.mark.slow
 def test_figures_without_matplotlib(precision, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"jaxmb\[plot\]"):

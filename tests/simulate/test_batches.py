@@ -38,6 +38,7 @@ def batch():
     return jax.jit(both)(jnp.array([1.0, 2.0]), jnp.array([3.0, 6.0, 9.0]))
 
 
+@pytest.mark.slow(but=("violation", "quantities"))
 @pytest.mark.parametrize("view", ALONE)
 def test_views_of_a_batch_are_those_of_its_members(batch, view):
     together = ALONE[view](batch)
@@ -56,6 +57,7 @@ def test_a_batch_is_saved_as_its_members_are(batch, tmp_path):
         np.testing.assert_allclose(saved[name][1, 2], value, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_coordinates_of_a_batch_by_name():
     kinetic, potential = lambda t, q, v, p: 0.5 * p["m"] * v @ v, lambda t, q, p: 0.5 * (q[0] ** 2 + 4.0 * q[1] ** 2)
     system = mb.lagrangian.LagrangianSystem(
@@ -89,7 +91,8 @@ def pushed(system, end, mass, speed, **options):
     return mb.simulate(changed, state, t1=0.9, throw=False, **options)
 
 
-@pytest.mark.parametrize("derivative", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
 def test_a_member_that_fails_is_not_a_number_throughout(mass_until, derivative):
     """Half way, from a start that is not finite, and from forces that are not: also what it depends on in no step."""
     one, nan = 1.0, np.nan
@@ -106,7 +109,8 @@ def test_a_member_that_fails_is_not_a_number_throughout(mass_until, derivative):
     np.testing.assert_allclose(derivatives[0, 2, 1], -2.0 / 3.0 * (1.0 - 0.8**1.5), rtol=1e-6)
 
 
-@pytest.mark.parametrize("solver", [None, pytest.param(mb.solvers.Hermite(), marks=pytest.mark.long), diffrax.Dopri8()])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [None, pytest.param(mb.solvers.Hermite(), marks=pytest.mark.slow), diffrax.Dopri8()])
 def test_a_member_that_cannot_start_takes_no_step(mass_until, solver):
     run = jax.jit(jax.vmap(lambda speed: pushed(mass_until, jnp.array(1.0), jnp.array(1.0), speed, solver=solver)))
     motion = run(jnp.array([1.0, np.nan, 1.0]))
@@ -116,6 +120,7 @@ def test_a_member_that_cannot_start_takes_no_step(mass_until, solver):
     np.testing.assert_array_equal(np.isinf(motion.ts), [[False] * 3, [True] * 3, [False] * 3])
 
 
+@pytest.mark.slow
 def test_forces_that_are_not_finite_at_the_start_end_the_run_at_once(mass_until):
     motion = pushed(mass_until, jnp.array(-1.0), jnp.array(1.0), jnp.array(1.0), saveat=None)
     assert motion.stats["num_steps"] == 1 and motion.result == mb.RESULTS.dt_min_reached
@@ -128,6 +133,7 @@ def test_a_single_run_that_fails_is_kept_as_far_as_it_came(mass_until):
     np.testing.assert_allclose(motion["body"].velocity[-1, 0], 1.0 + 2.0 / 3.0 * 0.5**1.5, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_state_that_was_not_found():
     mechanism = mb.mechanisms.get("four_bar")
 
@@ -141,7 +147,7 @@ def test_derivatives_of_a_state_that_was_not_found():
         np.testing.assert_array_equal(np.isnan(jax.jit(jax.vmap(derivative(angle)))(lengths)), [False, True])
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_the_gradient_of_a_sum_over_a_batch():
     """Of what the members share: the sum of theirs."""
     mechanism = mb.mechanisms.get("pendulum")
@@ -162,6 +168,7 @@ def test_the_gradient_of_a_sum_over_a_batch():
     np.testing.assert_allclose(together, jnp.sum(each), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_vmap_over_lengths_equals_the_loop():
     mechanism = mb.mechanisms.get("four_bar")
 
@@ -178,6 +185,7 @@ def test_vmap_over_lengths_equals_the_loop():
     np.testing.assert_allclose(together, [single(length) for length in lengths], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_failed_members_leave_the_others_alone():
     mechanism = mb.mechanisms.get("four_bar")
 

@@ -33,6 +33,7 @@ def driven(amplitude, **options):
     return mb.simulate(BAR, mb.assemble(BAR), t1=0.5, inputs=inputs, **options)["bar"].angle[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run, x", [(time_of_event, 0.5), (saved, 1.5), (driven, 2.0)])
 def test_derivatives_by_what_functions_close_over(run, x):
     step = 1e-3

@@ -13,6 +13,8 @@ import jaxmb as mb
 from jaxmb.simulate import compiling
 from jaxmb.simulate.loop import Loop
 
+pytestmark = pytest.mark.slow
+
 # `jaxmb.simulate` is the function.
 solve = importlib.import_module("jaxmb.simulate.solve")
 integrate = importlib.import_module("jaxmb.simulate.integrate")
@@ -26,7 +28,6 @@ def programs(monkeypatch):
     return traced
 
 
-@pytest.mark.always
 def test_twenty_calls_of_a_user(programs):
     """Times, tolerances, numbers of steps and of saved times, errors, other parameters."""
     machine = mb.mechanisms.pendulum()

@@ -48,7 +48,8 @@ def delayed(place, width, height):
     return 1.0 - (time - 2 * width)
 
 
-@pytest.mark.parametrize("solver", ["Adams", pytest.param("Hermite", marks=pytest.mark.long), "Dopri8", "Tsit5"])
+@pytest.mark.slow("0.3-0.03-Adams", "0.3-0.03-Dopri8", "0.3-0.03-Tsit5")
+@pytest.mark.parametrize("solver", ["Adams", pytest.param("Hermite", marks=pytest.mark.slow), "Dopri8", "Tsit5"])
 @pytest.mark.parametrize("place, width", [(0.3, 0.03), (0.61, 1e-3)])
 def test_a_ball_that_passes_a_thin_layer(solver, place, width):
     system, rtol = with_layer(LAYER, place, width, 0.4), 1e-6
@@ -67,7 +68,7 @@ def test_a_ball_that_a_thin_layer_throws_back_also_backwards_in_time():
     np.testing.assert_allclose(back.ys.u[-1], system.guess.u, atol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_same_under_jit_and_vmap():
     places = np.array([0.2, 0.47, 0.8])
 
@@ -78,7 +79,7 @@ def test_the_same_under_jit_and_vmap():
     np.testing.assert_allclose(jit_quickly(jax.vmap(end))(places), [delayed(x, 1e-3, 0.4) for x in places], atol=3e-7)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
 def test_derivatives_of_a_ball_that_passes_a_thin_layer(solver):
     def end(height, rtol=1e-10):
@@ -103,7 +104,7 @@ def bouncing(gap):
     return mb.Scene([ball], forces=forces).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_ball_that_bounces_takes_the_same_steps_with_a_gap():
     ends = []
     for gap in (None, lambda poses, t, p: poses[0, 1]):
@@ -136,6 +137,7 @@ def strike(rate=6.0):
 STRIKE = strike()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
 def test_a_finger_that_is_driven_evenly_strikes_a_paddle(rtol):
     motion = mb.simulate(STRIKE, mb.assemble(STRIKE, fix={"pin.angle": 0.0}), t1=2.0, rtol=rtol)
@@ -146,7 +148,7 @@ def test_a_finger_that_is_driven_evenly_strikes_a_paddle(rtol):
 # The longest step.
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["Adams", "Hermite", "Dopri8"])
 def test_dtmax_bounds_steps_and_leaves_the_tolerances(solver):
     system, longest = bouncing(None), 0.01

@@ -37,13 +37,13 @@ BALL = ball(0.5)
 FALL = np.sqrt(2 / G)
 
 
+@pytest.mark.slow
 def test_a_time_that_is_too_coarse_for_contacts_is_named():
     """Seconds since 1970: the next number is a quarter of a microsecond away."""
     with pytest.raises(RuntimeError, match=r"numbers next to t = 1.7e\+09 are 2.4e-07 s away.*begin at zero"):
         mb.simulate(BALL, mb.assemble(BALL), t0=1.7e9, t1=1.7e9 + 1)
 
 
-@pytest.mark.always
 def test_bouncing_ball_comes_to_rest():
     """Twenty impacts, and the sum of all that follow."""
     saveat = diffrax.SaveAt(ts=np.array([0.4, 1.0, 1.5, 2.0]), dense=True)
@@ -87,7 +87,6 @@ def end(values, t1, **options):
     return motion["ball"].position[-1, 1]
 
 
-@pytest.mark.always
 def test_derivatives_through_impacts():
     at, t1 = jnp.array([0.8, 0.1]), jnp.array(1.9)
     exact = lambda values, t1: height(t1, *values, 3)
@@ -98,6 +97,7 @@ def test_derivatives_through_impacts():
         np.testing.assert_allclose(got, known, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_saltation_matrix_of_an_impact():
     """How height and speed after an impact change with those at the start, by the formula for a hybrid system.
 
@@ -123,6 +123,7 @@ def test_the_saltation_matrix_of_an_impact():
         np.testing.assert_allclose(jit_quickly(mode(end))(at), exact, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_forward_mode_is_reverse_mode_through_impacts():
     at = jnp.array([0.7, 0.05])
     forward, reverse = (jit_quickly(mode(lambda at: end(at, 2.0)))(at) for mode in (jax.jacfwd, jax.grad))
@@ -138,7 +139,7 @@ def particle_on_a_sphere(x, y):
     ).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_through_closing_sliding_and_opening():
     """A particle falls on a sphere, slides down and leaves it: both modes, and differences of a tighter solution."""
     system = particle_on_a_sphere(0.3, 1.3)
@@ -159,6 +160,7 @@ def test_derivatives_through_closing_sliding_and_opening():
         np.testing.assert_allclose(reverse[k], (8 * near - far) / (12 * h), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_events_have_derivatives():
     """Times, impulses and energies lost, in both modes, against closed forms."""
 
@@ -182,6 +184,7 @@ def test_events_have_derivatives():
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_member_without_events_has_finite_derivatives_of_them():
     """In space, where zeros are no attitude; one member of the batch meets the floor, the other does not."""
     system = mb.Scene(
@@ -202,6 +205,7 @@ def test_a_member_without_events_has_finite_derivatives_of_them():
     np.testing.assert_allclose(slopes, [fall / 2, 0.0], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_time_of_opening_has_a_derivative():
     """A particle that slides down a sphere from rest leaves it at a time with constant `t² g`."""
     system = particle_on_a_sphere(0.6, 0.8)
@@ -214,6 +218,7 @@ def test_the_time_of_opening_has_a_derivative():
     np.testing.assert_allclose(slope, -time / (2 * G), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_time_of_opening_where_forces_balance():
     """A particle on a floor that is pushed upwards by more and more leaves it when nothing acts on it altogether."""
     system = mb.Scene(
@@ -232,6 +237,7 @@ def test_the_time_of_opening_where_forces_balance():
     np.testing.assert_allclose(found, [1.0, 1.0], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_time_of_a_jump_beside_a_contact():
     """Neither the start of the run nor an impact is a jump: the ball bounces, and a pull sets in later."""
     system = mb.Scene(
@@ -252,6 +258,7 @@ def test_the_time_of_a_jump_beside_a_contact():
     np.testing.assert_allclose(slope, -4.0 * 0.08, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_derivatives_by_known_jumps_beside_a_stop():
     """A pull sets in while a ball falls onto a stop, and ends after the impact: by its size and both times."""
     system = mb.Scene(
@@ -285,6 +292,7 @@ def test_derivatives_by_known_jumps_beside_a_stop():
     np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_ball_on_a_floor_that_vibrates():
     """It lands without a rebound, rides, and lifts off where the floor falls as gravity does."""
     system = mb.Scene(
@@ -318,6 +326,7 @@ def test_a_ball_on_a_floor_that_vibrates():
     np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_particle_that_slides_on_a_slope_that_rises():
     """Dry friction on it is that under a gravity which is larger by the acceleration of the ground."""
     gradient = 0.6
@@ -350,6 +359,7 @@ def test_derivatives_of_a_particle_that_slides_on_a_slope_that_rises():
     np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_block_between_stops_that_move():
     """Each impact is with the stop as fast as it moves; members of a batch as one run."""
     block = planar.Body("block", mass=2.0, inertia=0.1, velocity=(1.5, 0.0))
@@ -391,6 +401,7 @@ def test_derivatives_of_a_block_between_stops_that_move():
         np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()], ids=["Adams", "Dopri8"])
 def test_a_ball_among_pegs(solver):
     """In one step it comes near to several of them; the one that it hits need not be the nearest at the end."""
@@ -414,8 +425,9 @@ def test_a_ball_among_pegs(solver):
         np.testing.assert_allclose(motion["ball"].position[-1], last, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "solver", [None, pytest.param(diffrax.Dopri8(), marks=pytest.mark.long)], ids=["Adams", "Dopri8"]
+    "solver", [None, pytest.param(diffrax.Dopri8(), marks=pytest.mark.slow)], ids=["Adams", "Dopri8"]
 )
 def test_the_first_peg_that_random_flights_meet(solver):
     """Steps are long, and gaps close and open again within them, also after they rose at the start."""
@@ -450,7 +462,7 @@ def test_the_first_peg_that_random_flights_meet(solver):
             )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_tangents_after_impacts_by_a_matrix_and_one_at_a_time(monkeypatch):
     state = mb.assemble(BALL)
 
@@ -471,7 +483,7 @@ def test_tangents_after_impacts_by_a_matrix_and_one_at_a_time(monkeypatch):
         np.testing.assert_allclose(other, forward, rtol=1e-10, atol=1e-13)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_events_are_found_once_in_a_program():
     """Derivatives have them from the motion."""
     found = lambda function: str(jax.make_jaxpr(function)(jnp.array([0.8, 0.1]))).count("name=find_event")
@@ -479,6 +491,7 @@ def test_events_are_found_once_in_a_program():
     assert found(value) == found(jax.grad(value)) == found(jax.jacfwd(value)) == 1
 
 
+@pytest.mark.slow
 def test_a_stop_that_vibrates():
     """Nothing of the motion towards it asks for short steps."""
     body = planar.Body("body", mass=2.0, inertia=0.1, velocity=(1.0, 0.0))
@@ -494,6 +507,7 @@ def test_a_stop_that_vibrates():
     np.testing.assert_allclose(motion.events.times[0], first, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_particle_at_rest_lifts_off_when_it_is_pulled():
     """Where everything rests no error estimate asks for short steps, and the pull is over at the end of a long one."""
     system = mb.Scene(
@@ -506,6 +520,7 @@ def test_a_particle_at_rest_lifts_off_when_it_is_pulled():
     np.testing.assert_allclose(motion.events.times[0], np.arcsin(2 / 3) / (2 * np.pi), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_events_are_those_until_the_motion_ends():
     event = diffrax.Event(lambda t, y, args, **_: t - 0.4, optimistix.Newton(1e-10, 1e-10))
     motion = mb.simulate(BALL, mb.assemble(BALL), t1=2.0, event=event, rtol=1e-10)
@@ -513,6 +528,7 @@ def test_events_are_those_until_the_motion_ends():
     assert len(motion.events) == 0 and motion.stats["num_events"] == 0
 
 
+@pytest.mark.slow
 def test_impulses_of_contacts_that_stay_closed_are_events():
     """A ball strikes a block on the floor, which passes the impulse on."""
     system = mb.Scene(
@@ -529,6 +545,7 @@ def test_impulses_of_contacts_that_stay_closed_are_events():
     np.testing.assert_allclose([event.impulse for event in motion.events], expected, rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [-1e-6, -1e-8, -1e-10])
 def test_a_start_that_overlaps_by_its_last_digits(gap):
     state = mb.assemble(BALL)
@@ -539,6 +556,7 @@ def test_a_start_that_overlaps_by_its_last_digits(gap):
         np.testing.assert_allclose(motion["ball"].velocity[-1, 1], rebound - 0.05 * G, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_numbers_that_do_not_agree_where_they_are_traced():
     @jax.jit
     def run(restitution):
@@ -549,6 +567,7 @@ def test_numbers_that_do_not_agree_where_they_are_traced():
     assert run(1.5) == mb.RESULTS.invalid_parameters._value
 
 
+@pytest.mark.slow("jit")
 @pytest.mark.parametrize("around", [lambda f: f, jax.jit], ids=["eager", "jit"])
 def test_second_derivatives_through_impacts_are_refused(around, monkeypatch):
     if around is not jax.jit:
@@ -558,6 +577,7 @@ def test_second_derivatives_through_impacts_are_refused(around, monkeypatch):
         jax.hessian(around(lambda at: end(at, 0.6)))(jnp.array([0.8, 0.1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"solver": diffrax.Tsit5()}, {"manifold": Projection()}], ids=["Tsit5", "sparse"])
 def test_other_solvers_and_manifolds(options):
     at, t1 = jnp.array([0.8, 0.1]), jnp.array(1.9)
@@ -566,6 +586,7 @@ def test_other_solvers_and_manifolds(options):
     np.testing.assert_allclose(slope, jax.grad(lambda at: height(t1, *at, 3))(at), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_have_their_own_events():
     at = jnp.array([[0.0, 0.0], [0.5, 0.0], [0.8, 0.1], [1.0, 0.3]])
 
@@ -581,6 +602,7 @@ def test_members_of_a_batch_have_their_own_events():
     np.testing.assert_allclose(together[0][2], height(1.9, 0.8, 0.1, 3), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_batch_whose_members_have_their_own_events():
     """Those of the closed form, in both modes, of members with two to six impacts."""
     at, impacts, t1 = jnp.array([[0.95, -0.5], [0.8, 0.1], [0.9, 0.3], [0.7, 0.3]]), (2, 3, 3, 6), 1.9
@@ -590,6 +612,7 @@ def test_derivatives_of_a_batch_whose_members_have_their_own_events():
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_mass_between_two_stops():
     """Without forces the speed is `restitution` to the number of impacts."""
     system = mb.Scene(
@@ -607,7 +630,7 @@ def test_a_mass_between_two_stops():
     np.testing.assert_allclose(np.asarray(motion.events.impulses)[:, 0], 6 * 1.9 * 0.9 ** np.arange(len(times)))
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_steps_between_impacts():
     """A rattling mass takes three steps from one stop to the other, and a fourth that was too long: the step after an
     impact is as long as it could be after the last one, and one that passes the middle is not too coarse.
@@ -626,6 +649,7 @@ def test_steps_between_impacts():
     assert motion.stats["num_steps"] <= 4.2 * 30
 
 
+@pytest.mark.slow
 def test_cradle():
     """Five balls almost touch: the last one takes all of the velocity of the first."""
     at = [-0.2, *(0.1 * k + 1e-6 * k for k in range(1, 5))]
@@ -644,6 +668,7 @@ def test_cradle():
     np.testing.assert_allclose(motion["b4"].position[-1, 0], at[4] + 1.0 - (0.2 + 4e-6), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_particle_leaves_a_sphere():
     """It slides from the top without friction and leaves the sphere at two thirds of its radius above the centre."""
     start = 0.1
@@ -660,7 +685,7 @@ def test_a_particle_leaves_a_sphere():
     np.testing.assert_allclose(late.q[:2], flight, atol=1e-9)
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_redundant_contacts_of_a_table():
     """A table falls flat on four legs: three of the reactions carry it, or two, and the fourth is implied."""
     table = spatial.Body("table", mass=2.0, inertia=np.diag([0.1, 0.1, 0.15]), position=(0.0, 0.0, 0.5))
@@ -678,6 +703,7 @@ def test_redundant_contacts_of_a_table():
     np.testing.assert_allclose(sum(f * leg[0] for f, leg in zip(forces, legs, strict=True)), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_block_comes_to_rest_on_its_corners():
     """Its corners strike in turn, infinitely often in a short time; energy is never gained."""
     block = planar.Body("block", mass=2.0, inertia=0.3, position=(0.0, 0.6), angle=0.05)
@@ -696,6 +722,7 @@ def test_a_block_comes_to_rest_on_its_corners():
     np.testing.assert_allclose(forces, [G, G], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_ball_bounces_off_the_edge_of_a_box():
     """It is reflected along the line from the edge to its centre."""
     radius, beyond, restitution = 0.1, 0.06, 0.7
@@ -715,6 +742,7 @@ def test_a_ball_bounces_off_the_edge_of_a_box():
     np.testing.assert_allclose(motion["ball"].position[-1], end, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_rope_tightens():
     """A free fall until the rope is tight, with the impulse along it."""
     system = mb.Scene(
@@ -730,6 +758,7 @@ def test_a_rope_tightens():
     np.testing.assert_allclose(motion.energy[-1], 0.0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_stop_that_is_only_just_reached():
     """Steps are long where a spring turns round: the stop is in the middle of one."""
     system = mb.Scene(
@@ -745,6 +774,7 @@ def test_a_stop_that_is_only_just_reached():
     np.testing.assert_allclose(event.time, np.arccos(-0.9999), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_motions_that_start_in_contact():
     closed = mb.assemble(BALL, fix={"floor.mode": 1})
     np.testing.assert_allclose(closed.q[1], 0.0, atol=1e-15)
@@ -757,7 +787,7 @@ def test_motions_that_start_in_contact():
     np.testing.assert_allclose(motion["ball"].position[-1, 1], 0.1 - G * 0.005, atol=1e-9)
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_refusals():
     state = mb.assemble(BALL)
     inside = mb.assemble(BALL, fix={"ball.y": -0.1})
@@ -799,6 +829,7 @@ def touch(policy, solver, system, rtol):
     return float(guards.touch)
 
 
+@pytest.mark.slow
 def test_gaps_that_count_as_closed():
     """A thousandth of the tolerance with every manifold, and no less than positions are found to."""
     ways = [
@@ -812,7 +843,7 @@ def test_gaps_that_count_as_closed():
         np.testing.assert_allclose(touch(policy(newton_tol=1e-5), solver, BALL, rtol), 1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-3, 1e-6])
 def test_what_counts_as_closed_does_not_depend_on_the_size_of_a_scene(rtol):
     """A ball beside bars whose rows are eliminated along the joints, with the steps of a dense matrix."""
@@ -831,7 +862,7 @@ def test_what_counts_as_closed_does_not_depend_on_the_size_of_a_scene(rtol):
         np.testing.assert_allclose(event.time, other.time, atol=10 * rtol)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_impact_of_a_driven_hammer_gives_energy():
     """The driver keeps the hammer at its speed v, and the ball leaves at (1 + e) v: a loss below zero."""
     bodies = [

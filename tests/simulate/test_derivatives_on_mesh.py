@@ -81,6 +81,7 @@ FORMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMS)
 def test_forward_reverse_and_the_discrete_solution(name):
     observe = FORMS[name]
@@ -93,7 +94,6 @@ def test_forward_reverse_and_the_discrete_solution(name):
     np.testing.assert_allclose(forward / scale, exact / scale, rtol=0, atol=1e-8)
 
 
-@pytest.mark.always
 def test_hessian_and_batches_without_an_option():
     energy = lambda p: jnp.sum(jnp.cos(jnp.arange(6.0)) * states(run(p)))
     gradient = jax.jit(jax.grad(energy))
@@ -109,6 +109,7 @@ def test_hessian_and_batches_without_an_option():
         jax.jacrev(jax.grad(energy))(POINT)
 
 
+@pytest.mark.slow
 def test_runs_longer_than_the_rows_that_are_kept():
     """Rows of segments are found again from their starts."""
     end = lambda p, most: states(run(p, adjoint=MeshAdjoint(most), saveat=TIMES))
@@ -127,7 +128,7 @@ def test_runs_longer_than_the_rows_that_are_kept():
 LONGER = ["backward", "jumps", "steps", "event", "projection", "hermite", "explicit", "implicit"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LONGER)
 def test_steps_of_segments_are_taken_again(name):
     """Also those of other solvers and manifolds, after jumps, and up to an event."""
@@ -136,6 +137,7 @@ def test_steps_of_segments_are_taken_again(name):
     np.testing.assert_allclose(cut, whole, rtol=1e-9, atol=1e-9 * np.max(np.abs(whole)))
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_run_that_is_too_long():
     second = jax.hessian(lambda p: jnp.sum(states(run(p, adjoint=MeshAdjoint(16)))))
     with pytest.raises(RuntimeError, match="Second derivatives need the rows of all steps, of which 16 are kept"):
@@ -156,6 +158,7 @@ class Onset(parts.AbstractPair, parts.AbstractForce):
         return jnp.stack([jnp.zeros(3), jnp.array([1.0, 0.0, 0.0]) * force])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [pytest.param(Adams(), id="Adams"), pytest.param(Hermite(), id="Hermite")])
 def test_derivatives_by_all_times(solver):
     """Start, end, saved times and times of jumps, first and second derivatives, against the solution in closed form."""
@@ -206,6 +209,7 @@ def test_times_that_are_numbers_have_no_derivatives_to_compile(moves, monkeypatc
     assert bool(found) == moves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [pytest.param(Adams(), id="Adams"), pytest.param(Hermite(), id="Hermite")])
 def test_the_time_of_an_impulse_has_a_derivative(solver):
     """A rail whose driver jumps from one rate to another at a time: the position of the load that it carries along."""
@@ -237,6 +241,7 @@ def test_the_time_of_an_impulse_has_a_derivative(solver):
         np.testing.assert_allclose(jax.jit(mode(angle))(at), central, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_times_of_jumps_have_no_derivatives_by_other_solvers():
     system = mb.Scene([planar.Body("body", mass=2.0, inertia=1.0)], forces=[mb.Gravity((0.0, -9.81))]).compile()
 

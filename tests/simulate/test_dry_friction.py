@@ -31,6 +31,7 @@ def slider(angle=0.0, velocity=3.0, **coefficients):
     ).compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, diffrax.Dopri8()], ids=["Adams", "Dopri8"])
 def test_a_block_that_is_pushed_to_and_fro_slips_at_each_peak(solver):
     """While it sticks nothing moves, so that no error estimate asks for short steps."""
@@ -50,7 +51,6 @@ def test_a_block_that_is_pushed_to_and_fro_slips_at_each_peak(solver):
     np.testing.assert_allclose(motion["block"].position[-1, 0], 0.0, atol=1e-8)
 
 
-@pytest.mark.always
 def test_a_block_slides_stops_and_stays():
     system = slider(coefficient=0.3)
     motion = mb.simulate(system, mb.assemble(system), t1=2.0, saveat=[0.5, 2.0], rtol=1e-10)
@@ -70,6 +70,7 @@ def test_a_block_slides_stops_and_stays():
     assert len(after.events) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -87,6 +88,7 @@ def test_other_solvers_and_manifolds(options):
     np.testing.assert_allclose(motion["block"].position[:, 0], x, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_batch_whose_members_stop_at_other_times():
     """One of them does not move at all, one does not stop; values and derivatives are those of each alone."""
     system = slider(coefficient=0.3)
@@ -107,6 +109,7 @@ def test_a_batch_whose_members_stop_at_other_times():
     np.testing.assert_allclose(reverse, slopes, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tan, time", [(0.29, None), (0.31, 0.7)])
 def test_a_block_stays_on_an_incline_within_the_cone(tan, time):
     """Below the angle of friction nothing moves, above it the block slides down; forces are those of statics."""
@@ -120,6 +123,7 @@ def test_a_block_stays_on_an_incline_within_the_cone(tan, time):
     np.testing.assert_allclose(np.linalg.norm(motion.reactions["rub"].force, axis=1), held, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["planar", "spatial"])
 def test_a_wheel_on_a_pin_stops(space):
     if space == "planar":
@@ -153,6 +157,7 @@ def belt():
     return mb.Scene(bodies, joints=joints, forces=[DOWN, spring, rub]).compile()
 
 
+@pytest.mark.slow
 def test_discs_that_roll_side_by_side():
     """They come nearer by rounding errors, which neither close their contact nor end the run."""
     discs = [
@@ -171,6 +176,7 @@ def test_discs_that_roll_side_by_side():
         np.testing.assert_allclose(motion[f"disc{k}"].position[-1], [0.5 + 0.4 * k, 0.2], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_stick_slip_on_a_belt():
     system = belt()
     motion = mb.simulate(system, mb.assemble(system), t1=6.0, rtol=1e-10)
@@ -210,6 +216,7 @@ def ramped(p):
     return first + further - slow * (3.0 - begins) ** 2 / 2, jnp.stack([stops, begins])
 
 
+@pytest.mark.slow
 def test_derivatives_through_stick_and_slip():
     """In reverse and forwards, against the closed form; the times of both events depend on the parameters."""
 
@@ -250,6 +257,7 @@ def disc(coefficient=0.2, height=RADIUS, velocity=3.0, spin=0.0, restitution=0.0
 DISC = disc()
 
 
+@pytest.mark.slow
 def test_a_disc_rolls_after_slipping():
     motion = mb.simulate(DISC, mb.assemble(DISC), t1=1.0, saveat=[0.3, 1.0], rtol=1e-10)
     stick = motion.events[-1]
@@ -262,6 +270,7 @@ def test_a_disc_rolls_after_slipping():
     np.testing.assert_allclose(motion.reactions["rub"].force, [[-0.2 * 1.5 * G, 0.0], [0.0, 0.0]], atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coefficient, spin", [(0.2, 0.0), (0.05, 0.0), (0.2, -40.0)])
 def test_friction_has_an_impulse(coefficient, spin):
     """That of a disc that bounces: in the cone, against the slip that remains, or such that none remains."""
@@ -279,6 +288,7 @@ def test_friction_has_an_impulse(coefficient, spin):
     np.testing.assert_allclose(motion["disc"].angular_velocity[-1], spin + 2 * impulse / 1.5 / RADIUS, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_through_an_impact_with_friction():
     """Of a bounce whose slip remains, and of one whose slip ends, and of rolling after slipping."""
 
@@ -307,6 +317,7 @@ def test_derivatives_through_an_impact_with_friction():
 HALF, TALL = 0.1, 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spin", [0.0, -40.0])
 def test_impulses_and_energies_change_as_their_differences(spin):
     """Of an impact with friction that slips to its end, or whose slip ends in it; and the time of it."""
@@ -328,6 +339,7 @@ def test_impulses_and_energies_change_as_their_differences(spin):
     np.testing.assert_allclose(forward, differences.T, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_rocking_block():
     """Housner's: between impacts a pendulum about a corner, and at each impact the angular velocity falls by
     `1 - 1.5 sin² α`. Source: G. W. Housner, Bull. Seism. Soc. Am. 53, 1963.
@@ -372,6 +384,7 @@ def painleve(angle, velocity, coefficient):
     return mb.Scene([rod], joints=[tip], forces=[DOWN, rub]).compile()
 
 
+@pytest.mark.slow
 def test_a_rod_that_jams():
     """Painlevé's: pushed along its lean it has no solution with much friction; pulled it has one."""
     system = painleve(1.2, 5.0, 2.0)
@@ -387,6 +400,7 @@ def test_a_rod_that_jams():
     np.testing.assert_allclose(motion.accelerations[0, 2], 3.0 * turn, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_painleves_paradox_is_where_it_was_found():
     """Beyond a friction of 4/3, where `tan θ` is between `(3 μ ± √(9 μ² − 16)) / 2`, the force at the end of a rod that
     is pushed has no value, or two where the rod turns so fast that it may also lift off (F. Génot and B. Brogliato,
@@ -411,6 +425,7 @@ def test_painleves_paradox_is_where_it_was_found():
     np.testing.assert_array_equal(jit_quickly(jax.vmap(run))(jnp.array(angle), jnp.array(turn)), paradox)
 
 
+@pytest.mark.slow
 def test_a_rod_falls_off_the_edge_of_a_table():
     """It tips about the edge, slides over it where `tan θ = μ a² / (a² + 9 b²)`, and leaves it."""
     half, beyond, coefficient = 0.5, 0.2, 0.5
@@ -463,6 +478,7 @@ def falling_chain():
     return mb.Scene(links, joints=joints, forces=[DOWN, rub]).compile()
 
 
+@pytest.mark.slow
 def test_an_impact_gives_no_energy_back():
     """Where the whole rebound would, it is less, and the derivative of the state after it is that of this rule."""
     system = falling_chain()
@@ -496,6 +512,7 @@ def test_an_impact_gives_no_energy_back():
     np.testing.assert_allclose(slope, difference, atol=1e-6 * np.max(np.abs(u_after)))
 
 
+@pytest.mark.slow
 def test_the_time_of_release_has_a_derivative_in_a_contact():
     """Of a disc that rolls until the force on it is too large for stick, also where a closed contact has a rounding
     error for a rate.

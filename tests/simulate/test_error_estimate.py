@@ -12,9 +12,10 @@ MACHINES = {"four_bar": 2.0, "heavy_top": 1.0, "roller_racer": 2.0, "slider_cran
 MORE = {"andrews": 0.03, "bricard": 2.0, "rolling_disc": 1.0, "spherical_four_bar": 1.0, "double_wishbone": 0.5}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [*list(MACHINES)[:2], *(pytest.param(name, marks=pytest.mark.long) for name in [*list(MACHINES)[2:], *MORE])],
+    [*list(MACHINES)[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in [*list(MACHINES)[2:], *MORE])],
 )
 def test_estimates_are_of_the_size_of_errors(name):
     mechanism = mb.mechanisms.get(name)
@@ -37,6 +38,7 @@ def test_estimates_are_of_the_size_of_errors(name):
     assert np.mean((ratios > 0.1) & (ratios < 10)) >= 0.95 and np.max(ratios) < 100, np.sort(ratios)[[0, 1, -2, -1]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, rtol", [(mb.solvers.Adams(), 1e-12), (mb.solvers.Hermite(), 2e-10)])
 def test_estimates_where_a_tighter_tolerance_has_the_same_steps(solver, rtol):
     """Near rounding tolerances of a range mean the same error of a step."""
@@ -55,12 +57,14 @@ def test_tolerances_without_room_for_a_second_run_are_refused():
         mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-15)
 
 
+@pytest.mark.slow("2.3e-14-True")
 @pytest.mark.parametrize("rtol, error", [(2.3e-14, True), (2.3e-15, False)])
 def test_the_least_tolerances_that_messages_name_are_accepted(rtol, error):
     mechanism = mb.mechanisms.get("pendulum")
     mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=rtol, error=error)
 
 
+@pytest.mark.slow
 def test_quantities_batches_and_derivatives():
     mechanism = mb.mechanisms.get("pendulum")
     system, name = mechanism.system, next(iter(mechanism.system.quantities()))
@@ -93,6 +97,7 @@ def test_quantities_batches_and_derivatives():
     assert not any(np.any(tangent) for tangent in jax.tree.leaves(of_estimate))
 
 
+@pytest.mark.slow
 def test_without_an_estimate_errors_say_what_to_do():
     mechanism = mb.mechanisms.get("pendulum")
     run = lambda **options: mb.simulate(mechanism.system, mechanism.state, t1=0.1, **options)

@@ -12,6 +12,8 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.parts import terrain
 
+pytestmark = pytest.mark.slow
+
 G, MASS, RADIUS, COEFFICIENT = 9.81, 2.0, 0.4, 0.3
 DOWN = mb.Gravity((0.0, 0.0, -G))
 UP, EAST = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)

@@ -14,6 +14,8 @@ from jaxmb.manifold import Projection
 from jaxmb.parts import terrain
 from jaxmb.solvers import Hermite
 
+pytestmark = pytest.mark.slow
+
 G, MASS, RADIUS, TOP = 9.81, 0.17, 0.03, 0.5
 DOWN = mb.Gravity((0.0, 0.0, -G))
 INERTIA = spatial.sphere(MASS, RADIUS)

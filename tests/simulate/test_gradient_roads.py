@@ -14,6 +14,8 @@ from sprung_pendulums import GRAVITY, HANGING, SPRING, double_pendulum, pendulum
 import jaxmb as mb
 from jaxmb import planar
 
+pytestmark = pytest.mark.slow
+
 
 def driven_pendulum():
     """Nothing is free: the driver says where the rod is."""

@@ -13,6 +13,8 @@ from execute_notebooks import readme_machine
 import jaxmb as mb
 from jaxmb import planar, spatial
 
+pytestmark = pytest.mark.slow
+
 TIME = 0.4
 
 

@@ -8,6 +8,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 
+pytestmark = pytest.mark.slow
+
 # With the default tolerance where none is given.
 TOLERANCES = {"coarse": {"rtol": 1e-4}, "medium": {"rtol": 1e-6}, "default": {}, "fine": {"rtol": 1e-10}}
 DEFAULT = 1e-8
@@ -76,7 +78,6 @@ def indexed(times):
     return -np.pi / 2 * turns - np.pi / 4 + np.arctan2(y, x) % (2 * np.pi) - np.pi, np.hypot(x, y)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", TOLERANCES)
 def test_a_geneva_wheel_turns_by_a_quarter_at_each_turn(name):
     drive, options = geneva(), TOLERANCES[name]
@@ -132,7 +133,6 @@ def escapement():
     return Drive(bodies, joints, forces, start, np.linspace(0.0, 3.0, 1001))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", TOLERANCES)
 def test_an_escapement_lets_one_tooth_pass_at_each_swing(name):
     drive, options = escapement(), TOLERANCES[name]

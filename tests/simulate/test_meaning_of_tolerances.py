@@ -70,19 +70,20 @@ def check(ratios):
     assert np.median(ratios) <= 3 and np.max(ratios) <= 15, np.round(ratios, 1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOTIONS)
 def test_errors_of_adams_method_are_those_of_a_runge_kutta_method(name):
     check(errors(name, "Adams") / errors(name, "Dopri8"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IMPLICIT)
 def test_errors_of_hermite_are_those_of_a_runge_kutta_method(name):
     check(errors(name, "Hermite") / errors(name, "Dopri8"))
 
 
-@pytest.mark.parametrize("solver, finest", [("Adams", 1e-13), pytest.param("Hermite", 1e-12, marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver, finest", [("Adams", 1e-13), pytest.param("Hermite", 1e-12, marks=pytest.mark.slow)])
 def test_steps_do_not_creep_where_rounding_limits_them(solver, finest):
     system, state = mechanism("four_bar").system, mechanism("four_bar").state
     run = lambda rtol: mb.simulate(system, state, t1=1.0, rtol=rtol, solver=SOLVERS[solver], max_steps=5000)
@@ -128,7 +129,7 @@ def test_modes_are_left_out_of_norms():
     np.testing.assert_allclose(norm(among), optimistix.rms_norm(mb.State(error, 2 * error)), rtol=1e-15)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_stops_that_are_never_reached_change_no_step(way):
     """The modes of contacts are no components whose errors count."""
@@ -141,7 +142,7 @@ def test_stops_that_are_never_reached_change_no_step(way):
     np.testing.assert_allclose(runs[0].ys.q[-1], runs[1].ys.q[-1, :3], rtol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [mb.solvers.Adams(), diffrax.Tsit5()], ids=["Adams", "Tsit5"])
 @pytest.mark.parametrize("name", ["bar.mass", "bar.angle"])
 def test_stops_that_are_never_reached_change_no_step_of_a_derivative(solver, name):
@@ -160,7 +161,7 @@ def test_stops_that_are_never_reached_change_no_step_of_a_derivative(solver, nam
     np.testing.assert_allclose(runs[0][0], runs[1][0], rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stops_change_no_step_beside_internal_states():
     drive = mb.Motor("drive", "pin.angle", command=0.5, lag=0.2)
     bar = planar.Body("bar", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
@@ -173,6 +174,7 @@ def test_stops_change_no_step_beside_internal_states():
     assert steps[0] == steps[1]
 
 
+@pytest.mark.slow
 def test_modes_of_friction_do_not_count():
     """In space they are two, and its velocities as many."""
     top = spatial.Body("top", mass=1.0, inertia=np.diag([1.0, 2.0, 3.0]), position=(0.0, 0.0, 1.0))
@@ -182,6 +184,7 @@ def test_modes_of_friction_do_not_count():
     assert counted_components(system) == (*range(7), *range(10, 16))
 
 
+@pytest.mark.slow
 def test_a_contact_that_is_closed_is_no_size_of_a_motion():
     """A small motion stays small where a mode is one."""
     start = mb.assemble(AMONG_STOPS, fix={"bar.angle": 0.5})

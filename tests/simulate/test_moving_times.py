@@ -11,6 +11,8 @@ from compiling import jit_quickly
 import jaxmb as mb
 from jaxmb import planar
 
+pytestmark = pytest.mark.slow
+
 START = 0.1
 
 

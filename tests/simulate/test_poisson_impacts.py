@@ -81,7 +81,7 @@ def phase(W, b, again, coefficient):
     raise AssertionError("no case fits")
 
 
-@pytest.mark.always
+@pytest.mark.slow("both corners")
 @pytest.mark.parametrize("angle, touching", [(0.0, (0, 1)), (0.3, (0,))], ids=["both corners", "one corner"])
 def test_a_block_strikes_the_ground(angle, touching):
     """At random velocities, with random coefficients."""
@@ -117,6 +117,7 @@ def test_a_block_strikes_the_ground(angle, touching):
     assert compared > 8 and 0 < sticks < compared
 
 
+@pytest.mark.slow
 def test_without_friction_one_contact_rebounds_as_by_newton():
     u = jnp.array([0.4, -2.0, 1.0])
     after = [
@@ -148,6 +149,7 @@ def nearest(W, b, again, coefficient):
     return x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coefficient", [0.1, 0.7])
 def test_a_bar_strikes_the_ground_in_space(coefficient):
     u = np.array([0.6, -0.3, -2.0, 1.0, -0.5, 2.0])
@@ -174,6 +176,7 @@ def cases():
     yield block((0.94, 0.95), (0.25, 0.17), ("poisson", "newton")), (0.33, -1.74, -2.37)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", range(5))
 def test_derivatives(case):
     """Of the velocities after impacts, the impulses and the energy, by all numbers and the velocities before."""

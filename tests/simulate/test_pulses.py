@@ -75,6 +75,7 @@ WAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("way", WAYS)
 def test_a_pulse_moves_a_machine_at_rest(way, solver):
@@ -92,6 +93,7 @@ def test_a_pulse_moves_a_machine_at_rest(way, solver):
         np.testing.assert_allclose(found.u, exact.u, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [END, -END])
 def test_a_pulse_under_jit_and_in_a_batch(end):
     """Also with heights that are traced, and backward in time."""
@@ -106,6 +108,7 @@ def test_a_pulse_under_jit_and_in_a_batch(end):
     np.testing.assert_allclose(rates, [one(x) for x in (0.0, 0.5, 1.0)], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signal", ["cubic", "function"])
 def test_gradient_by_the_height_of_a_pulse(signal):
     def rate(height, rtol):
@@ -140,6 +143,7 @@ class Silent(Thruster):
     given_in_time = mb.parts.AbstractForce.given_in_time
 
 
+@pytest.mark.slow
 def test_a_part_of_ones_own():
     system = pendulum(Thruster("jet", "bob")).compile()
     assert jnp.max(jnp.abs(mb.simulate(system, mb.assemble(system), t1=END).ys.u)) > 1e-2
@@ -176,7 +180,8 @@ BURST = mb.Scene(
 ).compile()
 
 
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("end", [END, -END])
 def test_a_pulse_of_a_force_with_internal_states(solver, end):
     """Of the force, whose size is a state, and of the rate of a state, in both directions of time."""
@@ -188,7 +193,7 @@ def test_a_pulse_of_a_force_with_internal_states(solver, end):
         np.testing.assert_allclose(motion["burst"].spent[-1], impulse, rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gradient_by_the_internal_state_of_a_pulse():
     """The velocity is proportional to the state."""
 
@@ -203,6 +208,7 @@ def test_gradient_by_the_internal_state_of_a_pulse():
         np.testing.assert_allclose(jit_quickly(jax.vmap(derivative(rate)))(sizes), slope, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_steps_of_the_users_own_controller():
     """Tolerances of the user miss no pulse either; times of the user's own are left to them."""
     system, inputs = WAYS["cubic series"](0.1)

@@ -8,6 +8,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar, spatial
 
+pytestmark = pytest.mark.slow
+
 Linear = mb.contact.Linear
 # Random cases of each kind, and the number of steps of a run that misses nothing.
 CASES, STEPS = 20, 4000
@@ -239,7 +241,6 @@ def start(system, places, rates):
     return mb.State(jnp.asarray(q), jnp.asarray(u), system.guess.z)
 
 
-@pytest.mark.long
 def test_a_bar_turns_through_weak_stops():
     """Opposite of their middle the angle wraps, and the force jumps from that of one stop to that of the other."""
     system, _ = joint_stop()
@@ -252,7 +253,6 @@ def test_a_bar_turns_through_weak_stops():
         np.testing.assert_allclose(found, known, rtol=0, atol=1e-5)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_contacts_are_not_passed_over(kind):
     system, case = KINDS[kind]()

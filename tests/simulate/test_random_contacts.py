@@ -10,6 +10,8 @@ import jaxmb as mb
 from jaxmb import planar
 from jaxmb.parts import terrain
 
+pytestmark = pytest.mark.slow
+
 MEMBERS, END = 40, 1.0
 TIMES = np.linspace(0.0, END, 101)
 DOWN = mb.Gravity((0.0, -9.81))

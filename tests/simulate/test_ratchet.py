@@ -45,7 +45,7 @@ def scene(ratchet):
     return mb.Scene(bodies, joints=[*joints, *contacts], forces=[moments]).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_ratchet():
     system = scene(LOCKS)
     state = mb.assemble(system, fix=dict(zip(("wheel.angle", "pawl.angle"), START, strict=True)))

@@ -60,7 +60,7 @@ def results():
     return jax.jit(jax.vmap(result))(*holds.T)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(len(SETS)), ids=["-".join(sorted(own)) or "none" for own in SETS])
 def test_the_first_reason_counts(results, k):
     # Events need steps, and an endless step has none.

@@ -51,6 +51,7 @@ def swing(system, state, **options):
     return mb.simulate(moved, state, t1=10.0, **options)
 
 
+@pytest.mark.slow(but=("car-Dopri8",))
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("name", SCENES)
 def test_a_machine_at_rest_takes_fewer_steps_than_a_swing(name, solver):
@@ -62,6 +63,7 @@ def test_a_machine_at_rest_takes_fewer_steps_than_a_swing(name, solver):
         assert jnp.max(jnp.abs(rest.ys.u)) <= 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_steps_at_rest_do_not_enlarge_rounding_errors(solver):
     """A pendulum that balances exactly at the start, and later is pushed by as much as rounding errors would."""
@@ -74,6 +76,7 @@ def test_steps_at_rest_do_not_enlarge_rounding_errors(solver):
     assert jnp.max(jnp.abs(rest.ys.u)) <= 1e-11
 
 
+@pytest.mark.slow
 def test_a_long_chain_at_rest():
     """Rounding errors of twenty bodies add up."""
     system = hanging_chain(20).compile()
@@ -82,6 +85,7 @@ def test_a_long_chain_at_rest():
     assert rest.stats["num_steps"] < swing(system, state, rtol=1e-6).stats["num_steps"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [1e-6, 1e-10])
 def test_a_small_motion_is_no_rest(amplitude):
     """An oscillator beside its balance, to its own size: its coordinates are small, and resolved as such."""
@@ -97,6 +101,7 @@ def test_a_small_motion_is_no_rest(amplitude):
     assert abs(end.u[-1, 0] / (amplitude * np.sqrt(10.0)) + np.sin(phase)) <= 1e-8
 
 
+@pytest.mark.slow
 def test_a_small_swing_is_no_rest():
     """A pendulum, a billionth of a radian from where it hangs, which coordinates of size one just resolve."""
     angle = 1e-9
@@ -108,6 +113,7 @@ def test_a_small_swing_is_no_rest():
     assert abs(end.u[-1, 2] / (angle * rate) + np.sin(rate * 5.0)) <= 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, solver", [("car", "Adams"), *[("pendulum", solver) for solver in SOLVERS]])
 def test_gradient_at_rest(name, solver):
     """By gravity, which moves the machine: forward and reverse mode, and differences of a tighter motion."""

@@ -7,7 +7,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
+
 
 # A contact of stiffness k lasts for π √(m / k), in which time a rigid one does not move: the error falls with 1 / √k.
 STIFFNESSES = (1e6, 1e8, 1e10, 1e12)

@@ -23,7 +23,8 @@ def pendulum():
     return system, mb.assemble(system)
 
 
-@pytest.mark.parametrize("kept", [pytest.param("dense", marks=pytest.mark.always), "steps"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kept", ["dense", "steps"])
 def test_a_long_motion_finds_more_room(pendulum, monkeypatch, kept):
     system, state = pendulum
     saveat = diffrax.SaveAt(**{kept: True})
@@ -72,6 +73,7 @@ def end(system, state, t1, **options):
     return angle
 
 
+@pytest.mark.slow
 def test_a_derivative_that_takes_more_steps_than_it_keeps_is_computed_again(pendulum, rooms):
     long = end(*pendulum, 1.0)
     whole = jax.jit(jax.grad(long))(9.81)
@@ -87,12 +89,14 @@ def test_a_derivative_that_takes_more_steps_than_it_keeps_is_computed_again(pend
     assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=20))(9.81)) and rooms[1:] == [64]
 
 
+@pytest.mark.slow
 def test_few_steps_have_a_small_program(pendulum, rooms):
     assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=3))(9.81))
     assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=16))(9.81))
     assert rooms == [4, 16]
 
 
+@pytest.mark.slow
 def test_a_motion_of_many_steps_tells_its_derivative(pendulum, rooms):
     long = end(*pendulum, 1.0)
     value = long(9.81)
@@ -101,6 +105,7 @@ def test_a_motion_of_many_steps_tells_its_derivative(pendulum, rooms):
     assert rooms == [65536]
 
 
+@pytest.mark.slow
 def test_a_short_motion_has_a_short_program(pendulum, rooms):
     short = end(*pendulum, 1e-2, rtol=1e-4)
     both = short(9.81), jax.value_and_grad(short)(9.81)
@@ -131,6 +136,7 @@ def narrow():
     return system, mb.assemble(system)
 
 
+@pytest.mark.slow
 def test_too_few_steps_are_no_singularity(narrow, rooms):
     """What is nearly singular everywhere has not failed for that."""
     system, state = narrow

@@ -31,6 +31,7 @@ def dense(rod):
     )
 
 
+@pytest.mark.slow
 def test_dense_output_is_on_the_constraints_and_accurate(rod, dense):
     ts = jnp.linspace(0.0, 2.0, 17)
     states = dense.at(ts)
@@ -41,6 +42,7 @@ def test_dense_output_is_on_the_constraints_and_accurate(rod, dense):
     assert float(jnp.max(jnp.abs(violation))) < 1e-13
 
 
+@pytest.mark.slow
 def test_steps_are_trimmed(dense):
     steps = int(dense.stats["num_accepted_steps"])
     assert dense.ts.shape == (steps + 1,) and float(dense.ts[0]) == 0.0 and float(dense.ts[-1]) == 2.0
@@ -51,6 +53,7 @@ def test_steps_are_trimmed(dense):
     assert names == "Names: rod, pin" and repr(dense.reactions) == "<of each joint: pin>"
 
 
+@pytest.mark.slow
 def test_saved_times_may_be_integers(rod):
     saveat = diffrax.SaveAt(ts=jnp.array([0, 1, 2]))
     found = mb.simulate(rod, rod.guess, t1=2.0, saveat=saveat)
@@ -70,6 +73,7 @@ def test_energy_momenta_and_save(dense, tmp_path):
     assert int(back["stats.num_steps"]) == int(dense.stats["num_steps"])
 
 
+@pytest.mark.slow
 def test_reactions_balance_the_motion(dense):
     reaction = dense.reactions["pin"]
     acceleration = dense.accelerations[:, :2]
@@ -82,6 +86,7 @@ def test_reactions_balance_the_motion(dense):
     assert list(dense.reactions) == ["pin"]
 
 
+@pytest.mark.slow
 def test_backward_in_time_returns(rod):
     there = mb.simulate(rod, mb.assemble(rod), t1=1.5, rtol=1e-11)
     end = jax.tree.map(lambda y: y[-1], there.ys)
@@ -90,6 +95,7 @@ def test_backward_in_time_returns(rod):
     np.testing.assert_allclose(back.ts, [1.0, 0.5, 0.0])
 
 
+@pytest.mark.slow
 def test_event_stops_the_motion(rod):
     hanging = lambda t, y, args, **kwargs: y.q[2] + np.pi / 2
     event = diffrax.Event(hanging, optx.Newton(rtol=1e-10, atol=1e-10))
@@ -100,6 +106,7 @@ def test_event_stops_the_motion(rod):
     np.testing.assert_allclose(sol["rod"].angular_velocity[-1], -np.sqrt(3 * G / 2.0), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_any_solver_gives_the_same_motion(rod):
     state = mb.assemble(rod)
     adams = mb.simulate(rod, state, t1=1.0, rtol=1e-10)
@@ -113,6 +120,7 @@ def test_any_solver_gives_the_same_motion(rod):
         assert float(other.constraint_violation.position[-1]) < 1e-13
 
 
+@pytest.mark.slow
 def test_other_numbers_do_not_compile_anew(rod):
     traces = []
 
@@ -126,6 +134,7 @@ def test_other_numbers_do_not_compile_anew(rod):
     assert len(traces) == 1 and np.all(np.isfinite(values))
 
 
+@pytest.mark.slow
 def test_what_was_given_may_change_later(rod):
     """Arrays that start where JAX could share their memory instead of copying them."""
 
@@ -152,6 +161,7 @@ def test_what_was_given_may_change_later(rod):
         body.position[0] = 2.0
 
 
+@pytest.mark.slow
 def test_a_gradient_through_a_failed_run_is_not_a_number(rod):
     """Taken alone, without the value that the error goes with."""
 
@@ -164,6 +174,7 @@ def test_a_gradient_through_a_failed_run_is_not_a_number(rod):
     assert np.all(np.isnan(gradient(jnp.array([1.0, 2.0]), 5)))
 
 
+@pytest.mark.slow
 def test_a_derivative_of_the_states_of_all_steps(rod):
     """Their number is known after the run, also where it is differentiated outside `jit`."""
     state = mb.assemble(rod)
@@ -176,6 +187,7 @@ def test_a_derivative_of_the_states_of_all_steps(rod):
     np.testing.assert_allclose(slope, jax.grad(last)(1.0, None), rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [0.3, -0.3])
 def test_times_that_are_traced_are_inside_the_interval(rod, end):
     state = mb.assemble(rod)
@@ -195,6 +207,7 @@ def test_times_that_are_traced_are_inside_the_interval(rod, end):
         assert ended == mb.RESULTS.saved_outside._value and np.all(np.isnan(angles))
 
 
+@pytest.mark.slow
 def test_trajectory_outside_its_use_is_an_error(rod):
     with pytest.raises(ValueError, match="saveat must be a vector"):
         mb.simulate(rod, mb.assemble(rod), t1=1.0, saveat=jnp.zeros((2, 2)))
@@ -202,6 +215,7 @@ def test_trajectory_outside_its_use_is_an_error(rod):
         mb.simulate(rod, mb.assemble(rod), t1=1.0, max_steps=5)
 
 
+@pytest.mark.slow
 def test_own_constraints_and_forces():
     """User functions against the library's parts: a rod as a distance, a blade, a spring."""
     masses = [
@@ -235,6 +249,7 @@ def test_own_constraints_and_forces():
     np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_constraint_nonlinear_in_velocity():
     """A particle held at constant speed under gravity, closed form: tan(φ/2) grows exponentially (Appell's type)."""
     speed = 2.0
@@ -251,6 +266,7 @@ def test_constraint_nonlinear_in_velocity():
     np.testing.assert_allclose(angle, -2 * jnp.arctan(jnp.tanh(G * sol.ts / (2 * speed))), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_driven_in_everything():
     """No degree of freedom: the motion is the driver's, and the torque it needs is its reaction."""
     body = planar.Body("rod", mass=3.0, inertia=1.0, position=(1.0, 0.0))
@@ -266,6 +282,7 @@ def test_driven_in_everything():
     np.testing.assert_allclose(sol.reactions["drive"].moment, about_pin, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_spring_of_zero_length_is_linear():
     """A motion that starts where a spring of no free length has zero length: derivatives are right there."""
     body = planar.PointMass("p", mass=2.0)
@@ -284,6 +301,7 @@ def test_spring_of_zero_length_is_linear():
     np.testing.assert_allclose(stiffness, (2.0 * np.cos(2.0) - np.sin(2.0)) / 4.0 / (2 * 2.0 * 2.0), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_baumgarte_brings_a_state_back_as_its_rate_says():
     """A pendulum 1 cm off its pin: Φ̈ + 2 rate Φ̇ + rate² Φ = 0, so Φ0 (1 + rate t) e^(−rate t)."""
     pendulum = mb.mechanisms.get("pendulum").system
@@ -301,6 +319,7 @@ def test_baumgarte_brings_a_state_back_as_its_rate_says():
         mb.manifold.Baumgarte(0.0)
 
 
+@pytest.mark.slow
 def test_derivatives_with_baumgarte():
     """Forward, reverse and central differences of a tighter solution, compiled and in a batch."""
     pendulum = mb.mechanisms.get("pendulum")
@@ -326,6 +345,7 @@ def test_derivatives_with_baumgarte():
     np.testing.assert_allclose(forward, central, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_of_violations_with_baumgarte():
     """A pin that is moved away from a pendulum by p: Φ = −p (1 + r t) e^(−r t), and its rate p r² t e^(−r t)."""
     rate, t1 = 5.0, 0.5
@@ -353,6 +373,7 @@ def test_derivatives_of_violations_with_baumgarte():
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_system_without_bodies_has_the_same_views(tmp_path):
     """A train in relative coordinates is neither a scene nor a Lagrangian system."""
     train = mb.mechanisms.longitudinal_train(n=3)
@@ -375,6 +396,7 @@ def test_a_system_without_bodies_has_the_same_views(tmp_path):
     assert [line.get_label() for line in coordinates.lines] == ["x1", "y1", "y2"]
 
 
+@pytest.mark.slow
 def test_moment_of_a_blade_is_about_its_point():
     """A blade exerts a force at its contact point and no moment there."""
     sleigh = mb.mechanisms.chaplygin_sleigh()
@@ -385,6 +407,7 @@ def test_moment_of_a_blade_is_about_its_point():
     np.testing.assert_allclose(reaction.moment, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
 def test_no_time_at_all(rod, count):
     motion = mb.simulate(rod, mb.assemble(rod), t0=1.0, t1=1.0, saveat=np.ones(count))
@@ -420,7 +443,8 @@ def with_function(options, function):
     return diffrax.SaveAt(subs=diffrax.SubSaveAt(ts=TS, t1=True, fn=function))
 
 
-@pytest.mark.parametrize("case", ["times", *(pytest.param(name, marks=pytest.mark.long) for name in list(SAVED)[1:])])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["times", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SAVED)[1:])])
 def test_a_function_sees_the_states_that_are_saved(rod, case):
     """They are on the constraints, to the last bit as those without a function."""
     options, others = SAVED[case]
@@ -439,7 +463,8 @@ def test_a_function_sees_the_states_that_are_saved(rod, case):
     assert float(jnp.max(jnp.abs(violation))) < (1e-7 if "steps" in case else 1e-12)
 
 
-@pytest.mark.parametrize("solver", [mb.solvers.Adams(), pytest.param(diffrax.Tsit5(), marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [mb.solvers.Adams(), pytest.param(diffrax.Tsit5(), marks=pytest.mark.slow)])
 def test_a_function_sees_euler_parameters_of_unit_length(solver):
     system = top()
     size = diffrax.SaveAt(ts=TS, fn=lambda t, y, args: jnp.linalg.norm(y.q[3:7]))
@@ -447,7 +472,7 @@ def test_a_function_sees_euler_parameters_of_unit_length(solver):
     np.testing.assert_allclose(found.ys, 1.0, rtol=0, atol=1e-14)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_what_a_function_returns(rod):
     """In both modes those of central differences, with times that move as well, under `jit` and in batches."""
 
@@ -486,12 +511,14 @@ def test_several_series_are_refused(rod, error):
         mb.simulate(rod, mb.assemble(rod), t1=1.0, saveat=several, error=error)
 
 
+@pytest.mark.slow
 def test_newton_iterations_of_a_projection_are_counted(rod):
     found = mb.simulate(rod, mb.assemble(rod), t1=1.0, manifold=mb.manifold.Projection())
     assert 0.5 < found.stats["newton_iterations"] / found.stats["num_steps"] < 5
 
 
-@pytest.mark.parametrize("redundant", [False, pytest.param(True, marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("redundant", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_too_few_steps_with_a_choice_for_runge_kutta_methods(rod, redundant):
     """The method that then looks for stiffness has a manifold and a formulation that suit it."""
     system = rod

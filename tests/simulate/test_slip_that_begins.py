@@ -103,7 +103,7 @@ def run(belt, x, v, end, rtol):
     return end, times[:number], after[:number]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8, 1e-10])
 @pytest.mark.parametrize("name", CASES)
 def test_a_block_on_a_belt(name, rtol):
@@ -119,6 +119,7 @@ def test_a_block_on_a_belt(name, rtol):
     assert times.size <= len(events) + 1
 
 
+@pytest.mark.slow("spring")
 @pytest.mark.parametrize("name", ["spring", "falling friction", "at the other limit"])
 def test_events_by_hand_are_those_of_a_smooth_law(name):
     """Friction that grows within a small velocity of slip has no events."""
@@ -155,7 +156,7 @@ def _random_case(chance):
     return belt, x, v, 10.0 ** chance.integers(-10, -3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_belts():
     """Many of them, with one program, against events by hand."""
     chance = np.random.default_rng(0)
@@ -194,7 +195,7 @@ def derivatives():
     return jit_quickly(forward), jit_quickly(reverse)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name, end", [("spring", 1.2), ("falling friction", 2.0)])
 def test_derivatives_where_slip_begins(name, end):
     """Forward, in reverse and by differences; its time moves with the numbers. Where friction falls with the velocity,
@@ -240,7 +241,7 @@ def _swings(end, weight, rate, radius=0.05, slip=0.3, mass=2.0, length=0.4, iner
     return first, run.y[:, -1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_pin_that_rubs_begins_to_turn():
     """Its friction depends on the force of the pin, which depends on the motion."""
     mass, length, rate = 2.0, 0.4, 2.0
@@ -276,7 +277,7 @@ def _in_space(on):
     return mb.Scene([block], joints=[joint], forces=[mb.Gravity((0.0, 0.0, -G)), rub, spring, push]).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("on", ["face", "floor"])
 def test_a_block_in_a_plane_in_space(on):
     """On a belt, and under a ramp of force, it slips along a line."""

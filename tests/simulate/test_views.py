@@ -53,6 +53,7 @@ def moved(system, turn=0.0):
     return motion_of(system, jnp.asarray(TIMES), jnp.asarray(q), jnp.asarray(u))
 
 
+@pytest.mark.slow("acceleration of a body")
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_view_is_one_program_for_all_parts_of_its_kind_and_all_numbers(chain, view):
     motion, other = moved(chain), moved(mb.with_parameters(chain, {"link1.mass": 7.0, "motor2.torque": 1.5}), turn=0.4)
@@ -82,6 +83,7 @@ def test_views_are_those_of_their_own_parts(chain):
         np.testing.assert_allclose(motion.reactions[f"pin{k}"].force, loads[:, k:].sum(axis=1), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_views_of_a_batch_compile_once_and_are_those_of_its_members(chain):
     members = [moved(chain, turn) for turn in (0.0, 0.5, 1.0)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
@@ -142,7 +144,7 @@ def bouncing():
     return run
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_events_are_computed_once_and_as_far_as_they_happened(bouncing):
     few, motion, many = bouncing(0.3), bouncing(-0.6), bouncing(-0.6, 16384)
     assert few.events is few.events
@@ -157,7 +159,7 @@ def test_events_are_computed_once_and_as_far_as_they_happened(bouncing):
     np.testing.assert_allclose(few.events.impulses[0, 0], 1.7 * 9.81 * fall, rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_events_of_a_batch_are_those_of_its_members(bouncing):
     members = [bouncing(height, 64) for height in (0.3, -0.3, -0.6)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members).events

@@ -7,10 +7,13 @@ Source: R. I. Leine, Ch. Glocker and D. H. van Campen, "Nonlinear dynamics of th
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.parts import AbstractRigidContact, fields
+
+pytestmark = pytest.mark.slow
 
 
 class Guide(AbstractRigidContact):

@@ -13,6 +13,7 @@ TOLERANCES = 10.0 ** -np.arange(4.5, 12.01, 0.125)
 ERRORS = np.array([1e-6, 1e-7, 1e-8, 1e-9])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_evaluations_at_equal_error(name):
     adams = evaluations_at(ERRORS, *work_precision(PROBLEMS[name], TOLERANCES))
@@ -22,8 +23,9 @@ def test_evaluations_at_equal_error(name):
     assert np.exp(np.mean(np.log(ratios))) < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["kepler 0.6", *(pytest.param(name, marks=pytest.mark.long) for name in PROBLEMS if name != "kepler 0.6")]
+    "name", ["kepler 0.6", *(pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name != "kepler 0.6")]
 )
 def test_errors_at_equal_tolerance_are_those_of_a_runge_kutta_method(name):
     # Every half decade: a single run is lucky or unlucky.
@@ -59,6 +61,7 @@ def clock():
     return run
 
 
+@pytest.mark.slow
 def test_high_orders_are_reached(clock):
     step_counts = np.asarray(clock(1e-10).solver_state.step_counts)
     assert step_counts[0] == 1
@@ -82,6 +85,7 @@ def test_dense_output(clock):
     assert jnp.max(jnp.abs(slopes - jax.vmap(lambda y: _clock(0.0, y, 1.0))(exact))) < 1e-6
 
 
+@pytest.mark.slow
 def test_dense_output_is_continuously_differentiable(clock):
     solution = clock(1e-6)
     mesh = solution.interpolation.ts[1 : int(solution.stats["num_accepted_steps"])]
@@ -97,6 +101,7 @@ def test_dense_output_increment(clock):
     np.testing.assert_allclose(increment, solution.evaluate(2.01) - solution.evaluate(2.0), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_saving_at_times_uses_dense_output():
     """Interpolated values have the accuracy of the steps, on a problem whose steps vary a lot."""
     problem = PROBLEMS["kepler 0.9"]
@@ -122,6 +127,7 @@ def _mesh(h, t1):
     return np.concatenate([opening, rest[1:]]), rest[1] - rest[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", range(1, 14))
 def test_order_of_convergence(order):
     """Local extrapolation gives one order more than the error estimate."""

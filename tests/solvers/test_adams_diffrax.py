@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import pytest
 from compiling import jit_as_users_do
 
 from jaxmb.solvers import Adams, MultistepController
@@ -32,6 +33,7 @@ def _assert_close(a, b, atol=2e-7):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol, rtol=0), a, b)
 
 
+@pytest.mark.slow
 def test_every_form_of_saving():
     ts = jnp.linspace(0.0, 4.0, 9)
     subs = {
@@ -50,6 +52,7 @@ def test_every_form_of_saving():
     assert solution.made_jump is False or not solution.made_jump
 
 
+@pytest.mark.slow
 def test_backward_in_time():
     ts = jnp.linspace(4.0, 0.0, 9)
     solution = _solve(4.0, 0.0, saveat=diffrax.SaveAt(ts=ts, dense=True), max_steps=256)
@@ -60,6 +63,7 @@ def test_backward_in_time():
     np.testing.assert_allclose(solution.ys, [1.0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_backward_mirrors_forward():
     mirrored = lambda t, y, omega: jax.tree.map(jnp.negative, _oscillator(-t, y, omega))
     forward = _solve(0.0, 4.0, saveat=diffrax.SaveAt(steps=True), max_steps=128)
@@ -69,6 +73,7 @@ def test_backward_mirrors_forward():
     _assert_close(jax.tree.map(lambda x: x[:n], forward.ys), jax.tree.map(lambda x: x[:n], backward.ys), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_event_is_located():
     event = diffrax.Event(lambda t, y, args, **kwargs: y["x"], optx.Newton(1e-12, 1e-12))
     solution = _solve(event=event)
@@ -81,6 +86,7 @@ def test_event_is_located():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(time_of_event))(jnp.array(1.0)), -np.pi / 2, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_batch_equals_loop():
     omegas = jnp.array([0.5, 1.0, 7.0, 20.0])
     # A step may err by 1e-8, a twentieth of this: shorter steps gather more rounding errors than the bound allows.
@@ -100,6 +106,7 @@ def test_batch_equals_loop():
     _assert_close(batch[0], loop[0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_continuation_repeats_the_unbroken_solve():
     """With solver and controller state a solve in two parts has no second start."""
     keep = diffrax.SaveAt(t1=True, solver_state=True, controller_state=True, made_jump=True)
@@ -117,6 +124,7 @@ def test_continuation_repeats_the_unbroken_solve():
     assert jumped.solver_state.step_counts[0] == 2
 
 
+@pytest.mark.slow
 def test_single_precision_and_mixed_leaves():
     y0 = {"x": jnp.array([1.0], jnp.float32), "v": jnp.zeros((1, 1), jnp.float32)}
     vector_field = lambda t, y, args: {"x": y["v"][0], "v": -y["x"][None]}
@@ -142,6 +150,7 @@ def _pulse(t, y, args):
     return jnp.where(t < 1.0, -y, -y + 3.0 * jnp.cos(t))
 
 
+@pytest.mark.slow
 def test_restart_after_a_jump_repeats_an_opening():
     saveat = diffrax.SaveAt(steps=True, solver_state=True)
     # So coarse that rounding errors have no say in the size of steps.
@@ -161,6 +170,7 @@ def test_restart_after_a_jump_repeats_an_opening():
     np.testing.assert_allclose(whole.ys[at_jump + 1 :][:n], fresh.ys[:n], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_jumps_in_a_batch_and_their_cost():
     def run(when):
         vector_field = lambda t, y, args: jnp.where(t < when, -y, -y + 3.0)
@@ -183,6 +193,7 @@ def test_unannounced_jump_is_found():
     assert solution.stats["num_rejected_steps"] < 40
 
 
+@pytest.mark.slow
 def test_stepping_to_times_costs_little():
     stops = jnp.linspace(0.05, 3.95, 40)
     controller = diffrax.ClipStepSizeController(MultistepController(1e-6, 1e-6), step_ts=stops)
@@ -193,6 +204,7 @@ def test_stepping_to_times_costs_little():
     _assert_close(jax.tree.map(lambda x: x[n - 1], solution.ys), _exact(4.0), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_step_after_a_short_one_recovers():
     stops = jnp.array([2.0, 2.0 + 1e-5])
     saveat = diffrax.SaveAt(steps=True)
@@ -204,6 +216,7 @@ def test_step_after_a_short_one_recovers():
     _assert_close(jax.tree.map(lambda x: x[n - 1], clipped.ys), _exact(4.0))
 
 
+@pytest.mark.slow
 def test_constant_steps():
     solver = Adams(rtol=1e-8, atol=1e-8)
     solution = diffrax.diffeqsolve(
@@ -217,6 +230,7 @@ def test_maximum_number_of_steps():
     assert solution.result == diffrax.RESULTS.max_steps_reached
 
 
+@pytest.mark.slow
 def test_evaluations_are_counted():
     calls = []
 
@@ -239,6 +253,7 @@ def test_evaluations_are_counted():
     assert len(calls) == 2 * solution.stats["num_steps"]
 
 
+@pytest.mark.slow
 def test_plain_terms_trace_no_manifold():
     jaxpr = str(jax.make_jaxpr(lambda: _solve().ys)())
     state = eqx.filter_eval_shape(lambda: _solve(saveat=diffrax.SaveAt(solver_state=True))).solver_state

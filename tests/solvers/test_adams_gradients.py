@@ -49,7 +49,6 @@ def differences():
     return np.array([(loss(PARAMETERS + step * e) - loss(PARAMETERS - step * e)) / (2 * step) for e in np.eye(4)])
 
 
-@pytest.mark.always
 def test_forward_equals_reverse():
     """On one and the same mesh: at a tolerance so coarse that rounding errors have no say in the size of steps."""
     loss = lambda adjoint: lambda p: _loss(p, adjoint, 1e-4)
@@ -58,17 +57,20 @@ def test_forward_equals_reverse():
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradient_equals_central_differences(forward, differences):
     """For a parameter, an initial value, and both ends of the interval."""
     np.testing.assert_allclose(forward, differences, rtol=0, atol=3e-7)
 
 
+@pytest.mark.slow
 def test_direct_adjoint():
     gradient = lambda adjoint: jax.jit(jax.grad(lambda p: _loss(p, adjoint, 1e-3, max_steps=64)))(PARAMETERS)
     direct, checkpointed = gradient(diffrax.DirectAdjoint()), gradient(diffrax.RecursiveCheckpointAdjoint())
     np.testing.assert_allclose(direct, checkpointed, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_backsolve_adjoint(forward):
     solution = lambda stiffness: diffrax.diffeqsolve(
         diffrax.ODETerm(_pendulum),
@@ -86,6 +88,7 @@ def test_backsolve_adjoint(forward):
     np.testing.assert_allclose(gradient, forward[0], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint, derivative", [(diffrax.ForwardMode(), jax.jacfwd), (diffrax.RecursiveCheckpointAdjoint(), jax.grad)]
 )
@@ -100,6 +103,7 @@ def test_what_a_vector_field_closes_over_is_differentiated(adjoint, derivative):
     np.testing.assert_allclose(jax.jit(jax.vmap(derivative(end)))(rates), -np.exp(-rates), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_gradient_of_dense_output_and_saved_times():
     ts = jnp.array([0.5, 1.3, 2.9])
 
@@ -119,6 +123,7 @@ def test_gradient_of_dense_output_and_saved_times():
     np.testing.assert_allclose(slope, (tight(angle + step) - tight(angle - step)) / (2 * step), rtol=0, atol=3e-7)
 
 
+@pytest.mark.slow
 def test_gradients_in_a_batch(forward):
     gradient = jax.jit(jax.vmap(jax.grad(lambda p: _loss(p, diffrax.RecursiveCheckpointAdjoint()))))
     batch = gradient(jnp.stack([PARAMETERS, PARAMETERS.at[0].set(9.0)]))

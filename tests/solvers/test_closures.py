@@ -68,6 +68,7 @@ def test_functions_that_are_written_anew_are_one_program():
     assert len(traced) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("through", [lambda f: f, jax.jit])
 def test_a_vector_field_of_a_solve_on_its_mesh(through):
     """The end is exp(-rate), the time of an event log(1 / level) / rate."""

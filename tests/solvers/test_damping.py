@@ -10,6 +10,7 @@ from jaxmb.solvers._formulas import FAMILIES
 from jaxmb.solvers.stability import formula, spectral_radius
 
 
+@pytest.mark.slow("E", "B")
 @pytest.mark.parametrize("family", FAMILIES)
 def test_what_is_let_through_does_not_grow(family):
     """And what is not, grows, or is so close to growing that a little longer or shorter step does."""
@@ -26,6 +27,7 @@ def test_what_is_let_through_does_not_grow(family):
         assert np.all(allowed) == (k <= FAMILIES[family].stable)
 
 
+@pytest.mark.slow
 def test_only_growing_motions_are_left_to_grow():
     steps, points = jnp.ones(3), np.array([2, 4, 7])
     damped = lambda *spectrum: np.asarray(are_damped("E", points, steps, jnp.asarray(spectrum)))

@@ -65,6 +65,7 @@ def _march(family, k, ts, first):
 VARIABLE = {"E": range(1, 8), "B": range(1, 4), "H": (1, 2), "Y": (1, 2)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_order_with_steps_of_any_size(name):
     family = FAMILIES[name]
@@ -85,6 +86,7 @@ def test_order_with_steps_of_any_size(name):
 # Stiff problems
 
 
+@pytest.mark.slow
 def test_van_der_pol_takes_few_steps():
     problem = PROBLEMS["van der Pol 1e3"]
     for rtol, steps, bound in ((1e-8, 700, 1e-6), (1e-10, 1150, 5e-9)):
@@ -94,6 +96,7 @@ def test_van_der_pol_takes_few_steps():
         assert error <= bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["van der Pol 1e6", "HIRES"])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
 def test_error_is_in_proportion_to_the_tolerance(name, rtol):
@@ -103,6 +106,7 @@ def test_error_is_in_proportion_to_the_tolerance(name, rtol):
     assert solution.stats["num_rejected_steps"] < 0.1 * solution.stats["num_accepted_steps"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
 def test_robertson_does_not_break_down(rtol):
     problem = PROBLEMS["Robertson"]
@@ -112,6 +116,7 @@ def test_robertson_does_not_break_down(rtol):
     assert solution.stats["num_steps"] < 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family, points", [("E", (2, 4)), ("H", (1, 2)), ("B", None), ("Y", None), ("E", (1,))])
 def test_every_family(family, points):
     error, solution = relative_error(PROBLEMS["HIRES"], 1e-6, solver=Hermite(family, points))
@@ -121,6 +126,7 @@ def test_every_family(family, points):
         assert set(used) <= {*range(1, points[0]), *points} and points[-1] in used
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["van der Pol 1e3", "Robertson"])
 def test_no_tolerance_is_missed_by_far(name):
     """Newton's method must not end, nor the error be filtered, by a matrix that hides what is wrong."""
@@ -135,6 +141,7 @@ def test_no_tolerance_is_missed_by_far(name):
         assert np.max(np.abs(end(rtol) / problem.y1 - 1)) < 300 * rtol, rtol
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [None, (1,)])
 def test_what_grows_is_not_stepped_over(points):
     """A pendulum that is let go above its pivot, nearer to it than the tolerance, falls nevertheless."""
@@ -191,6 +198,7 @@ def by_both_modes():
     return _by_both_modes()
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_on_the_same_mesh():
     """To rounding: step sizes that follow from error estimates feel the rounding by which two programs differ."""
     mesh = np.append(0.0, np.geomspace(1e-5, 70.0, 150))
@@ -200,6 +208,7 @@ def test_forward_and_reverse_on_the_same_mesh():
     np.testing.assert_allclose(against, along, rtol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "t1, mus, rtol, same, h", [(70.0, (100.0, 120.0), 3e-13, 1e-10, 0.1), (100.0, (100.0, 55.0), 1e-11, 1e-8, 0.01)]
 )
@@ -213,6 +222,7 @@ def test_forward_reverse_and_central_differences(by_both_modes, t1, mus, rtol, s
     np.testing.assert_allclose(along, central, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_reaction_over_eleven_decades():
     """Where y1 = k2² / (k3 k1² t) and y2 = k2 / (k1 k3 t), up to terms of the order of y1."""
     problem = PROBLEMS["Robertson"]
@@ -229,6 +239,7 @@ def test_derivatives_of_a_reaction_over_eleven_decades():
     np.testing.assert_allclose(against, along, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_field_without_derivative_is_noticed():
     hidden = lambda t, y, args: jnp.stack([-jax.lax.stop_gradient(y[0]), -y[1]])
     shown = lambda t, y, args: -y
@@ -248,6 +259,7 @@ def test_a_field_without_derivative_is_noticed():
         assert program(y0).tolist() == [wrong] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hides", [True, False])
 def test_a_simulation_warns_of_a_part_without_derivative(hides, recwarn):
     hide = jax.lax.stop_gradient if hides else lambda x: x
@@ -281,6 +293,7 @@ def _run(t0=0.0, t1=5.0, y0=None, controller=None, **kwargs):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family, points", [("E", None), ("B", None), ("H", (1,)), ("Y", None)])
 def test_dense_output(family, points):
     ts = jnp.linspace(0.0, 5.0, 101)
@@ -297,6 +310,7 @@ def test_dense_output(family, points):
     np.testing.assert_allclose(solution.ys, _exact(np.asarray(ts)), rtol=0, atol=5e-6)
 
 
+@pytest.mark.slow
 def test_jumps_restart():
     controller = diffrax.ClipStepSizeController(MultistepController(1e-8, 1e-8), jump_ts=jnp.array([1.0, 2.5]))
     solution = _run(controller=controller, saveat=diffrax.SaveAt(t1=True, solver_state=True))
@@ -304,6 +318,7 @@ def test_jumps_restart():
     np.testing.assert_allclose(solution.ys[-1], _exact(np.array(5.0)), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_backward_in_time():
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: 1e4 * (y - jnp.cos(t)) - jnp.sin(t)),
@@ -317,18 +332,21 @@ def test_backward_in_time():
     np.testing.assert_allclose(solution.ys[-1], [1.0], rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_event():
     event = diffrax.Event(lambda t, y, args, **kwargs: y[0] - 0.5, optx.Newton(1e-8, 1e-8))
     solution = _run(event=event)
     np.testing.assert_allclose(solution.ts[-1], np.arccos(0.5), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_batch_equals_loop():
     slow = lambda y: _run(y0=y, t1=2.0).ys[-1]
     starts = jnp.stack([jnp.array([1.0, 1.0]), jnp.array([1.5, 0.0]), jnp.array([-3.0, 2.0])])
     np.testing.assert_allclose(jax.vmap(slow)(starts), [slow(y) for y in starts], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_single_precision():
     problem = PROBLEMS["HIRES"]
     solution = diffrax.diffeqsolve(
@@ -368,6 +386,7 @@ def test_other_controllers_are_refused():
         _run(controller=diffrax.PIDController(1e-6, 1e-6))
 
 
+@pytest.mark.slow
 def test_a_field_that_is_not_finite_ends_the_solve():
     term = diffrax.ODETerm(lambda t, y, args: jnp.sqrt(0.5 - t) * y)
     controller = MultistepController(1e-6, 1e-6)

@@ -10,6 +10,8 @@ from jaxmb.solvers._dense import DenseLinearization
 from jaxmb.solvers._field import derivatives
 from jaxmb.solvers._newton import KnownStep, at_end
 
+pytestmark = pytest.mark.slow
+
 
 class Field(eqx.Module):
     parameter: jax.Array

@@ -34,6 +34,7 @@ def plain(residual, x):
     return jnp.concatenate([out["first"], out["sum"]])
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_map():
     for through in (
         lambda f: f,
@@ -66,6 +67,7 @@ def test_values_that_are_not_used_are_not_asked_for():
         assert asked and all(used["sum"] and not used["first"] for used in asked)
 
 
+@pytest.mark.slow
 def test_derivatives_of_derivatives_and_batches():
     energy = lambda f: lambda r, x: jnp.sum(jnp.cos(f(r, x)))
     second = lambda f: jax.jacfwd(lambda r, x: jnp.sum(jax.grad(energy(f), 1)(r, x) ** 2), 0)

@@ -80,6 +80,7 @@ def _solve(term, t1=12.0, tolerance=1e-8, **kwargs):
     return diffrax.diffeqsolve(term, Adams(), 0.0, t1, None, y0, stepsize_controller=controller, **kwargs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t1", [12.0, -12.0])
 def test_state_stays_on_the_manifold(t1):
     saveat = diffrax.SaveAt(steps=True, solver_state=True)
@@ -90,6 +91,7 @@ def test_state_stays_on_the_manifold(t1):
     assert solution.solver_state.chart["changes"] > 5
 
 
+@pytest.mark.slow
 def test_change_of_chart_keeps_the_order():
     """Neither restarts nor low orders after the start, and no more steps than without a manifold."""
     term = Circle(jnp.array(1.0))
@@ -115,6 +117,7 @@ def test_other_solvers_run_without_charts():
     np.testing.assert_allclose(solution.ys[-1], _exact(12.0), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_failed_evaluation_retries_the_step():
     whole = _solve(Circle(jnp.array(1.0)), 3.0)
     retried = _solve(Circle(jnp.array(1.0), fail=0.02), 3.0)
@@ -142,6 +145,7 @@ def test_failed_evaluation_under_fixed_steps_is_an_error():
     assert solution.result == diffrax.RESULTS.nonlinear_divergence
 
 
+@pytest.mark.slow
 def test_batch_with_charts_and_failures_equals_loop():
     rates = jnp.array([0.6, 1.0, 2.3])
 
@@ -159,6 +163,7 @@ def test_batch_with_charts_and_failures_equals_loop():
     np.testing.assert_array_equal(batch[2], loop[2])
 
 
+@pytest.mark.slow
 def test_jump_on_the_manifold():
     controller = diffrax.ClipStepSizeController(MultistepController(1e-8, 1e-8), jump_ts=jnp.array([2.0]))
     saveat = diffrax.SaveAt(t1=True, solver_state=True)
@@ -177,6 +182,7 @@ def test_jump_on_the_manifold():
     np.testing.assert_allclose(solution.ys[-1], _exact(4.0), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_gradients_through_charts():
     end = lambda rate, adjoint: _solve(Circle(rate), 4.0, 1e-10, adjoint=adjoint).ys[-1]
     loss = lambda rate, adjoint: jnp.sum(end(rate, adjoint) * jnp.array([1.0, 0.5]))

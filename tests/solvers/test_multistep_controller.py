@@ -103,6 +103,7 @@ def test_complex_states_are_refused():
         _solve(y0=1.0 + 1.0j)
 
 
+@pytest.mark.slow
 def test_blow_up_ends_with_the_smallest_step():
     """`y' = y^2` from one is infinite at one."""
     term = diffrax.ODETerm(lambda t, y, args: y**2)
@@ -112,6 +113,7 @@ def test_blow_up_ends_with_the_smallest_step():
         _solve(term, t1=2.0, max_steps=2000)
 
 
+@pytest.mark.slow
 def test_undefined_region_is_left_at_once():
     """A first step into where the square root is undefined is retried smaller."""
     term = diffrax.ODETerm(lambda t, y, args: -jnp.sqrt(y))
@@ -126,6 +128,7 @@ def test_vector_field_that_is_never_finite():
     assert solution.result == diffrax.RESULTS.dt_min_reached
 
 
+@pytest.mark.slow
 def test_bounds_of_the_step():
     saveat = diffrax.SaveAt(t0=True, steps=True)
     steps = lambda s: np.diff(np.asarray(s.ts[: int(s.stats["num_accepted_steps"]) + 1]))
@@ -139,6 +142,7 @@ def test_bounds_of_the_step():
     assert np.min(steps(solution)[:-1]) > 0.01 * (1 - 1e-12)
 
 
+@pytest.mark.slow
 def test_tolerances_beyond_rounding_have_the_same_steps():
     """All that ask for more than rounding errors allow."""
     swing = diffrax.ODETerm(lambda t, y, args: jnp.array([y[1], -jnp.sin(y[0])]))

@@ -183,6 +183,7 @@ def test_formulas_without_a_sector(family, k):
     assert stability_angle(adams(k)) == 0
 
 
+@pytest.mark.slow(but=("Y3",))
 @pytest.mark.parametrize("each", [formula("E", 5), formula("B", 7), formula("Y", 3)], ids=lambda each: each.name)
 def test_angle_is_sharp(each):
     """Beside the ray at the angle there is a point of instability on one side only."""
@@ -192,6 +193,7 @@ def test_angle_is_sharp(each):
     assert ray(angle - 0.02) < 1 < ray(angle + 0.02)
 
 
+@pytest.mark.slow("6", "7")
 @pytest.mark.parametrize("k", range(1, 8))
 def test_stiff_abscissas(k):
     each = formula("E", k)
@@ -290,6 +292,7 @@ def test_growth_of_Y():
     np.testing.assert_allclose([largest_growth("Y", 2), largest_growth("Y", 3)], [1.5, 1.0629], rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_growth_below_one():
     assert 0.98 < largest_growth("B", 11) < 1
 

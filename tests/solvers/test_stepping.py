@@ -63,6 +63,7 @@ def solve(adjoint=None, **given):
     return diffrax.diffeqsolve(**{"solver": diffrax.Tsit5(), "y0": jnp.array([1.0, 0.0]), **options, **given})
 
 
+@pytest.mark.slow(but=("fixed steps", "jump"))
 @pytest.mark.parametrize("name", CASES)
 def test_a_solve_is_that_of_diffrax(name):
     own, other = solve(MeshAdjoint(64), **CASES[name]), solve(**CASES[name])
@@ -73,6 +74,7 @@ def test_a_solve_is_that_of_diffrax(name):
         np.testing.assert_allclose(own.evaluate(1.3), other.evaluate(1.3), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_member_that_fails_at_an_event_does_not_stop_the_others():
     def at_event(start):
         term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -4.0 * y[0]]))
@@ -90,6 +92,7 @@ def test_a_member_that_fails_at_an_event_does_not_stop_the_others():
     np.testing.assert_allclose(rates[::2], [slope(1.0), slope(0.5)], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_time_of_an_event_beside_one_without_a_derivative():
     def at_event(rate):
         norm = lambda t, y, args, **_: jnp.sqrt(y[2] ** 2 + y[3] ** 2) - 1.0
@@ -105,6 +108,7 @@ def test_the_time_of_an_event_beside_one_without_a_derivative():
     np.testing.assert_allclose([jax.grad(at_event)(4.0), jax.jacfwd(at_event)(4.0)], exact, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_member_without_an_event_ends_where_it_ends_alone():
     def at_end(start):
         found = solve(

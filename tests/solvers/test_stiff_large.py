@@ -104,6 +104,7 @@ def moving(system, seed=0):
 # Linear algebra
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "size"), [(30, 2), (9, 4)])
 def test_elimination_of_unsymmetric_matrices(n, size):
     random = np.random.default_rng(n)
@@ -147,7 +148,7 @@ def dense_resolvent(system, y, x, r):
     return np.concatenate([N @ (move + r * solved), solved])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("build, n", [(chain, 12), (cable, 6), (ladder, 5), (tower, 4)])
 def test_resolvents_are_those_of_dense_matrices(build, n):
     system = build(n)
@@ -168,7 +169,7 @@ def test_resolvents_are_those_of_dense_matrices(build, n):
     np.testing.assert_allclose(bound, 0.0, rtol=0, atol=1e-11)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("n, damping", [(6, 0.0), (6, 20.0), (2, 20.0)])
 def test_the_spectrum_is_that_near_the_step(n, damping):
     """Of the dense Jacobian in independent coordinates, by `linearise` at rest: the eigenvalue nearest to an
@@ -196,7 +197,7 @@ def run(system, state, *, rtol, **options):
     return mb.simulate(system, state, rtol=rtol, solver=Hermite(), **options)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "build, n, t1",
     [(lambda n: chain(n, stiffness=1e5, damping=1.0, curl=0.1), 4, 0.2), (cable, 3, 0.3), (tower, 2, 0.2)],
@@ -222,7 +223,7 @@ def _ends(sol):
     return jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]), sol.stats["num_steps"], violation
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_long_chain_moves_as_by_other_equations():
     times, n = np.array([0.1, 0.3]), 20
     expected = sprung_chain(times, n=n, stiffness=1e4, damping=20.0)
@@ -235,7 +236,7 @@ def test_a_long_chain_moves_as_by_other_equations():
     assert np.all(sol.constraint_violation.velocity <= 1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("build, sizes", [(chain, (100, 400)), (cable, (50, 200)), (tower, (50, 200))])
 def test_no_dense_matrix_and_programs_of_one_size(build, sizes):
     lines = []
@@ -249,7 +250,7 @@ def test_no_dense_matrix_and_programs_of_one_size(build, sizes):
     assert lines[1] <= 1.3 * lines[0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_events_and_dense_output():
     """The first rod reaches a given angle, and states between steps are on the constraints."""
     system, target = chain(2), 0.2
@@ -272,7 +273,7 @@ def test_events_and_dense_output():
             np.testing.assert_allclose(system.velocity_residual(0.0, y.q[k], y.u[k]), 0.0, rtol=0, atol=1e-11)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_batch_equals_the_loop():
     system = chain(2, curl=0.2)
     state = mb.assemble(system)
@@ -291,7 +292,7 @@ def test_a_batch_equals_the_loop():
     np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("build, n, t1", [(lambda n: chain(n, curl=0.2), 3, 0.2), (cable, 3, 0.1)])
 def test_derivatives_three_ways(build, n, t1):
     system = build(n)

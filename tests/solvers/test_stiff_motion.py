@@ -51,6 +51,7 @@ def bushing():
     return bounded
 
 
+@pytest.mark.slow
 def test_few_steps_at_every_tolerance():
     mechanism = library("stiff_four_bar")
     references = mechanism.references
@@ -66,6 +67,7 @@ def test_few_steps_at_every_tolerance():
         assert stats["num_rejected_steps"] < 0.1 * int(stats["num_accepted_steps"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rtol, of_velocities", [(2e-2, None), (2e-3, None), (1e-5, 2e-2), (1e-6, 2e-2), (1e-7, 2e-2), (1e-8, 2e-2)]
 )
@@ -77,6 +79,7 @@ def test_stiffness_does_not_make_steps_shorter(rtol, of_velocities):
     assert steps[1] < 1.15 * steps[0]
 
 
+@pytest.mark.slow
 def test_velocities_that_need_not_be_known_so_well():
     """A vibration that shows in velocities only is stepped over where these may be wrong by it.
 
@@ -95,6 +98,7 @@ def test_velocities_that_need_not_be_known_so_well():
     assert np.mean(counts[1e10]) < 1.15 * np.mean(counts[1e8])
 
 
+@pytest.mark.slow("100.0-0.0", "100.0-100.0", "10000.0-0.0", "100000000.0-0.0", "10000000000.0-0.0")
 @pytest.mark.parametrize("damping", [0.0, 1e2])
 @pytest.mark.parametrize("stiffness", [1e2, 1e4, 1e6, 1e8, 1e10, 1e12, 1e14])
 def test_every_stiffness(stiffness, damping):
@@ -106,6 +110,7 @@ def test_every_stiffness(stiffness, damping):
         np.testing.assert_allclose(ys.q[-1, 2::3], rigid, rtol=0, atol=2e-4 + 1e3 / stiffness)
 
 
+@pytest.mark.slow("100000000.0")
 @pytest.mark.parametrize("ratio", [1e-8, 1e-4, 1e4, 1e8])
 def test_every_ratio_of_masses(ratio):
     loose, tight = (bushing()(mass=3.0 * ratio, rtol=rtol) for rtol in (2e-4, 2e-6))
@@ -113,6 +118,7 @@ def test_every_ratio_of_masses(ratio):
     np.testing.assert_allclose(loose[0].q, tight[0].q, rtol=0, atol=2e-4 * np.max(np.abs(tight[0].q)))
 
 
+@pytest.mark.slow(but=("0.001", "1e-05"))
 @pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-7, 1e-9, 1e-11])
 def test_every_tolerance(rtol):
     ys, _, successful = bushing()(rtol=rtol)
@@ -121,6 +127,7 @@ def test_every_tolerance(rtol):
     np.testing.assert_allclose(ys.q[-1, 2::3], expected, rtol=20 * rtol)
 
 
+@pytest.mark.slow
 def test_flyball_to_the_end():
     mechanism = library("flyball")
     trajectory = mb.simulate(
@@ -146,6 +153,7 @@ def slider():
     return mb.Scene([body], forces=[spring]).compile()
 
 
+@pytest.mark.slow
 def test_a_start_on_a_fast_transient():
     """A millionth of a second after the start the motion is ten thousand times slower."""
     system, ts = slider(), np.array([1e-7, 1e-6, 1e-5, 1e-3, 0.05])
@@ -155,6 +163,7 @@ def test_a_start_on_a_fast_transient():
     assert out.stats["num_steps"] < 400
 
 
+@pytest.mark.slow
 def test_a_force_that_jumps():
     """A spring that becomes ten times as stiff where half the way is gone: to the event, and on from it."""
     system = slider()
@@ -192,6 +201,7 @@ DIFFERENTIATED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_forward_reverse_and_central_differences(name):
     """With respect to logarithms of stiffness and damping, while the four-bar's bushing vibrates."""
@@ -226,6 +236,7 @@ def test_forward_reverse_and_central_differences(name):
 # Stiffness that is found
 
 
+@pytest.mark.slow
 def test_auto_says_that_a_motion_is_stiff():
     mechanism = library("stiff_four_bar")
     with pytest.warns(UserWarning, match="Hermite"):
@@ -237,6 +248,7 @@ def test_auto_says_that_a_motion_is_stiff():
     np.testing.assert_allclose(switched.ys.q, found.ys.q, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("solver", ["auto", "switch"])
 def test_auto_leaves_other_motions_to_adams(solver):
@@ -247,7 +259,7 @@ def test_auto_leaves_other_motions_to_adams(solver):
     np.testing.assert_allclose(found.ys.q, plain.ys.q, rtol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_error_of_too_few_steps_says_whether_a_motion_is_stiff():
     """By some more steps with Adams' method, also where a Runge–Kutta method took the others."""
     stiff, other = library("stiff_four_bar"), library("four_bar")
@@ -269,6 +281,7 @@ def test_bad_words():
         jax.jit(lambda s: mb.simulate(mechanism.system, s, t1=1.0, solver="switch").ys)(mechanism.state)
 
 
+@pytest.mark.slow("input")
 @pytest.mark.parametrize("traced", ["parameter", "tolerance", "saved time", "jump", "input"])
 def test_a_switch_sees_every_number(traced):
     """Whatever is traced, a motion is not seen before it ends."""
@@ -290,7 +303,7 @@ def test_a_switch_sees_every_number(traced):
             transform(run)(jnp.ones(2) if transform not in (jax.jit, jax.jacfwd) else 1.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_error_estimate_of_a_switch_is_that_of_its_method():
     mechanism = library("stiff_four_bar")
     run = lambda solver: mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-9, solver=solver, error=True)
@@ -300,6 +313,7 @@ def test_the_error_estimate_of_a_switch_is_that_of_its_method():
     assert switched.closer.stats["num_steps"] == implicit.closer.stats["num_steps"]
 
 
+@pytest.mark.slow
 def test_implicit_solvers_of_diffrax():
     mechanism = library("four_bar")
     other = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-6, solver=diffrax.Kvaerno5())

@@ -28,6 +28,7 @@ def run(vector_field, t1, y0, args, rtol, solver):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, t1", [("van der Pol 1e3", 2.0), ("Robertson", 40.0), ("HIRES", 100.0)])
 @pytest.mark.parametrize("rtol", [1e-5, 1e-9])
 def test_stiff_problems_are_found(name, t1, rtol):
@@ -40,6 +41,7 @@ def test_stiff_problems_are_found(name, t1, rtol):
     assert stopped.stats["num_steps"] < 400
 
 
+@pytest.mark.slow("1e-06-kepler 0.6", "1e-12-pleiades", "1e-12-arenstorf")
 @pytest.mark.parametrize("name", SMOOTH)
 @pytest.mark.parametrize("rtol", [1e-3, 1e-6, 1e-9, 1e-12])
 def test_others_are_not(name, rtol):
@@ -49,6 +51,7 @@ def test_others_are_not(name, rtol):
     assert int(solution.solver_state.stiffness.steps) < 0.15 * int(solution.stats["num_accepted_steps"])
 
 
+@pytest.mark.slow
 def test_counting_changes_nothing():
     problem = SMOOTH["arenstorf"]
     plain, counted = (
@@ -59,6 +62,7 @@ def test_counting_changes_nothing():
     assert plain.solver_state.stiffness is None
 
 
+@pytest.mark.slow
 def test_in_a_batch():
     """Stiffness is each member's own."""
     solve = lambda rate: run(

@@ -30,7 +30,8 @@ def at_rest(offset):
     return mb.State(jnp.stack([jnp.ones_like(offset), offset]), jnp.zeros(2))
 
 
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.slow)])
 def test_a_fast_mode_at_rest(solver):
     system = two_masses()
 
@@ -45,6 +46,7 @@ def test_a_fast_mode_at_rest(solver):
         np.testing.assert_allclose(forward(0.0, rtol), reverse(0.0, rtol), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_only_runs_that_are_differentiated_resolve_the_tangent():
     system = two_masses()
 
@@ -61,6 +63,7 @@ def test_only_runs_that_are_differentiated_resolve_the_tangent():
     np.testing.assert_allclose(values, plain, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_batches_events_dense_output_and_nested_jit():
     system = two_masses()
     crossing = diffrax.Event(lambda t, y, args, **kw: y.q[0], root_finder=None)
@@ -80,7 +83,7 @@ def test_batches_events_dense_output_and_nested_jit():
     np.testing.assert_allclose(slope, np.cos(RATE * end), atol=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_second_derivatives():
     system = two_masses()
 
@@ -107,7 +110,8 @@ def cart():
     )
 
 
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.slow)])
 def test_a_force_of_strength_zero_on_a_mass_at_rest(solver):
     """The motion is none, and its derivative is a function of time; also by strengths that nothing is seen of."""
     system = cart()
@@ -127,6 +131,7 @@ def test_a_force_of_strength_zero_on_a_mass_at_rest(solver):
         np.testing.assert_allclose(forward(0.0, rtol), whole(0.0, rtol), rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
 def test_a_force_of_strength_zero_beside_constraints(solver):
     """Derivatives of a cart on a rail at rest, by the strength alone and beside those by where it starts."""
@@ -153,6 +158,7 @@ def test_a_force_of_strength_zero_beside_constraints(solver):
     np.testing.assert_allclose(jax.jit(jax.jacfwd(end, argnums=(0, 1)))(0.0, 0.0), both, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_parameters_of_constraints_with_steps_that_are_projected():
     """Where constraints move with parameters, tangents start on those that have moved: steps need not be short."""
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
@@ -177,6 +183,7 @@ def test_parameters_of_constraints_with_steps_that_are_projected():
     np.testing.assert_allclose(jax.grad(lambda x: whole(x, "Dopri8", 1e-8, False)[0])(0.0), exact, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
 def test_a_body_that_is_held(solver):
     """Of its tangents constraints leave nothing but rounding, which steps do not resolve."""
@@ -202,6 +209,7 @@ def test_a_body_that_is_held(solver):
     np.testing.assert_allclose(reverse, slope, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_controls_that_are_zero():
     """Their gradient, where an optimisation of controls begins, is that of any others, since the system is linear."""
     cart = planar.Body("cart", mass=1.0, inertia=0.1)
@@ -225,6 +233,7 @@ def test_controls_that_are_zero():
     np.testing.assert_allclose(slopes(jnp.sin(12.0 * times)), exact, rtol=0, atol=3e-6)
 
 
+@pytest.mark.slow
 def test_a_mode_that_is_kicked_late():
     # The random part of the tangent has died away, by the factor exp(-40), when the kick comes.
     system = LagrangianSystem(
@@ -250,6 +259,7 @@ def test_a_mode_that_is_kicked_late():
         np.testing.assert_allclose(slope, exact, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moves_start", [False, True])
 def test_no_direction_leaves_the_steps_of_the_motion(moves_start):
     # A slow mode beside a fast one at rest, which a method for stiff systems damps, and so does its derivatives.
@@ -288,7 +298,7 @@ def test_directions_are_checked():
         run(1.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_train():
     """Hinged cars hardly turn; on the mesh of the motion alone this derivative was wrong by a factor of 2500."""
     mechanism = mb.mechanisms.get("train")

@@ -107,6 +107,7 @@ def found(is_new, middle, end, made_jump=False, before=0.0):
     return events.crossing(guards, 1.0, None, times, states, at, jnp.asarray(made_jump))
 
 
+@pytest.mark.slow
 def test_a_guard_that_begins_counts_at_the_end_of_a_step():
     """Between its ends a step errs by more than such a guard is."""
     assert found(False, -1e-4, 1e-4).within == 1

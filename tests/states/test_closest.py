@@ -52,11 +52,12 @@ def held_in(system, names):
     return held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "names"),
     [
         (planar_tree, ["rod3.angle", "rod9.x"]),
-        pytest.param(hanging_net, ["p22.z", "hook1.orientation"], marks=pytest.mark.long),
+        pytest.param(hanging_net, ["p22.z", "hook1.orientation"], marks=pytest.mark.slow),
     ],
 )
 def test_the_closest_state_and_its_derivatives(build, names):
@@ -94,6 +95,7 @@ def test_the_closest_state_and_its_derivatives(build, names):
     np.testing.assert_allclose(pulled, weights @ dfound, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.05, 0.4])
 def test_rough_guesses(size):
     """A tree of 300 rods, every coordinate off by some tenths: a minimum at which every change is along the rods."""
@@ -113,7 +115,7 @@ def test_rough_guesses(size):
     np.testing.assert_allclose(push, (at(h) - at(-h)) / (2 * h), rtol=0, atol=1e-6 * np.max(np.abs(push)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_coordinates_of_joints_are_held():
     """In a tree of 300 rows as with dense matrices, with derivatives."""
     system = planar_tree(150)
@@ -147,6 +149,7 @@ def test_poses_that_close_are_kept():
     assert 0 < np.max(np.abs(opened.q - system.guess.q)) <= 1e-9
 
 
+@pytest.mark.slow("50.0")
 @pytest.mark.parametrize("distance", [50.0, 150.0])
 def test_a_body_that_is_far_from_where_it_belongs(distance):
     """A bar of a metre, put many lengths from its pin: the closest place on the circle around it is found."""

@@ -50,8 +50,9 @@ def closed(system, guesses):
     return jax.vmap(lambda q: mb.assemble(system, mb.State(q, rest), throw=False).q)(guesses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[] if kind in ("Revolute", "Screw") else pytest.mark.long) for kind in JOINTS]
+    "kind", [pytest.param(kind, marks=[] if kind in ("Revolute", "Screw") else pytest.mark.slow) for kind in JOINTS]
 )
 def test_axes_close_the_same_way_from_guesses_tilted_past_a_right_angle(kind):
     tilts = [(angle, axis) for angle in (80, 100, 140, 170, 179.9) for axis in ((1.0, 0.0, 0.0), (1.0, 2.0, 0.0))]
@@ -61,6 +62,7 @@ def test_axes_close_the_same_way_from_guesses_tilted_past_a_right_angle(kind):
     np.testing.assert_allclose(axes, np.tile(UP, (len(tilts), 1)), rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_screw_closes_in_its_thread():
     x = np.array([1.0, 0.0, 0.0])
     system = scene("Screw", point_a=(0.0, 0.0, 0.0), point_b=(0.0, 0.0, 0.0), offset=0.0, x_a=x, x_b=x).compile()
@@ -71,6 +73,7 @@ def test_a_screw_closes_in_its_thread():
     np.testing.assert_allclose(heading[:, :2], np.stack([np.cos(theta), np.sin(theta)], 1), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_scene_is_compiled_where_its_axes_agree():
     tilt = turn((1.0, 0.0, 0.0), np.deg2rad(100))
     system = scene("Revolute", tilt, point_a=(0.3, 0.1, 0.2), point_b=(0.0, 0.0, 0.0)).compile()
@@ -81,7 +84,7 @@ def test_a_scene_is_compiled_where_its_axes_agree():
     np.testing.assert_allclose(system.catalogue.joint_coordinate(angle, 0.0, state.q), 0.0, rtol=0, atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_the_configuration_closest_to_a_tilted_guess():
     tilt, point = turn((1.0, 0.0, 0.0), np.deg2rad(100)), np.array([0.1, 0.0, 0.0])
     system = scene("Revolute", tilt, point_a=(0.3, 0.1, 0.2), point_b=(0.0, 0.0, 0.0)).compile()
@@ -97,6 +100,7 @@ def test_derivatives_of_the_configuration_closest_to_a_tilted_guess():
     np.testing.assert_allclose(jnp.sum(forward), reverse @ along, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_axes_against_each_other_are_refused():
     system = compiled("Revolute")
     for angle in (np.pi, np.deg2rad(179.999), np.deg2rad(160)):
@@ -111,6 +115,7 @@ def test_axes_against_each_other_are_refused():
         mb.assemble(system, opposed, fix=held)
 
 
+@pytest.mark.slow
 def test_a_prescribed_angle_is_met_and_not_its_opposite():
     hinge = spatial.Revolute("joint", "ground", "body", point=(0.0, 0.0, 0.0), axis=UP)
     x = {"axis_a": UP, "x_a": (1.0, 0.0, 0.0), "x_b": (1.0, 0.0, 0.0)}
@@ -193,8 +198,9 @@ FAILURES = {
 LONG = ("equilibrium", "torque", "linearise")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "case", [pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in FAILURES]
+    "case", [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in FAILURES]
 )
 def test_the_derivative_of_what_is_not_found_is_not_a_number(case):
     """An error where a value is asked for, and NaN in every kind of derivative, also outside of `jit`."""
@@ -208,6 +214,7 @@ def test_the_derivative_of_what_is_not_found_is_not_a_number(case):
     assert jnp.all(jnp.isnan(jax.vmap(jax.grad(function))(jnp.full(2, wrong))))
 
 
+@pytest.mark.slow
 def test_the_derivative_of_what_is_found():
     """The slope of a circle; with `throw` a failure is an error in a derivative as well."""
     np.testing.assert_allclose(jax.grad(placed)(0.3), -0.75, rtol=1e-9)
@@ -216,7 +223,7 @@ def test_the_derivative_of_what_is_found():
         jax.grad(lambda x: mb.assemble(bar(), fix={"bar.x": x}, throw=True).q[1])(3.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_gradient_of_a_motion_from_a_state_that_is_not_found():
     angle = lambda x: mb.simulate(bar(), mb.assemble(bar(), fix={"bar.x": x}), t1=0.1)["bar"].angle[-1]
     assert jnp.isnan(jax.grad(angle)(3.0)) and jnp.isnan(jax.jit(jax.grad(angle))(3.0))

@@ -53,6 +53,7 @@ def solver():
     return solve
 
 
+@pytest.mark.slow
 def test_pendulum_on_a_spring_and_its_derivatives():
     solve = solver()
     state = solve(5.0, 2.0, throw=True)
@@ -70,6 +71,7 @@ def test_pendulum_on_a_spring_and_its_derivatives():
     np.testing.assert_allclose(jax.jit(jax.jacrev(of, (0, 1)))(5.0, 2.0), slopes, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_members_without_equilibrium_do_not_spoil_a_batch():
     masses = jnp.array([2.0, jnp.nan, 3.0])
     solve = solver()
@@ -84,6 +86,7 @@ def test_members_without_equilibrium_do_not_spoil_a_batch():
         np.testing.assert_array_equal(np.isnan(values).all(axis=1), [False, True, False])
 
 
+@pytest.mark.slow
 def test_search_goes_down():
     """From nearly upright to hanging, and not to the near equilibrium on top."""
     system = mb.with_parameters(cart(), {"spring.stiffness": 0.0})
@@ -93,6 +96,7 @@ def test_search_goes_down():
     np.testing.assert_allclose(np.sin(state.q[5]), -1.0, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_guess_without_forces_on_top_is_left():
     """A pendulum upright hangs, and with a soft spring it leans; with a stiff one it stays."""
     system = mb.with_parameters(cart(), {"spring.stiffness": 0.0})
@@ -112,7 +116,7 @@ def test_a_guess_without_forces_on_top_is_left():
     assert tilt > 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_where_the_guess_was_left():
     system = mb.with_parameters(cart(), {"spring.free_angle": 0.5 * np.pi})
     upright = mb.State(jnp.array([-0.7, 0.0, 0.0, -0.7, 1.0, 0.5 * np.pi]), jnp.zeros(6))
@@ -151,6 +155,7 @@ def test_forces_without_potential_that_lead_back_are_stable():
     np.testing.assert_allclose(mb.equilibrium(system).q, 0.0, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["parallelogram", "bricard"])
 def test_redundant_joints(name):
     """The potential is least where nothing accelerates."""
@@ -163,6 +168,7 @@ def test_redundant_joints(name):
     assert energy(state.q) < energy(mechanism.state.q) - 1e-3
 
 
+@pytest.mark.slow
 def test_a_rigid_body_in_space_hangs_from_three_springs():
     corners = np.array([[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]])
     plate = spatial.Body("plate", mass=4.0, inertia=(0.5, 0.6, 0.9), position=(0.1, 0.0, -0.5))
@@ -194,6 +200,7 @@ def test_what_nothing_balances_is_named(forces, message):
         mb.equilibrium(system)
 
 
+@pytest.mark.slow
 def test_what_cannot_rest_is_refused():
     turn = lambda t, p: p["rate"] * t
     drive = planar.Driver("drive", "ground", "bob", quantity="angle", motion=turn, parameters={"rate": 1.0})
@@ -217,6 +224,7 @@ def hung_on_a_floor(*forces, stiffness=5.0):
     return mb.Scene([ball], joints=[floor], forces=[spring, *forces]).compile()
 
 
+@pytest.mark.slow
 def test_contacts_hold_in_an_equilibrium():
     heavy = hung_on_a_floor(mb.Gravity((0.0, -G)))
     with pytest.raises(ValueError, match=r"floor is open and overlapped: .*fix=\{'floor.mode': 1\}"):
@@ -234,6 +242,7 @@ def test_contacts_hold_in_an_equilibrium():
         mb.equilibrium(light, fix={"floor.mode": 0.5})
 
 
+@pytest.mark.slow
 def test_legs_that_share_a_weight_do_not_pull():
     """Of four legs only the sum of the forces is known."""
     top = spatial.Body("top", mass=4.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 0.0, 0.5))

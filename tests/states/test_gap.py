@@ -26,6 +26,7 @@ def gap(machine, plain, rod, crank):
     return mb.assembly_gap(mb.with_parameters(machine, {"rod": rod, "crank": crank}), plain.state, fix=FIX)
 
 
+@pytest.mark.slow
 def test_the_gap_is_zero_where_a_mechanism_closes_and_grows_where_not(machine, plain):
     """With the crank at 180° the pivots of coupler and rocker, 2.5 m long, are 2.5 + crank apart."""
     rods = jnp.array([0.2, 0.6, 0.99, 1.01, 3.0, 5.99, 6.01, 6.5])
@@ -39,6 +40,7 @@ def test_the_gap_is_zero_where_a_mechanism_closes_and_grows_where_not(machine, p
     np.testing.assert_array_equal(np.isnan(solved(rods)).any(axis=1), missing > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rod", [0.3, 6.4])
 def test_derivatives_of_the_gap(machine, plain, rod):
     """Forward mode, reverse mode and central differences agree; a coupler too short wants to be longer."""

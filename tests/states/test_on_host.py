@@ -28,6 +28,7 @@ def held_coordinates(system, names):
     return held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holds", [False, True])
 @pytest.mark.parametrize("name", MACHINES)
 def test_closest_states_are_those_of_programs(name, holds):
@@ -90,9 +91,10 @@ def of_a_lagrangian():
     return mb.lagrangian.LagrangianSystem(kinetic=kinetic, constraints=[ring, blade], q=[0.6, 0.7, 0.2])
 
 
-LONG = [pytest.param(make, marks=pytest.mark.long) for make in (screwed, rolling, of_a_lagrangian)]
+LONG = [pytest.param(make, marks=pytest.mark.slow) for make in (screwed, rolling, of_a_lagrangian)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [driven, stopped, *LONG])
 def test_states_of_any_constraints_are_those_of_programs(make):
     system, t, key = make(), jnp.asarray(0.3), jax.random.key(7)
@@ -114,6 +116,7 @@ def test_states_of_any_constraints_are_those_of_programs(make):
     np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_coordinates_that_cannot_be_held_together_are_left_to_programs():
     system = mb.mechanisms.get("four_bar").system
     held = held_coordinates(system, ["crank.angle", "rocker.angle"])
@@ -129,6 +132,7 @@ def hinge(turn, **more):
     return mb.Scene([arm], joints=[spatial.Revolute("hinge", "ground", "arm", **points, **axes)])
 
 
+@pytest.mark.slow
 def test_a_joint_that_is_half_a_turn_off_is_turned_back():
     over = mb.rotations.from_axis_angle(np.array([1.0, 0.0, 0.0]), np.pi - 0.01)
     system = hinge(over).compile()
@@ -140,6 +144,7 @@ def test_a_joint_that_is_half_a_turn_off_is_turned_back():
     np.testing.assert_allclose(axis, [0.0, 0.0, 1.0], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_slide_that_is_half_a_turn_off_is_turned_back():
     block = planar.Body("block", mass=1.0, inertia=0.1, position=(0.3, 0.0), angle=3.0)
     slide = planar.Prismatic(
@@ -149,6 +154,7 @@ def test_a_slide_that_is_half_a_turn_off_is_turned_back():
     np.testing.assert_allclose(state.q[2], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_within_a_program_of_the_users():
     system = mb.mechanisms.get("four_bar").system
     outside = mb.assemble(system, fix={"crank.angle": 1.2}, rates={"crank.angle": 2.0})
@@ -181,7 +187,7 @@ def hanging_in_space():
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_equilibrium_is_that_of_a_program():
     spring = planar.SpringDamper("spring", "ground", "bar", stiffness=20.0, point_a=(1.0, 1.0), point_b=(0.4, 0.0))
     system = hanging([spring])
@@ -193,7 +199,7 @@ def test_an_equilibrium_is_that_of_a_program():
         np.testing.assert_allclose(outside.q, inside.q, rtol=0, atol=1e-10)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_equilibrium_in_space_is_that_of_a_program():
     system = hanging_in_space()
     outside = mb.equilibrium(system)

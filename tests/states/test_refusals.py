@@ -59,6 +59,7 @@ ASSEMBLED = {
 }
 
 
+@pytest.mark.slow(but=("a joint beyond",))
 @pytest.mark.parametrize("case", ASSEMBLED)
 def test_coordinates_that_cannot_be_fixed(machine, case):
     """A coordinate that moves elsewhere is not called dependent, and a lone one is not said to depend on others."""
@@ -68,6 +69,7 @@ def test_coordinates_that_cannot_be_fixed(machine, case):
     assert len(fix) > 1 or not re.search("each other|these coordinates", str(error.value))
 
 
+@pytest.mark.slow
 def test_coordinates_beyond_the_reach_of_a_bar_that_is_drawn_at_it(bar):
     """The bar is drawn at the end of the reach of x, which is free elsewhere."""
     with pytest.raises(ValueError, match=r"value of bar.x is out of reach.* remain in pin \(2\.5\)"):
@@ -80,6 +82,7 @@ def test_coordinates_beyond_the_reach_of_a_bar_that_is_drawn_at_it(bar):
     np.testing.assert_allclose(mb.assemble(bar, raised, fix={"bar.x": 0.4}).q[2], np.arccos(0.8), rtol=1e-12)
 
 
+@pytest.mark.slow(but=("piston.y",))
 @pytest.mark.parametrize("rate", ["slide.displacement", "piston.x", "piston.y"])
 def test_rates_that_a_position_forbids(straight, rate):
     """At the dead centre the piston stands still, and across its guide it always does."""
@@ -106,6 +109,7 @@ def pulled():
     return slider_crank(0.6, mb.JointDriver("pull", "slide.displacement", value=start, rate=0.05))[0], start
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_drive_that_leaves_its_reach_is_named(pulled, method):
     """By one result, with every way to stay on the constraints, at the time at which it does."""
@@ -120,6 +124,7 @@ def test_a_drive_that_leaves_its_reach_is_named(pulled, method):
     assert "friction" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_large_mechanism_tells_the_same():
     """Sparse elimination does not look at ranks: a drive of one of many arms leaves its reach."""
     bodies, joints = [], []
@@ -138,6 +143,7 @@ def test_a_large_mechanism_tells_the_same():
         mb.simulate(system, mb.assemble(system), t1=1.0)
 
 
+@pytest.mark.slow
 def test_times_too_coarse_for_any_step_are_named(bar):
     """Seconds since 1970: the first step would be shorter than the distance between two numbers."""
     where = r"came to t = 1700000000\S* of 1700000002\. The time is too coarse.*2.4e-07 s away.*begin at zero"

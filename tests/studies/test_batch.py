@@ -61,6 +61,7 @@ def test_a_remainder_compiles_nothing_more():
     assert len(names) == 1 and len(traced) == 1
 
 
+@pytest.mark.slow("1")
 @pytest.mark.parametrize("size", [1, 3, None])
 def test_derivatives_are_those_of_a_batch(size):
     shared, x = jnp.array([0.3, 0.7]), jnp.linspace(0.5, 2.0, 7)
@@ -91,6 +92,7 @@ def test_a_last_member_that_fails_leaves_the_others():
     np.testing.assert_allclose(slope[:4], 0.5 / np.sqrt(x[:4]))
 
 
+@pytest.mark.slow
 def test_tables_of_which_a_step_writes_a_row_do_not_make_blocks_small():
     """So those of a gradient, which keeps a row of every step, are not of single members."""
     machine = mb.mechanisms.pendulum(length=1.25)
@@ -162,6 +164,7 @@ def test_functions_that_cannot_be_batched_are_refused():
     np.testing.assert_allclose(mb.batch(known.bind, 1)(np.arange(4.0)), np.sin(np.arange(4.0)), rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_motions_in_blocks():
     """Steps and states of a batch of simulations, one of which fails, and of single runs."""
     mechanism = mb.mechanisms.get("pendulum")
@@ -194,6 +197,7 @@ def test_members_side_by_side_have_the_numbers_of_a_batch(count, side_by_side):
     jax.tree.map(lambda a, b: np.testing.assert_equal(a.dtype, b.dtype), found, together)
 
 
+@pytest.mark.slow
 def test_members_side_by_side_have_the_derivatives_of_a_batch(side_by_side):
     def last(x, factor):
         return jax.lax.fori_loop(0, 3, lambda k, y: jnp.sin(factor * y) + k, x) ** 2

@@ -6,9 +6,9 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 
-G = 9.81
+pytestmark = pytest.mark.slow
 
-pytestmark = pytest.mark.long
+G = 9.81
 
 
 def test_restitution_and_friction_from_a_recorded_motion():

@@ -24,6 +24,7 @@ def machine(plain):
     return designed(plain)
 
 
+@pytest.mark.slow
 def test_one_name_sets_everything_that_follows(plain, machine):
     longer = mb.with_parameters(machine, {"rod": 3.2, "crank.mass": 2.0})
     known = mb.parameters(longer)
@@ -40,6 +41,7 @@ def test_one_name_sets_everything_that_follows(plain, machine):
     np.testing.assert_array_equal(start.q, other.q)
 
 
+@pytest.mark.slow
 def test_a_batch_of_designs(machine, plain):
     def height(rod):
         new = mb.with_parameters(machine, {"rod": rod})
@@ -77,6 +79,7 @@ def test_a_description_lists_the_variables(machine):
     assert "rod    traced" in seen[0]
 
 
+@pytest.mark.slow
 def test_a_lagrangian_system_has_design_variables():
     swing = LagrangianSystem(
         kinetic=lambda t, q, v, p: 0.5 * p["inertia"] * (v @ v),
@@ -147,6 +150,7 @@ def test_bad_designs_are_named(message, bad, plain, machine):
         bad(plain.system, machine)
 
 
+@pytest.mark.slow
 def test_derivatives_through_design_assembly_and_motion(machine, plain):
     """The rocker's angle after a motion, by the length of the coupler: both modes, and differences of a tighter run."""
 
@@ -164,7 +168,7 @@ def test_derivatives_through_design_assembly_and_motion(machine, plain):
     np.testing.assert_allclose(forward, central, rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_by_a_length_of_a_redundant_loop():
     """As above for a loop in space, three rows of which follow from the others at every length."""
     loop = mb.mechanisms.spatial_loop()

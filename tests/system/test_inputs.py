@@ -39,6 +39,7 @@ def angle_under(torque, breaks=()):
     return y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("interpolation", "torque"),
     [
@@ -57,6 +58,7 @@ def test_a_torque_that_is_a_series(pendulum, interpolation, torque):
     np.testing.assert_allclose(motion.forces["motor"][-1, 1, 2], torque(1.0), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3, 4, 9])
 def test_the_spline_is_that_without_knots_at_the_second_and_the_last_but_one(count):
     random = np.random.default_rng(count)
@@ -71,6 +73,7 @@ def test_the_spline_is_that_without_knots_at_the_second_and_the_last_but_one(cou
     np.testing.assert_array_equal(jax.vmap(series)(outside), values[[0, -1]])
 
 
+@pytest.mark.slow
 def test_derivatives_with_respect_to_the_values_of_a_series(pendulum):
     # On one mesh: steps that are rejected at a knot depend on rounding, which differs between the two modes.
     fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.02, "solver": diffrax.Dopri8()}
@@ -91,6 +94,7 @@ def test_derivatives_with_respect_to_the_values_of_a_series(pendulum):
     np.testing.assert_allclose(forward, differences, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_series_that_is_shorter_than_a_motion_whose_end_is_traced(pendulum):
     @jax.jit
     def ended(t1):
@@ -101,6 +105,7 @@ def test_a_series_that_is_shorter_than_a_motion_whose_end_is_traced(pendulum):
     assert ended(1.1 * TS[-1]) == mb.RESULTS.input_ended._value
 
 
+@pytest.mark.slow
 def test_a_driver_that_is_a_series_moves_with_its_rates(pendulum):
     rod = planar.Body("rod", mass=MASS, inertia=planar.rod(MASS, LENGTH), position=(LENGTH / 2, 0.0))
     drive = planar.Driver(
@@ -117,6 +122,7 @@ def test_a_driver_that_is_a_series_moves_with_its_rates(pendulum):
     np.testing.assert_allclose(motion.accelerations[:, 2], spline(motion.ts, 2), rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_kink_of_a_driven_angle_comes_with_its_impulse():
     def arm(motion, parameters):
         bodies = [
@@ -138,7 +144,8 @@ def test_a_kink_of_a_driven_angle_comes_with_its_impulse():
     np.testing.assert_allclose(found.ys.u, expected.ys.u, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("solver", [None, pytest.param(mb.solvers.Hermite(), marks=pytest.mark.long), diffrax.Dopri8()])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [None, pytest.param(mb.solvers.Hermite(), marks=pytest.mark.slow), diffrax.Dopri8()])
 def test_an_input_of_a_lagrangian_system(solver):
     system = mb.lagrangian.LagrangianSystem(
         kinetic=lambda t, q, v, p: 0.5 * INERTIA * v[0] ** 2,
@@ -153,6 +160,7 @@ def test_an_input_of_a_lagrangian_system(solver):
     np.testing.assert_allclose(motion["angle"][-1], angle_under(CubicSpline(TS, TORQUES))[0], rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_length_of_a_lagrangian_constraint_takes_its_rate_along():
     """A point on a string that is drawn in, beside the same length as a function of time."""
 
@@ -233,6 +241,7 @@ SPEED = 0.5
 MOVING = lambda t: jnp.stack([SPEED * t, 0.0 * t])
 
 
+@pytest.mark.slow
 def test_forces_take_the_rates_of_points_that_move():
     """Each damps the rate at which the block moves away from what moves, with a coefficient of its own."""
     control = lambda t, measured, states, parameters: (-8.0 * measured["rate"], {})
@@ -261,6 +270,7 @@ def test_forces_take_the_rates_of_points_that_move():
     np.testing.assert_allclose(system.state_rates(time, state.q, state.u), [-512 * rate])
 
 
+@pytest.mark.slow
 def test_rates_of_numbers_that_move_nothing():
     """A radius of friction and a free angle only scale and shift; a stop that moves pushes as fast as it comes."""
     bar = planar.Body("bar", mass=1.0, inertia=0.1, angle=0.5)
@@ -299,6 +309,7 @@ def test_the_rate_of_a_joint_with_a_point_that_moves():
     np.testing.assert_allclose([state.q[0], state.u[0]], [0.3 + 2.0 * SPEED, 0.2 + SPEED], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_contacts_on_ground_that_rises():
     """Forces are those on ground at rest of a body that moves downwards as fast, against friction as well."""
     laws = {"normal": mb.contact.Linear(1e4), "friction": mb.contact.Coulomb(0.5, transition_speed=0.1)}
@@ -324,6 +335,7 @@ def test_contacts_on_ground_that_rises():
     assert np.abs(expected - accelerations(still, u)).max() > 1.0
 
 
+@pytest.mark.slow("disc")
 @pytest.mark.parametrize("kind", ["sphere", "disc"])
 def test_rolling_on_a_plane_that_moves(kind):
     """As on a plane at rest, seen from the plane."""
@@ -340,6 +352,7 @@ def test_rolling_on_a_plane_that_moves(kind):
     np.testing.assert_allclose(residuals(moving, u), residuals(still, seen), atol=1e-12)
 
 
+@pytest.mark.slow("friction")
 @pytest.mark.parametrize(
     ("part", "name"),
     [
@@ -353,6 +366,7 @@ def test_points_that_must_be_fixed(part, name):
         mb.with_inputs(sliding([part]), {name: MOVING})
 
 
+@pytest.mark.slow
 def test_a_spring_and_damper_on_a_base_that_shakes():
     """Against SciPy, with the derivative by the amplitude, in which the motion is linear."""
     pair = planar.SpringDamper("pair", "ground", "block", stiffness=50.0, damping=3.0, free_length=0.5)
@@ -374,6 +388,7 @@ def test_a_spring_and_damper_on_a_base_that_shakes():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(0.1), slope, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_dry_friction_of_a_rail_that_moves():
     """It drags the block until that moves as the rail does."""
     rub = mb.DryFriction("rub", "rail", coefficient=0.3)
@@ -395,6 +410,7 @@ def ramp(d, width):
     return 0.5 * (d + root), 0.5 * (1 + d / root)
 
 
+@pytest.mark.slow
 def test_derivatives_on_compliant_ground_that_rises():
     """A ball on a spring and damper of the ground, and a tyre that slips, by how the ground moves and its stiffness."""
     springs, radius, smoothing, grip = 2000.0, 0.3, 1e-3, {"slip_stiffness": 5.0, "relaxation_length": 0.2}
@@ -447,6 +463,7 @@ def test_derivatives_on_compliant_ground_that_rises():
     np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_ball_that_rolls_on_a_plate_that_shakes():
     """It is taken along by the share `I / (I + m r²)` of the plate's motion, and rises with it."""
     radius, inertia = 0.1, 0.003
@@ -476,6 +493,7 @@ def test_derivatives_of_a_ball_that_rolls_on_a_plate_that_shakes():
     np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_disc_that_rolls_on_a_plate_that_shakes():
     """A coin that leans, against the balance of its angular momentum about the point where it touches the plate."""
     radius, lean, along, about = 0.2, 0.3, 0.005, 0.01
@@ -527,6 +545,7 @@ def test_derivatives_of_a_disc_that_rolls_on_a_plate_that_shakes():
     np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plane", "space"])
 def test_a_knife_edge_whose_point_moves(kind):
     """A sled with a skate that moves along and across it, against the equations in velocities that turn with it."""
@@ -583,6 +602,7 @@ def test_a_knife_edge_whose_point_moves(kind):
     np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_compliant_stop_whose_ends_move():
     """A block bounces between both, by how they move and how stiff they are; members of a batch as one run."""
     stop = mb.JointStop("stop", "rail.displacement", lower=0.0, upper=1.0, stiffness=400.0, damping=3.0, smoothing=0.02)
@@ -616,6 +636,7 @@ def test_derivatives_of_a_compliant_stop_whose_ends_move():
         np.testing.assert_allclose(derivative, central_differences(exact, at), rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_rate_of_a_joint_that_moves():
     """A rail that travels and turns: by how it does, by the prescribed coordinate and rate, and by the time."""
     system = sliding()
@@ -649,6 +670,7 @@ def test_derivatives_of_the_rate_of_a_joint_that_moves():
         np.testing.assert_allclose(derivative, jax.jacfwd(exact)(at), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t0", [0.7, 1.0])
 def test_a_run_backward_starts_before_a_jump_at_its_start(pendulum, t0):
     """At the last time the value does not jump, but its derivative by the values does."""
@@ -712,7 +734,7 @@ def test_series_of_one_kind_are_one_part_of_the_program(driven, interpolation):
     assert one < all_ <= 1.3 * one
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulation_with_many_series_of_one_kind_is_no_longer_program(driven):
     def size(count):
         inputs = by_motor(count)
@@ -721,6 +743,7 @@ def test_a_simulation_with_many_series_of_one_kind_is_no_longer_program(driven):
     assert size(MOTORS) <= 1.3 * size(1)
 
 
+@pytest.mark.slow
 def test_inputs_of_all_kinds_side_by_side(driven):
     """Each motor has the torque of its own input, and the others their constants."""
     kinds = [
@@ -755,6 +778,7 @@ def test_an_input_in_place_of_one_of_several(driven):
         mb.with_parameters(again, {"motor3.torque": 1.0})
 
 
+@pytest.mark.slow
 def test_series_of_one_kind_of_a_lagrangian_system():
     names = [f"torque{k}" for k in range(MOTORS)]
     system = mb.lagrangian.LagrangianSystem(
@@ -794,6 +818,7 @@ def test_series_of_a_batch_and_traced_ones(driven):
     np.testing.assert_allclose(found, np.asarray(scales)[:, None, None] * SERIES[:5].T, rtol=2e-15)
 
 
+@pytest.mark.slow
 def test_steps_pass_no_pulse_of_one_of_several_series(driven):
     """Steps end where each of the series turns, as with each of them alone."""
     q, u = driven.guess.q, driven.guess.u
@@ -816,7 +841,7 @@ def two_motors():
     return mb.Scene(bodies, joints=pins, forces=[mb.Gravity((0.0, -G)), *motors]).compile()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_derivatives_by_values_and_times_of_several_series(two_motors, interpolation):
     def angle(x, rtol):

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax import lax
 
 import jaxmb as mb
@@ -33,6 +34,7 @@ def test_a_quantity_is_computed_once_in_a_trace():
     assert counted(lambda x: Angle(x).sine + Angle(x).sine, 0.3) == 2
 
 
+@pytest.mark.slow
 def test_quantities_of_branches_loops_and_derivatives_stay_there():
     def program(x):
         angle = Angle(x)

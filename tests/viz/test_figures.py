@@ -76,6 +76,7 @@ def test_times_that_a_run_did_not_reach_are_left_out(piston):
             picture(stuck)
 
 
+@pytest.mark.slow
 def test_a_batch_is_refused_with_the_way_to_its_members(piston):
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), piston)
     for picture in (viz.plot_motion, viz.plot_mechanism, lambda motion: chosen(motion, 10)):
@@ -102,6 +103,7 @@ def test_a_cell_of_a_notebook_shows_a_figure(piston):
         assert figure._repr_png_().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_events_are_lines_in_every_panel():
     """They do not change the limits of the panels; the first one has a legend of them."""
     figure = viz.plot_motion(bounced())
@@ -171,6 +173,7 @@ def test_slides_in_space_are_drawn_at_the_body_that_slides(kind):
     np.testing.assert_allclose(shown.residual(SPACE, poses, 0.0), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_in_space_the_angles_are_those_of_joints():
     nut = spatial.Body("nut", mass=1.0, inertia=np.eye(3), position=PLACE)
     pin = spatial.Cylindrical("pin", "ground", "nut", point=(0.0, 0.0, 0.0), axis=AXIS)
@@ -188,6 +191,7 @@ def test_in_space_the_angles_are_those_of_joints():
         viz.plot_mechanism(motion, frames=0)
 
 
+@pytest.mark.slow
 def test_a_motion_in_space_shows_places_of_bodies_and_coordinates_of_joints():
     """Of a nut that turns at 0.3 rad/s and moves by 0.1 m/s along its axis."""
     nut = spatial.Body("nut", mass=1.0, inertia=np.eye(3), position=PLACE)

@@ -51,6 +51,7 @@ def page(pendulum):
     return viz.show(pendulum[0], points=["tip", "pin", "bar"], reactions=["pin"], forces=["spring"])
 
 
+@pytest.mark.slow
 def test_a_page_is_complete(page):
     """Nothing in it is fetched, and its size is that of viser's client and little more."""
     assert not re.search(r"""(src|href)=["']?(https?:)?//|@import|url\(http""", page.html)
@@ -78,6 +79,7 @@ def test_bodies_are_where_they_were_at_the_saved_times(page, pendulum):
     assert np.allclose(clock[0], ts) and [float(text[4:8]) for text in clock[1]] == list(ts)
 
 
+@pytest.mark.slow
 def test_an_event_is_named_for_half_a_second_of_playing():
     """The motion of 1.5 s is shown in 2 s."""
     times, texts = Page(viz.show(bounced()).html).values("/clock", "text")
@@ -204,6 +206,7 @@ def test_bodies_on_which_nothing_acts_are_cuboids_of_their_inertia():
     assert np.allclose(turn @ own @ turn.T, moments) and ball.primitive == "sphere"
 
 
+@pytest.mark.slow
 def test_wheels_terrain_and_tracks():
     """A track wraps its circles: between equal ones two straight parts and one circumference."""
     wheels = [planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.5)) for name, x in (("a", 0.0), ("b", 3.0))]
@@ -309,6 +312,7 @@ def test_motions_that_cannot_be_shown(pendulum):
         viz.show([trajectory, still])
 
 
+@pytest.mark.slow
 def test_a_motion_with_internal_states():
     follow = lambda t, measured, states, p: (states["lag"], {"lag": -measured["angle"]})
     joint = planar.Revolute("pin", "ground", "wheel", point=(0.0, 0.0))
@@ -390,7 +394,7 @@ def test_the_command_opens_a_page_where_there_is_a_screen(pendulum, monkeypatch,
     assert opened == [(tmp_path / "motion.html").resolve().as_uri()] and "no screen" not in capsys.readouterr().out
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("space", SPACES)
 def test_every_part_has_its_picture(space):
     """Shapes and lines are finite, and lines between two points meet the anchors of the part."""
@@ -409,7 +413,7 @@ def test_every_part_has_its_picture(space):
         assert "/clock" in Page(viz.show(still).html).names()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_motion_that_was_simulated():
     """All steps, forwards and backwards in time."""
     body = spatial.Body("top", mass=1.0, inertia=np.diag([0.1, 0.1, 0.05]), position=(0.0, 0.1, 0.5))

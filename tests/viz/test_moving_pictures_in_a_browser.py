@@ -7,8 +7,10 @@ from browser import CHROMIUM, browser
 
 import jaxmb as mb
 
+pytestmark = pytest.mark.slow
+
 pytestmark = [
-    pytest.mark.long,
+    pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)"),
     # Of the notebook's kernel and of the browser's socket, which this package does not touch.
     pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning"),

@@ -38,6 +38,7 @@ def states(rng, k):
     return jnp.asarray(rng.normal(size=(k, 3)))
 
 
+@pytest.mark.slow
 def test_a_plate_in_the_ground_is_a_slope_of_terrain():
     """And from below as from above."""
     pose, velocity = jnp.array([[0.3, 0.1, 0.7]]), jnp.array([[1.0, -0.5, 2.0]])
@@ -51,6 +52,7 @@ def test_a_plate_in_the_ground_is_a_slope_of_terrain():
         np.testing.assert_allclose(part.energy(PLANE, both, 0.0), slope.energy(PLANE, pose, 0.0), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_plates_in_line_bear_as_one():
     """Wherever a disc is, and whichever body they are of: its wrench is that of one long plate."""
     ends = np.array([-1.0, -0.2, 0.3, 1.0])
@@ -81,6 +83,7 @@ def test_plates_in_line_bear_as_one():
     np.testing.assert_allclose(jnp.sum(found[:, 1:], axis=1), expected[:, 1], rtol=0, atol=1e-9 * 4e4)
 
 
+@pytest.mark.slow
 def test_the_force_is_twice_differentiable_over_the_end_of_a_plate():
     part = plate(edge=0.1, **LAWS).resolve(PLANE, jnp.zeros((2, 3)))
     force = lambda x: part.wrenches(PLANE, jnp.zeros((2, 3)).at[0, 0].set(x).at[0, 1].set(0.15), jnp.ones((2, 3)), 0.0)
@@ -100,6 +103,7 @@ def collision(part, place, velocity=(0.0, -3.0)):
     return mb.Scene([disc, *others], forces=[part]).compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "part, gap",
     [
@@ -131,6 +135,7 @@ def test_a_disc_bounces_off_a_free_body(part, gap):
     np.testing.assert_allclose(sol.energy, 9.0, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_disc_rolls_down_a_wedge_that_is_free_to_slide():
     """After its slip has settled it gains `g sin α / (3/2 − m cos²α / (m + M))` along the wedge's slope, which recoils
     so that the momentum along the ground stays zero.
@@ -156,6 +161,7 @@ def test_a_disc_rolls_down_a_wedge_that_is_free_to_slide():
     np.testing.assert_allclose(sol.forces["touch"][:, 0, :2] @ down, -0.5 * m * gain, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plate", "disc", "corner"])
 def test_derivatives_of_an_oblique_collision_with_friction(kind):
     """Forward mode, reverse mode and differences, under `jit` and `vmap`."""
@@ -217,6 +223,7 @@ def test_what_cannot_touch_is_refused(part, message):
         own.resolve(PLANE, jnp.zeros((len(own.bodies), 3)))
 
 
+@pytest.mark.slow
 def test_the_corners_of_a_chain_bear():
     """On the ridge of a roof a disc rests as on a point; no side alone bears it there."""
     poses = jnp.zeros((4, 3)).at[0, 1].set(0.19)
@@ -228,6 +235,7 @@ def test_the_corners_of_a_chain_bear():
     np.testing.assert_allclose(on_disc(roof(chain=True, **LAWS)), on_disc(roof(**LAWS)), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_forces_at_corners_follow_from_the_energy_and_balance():
     """Also where the plates are not quite joined; and those of friction and damping balance, too, and take energy."""
     rng, still = np.random.default_rng(3), jnp.zeros((4, 3))
@@ -263,12 +271,13 @@ def test_what_is_no_chain_is_refused():
         backwards.resolve(PLANE, jnp.zeros((4, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [
         ("ball", "box", "box"),
-        pytest.param(("ball", "box", "lid"), marks=pytest.mark.long),
-        pytest.param(("ball", "box", "ground"), marks=pytest.mark.long),
+        pytest.param(("ball", "box", "lid"), marks=pytest.mark.slow),
+        pytest.param(("ball", "box", "ground"), marks=pytest.mark.slow),
     ],
 )
 def test_several_plates_of_one_body_bear_as_one_contact_each(names):

@@ -151,6 +151,7 @@ def setup(request):
     return set_up(CASES[request.param])
 
 
+@pytest.mark.slow("Revolute")
 def test_joint_holds_along_admissible_motions(setup):
     check_joint_holds(setup)
 
@@ -346,6 +347,7 @@ def force_state():
     return random_poses(rng), random_poses(rng), random_poses(rng)
 
 
+@pytest.mark.slow("PlateContact-0.0", "PlateContact-1.0", "DiscContact-0.0", "DiscContact-1.0")
 @pytest.mark.parametrize("damping", [0.0, 1.0])
 @pytest.mark.parametrize("name", springs(0.0))
 def test_spring_power_is_loss_of_energy(name, damping):
@@ -361,6 +363,7 @@ def test_spring_power_is_loss_of_energy(name, damping):
         np.testing.assert_allclose(power, -energy_rate, rtol=1e-12)
 
 
+@pytest.mark.slow("PlateContact")
 @pytest.mark.parametrize("name", pairs())
 def test_action_equals_reaction(name):
     given, poses, velocities = force_state()
@@ -370,6 +373,7 @@ def test_action_equals_reaction(name):
     np.testing.assert_allclose(net_wrench(poses, wrenches), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow("PlateContact", "Track")
 @pytest.mark.parametrize("name", forces())
 def test_force_parameter_derivatives(name):
     part = forces()[name]
@@ -397,6 +401,7 @@ def test_damper_and_point_force():
         np.testing.assert_allclose(wrench @ velocities[0], force_W @ velocity, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free_length", [0.0, 0.5])
 def test_spring_of_zero_length(free_length):
     poses, velocities = jnp.zeros((2, 3)), jnp.ones((2, 3))
@@ -411,6 +416,7 @@ def test_spring_of_zero_length(free_length):
     np.testing.assert_allclose(by_velocity[1, :2, 1, :2], -2.0 * np.eye(2), rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_motions_about_a_spring_of_zero_length_are_damped():
     body = planar.Body("body", mass=1.0, inertia=0.1)
     slide = planar.Prismatic("slide", "ground", "body", point=(0.0, 0.0), axis=(1.0, 0.0))
@@ -517,6 +523,7 @@ def test_part_errors(part, message):
         part.resolve(PLANE, jnp.zeros((len(part.bodies), 3)))
 
 
+@pytest.mark.slow
 def test_errors_of_choices():
     with pytest.raises(ValueError, match="'drive': quantity must be one of"):
         driver("w")
@@ -526,5 +533,6 @@ def test_errors_of_choices():
         planar.PointForce("F", "a", force=X, frame="space")
 
 
+@pytest.mark.slow
 def test_every_part_meets_its_identities():
     check_every_part_has_cases(planar, QUANTITIES, CASES, ROLLING, forces().values(), BODIES)

@@ -33,6 +33,7 @@ def perimeter(centres, radii):
     return ConvexHull((centres[:, None] + radii[:, None, None] * ring).reshape(-1, 2)).area
 
 
+@pytest.mark.slow
 def test_length_of_polygon_and_belt():
     part = track()
     assert part.bodies == ("hull", "rear", "front") and part.owners == (0, 0, 1, 2)
@@ -46,6 +47,7 @@ def test_length_of_polygon_and_belt():
     np.testing.assert_allclose(belt(np.zeros(4)), part.length(PLANE, poses()), rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_belt_around_two_equal_pulleys():
     """Its ends turn back by just half a turn; the middle pulley is not in the way."""
     path = [("a", (1.0, 0.0)), ("a", (-1.0, 0.0)), ("a", (0.0, 0.0))]
@@ -93,6 +95,7 @@ def test_tracks_of_two_vehicles_are_one_kernel():
     assert len(stack(pairs, Layout(PLANE, (True,) * 6))) == 1
 
 
+@pytest.mark.slow
 def test_points_that_coincide():
     """A span without length pulls nowhere."""
     path = [("a", (1.0, 0.0)), ("b", (0.0, 0.0)), ("c", (0.0, 0.0))]
@@ -118,6 +121,7 @@ def test_bad_tracks(options, message):
         track(**options).resolve(PLANE, poses())
 
 
+@pytest.mark.slow
 def test_progressive_stop():
     """The model's moment on both sides, the more so the farther in, and next to none between."""
     stop = mb.JointStop("stop", "pivot.angle", stiffness=2e6, lower=-0.5, upper=0.7, exponent=3.0)

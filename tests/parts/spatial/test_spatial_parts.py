@@ -198,10 +198,12 @@ def setup(request):
     return set_up(CASES[request.param])
 
 
+@pytest.mark.slow("Spherical")
 def test_joint_holds_along_admissible_motions(setup):
     check_joint_holds(setup)
 
 
+@pytest.mark.slow("Revolute", "Composite of all kinds")
 def test_joint_rank_and_freedoms(setup):
     check_joint_rank(setup)
 
@@ -320,6 +322,7 @@ def driver(quantity, motion, **kwargs):
     return spatial.Driver("drive", "a", "b", quantity=quantity, motion=motion, parameters={"speed": 3.0}, **kwargs)
 
 
+@pytest.mark.slow
 def test_angle_driver_passes_many_turns():
     rng = np.random.default_rng(1)
     poses, axis, point = random_poses(rng), random_unit(rng), jnp.asarray(rng.normal(size=3))
@@ -534,6 +537,7 @@ def force_state(seed=9):
     return random_poses(rng), random_poses(rng), jnp.asarray(rng.normal(size=(2, 6)))
 
 
+@pytest.mark.slow("Bushing-0.0")
 @pytest.mark.parametrize("damping", [0.0, 1.0])
 @pytest.mark.parametrize("name", springs(0.0))
 def test_spring_power_is_loss_of_energy(name, damping):
@@ -558,6 +562,7 @@ def test_action_equals_reaction(name):
     np.testing.assert_allclose(net_wrench(poses, wrenches), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow("Bushing", "Contact", "Tyre")
 @pytest.mark.parametrize("name", forces())
 def test_force_parameter_derivatives(name):
     part = forces()[name]
@@ -598,6 +603,7 @@ def test_damper_and_point_force():
         np.testing.assert_allclose(wrench @ velocities[0], force_W @ velocity, rtol=1e-12)
 
 
+@pytest.mark.slow("0.0")
 @pytest.mark.parametrize("free_length", [0.0, 0.5])
 def test_spring_of_zero_length(free_length):
     poses = jnp.stack([jnp.array(SPACE.ground)] * 2)
@@ -790,5 +796,6 @@ def test_errors_of_choices():
         spatial.rod(1.0, 1.0, "w")
 
 
+@pytest.mark.slow
 def test_every_part_meets_its_identities():
     check_every_part_has_cases(spatial, QUANTITIES, CASES, ROLLING, forces().values(), BODIES)

@@ -88,6 +88,7 @@ TRUE = {
 }
 
 
+@pytest.mark.slow
 def test_unknowns_of_every_kind_from_two_experiments(three):
     assert three.converged and not three.undetermined and tuple(three.parameters) == tuple(TRUE)
     for name, true in TRUE.items():
@@ -100,11 +101,13 @@ def test_unknowns_of_every_kind_from_two_experiments(three):
     )
 
 
+@pytest.mark.slow
 def test_what_is_held_out_is_predicted(three):
     (own,) = three.held_out.values()
     assert own.residuals.size == 60 and 0.7 < own.rms < 1.3
 
 
+@pytest.mark.slow
 def test_a_density_has_the_same_gradient_by_both_modes(three):
     """Also as central differences; and under a batch, with a member whose simulation fails."""
     density = three.logdensity()
@@ -131,6 +134,7 @@ def _forward(density, z):
     return jax.jit(jax.jacfwd(of_problem))(z)
 
 
+@pytest.mark.slow
 def test_the_density_includes_prior_likelihood_and_volume(three):
     """The difference between two points, written out."""
     density = three.logdensity()
@@ -155,6 +159,7 @@ def test_the_density_includes_prior_likelihood_and_volume(three):
     np.testing.assert_allclose(density(other) - density(z), by_hand(other) - by_hand(z), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_report_shows_everything_on_one_page(three, tmp_path):
     path = three.report(tmp_path / "out")
     text = path.read_text()
@@ -162,6 +167,7 @@ def test_a_report_shows_everything_on_one_page(three, tmp_path):
     assert text.count("<img") == 7 and "worn encoder" in text and "exp3 gyro (held out)" in text
 
 
+@pytest.mark.slow
 def test_bands_of_predictions(three):
     """Deviations as by hand, from central differences and the covariance."""
     found = three.predict(["rod.angle", "pin.force"], experiment="worn", level=0.9)
@@ -194,6 +200,7 @@ def test_a_level_is_a_probability(level, message):
             ask(fit, "rod.angle", level=level)
 
 
+@pytest.mark.slow
 def test_a_profile_is_what_fits_with_a_known_value_give(motion):
     """Without known noise; the interval's ends are where the likelihood ratio says."""
     own = swing()
@@ -215,7 +222,7 @@ def test_a_profile_is_what_fits_with_a_known_value_give(motion):
     np.testing.assert_allclose(given.parameters["damping"][1], known.parameters["damping"], rtol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_intervals_cover_the_truth():
     """95 % intervals of each parameter of 400 synthetic data sets, all by one compiled program."""
     own = swing()
@@ -234,6 +241,7 @@ def test_intervals_cover_the_truth():
         assert 0.92 <= count / 400 <= 0.98, name
 
 
+@pytest.mark.slow
 def test_several_starts_find_the_best_minimum():
     """A pendulum's length from many swings: too long or too short a start misses some of them."""
     own = mb.with_parameters(swing(), {"damping": 0.0})
@@ -265,6 +273,7 @@ def unstable():
     return mb.Scene([rod], joints=[pin], forces=[damper, mb.Gravity((0.0, -9.81))]).compile()
 
 
+@pytest.mark.slow
 def test_multiple_shooting_where_single_shooting_fails():
     """Both have the same minimum, which only the segments lead to."""
     own = unstable()
@@ -312,6 +321,7 @@ def double_pendulum():
     return mb.Scene(bodies, joints=joints, forces=forces).compile()
 
 
+@pytest.mark.slow
 def test_double_pendulum_with_friction_from_encoders():
     """The lower rod and the friction of both joints from two experiments; the upper rod is known."""
     own, random = double_pendulum(), np.random.default_rng(5)
@@ -330,6 +340,7 @@ def test_double_pendulum_with_friction_from_encoders():
         assert abs(fit.parameters[name] - value) < 4 * fit.deviations[name] < 0.1 * value, name
 
 
+@pytest.mark.slow
 def test_four_bar_with_biased_accelerometers():
     """A closed loop: the coupler's inertia and a hinge's damping from an encoder and two accelerometers with biases."""
     lengths = {"crank": 1.0, "coupler": 2.0, "rocker": 2.0}
@@ -374,7 +385,7 @@ def test_four_bar_with_biased_accelerometers():
         assert np.all(4 * fit.deviations[name] < np.abs(value)), name
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["soft_l1", "huber"])
 def test_robust_losses_withstand_outliers(motion, loss):
     """Every tenth sample is far off; the gradient of the objective three ways, of a batch with a failure as well."""
@@ -409,7 +420,7 @@ def test_robust_losses_withstand_outliers(motion, loss):
     assert values[1] == -jnp.inf and not np.any(gradients[1])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_robust_loss_with_segments(motion):
     """The minimum is that of whole motions."""
     own, random = swing(), np.random.default_rng(4)
@@ -425,7 +436,7 @@ def test_a_robust_loss_with_segments(motion):
         np.testing.assert_allclose(pieces.deviations[name], fit.deviations[name], rtol=1e-2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sensors_with_times_of_their_own(motion):
     """As the same samples among all times, with the others missing; with a delay, held out, and in segments."""
     own, random = swing(), np.random.default_rng(6)
@@ -458,7 +469,7 @@ def test_sensors_with_times_of_their_own(motion):
         assert alone.parameters == same.parameters
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_second_start_that_fits_as_well():
     """The sign of an angle of which only the square is seen."""
     own = swing()
@@ -477,6 +488,7 @@ def test_a_second_start_that_fits_as_well():
     np.testing.assert_allclose(abs(fit.parameters["initial.theta"]), 0.5, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_prior_is_one_more_measurement():
     """With a strong one the estimate is its mean; without data on a parameter, its deviation is the prior's."""
     own = swing()
@@ -535,6 +547,7 @@ def test_a_start_that_fails_leaves_the_others_alone():
     np.testing.assert_allclose(good.z, [1.0, 1.0])
 
 
+@pytest.mark.slow
 def test_inertia_matrices_stay_those_of_bodies():
     """Second moments of mass are positive, so principal moments satisfy the triangle inequalities."""
     inertia = np.diag([2.0, 1.5, 1.0])
@@ -550,6 +563,7 @@ def test_inertia_matrices_stay_those_of_bodies():
         free_parameters(own, {"top.inertia": np.diag([1.0, 1.0, 2.0])})
 
 
+@pytest.mark.slow
 def test_vectors_of_values_and_back(system):
     """For every kind of range, with the volume of a change."""
     names = {"rod.mass": 3.0, "spring.stiffness": 7.0, "pin.point_b": [-0.4, 0.1], "spring.damping": 0.2}
@@ -646,6 +660,7 @@ def test_messages(system, measured, change, message):
         mb.identify(system, measured, **({"free": ["rod.mass"]} | change))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held_out", [False, True])
 def test_an_experiment_without_unknowns(system, held_out):
     """Its own parameters are all that is free; it is predicted all the same."""

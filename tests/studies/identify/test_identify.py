@@ -65,6 +65,7 @@ def noisy(motion, seed):
     return {"rod.angle": np.asarray(motion["rod"].angle) + SIGMA["rod.angle"] * noise}
 
 
+@pytest.mark.slow
 def test_recovers_parameters_with_honest_deviations(system, motion):
     """Over many draws of the noise, errors divided by their standard deviations have unit size."""
     scores = []
@@ -76,7 +77,7 @@ def test_recovers_parameters_with_honest_deviations(system, motion):
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.4
 
 
-@pytest.mark.always
+@pytest.mark.slow
 def test_result(system, motion):
     """The result carries the fitted system, its state, and a table; NaN samples are left out."""
     measured = noisy(motion, 0)
@@ -92,6 +93,7 @@ def test_result(system, motion):
     assert repr([fit]).startswith("[Identification of spring.stiffness, spring.damping: converged")
 
 
+@pytest.mark.slow
 def test_without_sigma_the_noise_is_estimated(system, motion):
     start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
     known = mb.identify(system, noisy(motion, 1), ts=TS, free=start, sigma=SIGMA)
@@ -103,6 +105,7 @@ def test_without_sigma_the_noise_is_estimated(system, motion):
     assert str(known.predict("rod.angle")) == f"Prediction: rod.angle ({TS.size},), with bands of 95%"
 
 
+@pytest.mark.slow
 def test_names_what_the_data_do_not_determine(system, motion, tmp_path):
     """Mass, inertia, stiffness and damping scaled together leave the motion as it is."""
     free = ["rod.mass", "rod.inertia", "spring.stiffness", "spring.damping"]
@@ -114,6 +117,7 @@ def test_names_what_the_data_do_not_determine(system, motion, tmp_path):
     assert "Correlations" in fit.report(tmp_path).read_text()
 
 
+@pytest.mark.slow
 def test_lengths_with_the_state_assembled_anew(system):
     """A body-fixed point, with the initial angle and rate held."""
     true = mb.with_parameters(system, {"pin.point_b": jnp.array([-0.45, 0.02])})
@@ -126,6 +130,7 @@ def test_lengths_with_the_state_assembled_anew(system):
     assert fit.components == ("pin.point_b[0]", "pin.point_b[1]")
 
 
+@pytest.mark.slow
 def test_numbers_of_starts_are_integers_of_python_or_numpy(system, motion):
     data = {"ts": TS, "free": ["spring.stiffness"], "solver": TSIT5}
     fit = mb.identify(system, noisy(motion, 2), **data, starts=np.int64(2), max_iterations=np.int32(20))
@@ -149,6 +154,7 @@ def swing():
     return identifying.swing()
 
 
+@pytest.mark.slow
 def test_lagrangian_system(swing):
     """A coordinate and its rate, at times of their own, from an angle and a rate that are given."""
     held = {"fix": {"theta": 0.5}, "rates": {"theta": 1.0}}
@@ -189,6 +195,7 @@ def test_names_of_a_lagrangian_system_mean_nothing():
     assert free_parameters(named, {"added.mass": -1.0})(jnp.zeros(1))["added.mass"] == -1.0
 
 
+@pytest.mark.slow
 def test_own_residuals_and_bounds(system, motion):
     """The estimate ends at the bound that is nearest to the truth."""
     exact = motion["rod"].angle
@@ -204,6 +211,7 @@ def test_own_residuals_and_bounds(system, motion):
     assert 7.0 <= fit.parameters["spring.stiffness"] < 7.05
 
 
+@pytest.mark.slow
 def test_start_that_cannot_be_assembled():
     """A rope too long for its loop, under derivatives as well."""
     bodies = [
@@ -220,6 +228,7 @@ def test_start_that_cannot_be_assembled():
         mb.identify(system, {"a.position": np.zeros((30, 2))}, ts=TS, free={"right.length": 30.0}, solver=TSIT5)
 
 
+@pytest.mark.slow
 def test_no_effect(system):
     with pytest.raises(ValueError, match=r"'rod.mass' has no effect"):
         mb.identify(system, ts=TS, free=["rod.mass"], residual=lambda trajectory: trajectory.ts, solver=TSIT5)
@@ -285,6 +294,7 @@ def test_free_parameters_start_where_they_should(system):
         assert values["rod.mass"] > 0 and 5.0 <= values["spring.stiffness"] <= 9.0
 
 
+@pytest.mark.slow
 def test_inertia_matrices_stay_positive_definite():
     from jaxmb import spatial
 
@@ -300,6 +310,7 @@ def test_inertia_matrices_stay_positive_definite():
     assert np.linalg.matrix_rank(jax.jacfwd(free.flat)(jnp.zeros(6))) == 6
 
 
+@pytest.mark.slow
 def test_failed_trials_are_rejected():
     """A square root near its branch point, on whose far side the iteration tries to land."""
     trials = []
@@ -383,6 +394,7 @@ def test_errors_of_the_motions_cost_few_iterations(errors, more):
         assert np.all(np.abs(found.z - known.z) <= 0.01 * deviations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["soft_l1", "huber"])
 def test_robust_losses_agree_with_scipy(name):
     """On estimates and objective; errors divided by their standard deviations have unit size, with outliers as well."""
@@ -409,6 +421,7 @@ def test_robust_losses_agree_with_scipy(name):
     assert np.all(np.abs(np.std(scores, axis=0) - 1) < 0.25)
 
 
+@pytest.mark.slow("huber")
 @pytest.mark.parametrize("name", ["soft_l1", "huber"])
 def test_derivatives_of_losses(name):
     loss, squares, h = LOSSES[name], np.array([0.0, 1e-12, 0.5, 1.5, 40.0]), 1e-6
@@ -419,6 +432,7 @@ def test_derivatives_of_losses(name):
     np.testing.assert_allclose(differences[2:], loss.curvature(squares)[2:], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_iterations_are_limited(system, motion):
     start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
     fit = mb.identify(system, noisy(motion, 0), ts=TS, free=start, sigma=SIGMA, solver=TSIT5, max_iterations=2)

@@ -61,6 +61,7 @@ RIGHT = [
 ]
 
 
+@pytest.mark.slow("30-0.01-0.01", "30-0.01-None", "100-0.01-None", "100-0.0-None", "100-0.0-0.01")
 @pytest.mark.parametrize("count, noise, sigma", RIGHT)
 def test_a_right_fit_is_not_accused(system, exact, count, noise, sigma):
     fit = fitted(system, samples(exact, count, noise, count), sigma)
@@ -70,7 +71,7 @@ def test_a_right_fit_is_not_accused(system, exact, count, noise, sigma):
         assert abs(fit.parameters[name] - true) <= 5 * fit.deviations[name] + 1e-6, name
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 7))
 @pytest.mark.parametrize("count, noise, sigma", RIGHT)
 def test_right_fits_of_a_swing_are_not_accused(system, exact, count, noise, sigma, seed):
@@ -104,8 +105,9 @@ WRONG = {
 SLOW = ("another sign", "another unit", "another motion")
 
 
+@pytest.mark.slow("too few iterations-without")
 @pytest.mark.parametrize("sigma", [NOISE, None], ids=["with sigma", "without"])
-@pytest.mark.parametrize("name", [pytest.param(own, marks=[pytest.mark.long] * (own in SLOW)) for own in WRONG])
+@pytest.mark.parametrize("name", [pytest.param(own, marks=[pytest.mark.slow] * (own in SLOW)) for own in WRONG])
 def test_a_wrong_fit_says_so(system, exact, name, sigma):
     change, arguments = WRONG[name]
     fit = fitted(system, samples(change(exact), 200, NOISE, 5), sigma, **arguments)
@@ -148,7 +150,7 @@ def spring_of(crank, measured, start, **change):
     return mb.identify(crank, {STROKE: measured}, ts=CRANK_TS, free={"spring.stiffness": start}, **arguments)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False], ids=["with sigma", "without"])
 @pytest.mark.parametrize("zero", [0.0, 0.4], ids=["another minimum", "another zero"])
 def test_the_spring_of_a_fast_slider_crank(crank, stroke, zero, known):
@@ -161,7 +163,7 @@ def test_the_spring_of_a_fast_slider_crank(crank, stroke, zero, known):
     assert np.isnan(fit.deviations["spring.stiffness"])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_right_fits_of_a_slider_crank_are_not_accused(crank, stroke, seed):
     measured = stroke + 2e-4 * (seed % 5 > 0) * np.random.default_rng(seed).standard_normal(stroke.size)
@@ -170,7 +172,7 @@ def test_right_fits_of_a_slider_crank_are_not_accused(crank, stroke, seed):
     assert abs(fit.parameters["spring.stiffness"] - 200) <= 5 * fit.deviations["spring.stiffness"] + 1e-4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_right_fits_of_a_pendulum_are_not_accused(seed):
     """Of two sensors with four components together."""
@@ -238,6 +240,7 @@ def test_what_was_tried_already_is_not_advised():
 OFFSETS = np.array([0.1, -0.2])
 
 
+@pytest.mark.slow
 def test_an_offset_that_is_free_for_all_components_together():
     """What is advised instead of freeing it frees it for each, and the fit is right."""
     own, ts = pendulum(), np.linspace(0.0, 1.0, 41)[1:]
@@ -255,6 +258,7 @@ def test_an_offset_that_is_free_for_all_components_together():
     np.testing.assert_allclose(fits[1].parameters["rod.position.bias"], OFFSETS, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_an_offset_that_is_free_for_all_experiments_together(system, exact):
     start = START | {"ts": TS}
     data = [samples(exact + offset, 200, NOISE, 5) for offset in OFFSETS]
@@ -339,6 +343,7 @@ def test_probabilities_hold(count, directions, rough):
     assert np.all(accused <= binom.isf(1e-6, draws, 1e-2))
 
 
+@pytest.mark.slow
 def test_estimates_at_the_ends_of_their_ranges():
     """Close to a bound, and not determined well enough to tell; or so far away that nothing tells how far."""
     positive = HalfLine(jnp.asarray(100.0), jnp.asarray(0.0))
@@ -379,7 +384,7 @@ def test_outliers_are_marked(system, exact):
         assert "beyond 5 σ" in fit.message and "loss='soft_l1'" in fit.message
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_bands_where_the_fit_explains_nothing(system, exact, tmp_path):
     fit = fitted(system, samples(exact + 0.1, 200, NOISE, 5), NOISE)
     page = fit.report(tmp_path / "page.html").read_text()

@@ -39,6 +39,7 @@ def monodromy(delta, epsilon):
     return np.stack([run([1.0, 0.0]), run([0.0, 1.0])], axis=1)
 
 
+@pytest.mark.slow
 def test_a_parametric_pendulum_has_mathieus_multipliers():
     system = parametric()
     found = mb.floquet(system, mb.assemble(system), 2 * np.pi)
@@ -49,6 +50,7 @@ def test_a_parametric_pendulum_has_mathieus_multipliers():
     assert "multiplier" in str(found)
 
 
+@pytest.mark.slow
 def test_the_tongues_of_mathieu():
     """With `a = 4 δ`, `q = −2 ε`, a multiplier is −1 on the borders of the first tongue: the trace is −2."""
     system, epsilon = parametric(), 0.2
@@ -86,6 +88,7 @@ def shaken():
     return mb.Scene([block, rod], joints=joints, forces=[mb.Gravity((0.0, -G))]).compile()
 
 
+@pytest.mark.slow
 def test_a_shaken_rod_on_hinges():
     system = shaken()
     found = mb.floquet(system, mb.assemble(system), 2 * np.pi / 7.0, coordinates=["rod.angle"])
@@ -97,6 +100,7 @@ def test_a_shaken_rod_on_hinges():
     np.testing.assert_allclose(found.monodromy, expected, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_swinging_rod_has_two_multipliers_of_one():
     rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.0, -0.5), angle=-np.pi / 2)
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))

@@ -50,6 +50,7 @@ def linear_pendulum():
     )
 
 
+@pytest.mark.slow
 def test_a_double_pendulum_has_its_closed_form():
     linear = linear_pendulum()
     assert linear.states == ("upper.angle", "lower.angle", "upper.angle_rate", "lower.angle_rate")
@@ -73,6 +74,7 @@ def test_a_double_pendulum_has_its_closed_form():
     assert "upper.angle" in str(linear) and str(linear).count("±") == 2
 
 
+@pytest.mark.slow
 def test_other_programs_and_responses():
     """The same numbers and names; free motion as SciPy computes it."""
     system, state = double_pendulum()
@@ -92,6 +94,7 @@ def test_other_programs_and_responses():
         linear.response(z0, 1.0)
 
 
+@pytest.mark.slow
 def test_what_rounding_explains_is_printed_as_zero():
     def lines(stiffness, damping):
         A = np.block([[np.zeros((2, 2)), np.eye(2)], [-stiffness, -damping]])
@@ -109,6 +112,7 @@ def test_what_rounding_explains_is_printed_as_zero():
     assert [line[:3] for line in lines(np.diag([1.0, 1e4]), np.diag([2.0, 0.0]))[1][:2]] == 2 * [["-1", "1", "1.0000"]]
 
 
+@pytest.mark.slow
 def test_a_mode_moves_on_the_constraints():
     linear = linear_pendulum()
     mode = linear.mode(0)
@@ -124,6 +128,7 @@ def test_a_mode_moves_on_the_constraints():
     np.testing.assert_allclose(mode.u, mode.eigenvalue * mode.q, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_eigenvalues_are_differentiated_forward_and_backward():
     A = np.random.default_rng(3).normal(size=(5, 5))
     dA = np.random.default_rng(4).normal(size=(5, 5))
@@ -150,6 +155,7 @@ def damped(system, state, mass, stiffness):
     return mb.linearise(changed, state).eigenvalues
 
 
+@pytest.mark.slow
 def test_derivatives_of_eigenvalues_by_parameters():
     system, state = double_pendulum()
     values = lambda x: (lambda w: jnp.stack([w[0].real, w[0].imag, w[2].imag]))(damped(system, state, x[0], x[1]))
@@ -177,6 +183,7 @@ def test_derivatives_of_eigenvalues_by_parameters():
     np.testing.assert_allclose(jax.vmap(values)(batch), np.stack([closed(x) for x in batch]), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_hanging_chain_has_the_zeros_of_laguerre_and_in_the_limit_those_of_bessel():
     found = {}
     for n in (6, 12):
@@ -211,6 +218,7 @@ def central(f, x, h=2e-3):
     return 1.5 * difference(1) - 0.6 * difference(2) + 0.1 * difference(3)
 
 
+@pytest.mark.slow
 def test_a_four_bar_on_a_spring_is_a_system_of_one_freedom():
     lengths, masses = (1.0, 3.0, 2.5), (1.0, 3.0, 2.5)
     bodies = [
@@ -254,6 +262,7 @@ def closed_loop(angles):
     return out, np.concatenate([at - P[5], np.cross(R @ AXES[5], AXES[5])])
 
 
+@pytest.mark.slow
 def test_bricards_redundant_loop_has_one_frequency():
     """Six hinges, whose rows leave no freedom by their count, on a spring of 3 N m/rad at the first one."""
     bodies, stiffness = [], 3.0
@@ -284,6 +293,7 @@ def test_bricards_redundant_loop_has_one_frequency():
     np.testing.assert_allclose(linear.frequencies, np.sqrt(stiffness / inertia), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_spinning_body_on_soft_bearings_has_gyroscopic_frequencies():
     """A rotor about its symmetry axis on isotropic springs at its centre: nutation at (C/A) Ω, and zero."""
     A, C, spin = 2.0, 3.0, 7.0
@@ -296,6 +306,7 @@ def test_a_spinning_body_on_soft_bearings_has_gyroscopic_frequencies():
     assert np.max(np.abs(linear.eigenvalues.real)) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_lagrangian_system_and_a_singular_mass_matrix():
     cart = lagrangian.LagrangianSystem(
         kinetic=lambda t, q, v, p: 0.5 * p["m"] * (v[0] ** 2 + v[1] ** 2),
@@ -332,6 +343,7 @@ def test_names_that_cannot_be(arguments, message):
         mb.linearise(system, state, **arguments)
 
 
+@pytest.mark.slow
 def test_dependent_names_and_inputs_that_move_joints():
     system, state = double_pendulum()
     with pytest.raises(ValueError, match=r"coordinates upper.angle, upper.x are not independent"):
@@ -340,6 +352,7 @@ def test_dependent_names_and_inputs_that_move_joints():
         mb.linearise(system, state, inputs=["A.point_b"])
 
 
+@pytest.mark.slow
 def test_a_state_that_is_no_equilibrium():
     system, state = double_pendulum()
     with pytest.raises(ValueError, match=r"no equilibrium: accelerations remain along .*jaxmb.equilibrium"):

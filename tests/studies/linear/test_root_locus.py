@@ -21,6 +21,7 @@ def two_masses():
     )
 
 
+@pytest.mark.slow
 def test_modes_keep_their_places_where_they_cross():
     values = np.linspace(1.0, 9.0, 18)
     locus = mb.root_locus(two_masses(), "k", values, state=mb.assemble)

@@ -22,6 +22,7 @@ def conical():
     return mb.Scene([ball], joints=[string], forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
 
 
+@pytest.mark.slow
 def test_a_conical_pendulum_runs_in_its_circle_and_nutates():
     system, angle = conical(), 0.6
     state = mb.steady_motion(system, fix={"ball.z": -2.0 * np.cos(angle)})
@@ -36,6 +37,7 @@ def test_a_conical_pendulum_runs_in_its_circle_and_nutates():
     assert np.max(np.abs(found[:2])) < 1e-6 and np.max(np.abs(found[2:].real)) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_motion_that_nothing_prescribes_is_found_near_the_guess():
     radius, height = 2.0 * np.sin(0.6), 2.0 * np.cos(0.6)
     faster = 1.02 * radius * np.sqrt(G / height)
@@ -47,6 +49,7 @@ def test_a_motion_that_nothing_prescribes_is_found_near_the_guess():
     assert abs(state.u[2]) < 1e-9
 
 
+@pytest.mark.slow
 def test_the_speed_of_a_cone_is_differentiable():
     system = conical()
 
@@ -62,6 +65,7 @@ def test_the_speed_of_a_cone_is_differentiable():
     np.testing.assert_allclose(jax.jit(jax.vmap(speed))(angles), exact(angles), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_flyball_governor_balances_its_springs():
     """Stationary values of V − ½ Ω² J over the arms' angle and the slider's height."""
     speed, stiffness, ball = 8.0, 2e3, 5.0
@@ -100,6 +104,7 @@ def disc(speed):
     return system, mb.assemble(system, rates={"disc.wy": speed / 0.3, "disc.wx": 0.0, "disc.wz": 0.0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.8, 1.2])
 def test_a_rolling_disc_falls_below_its_critical_speed(speed):
     """λ² (A + m r²) = m g r − C (C + m r²) ω² / A, which changes its sign at v² = g r / 3 (Routh)."""
@@ -111,6 +116,7 @@ def test_a_rolling_disc_falls_below_its_critical_speed(speed):
     assert (speed**2 < G * r / 3) == (np.max(found.real) > 1e-6)
 
 
+@pytest.mark.slow
 def test_a_disc_in_a_steady_circle():
     given = mechanisms.get("rolling_disc", lean=0.4, turn=-2.0)
     names = given.system.rate_names()
@@ -135,6 +141,7 @@ def test_a_disc_in_a_steady_circle():
     np.testing.assert_allclose(half.ys.q[-1, 2] - state.q[2], -(start.q[2] - state.q[2]), atol=2e-10)
 
 
+@pytest.mark.slow
 def test_ignorable_coordinates_of_a_lagrangian():
     """A bead on a turning hoop in the coordinates θ and the hoop's angle φ: cos θ = g / (r Ω²)."""
     hoop = lagrangian.LagrangianSystem(
@@ -155,6 +162,7 @@ def test_ignorable_coordinates_of_a_lagrangian():
         mb.steady_motion(hoop, rates={"phi": 4.0})
 
 
+@pytest.mark.slow
 def test_what_is_no_steady_motion():
     rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
@@ -178,6 +186,7 @@ def corded(**wheels):
     return bodies, [*hinges, mb.FixedTendon("cord", along, coefficients=(0.3, -0.3)[: len(wheels)])]
 
 
+@pytest.mark.slow
 def test_a_wheel_that_winds_up_a_cord():
     """The count of its turns advances with it, however often it has turned."""
     bodies, joints = corded(wheel=2.0)
@@ -190,6 +199,7 @@ def test_a_wheel_that_winds_up_a_cord():
     np.testing.assert_allclose(mb.linearise(system, later).A, [[0.0, 1.0], [0.0, 0.0]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_wheels_that_a_cord_keeps_together():
     """They turn at one speed, the stretch of the cord between them balances a torque, and they vibrate about that."""
     one, two, stiffness, damping, r = 2.0, 0.5, 40.0, 0.7, 0.3
@@ -208,6 +218,7 @@ def test_wheels_that_a_cord_keeps_together():
     np.testing.assert_allclose(length, 1.5 / (stiffness * r), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_motion_against_a_contact_is_not_steady():
     bar = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.5, 0.0))
     pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))

@@ -11,6 +11,8 @@ from scipy.optimize import differential_evolution
 import jaxmb as mb
 from jaxmb.mechanisms import ride
 
+pytestmark = pytest.mark.slow
+
 # A. Kunjur and S. Krishnamurty, "Genetic algorithms in mechanism synthesis", J. Applied Mechanisms and Robotics 4(2),
 # 1997; J. A. Cabrera, A. Simon and M. Prado, "Optimal synthesis of mechanisms with genetic algorithms", Mechanism and
 # Machine Theory 37, 2002; S. K. Acharyya and M. Mandal, "Performance of EAs for four-bar linkage synthesis", Mechanism
@@ -131,7 +133,6 @@ def evolved(objective, bounds, size, generations=1000):
     return differential_evolution(lambda x: objective(np.atleast_2d(x.T)), bounds, **options).fun
 
 
-@pytest.mark.long
 def test_four_bar_through_a_line():
     """Six points of a vertical line without timing, with a bound of the transmission angle."""
     system, state = four_bar((35.0, 15.0, 30.0, 30.0), 20.0, 0.5)
@@ -170,7 +171,6 @@ def test_four_bar_through_a_line():
     assert best.outputs["error"] <= published["Cabrera 2011"] and published["Nguyen-Van 2022"] < 1e-10
 
 
-@pytest.mark.long
 def test_four_bar_along_an_arc():
     """Five points with prescribed crank angles from 30° to 90°."""
     angles = np.deg2rad([30.0, 45.0, 60.0, 75.0, 90.0])
@@ -196,7 +196,6 @@ def test_four_bar_along_an_arc():
     assert best.outputs["error"] <= min(published.values()) < 2e-6 and best.outputs["error"] < searched
 
 
-@pytest.mark.long
 def test_four_bar_around_a_loop():
     """Eighteen points of Kunjur and Krishnamurty, every 20° of the crank."""
     system, state = four_bar((1.0, 0.4, 1.0, 1.0), 1.0, 1.0)
@@ -226,7 +225,6 @@ def test_four_bar_around_a_loop():
     assert best.objective < 0.0091 < min(published.values()) and best.objective < searched
 
 
-@pytest.mark.long
 def test_camber_curve_of_a_double_wishbone():
     """The upper ball joint and the tie rod for a camber proportional to the wheel's travel, with little bump steer."""
     m = mb.mechanisms.get("double_wishbone")
@@ -266,7 +264,6 @@ def test_camber_curve_of_a_double_wishbone():
     assert np.max(np.abs(best.outputs["camber"] + 0.6 * travel)) < np.deg2rad(0.2)
 
 
-@pytest.mark.long
 def test_comfort_of_a_tracked_vehicle():
     """Torsion bars and dampers for the smoothest ride over a bump with bounded travel of the arms, from a start that
     travels too far.

@@ -209,6 +209,7 @@ def test_a_large_constant_part_where_the_start_is_on_a_bound_and_a_constraint():
     assert best.success and round_(best.parameters["x"]) < 1e-8 * 1e5
 
 
+@pytest.mark.slow("optax")
 @pytest.mark.parametrize("method", ["slsqp", optax.lbfgs()], ids=METHODS)
 def test_bounds_by_every_method(method):
     """The optimum on a bound: x = (0.8, 0.64)."""
@@ -229,6 +230,7 @@ def test_equations_and_bounds_of_components():
     assert [c.active for c in best.constraints] == [True, False, True]
 
 
+@pytest.mark.slow
 def test_both_modes_of_derivatives_agree():
     forward, reverse = (
         Program(valley, Plain(), ("f", "x"), forward).linearised(jnp.ones(2))  # pyright: ignore
@@ -245,6 +247,7 @@ class Plain:
         return {"x": z}
 
 
+@pytest.mark.slow
 def test_the_mode_is_the_one_that_the_function_allows():
     """A simulation has both; a function with a rule of its own for reverse mode, and one with a loop, have one."""
     m = mb.mechanisms.get("pendulum")
@@ -395,6 +398,7 @@ def hills(v):
     return {"f": jnp.sum(v["x"] ** 2 + 20.0 * (1 - jnp.cos(4.0 * v["x"])))}
 
 
+@pytest.mark.slow
 def test_several_starts_find_the_deepest_valley():
     one = mb.optimise(hills, {"x": [2.9, -3.1]}, bounds={"x": (-4.0, 4.0)})
     many = mb.optimise(hills, {"x": [2.9, -3.1]}, bounds={"x": (-4.0, 4.0)}, starts=64)
@@ -404,6 +408,7 @@ def test_several_starts_find_the_deepest_valley():
         mb.optimise(hills, {"x": [2.9, -3.1]}, starts=8)
 
 
+@pytest.mark.slow
 def test_design_variables_bring_bounds_and_scales():
     m = mb.mechanisms.get("pendulum")
     name = "gravity.acceleration"
@@ -420,6 +425,7 @@ def test_design_variables_bring_bounds_and_scales():
         mb.optimise(lambda v: v["g"], ["h"], system=system)
 
 
+@pytest.mark.slow
 def test_mean_and_spread_of_a_robust_design():
     """Two minima of equal depth, one of them wide: with scatter the wide one is better."""
     depth = lambda x, at, width: jnp.exp(-(((x - at) / width) ** 2))

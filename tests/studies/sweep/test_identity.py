@@ -40,6 +40,7 @@ def test_words_make_no_difference():
     assert identity(swept_functions.plain) == identity(functools.partial(lambda f, k: {"y": f * k}, 2))
 
 
+@pytest.mark.slow
 def test_another_process_with_other_hashes_knows_all_of_them():
     code = (
         "import json, numpy as np, swept_functions as s\n"
@@ -77,7 +78,7 @@ def test_a_machine_under_another_driver_does_not_get_the_results_of_the_first(tm
     assert again.identical(found)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sweeps_of_motions_and_of_their_gradients_are_known_again():
     def runs(speed):
         scene = mb.mechanisms.pendulum().scene

@@ -57,6 +57,7 @@ def test_outputs_of_any_shape_over_a_grid(tmp_path):
     xr.testing.assert_identical(kept, found)
 
 
+@pytest.mark.slow
 def test_a_plain_reader_opens_the_store(undisturbed):
     store, found = undisturbed
     plain = xr.open_zarr(store, chunks=None)
@@ -81,6 +82,7 @@ def copied(undisturbed, tmp_path):
     return shutil.copytree(undisturbed[0], tmp_path / "runs.zarr")
 
 
+@pytest.mark.slow
 def test_a_sweep_that_is_done_computes_nothing_and_one_that_is_not_what_is_missing(undisturbed, copied, monkeypatch):
     before, computed, own = files(copied), [], Work.__call__
     counted = lambda work, task, tell: (computed.append(task.place), own(work, task, tell))[1]
@@ -111,6 +113,7 @@ def _flip(file):
 ALONE = r"without the file status/c/7 these alone are computed again.*overwrite=True"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message", "readers"),
     [
@@ -308,7 +311,7 @@ def test_steps_and_their_limit_are_told():
     assert "maximum number of solver steps" in str(found["message"][2].item())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_motions_that_fail_have_a_status():
     mechanism = mb.mechanisms.get("pendulum")
     name = next(name for name in mb.parameters(mechanism.system) if name.endswith("mass"))
@@ -429,7 +432,7 @@ def _with_small_disk(store):
     return mb.sweep(grow, mb.cases.table(a=np.arange(1.0, 21.0)), store, chunk=10, progress=False)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_full_disk_is_a_clear_error(tmp_path):
     refused = pytest.raises(OSError, match=r"cannot be written.*The chunks that are done are kept")
     with ProcessPoolExecutor(1, mp_context=forked()) as processes, refused:
@@ -437,7 +440,7 @@ def test_a_full_disk_is_a_clear_error(tmp_path):
     assert not list((tmp_path / "runs.zarr").rglob("*.partial"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_killed_five_times_it_ends_with_the_same_bits(undisturbed, tmp_path):
     store, random = tmp_path / "runs.zarr", np.random.default_rng()
     done = []
@@ -454,7 +457,7 @@ def test_killed_five_times_it_ends_with_the_same_bits(undisturbed, tmp_path):
     assert files(store) == files(undisturbed[0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_workers_and_the_session_killed(undisturbed, tmp_path):
     """Workers die one after another, then the session with all of its workers; nothing stays behind."""
     store, killed = tmp_path / "runs.zarr", []
@@ -494,7 +497,7 @@ def _runs(pid):
         return False
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_a_dask_cluster_that_loses_workers(undisturbed, tmp_path):
     from distributed import Client, LocalCluster
@@ -513,7 +516,7 @@ def test_a_dask_cluster_that_loses_workers(undisturbed, tmp_path):
     assert files(store) == files(undisturbed[0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_lambda_and_a_closure_go_to_processes(tmp_path):
     factor = jnp.asarray(3.0)
     found = mb.sweep(lambda a: {"x": factor * a}, mb.cases.grid(a=[1.0, 2.0]), processes=2, chunk=1, progress=False)
