@@ -117,7 +117,7 @@ class AbstractFrictionLaw(AbstractLaw):
         """Force [N] on the body.
 
         **Arguments:** `load`: normal force [N]; `engaged`: from 0 off the ground to 1 in full contact; `slip`: velocity
-        along the ground [m/s] of the body's lowest point; `travel`: that of its centre.
+        along the ground [m/s] of the body's lowest point; `travel`: the velocity of its centre.
         """
 
 
@@ -292,12 +292,12 @@ class Contact(AbstractContact):
     **Arguments:**
 
     - `bodies`: one name or several; all share one terrain, one law and one set of parameters.
-    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but that it rises and sinks where its
-        numbers are inputs.
+    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but it rises and sinks if its numbers
+        are inputs.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
     - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the origins of the frames.
-    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, from which on it acts fully.
     - `smoothing` [m] > 0. Far above the ground a depth of `smoothing² / (4 |d|)` remains.
     """
 
