@@ -14,10 +14,10 @@ from .space import AbstractSpace, Point, Pose, Velocity, Wrench
 
 
 class AbstractFrame(AbstractPart):
-    """A frame fixed in a body, or in another frame, which is then its `base`; a scene fills that in.
+    """A frame fixed in a body, or in another frame, its `base`, which a scene fills in.
 
-    A part that names a frame in place of a body sees the pose and the velocity of the frame: points and axes that are
-    given with the part are in the frame's axes, from its origin.
+    A part that names a frame in place of a body sees the pose and the velocity of the frame. Points and axes given with
+    the part are in the frame's axes, from its origin.
     """
 
     name: str = fields.name()
@@ -34,7 +34,7 @@ class AbstractFrame(AbstractPart):
 
     @abc.abstractmethod
     def own_wrench(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
-        """The wrench on the base that is equivalent to one on the frame."""
+        """The wrench on the base that is equivalent to a wrench on the frame."""
 
     @abc.abstractmethod
     def own_point(self, point: Point) -> Point:
@@ -59,18 +59,18 @@ class AbstractFrame(AbstractPart):
         return self.own_velocity(space, pose, velocity)
 
     def wrench(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
-        """The wrench on the body that is equivalent to one on the frame."""
+        """The wrench on the body that is equivalent to a wrench on the frame."""
         if self.base is None:
             return self.own_wrench(space, pose, wrench)
         return self.base.wrench(space, pose, self.own_wrench(space, self.base.pose(space, pose), wrench))
 
     def wrench_on_frame(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
-        """The wrench on the frame that is equivalent to one on the body."""
+        """The wrench on the frame that is equivalent to a wrench on the body."""
         if self.base is not None:
             pose, wrench = self.base.pose(space, pose), self.base.wrench_on_frame(space, pose, wrench)
         d = space.dimension
         at_origin = space.point_force(pose, self.own_point(jnp.zeros(d, wrench.dtype)), wrench[:d])
-        # Components of moments change as those of angular velocities do.
+        # Components of moments change like those of angular velocities.
         moment = jnp.concatenate([jnp.zeros_like(wrench[:d]), wrench[d:] - at_origin[d:]])
         return jnp.concatenate([wrench[:d], self.own_velocity(space, pose, moment)[d:]])
 
@@ -83,13 +83,13 @@ class AbstractFrame(AbstractPart):
 class LinkFrame(AbstractFrame):
     """The frame of a body whose mass centre is not its origin.
 
-    **Arguments:** `centre` [m]: the mass centre in the frame, whose axes are those of the body.
+    **Arguments:** `centre` [m]: the mass centre in the frame, whose axes are the body's.
     """
 
     centre: fields.Number = fields.parameter(shape=("d",), unit="m")
 
     def own_pose(self, space, pose):
-        # What is prepared belongs to the attitude, which is the body's.
+        # Prepared quantities belong to the attitude, which is the body's.
         xp = namespace(pose, self.centre)
         return xp.concatenate([space.point(pose, -self.centre), pose[space.dimension :]])
 
@@ -107,10 +107,10 @@ class LinkFrame(AbstractFrame):
 
 
 def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBody]) -> dict[str, AbstractFrame]:
-    """Checked frames with their bases, by name; also those of the bodies whose mass centre is not their origin, by the
-    names of these.
+    """Checked frames with their bases, by name; bodies whose mass centre is not their origin have a frame under their
+    name.
 
-    **Raises:** `ValueError` for frames on unknown bodies, and those that are fixed in themselves.
+    **Raises:** `ValueError` for frames on unknown bodies, and frames that are fixed in themselves.
     """
     given, known = {frame.name: frame for frame in frames}, {body.name: body for body in bodies}
     out: dict[str, Any] = {

@@ -27,11 +27,11 @@ class Friction(AbstractNonIdeal):
     system = jaxmb.Scene([bar], joints=[pin], forces=[rub, jaxmb.Gravity((0.0, -9.81))]).compile()
     ```
 
-    The slip s combines the relative velocity of the bodies at the joint's point (of a single body: relative to the
-    ground) with `radius` times their relative angular velocity, so that one law serves pins, slides and cylinders. The
-    force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest. N is the magnitude of
-    the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If no
-    such N exists, or more than one (Painlevé's paradox), the simulation ends with `friction_undetermined`.
+    The slip s combines the relative velocity of the bodies at the joint's point (a single body's: relative to the
+    ground) with `radius` times their relative angular velocity. The same law thus serves pins, slides and cylinders.
+    The force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest. N is the magnitude
+    of the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If
+    no such N exists, or more than one (Painlevé's paradox), the simulation ends with `friction_undetermined`.
 
     **Arguments:**
 
@@ -52,7 +52,7 @@ class Friction(AbstractNonIdeal):
 
     def complete(self, space, joint, poses):
         if isinstance(joint, AbstractInertialConstraint):
-            raise ValueError(f"{self.label}: {joint.label} is no joint with a smooth force; use jaxmb.DryFriction.")
+            raise ValueError(f"{self.label}: {joint.label} is not a joint with a smooth force; use jaxmb.DryFriction.")
         k = poses.shape[0] - 1
         if k > 1:
             raise ValueError(f"{self.label}: {joint.name!r} connects more than two bodies; use NonIdeal.")

@@ -1,4 +1,4 @@
-"""Docstrings of classes: they explain their own arguments only, and have those of their base classes before these."""
+"""Docstrings of classes: a class explains its new arguments only; the inherited arguments are put before these."""
 
 import inspect
 import re
@@ -7,7 +7,7 @@ _ARGUMENTS = re.compile(r"\*\*Arguments:\*\*\s+(.*?)(?=\n\n(?!- )|\Z)", re.DOTAL
 
 
 def with_inherited_arguments(cls: type) -> str | None:
-    """The docstring of a class with the arguments that its bases explain and that it does not explain itself."""
+    """The docstring of a class with the inherited arguments that only its bases explain."""
     if cls.__doc__ is None:
         return None
     inherited = {}

@@ -36,10 +36,10 @@ class ModuleWeights(eqx.Module):
 
 @functools.singledispatch
 def as_weights(module: Any) -> ModuleWeights:
-    """A module as its weights and the rest; what is that already stays as it is.
+    """A module as its weights and the rest; `ModuleWeights` stay as they are.
 
-    **Raises:** `ValueError` for a module without weights, and for arrays of other numbers, which are neither weights
-    nor static.
+    **Raises:** `ValueError` for a module without weights, and for arrays that are not of floating-point numbers, which
+    are neither weights nor static.
     """
     if not isinstance(module, eqx.Module):
         raise ValueError(f"expected an equinox module, such as an eqx.nn.MLP, got {module!r}")
@@ -50,8 +50,8 @@ def as_weights(module: Any) -> ModuleWeights:
             return leaf
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(
-                f"{_place(path)} is an array of {leaf.dtype} numbers; weights are floating-point numbers, and what is "
-                "fixed is no array"
+                f"{_place(path)} is an array of {leaf.dtype} numbers; weights are floating-point arrays, and fixed "
+                "values must not be arrays"
             )
         weights.append(leaf)
         return jax.ShapeDtypeStruct(leaf.shape, dtype)
@@ -83,9 +83,9 @@ def with_weights(like: eqx.Module, values: Float[Array, "n"]) -> eqx.Module:
 
 
 def weights_of(module: eqx.Module, like: eqx.Module) -> Float[Array, "n"]:
-    """The weights of a module that must differ from another one in nothing else.
+    """The weights of a module that may differ from `like` in its weights only.
 
-    **Raises:** `ValueError` that names what differs.
+    **Raises:** `ValueError` that names the difference.
     """
     found = as_weights(module)
     if found.like == like:

@@ -1,4 +1,4 @@
-"""Error messages for unknown names, with the nearest known ones."""
+"""Error messages for unknown names, with the nearest known names."""
 
 import difflib
 import functools
@@ -12,13 +12,13 @@ _Result = TypeVar("_Result")
 
 
 class UnknownNameError(ValueError, KeyError):
-    """A name that stands for nothing. It is a `KeyError` as well, so that `in` and `get` of a mapping work."""
+    """An unknown name. It is a `KeyError` as well, so that `in` and `get` of a mapping work."""
 
     __str__ = ValueError.__str__
 
 
 def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> UnknownNameError:
-    """An error for an unknown name, with the nearest known ones; of `"rod.phi"`, and of `"rod"` where names have dots,
+    """An error for an unknown name, with the nearest known names; for `"rod.phi"`, or `"rod"` where names have dots,
     with all names of `"rod"`. `where`: the part or argument that has the name.
     """
     lead = f"{where}: " if where else ""
@@ -50,9 +50,10 @@ def _alike(name: str, known: list[str]) -> list[str]:
 
 
 def check_arguments(what: str, signature: inspect.Signature, positional: int, names: Iterable[str]) -> None:
-    """Raise a `TypeError` that lists what a function or class takes, for arguments that it does not take.
+    """Raise a `TypeError` that lists the arguments of a function or class, for arguments that it does not take.
 
-    **Arguments:** `what`: its name; its `signature`; the number of `positional` arguments and the `names` of others.
+    **Arguments:** `what`: its name; its `signature`; the number of `positional` arguments and the `names` of the
+    others.
     """
     taken = signature.parameters
     kinds = {own.kind for own in taken.values()}
@@ -75,9 +76,9 @@ def check_arguments(what: str, signature: inspect.Signature, positional: int, na
 def names_arguments(
     function: Callable[_Arguments, _Result], gone: Mapping[str, str] = MappingProxyType({})
 ) -> Callable[_Arguments, _Result]:
-    """A function whose error for an unknown argument names the nearest one, or all that it takes.
+    """A function whose error for an unknown argument names the nearest argument, or all arguments.
 
-    **Arguments:** `gone`: arguments of the last release by name, with the new way.
+    **Arguments:** `gone`: removed arguments by name, each with its replacement.
     """
     signature = inspect.signature(function)
     taken = signature.parameters

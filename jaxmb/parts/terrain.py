@@ -31,7 +31,7 @@ from .smooth import step
 __all__ = ["AbstractTerrain", "Bump", "Flat", "Ramp", "Sinusoid", "Slope", "Spline", "Surface"]
 
 Place = Float[Array, "h"]
-# The share of a bump or wave within which the ground rises or falls once.
+# The fraction of a bump or wave within which the ground rises or falls once.
 _SHARE = 0.25
 
 
@@ -47,8 +47,8 @@ class AbstractTerrain(AbstractLaw):
         """Height [m] above the world's origin at a place [m], continuously differentiable."""
 
     def detail(self, place: Place) -> Float[Array, ""]:
-        """Hook: a length [m] within which the ground around a place rises or falls once at most; by default infinite.
-        Between two places that are so far apart no step looks at a contact.
+        """Hook: a length [m] within which the ground around a place rises or falls at most once; by default infinite.
+        Steps evaluate contacts at least once over this length.
         """
         return jnp.asarray(jnp.inf, place.dtype)
 
