@@ -98,7 +98,7 @@ def perpendicular(x_a: Any, y_b: Any, along: tuple[Any, Any] = (None, None)) -> 
 
 
 def in_planes(part: Any, normals: Iterable[Any]) -> tuple[Product, ...]:
-    """Point B of a part stays in planes (on lines in planar scenes) with these normals, fixed in A and through point A."""
+    """Point B of a part stays in planes (lines in planar scenes) with these normals, fixed in A and through point A."""
     return tuple(Product(x, part.point_b, part.point_a) for x in normals)
 
 

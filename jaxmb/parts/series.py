@@ -27,7 +27,7 @@ def sample_times(t0: Scalar, t1: Scalar) -> Float[Array, "n"]:
 
 
 class AbstractSignal(eqx.Module):
-    """A value as a function of time; `of_arrays`: whether signals of the same structure differ in their arrays alone."""
+    """A value as a function of time; `of_arrays`: whether signals of one structure differ in their arrays alone."""
 
     of_arrays: ClassVar[bool] = False
 

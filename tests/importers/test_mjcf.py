@@ -301,7 +301,7 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
     [
         (TWICE, "", "", "Joints in succession to 'a' are degenerate, hinge 'p1', hinge 'p3' are parallel hinges"),
         (joint("s1", "slide") + joint("s2", "slide"), "", "", "slide 's1', slide 's2' slide in directions that depend"),
-        (FOUR, "", "", "hinge 'h0', hinge 'h1', hinge 'h2', hinge 'h3' turn in more ways than the three"),
+        (FOUR, "", "", "hinge 'h0', hinge 'h1', hinge 'h2', hinge 'h3' have more than three rotations"),
         (FLAT, "", "", "the axes of the hinges 'f1', 'f2', 'f3' lie in one plane in the middle of the range of 'f2'"),
         (
             HINGE,
