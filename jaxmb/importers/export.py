@@ -19,7 +19,7 @@ from .notes import Notes, checked_ignore
 
 @dataclasses.dataclass(frozen=True)
 class Exported:
-    """The `text` of an MJCF file, and `notes` on what is different in MuJoCo."""
+    """The `text` of an MJCF file, and `notes` on differences in MuJoCo."""
 
     text: str
     notes: tuple[str, ...]
@@ -35,13 +35,13 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     exported.text, exported.notes
     ```
 
-    Joints that make a tree become joints of MuJoCo, with the names and the values of the coordinates here; those that
+    Joints in a spanning tree become joints of MuJoCo, with the names and values of the coordinates here. Joints that
     close loops become equality constraints, which MuJoCo holds softly. Angles are in (−π, π] at the given pose, from
-    which MuJoCo counts them on; what a spring, stop or actuator counts from another turn is written for these angles.
-    Several springs, dampers, frictions or stops of one joint are one. Frames of bodies are at their mass centres.
+    which MuJoCo counts on; the numbers of springs, stops and actuators are shifted by full turns accordingly. Several
+    springs, dampers, frictions or stops of a joint are merged. Frames of bodies are at their mass centres.
 
-    **Arguments:** `system`: a compiled scene; `state`: where the machine stands, default the poses given with the
-    bodies, which must satisfy the constraints; `ignore`: names of parts to leave out.
+    **Arguments:** `system`: a compiled scene; `state` of the machine, default the poses given with the bodies, which
+    must satisfy the constraints; `ignore`: names of parts to leave out.
 
     **Returns:** an `Exported`.
 

@@ -17,9 +17,9 @@ from .description import rotation_of
 from .export_tree import Tree, numbers, of_class, parts_of
 from .notes import Notes
 
-# MuJoCo reads this free length of a tendon's spring as the length in the pose of the file.
+# For this free length of a tendon's spring MuJoCo takes the length in the file's pose.
 _LENGTH_OF_POSE = -1.0
-_COUNTS = "These see an angle within half a turn of middle, or of free; MuJoCo counts it on from the given pose: {}."
+_COUNTS = "Here an angle is within half a turn of middle or free; MuJoCo counts it on from the given pose: {}."
 
 
 def write_forces(
@@ -50,10 +50,10 @@ class _Writer:
     def __init__(self, tree: Tree, elements: dict[str, Any], sections: dict[str, Any], notes: Notes):
         self.tree, self.elements, self.sections, self.notes = tree, elements, sections, notes
         self.tendons: dict[str, Any] = {}
-        # How far MuJoCo's lengths of tendons are ahead of those here, which may have wound up by full turns.
+        # MuJoCo's lengths of tendons minus the lengths here, which may have wound up by full turns.
         self.lengths: dict[str, float] = {}
         self.springs: dict[str, tuple[float, float]] = {}
-        # By names of joints: the range that stops leave; and for each part how far the joint is ahead of what it sees.
+        # By names of joints: the range between stops; and for each part MuJoCo's coordinate minus the part's.
         self.ranges: dict[str, tuple[float, float]] = {}
         self.turns: dict[str, dict[str, float]] = {}
 
@@ -66,8 +66,8 @@ class _Writer:
             own.set("quat", numbers(from_matrix(back @ rotation)))
 
     def ahead(self, part, about):
-        """How far MuJoCo's value of a part's coordinate is ahead of the one that the part sees, of an angle the one
-        within half a turn of another: full turns, or what a tendon winds up in these.
+        """MuJoCo's coordinate minus the part's: full turns [rad] for an angle, which the part wraps to within half a
+        turn of `about`, or the length by which such turns wind up a tendon.
         """
         (coordinate,) = part.acts_on
         joint = self.tree.coordinates.get(coordinate)
@@ -200,7 +200,7 @@ class _Writer:
             return False
         self.ranges[joint.name] = lower, upper
         self.tree.elements[joint.name].set("range", numbers((lower, upper)))
-        self.notes.say("Stops are MuJoCo's limits, of its own stiffness: {}.", part.name)
+        self.notes.say("Stops are MuJoCo's limits, with its stiffness: {}.", part.name)
         return None
 
     def friction(self, part):
@@ -213,7 +213,7 @@ class _Writer:
 
 
 def _add(element, name, value):
-    """Add to a number of an element, which several parts may give."""
+    """Add to a number of an element, to which several parts may contribute."""
     element.set(name, numbers(float(element.get(name, 0.0)) + float(value)))
 
 

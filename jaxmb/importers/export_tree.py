@@ -20,9 +20,9 @@ from ..parts.spatial.kinematics import SPACE
 from .description import rotation_of, unused
 from .notes import Notes
 
-# What MuJoCo calls the fixed world.
+# MuJoCo's name of the fixed world.
 _WORLD = "world"
-# The methods by which a class says what its parts do.
+# The methods by which a class defines its laws.
 _LAWS = {"residual", "coordinates", "wrenches", "energy", "state_rates", "length", "force"}
 
 
@@ -32,7 +32,7 @@ def numbers(values: Any) -> str:
 
 
 def of_class(table: Mapping[type, Any], part: Any) -> Any:
-    """The entry of a table for the class of a part, or for the one that its laws are from; None without one."""
+    """The entry of a table for the class of a part, or for the class that defines its laws; None without one."""
     for cls in type(part).__mro__:
         if cls in table or _LAWS & vars(cls).keys():
             return table.get(cls)
@@ -41,8 +41,8 @@ def of_class(table: Mapping[type, Any], part: Any) -> Any:
 
 @dataclasses.dataclass
 class PlacedPart:
-    """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, the coordinates of
-    joints that it acts on, the values of its scalar coordinates, and the names in the scene and the file.
+    """A part of the scene with concrete numbers: the names of its bodies, the poses that it sees, the coordinates that
+    it acts on, the values of its scalar coordinates, and the names used in the scene and the file.
     """
 
     name: str
@@ -60,7 +60,7 @@ class PlacedPart:
 
     @functools.cached_property
     def joints(self) -> list[ElementaryJoint] | None:
-        """The hinges, slides and balls in succession that the part is; None if it is no such joint."""
+        """The part as hinges, slides and balls in succession; None if it is not such a joint."""
         is_known = isinstance(self.part, AbstractConstraint) and self.part.declares("elementary_joints", "coordinates")
         return jax.device_get(self.part.elementary_joints(SPACE, self.poses)) if is_known else None
 
@@ -74,15 +74,15 @@ class PlacedPart:
         return pose[:3] + rotation_of(pose[3:7]) @ point
 
     def turns(self, value: float, about: Any, k: int = 0) -> float:
-        """By how many full turns [rad] a value of its k-th coordinate is ahead of the one that the part sees, of an
-        angle the one within half a turn of another.
+        """The full turns [rad] by which a value exceeds the part's k-th coordinate, an angle wrapped to within half a
+        turn of `about`.
         """
         return float(turns(jnp.asarray(value - about).reshape(()))) if self.part.is_periodic(k) else 0.0
 
 
 @dataclasses.dataclass
 class TreeBody:
-    """A body of the tree, with its joints from the parent on, which have the names that MuJoCo knows them by."""
+    """A body of the tree, with its joints from the parent on, under their names in MuJoCo."""
 
     body: str
     parent: str
@@ -93,8 +93,8 @@ class TreeBody:
 class Tree:
     """The bodies in order, parents first; the constraints that close loops, each with the name of the part, a tag and
     attributes; and for each coordinate, `"hip.angle"`, MuJoCo's joint. `scalars`: the scalar coordinates of the scene;
-    `names`: those of the scene and of elements that have none there; `bodies`: what MuJoCo calls the bodies;
-    `elements`: the XML elements of joints.
+    `names` used in the scene and the file; `bodies`: MuJoCo's names of the bodies; `elements`: the XML elements of
+    joints.
     """
 
     poses: dict[str, np.ndarray]
@@ -108,8 +108,8 @@ class Tree:
 
 
 def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPart]:
-    """The parts of some groups, where the tree has the bodies and the scalar coordinates."""
-    # Scalar coordinates are no bodies; their numbers are those after the bodies'.
+    """The parts of some groups, at the tree's poses and scalar coordinates."""
+    # Scalar coordinates are not bodies; they are numbered after the bodies.
     names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
     for group in groups:
         for k, name in enumerate(group.group.names):
@@ -131,7 +131,7 @@ def _acts_on(group, part, k):
 
 
 def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree:
-    """The tree of a system's bodies. Joints are taken in their order, those that cannot close a loop before others."""
+    """The tree of a system's bodies. Joints are taken in their order, but first all that cannot close a loop."""
     poses = np.asarray(system.poses(q))
     scalars = np.asarray(system.bodies.prepared_poses(q))[len(poses) : -1, 0]
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
@@ -175,18 +175,18 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
 
 
 def _new(name, names):
-    """A name that no element of the file has, to be one of them."""
+    """A new name, unused in the file, which is added to the names."""
     out = unused(name, names.__contains__)
     names.add(out)
     return out
 
 
 def _bodies(system, names, notes):
-    """What MuJoCo calls the bodies: it keeps one name for the fixed world."""
+    """MuJoCo's names of the bodies; a name is reserved for the fixed world."""
     out = {name: name for name in system.body_names}
     if _WORLD in out:
         out[_WORLD] = _new(f"{_WORLD} body", names)
-        notes.say("Bodies have other names, since MuJoCo has these: {}.", f"{_WORLD} → {out[_WORLD]}")
+        notes.say("Bodies have other names, since MuJoCo reserves these: {}.", f"{_WORLD} → {out[_WORLD]}")
     return out
 
 
@@ -199,7 +199,7 @@ def _free(body, tree, rotates):
 
 
 def _oriented(part, tree, child):
-    """The joints of MuJoCo that a joint is, from the parent to the child."""
+    """A joint as joints of MuJoCo, from the parent to the child."""
     back, single = child == part.bodies[0], len(part.joints) == 1
     joints = []
     for own in part.joints:
@@ -213,7 +213,7 @@ def _oriented(part, tree, child):
 
 
 def _ends(part, tree):
-    """Attributes that name the bodies, a moving one first, and the number of that."""
+    """Attributes that name the bodies, a moving body first, and its number."""
     k = 0 if part.bodies[0] != GROUND else 1
     other = part.bodies[1 - k]
     return {"body1": tree.bodies[part.bodies[k]]} | ({} if other == GROUND else {"body2": tree.bodies[other]}), k
@@ -274,7 +274,7 @@ _CLOSING_PARTS = {JointCoupling: _close_coupling, JointDriver: _close_driver}
 
 
 def _closing(part):
-    """What writes a part as equality constraints; None if there is nothing."""
+    """The function that writes a part as equality constraints; None without one."""
     if part.joints is None:
         return of_class(_CLOSING_PARTS, part.part)
     return _CLOSING_JOINTS.get(tuple(joint.kind for joint in part.joints))

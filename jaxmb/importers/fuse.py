@@ -22,10 +22,10 @@ class Chain:
 
 @dataclasses.dataclass
 class Fused:
-    """What links became.
+    """The links as bodies and chains of joints.
 
-    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with the names that they
-    have in the scene; `of`: for each link the name of its carrier, or the world; `links` by their names; `chains`.
+    **Fields:** `carriers`: the bodies, with their names in the scene, by the name of the link whose frame they have;
+    `of`: for each link the name of its carrier, or the world; `links` by their names; `chains`.
     """
 
     carriers: dict[LinkKey, Link]
@@ -50,14 +50,14 @@ class Fused:
         return body.name, body.point(own.position + own.rotation @ at)
 
     def rotation(self, link: LinkKey) -> np.ndarray:
-        """The rotation matrix from a link's axes to those of its body."""
+        """The rotation matrix from a link's axes to its body's."""
         body = self.placed(link)
         if self.of[link] == link:
             return np.eye(3)
         return body.rotation.T @ self.links[link].rotation
 
     def frames(self) -> dict[str, tuple[str, np.ndarray, np.ndarray]]:
-        """For each link that is fixed to another one its body, and position and rotation in it."""
+        """For each link that is fixed to another link its body, and position and rotation in it."""
         out = {}
         for name, carrier in self.of.items():
             if name is not WORLD and carrier != name and (carrier is WORLD or carrier in self.carriers):
@@ -65,8 +65,8 @@ class Fused:
         return out
 
     def moved_inertia(self, joint: Joint) -> float:
-        """The inertia [kg m²] or mass [kg] that moves with a joint, all other joints held; in a closed loop only that
-        of the next body.
+        """The inertia [kg m²] or mass [kg] that moves with a joint, with all other joints held; in a closed loop only
+        the next body's.
         """
         start, blocked = self.of[joint.child], self.of[joint.parent]
         seen, queue = {start}, [start]

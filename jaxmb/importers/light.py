@@ -1,4 +1,4 @@
-"""Links whose inertia is none, that of a joint, or not that of a rigid body."""
+"""Links without inertia, with the armature of a joint, or with an inertia that no rigid body has."""
 
 from collections import Counter
 
@@ -8,12 +8,12 @@ from ..linalg.graphs import connected
 from .description import WORLD, Joint, Link, LinkKey, Machine
 from .notes import Notes
 
-# The share of the largest moment of inertia that is taken for rounding.
+# The fraction of the largest moment of inertia that counts as rounding.
 _ROUNDED = 0.05
 
 
 def bodies_of(machine: Machine) -> dict[LinkKey, LinkKey]:
-    """For each link and the world the first one of the file that it is fixed to."""
+    """For each link and the world, the first link of the file that it is fixed to."""
     names: tuple[LinkKey, ...] = (WORLD, *machine.links)
     number = {name: k for k, name in enumerate(names)}
     welds = [(number[own.parent], number[own.child]) for own in machine.joints if own.kind == "fixed"]
@@ -21,12 +21,12 @@ def bodies_of(machine: Machine) -> dict[LinkKey, LinkKey]:
 
 
 def without_ends(machine: Machine, notes: Notes) -> list[str]:
-    """Take the links out of a machine that have no mass and hang at one joint, with all that they carry.
+    """Remove from a machine the massless links that hang at one joint, with all that they carry.
 
-    They take no force, so none passes their joint, whatever acts there. Those stay that something else holds as well:
-    a loop, a tendon, an actuator, or couplings that could pass a force on.
+    They take no force, so no force passes their joint. A link stays if it is also held by a loop, a tendon, an
+    actuator, or couplings that could transmit a force.
 
-    **Returns:** the names of the links that were taken out.
+    **Returns:** the names of the removed links.
     """
     before = list(machine.links)
     while True:
@@ -37,7 +37,7 @@ def without_ends(machine: Machine, notes: Notes) -> list[str]:
         held = Counter(of[link] for joint in moving for link in (joint.parent, joint.child))
         held.update(of[link] for loop in machine.loops for link in (loop.link_a, loop.link_b))
         held.update(of[link] for tendon in machine.tendons for link, _ in tendon.points)
-        # Bodies to leave out, and the joints that they hang at.
+        # Bodies to remove, and the joints at which they hang.
         ends: dict[LinkKey, str | None] = {body: None for body in of.values() if body not in heavy and held[body] == 0}
         for joint in moving:
             for link in (joint.parent, joint.child):
@@ -49,7 +49,7 @@ def without_ends(machine: Machine, notes: Notes) -> list[str]:
 
 
 def _alone(machine, notes, joint):
-    """Whether no force that acts on a joint can reach another one."""
+    """Whether no force on a joint can reach another joint."""
     acting = [actuator for actuator in machine.actuators if not actuator.on_tendon and actuator.of == joint.name]
     along = [tendon for tendon in machine.tendons if any(name == joint.name for name, _ in tendon.joints)]
     coupled = [own for own in machine.couplings if joint.name in _coupled(own)]
@@ -59,7 +59,7 @@ def _alone(machine, notes, joint):
 
 
 def _coupled(coupling):
-    """The joints that a coupling has."""
+    """The joints of a coupling."""
     return set() if coupling.of_tendons else {coupling.joint, *(name for name, _, _ in coupling.others)}
 
 
@@ -76,10 +76,10 @@ def _take_out(machine, links, joints, notes):
 
 
 def with_rotors(machine: Machine, notes: Notes) -> None:
-    """Make the armature of free joints, and of ball joints on the ground, a link of its own, fixed to theirs.
+    """Make the armature of free joints, and of ball joints on the ground, a separate link, fixed to the joint's link.
 
-    The velocities of these joints are those of the link, so armature is the mass of a point in the origin of its frame,
-    without weight, and the inertia of a ball about it. No link moves like a ball joint between two moving ones.
+    The velocities of these joints are the link's, so the armature is a weightless point mass in the origin of its
+    frame, and the inertia of a ball about it. No link moves like a ball joint between two moving links.
     """
     of = bodies_of(machine)
     heavy = {of[name] for name, link in machine.links.items() if link.mass}
@@ -101,8 +101,8 @@ def with_rotors(machine: Machine, notes: Notes) -> None:
 
 
 def rigid(link: Link, notes: Notes) -> np.ndarray:
-    """The inertia of a link, shape (3, 3), symmetric, with its largest principal moment at most the sum of the others
-    where it is larger by rounding.
+    """The inertia of a link, shape (3, 3), symmetric; a largest principal moment that exceeds the sum of the others by
+    rounding is lowered to it.
     """
     inertia = 0.5 * (link.inertia + link.inertia.T)
     moments, axes = np.linalg.eigh(inertia)

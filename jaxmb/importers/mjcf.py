@@ -30,14 +30,14 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     ```
 
     MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here:
-    `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`; of a `weld`
-    whose `torquescale` is zero the point only. Several joints of one body are one `spatial.Composite`, of which each is
-    a coordinate.
+    `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`; a `weld` with
+    zero `torquescale` holds the point only. Several joints of a body become one `spatial.Composite`, with a coordinate
+    for each.
 
-    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words
-    such as `"collisions"`, `"limits"` and `"friction"`, or names of elements.
+    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: elements to leave out, by words
+    such as `"collisions"`, `"limits"` and `"friction"`, or by name.
 
-    **Returns:** an `ImportedModel`; its `notes` say what is approximated.
+    **Returns:** an `ImportedModel`; its `notes` list the approximations.
 
     **Raises:** `ValueError` that lists the elements that cannot be imported; `ImportError` without MuJoCo, `pip install
     "jaxmb[import]"`.
@@ -102,7 +102,7 @@ class _Names:
         return self("body", k) if k else WORLD
 
     def joint(self, k: int) -> str:
-        """A joint; one without a name is called after its body."""
+        """A joint; without a name it is called after its body."""
         return self._find("joint", k) or self._unused("joint", f"{self('body', self._model.jnt_bodyid[k])} joint {k}")
 
 
@@ -119,7 +119,7 @@ def _read_links(model, data, names, machine):
             rotation=np.array(data.xmat[k]).reshape(3, 3),
         )
         if model.body_mocapid[k] >= 0:
-            # What moves as prescribed may have any mass.
+            # Links with prescribed motion may have any mass.
             link = machine.links[name]
             link.moved, link.mass, link.inertia = True, max(link.mass, 1.0), link.inertia + np.eye(3)
         if model.body_gravcomp[k]:
@@ -139,7 +139,7 @@ def _read_joints(model, data, names, machine, off):
         parent = names.link(model.body_parentid[body]) if k == first else child
         child = names("body", body)
         if k < last:
-            # Between joints in succession there are links without mass.
+            # Massless links lie between joints in succession.
             place = {"position": machine.links[child].position, "rotation": machine.links[child].rotation}
             child = machine.add(Link(f"{child} after {names.joint(k)}", **place))
         scalar = kind in ("hinge", "slide")
@@ -190,8 +190,8 @@ def _read_equalities(mujoco, model, names, machine, notes):
 
 
 def _tendon_coupling(mujoco, model, names, name, one, two, data):
-    """A tendon's length as a polynomial of another's, both from their lengths at the reference pose; between the joints
-    along them where it is a sum of polynomials of their coordinates, which may then turn without end.
+    """A tendon's length as a polynomial of another's, both from their lengths at the reference pose. If it is a sum of
+    polynomials of joint coordinates, the coupling is between the joints, which may then turn without end.
     """
     on_joints = lambda k: model.wrap_type[model.tendon_adr[k]] == mujoco.mjtWrap.mjWRAP_JOINT
     tendons = [one] if two < 0 else [one, two]
@@ -216,7 +216,7 @@ def _tendon_coupling(mujoco, model, names, name, one, two, data):
 def _loop(mujoco, model, names, name, k, data):
     one, two = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
     weld = model.eq_type[k] == mujoco.mjtEq.mjEQ_WELD
-    # MuJoCo multiplies the residuals of a weld's rotation by this number: with zero it holds the point only.
+    # MuJoCo multiplies the residuals of a weld's rotation by this number: at zero the weld holds the point only.
     holds_rotation = weld and data[10] != 0
     if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
         a, b = (names.link(model.site_bodyid[site]) for site in (one, two))
@@ -272,7 +272,7 @@ def _read_shapes(mujoco, model, names, machine, notes):
 
 
 def _shape(kinds, model, k, place):
-    """The shapes of a geom; none of height fields and signed distances."""
+    """The shapes of a geom; none for height fields and signed distances."""
     size = np.array(model.geom_size[k])
     match kinds(int(model.geom_type[k])):
         case kinds.mjGEOM_PLANE:

@@ -10,7 +10,7 @@ from .notes import Notes
 
 
 def read_actuators(mujoco: Any, model: Any, names: Any, notes: Notes, off: Collection[str]) -> list[ActuatorElement]:
-    """The actuators of a model; the others are refused. `off`: names of MuJoCo's flags that are disabled."""
+    """The actuators of a model; unsupported actuators are refused. `off`: names of MuJoCo's flags that are disabled."""
     out = []
     for k in range(len(model.actuator_trntype)):
         name = names("actuator", k)
@@ -33,8 +33,8 @@ def _read(mujoco, model, names, notes, k, name):
     gear = float(model.actuator_gear[out][0])
     control_range = tuple(model.actuator_ctrlrange[control]) if model.actuator_ctrllimited[control] else None
     if kind == transmissions.mjTRN_BODY:
-        # Shapes that may touch are left out, or the model is refused.
-        notes.say("Adhesion acts in contacts only, of which there are none here: {}.", name)
+        # Shapes that may touch are ignored, or the model is refused.
+        notes.say("Adhesion acts in contacts only, and there are none here: {}.", name)
         return None
 
     def refuse(what):
@@ -46,9 +46,9 @@ def _read(mujoco, model, names, notes, k, name):
         if lag <= 0:
             return refuse("has a filter whose time constant is not positive")
         if model.actuator_actlimited[k] and not _within(control_range, model.actuator_actrange[k]):
-            return refuse("has a range of its activation that the control may leave")
+            return refuse("has a range of activation that the control may leave")
     elif dynamics != mujoco.mjtDyn.mjDYN_NONE:
-        return refuse("has dynamics of its own that are no filter, such as an integrator or a muscle")
+        return refuse("has dynamics other than a filter, such as an integrator or a muscle")
     if kind in (transmissions.mjTRN_JOINT, transmissions.mjTRN_JOINTINPARENT):
         if mujoco.mjtJoint(int(model.jnt_type[target])) not in (
             mujoco.mjtJoint.mjJNT_HINGE,
@@ -95,7 +95,7 @@ def _read(mujoco, model, names, notes, k, name):
 
 
 def _acting_on(mujoco, model, joint):
-    """Numbers of the actuators that may act on a joint, by themselves or by a tendon."""
+    """Numbers of the actuators that may act on a joint, directly or through a tendon."""
     kinds, found = mujoco.mjtTrn, []
     for k, (number, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
         kind = kinds(int(number))

@@ -1,4 +1,4 @@
-"""MuJoCo's compilation of an MJCF file, without what only pictures need."""
+"""MuJoCo's compilation of an MJCF file, without elements for pictures only."""
 
 import os
 import warnings
@@ -10,11 +10,11 @@ from .source import file_name, is_text
 
 
 def compiled(mujoco: Any, source: Any, notes: Notes) -> tuple[Any, str]:
-    """MuJoCo's model of a path, a text or an `MjSpec`, and what messages call it.
+    """MuJoCo's model of a path, a text or an `MjSpec`, and its name in messages.
 
-    Materials and textures, and meshes that are missing, are left out, and `notes` say so.
+    Materials, textures and missing meshes are left out, with a note.
 
-    **Raises:** `ValueError` for a file that MuJoCo does not accept, and for a missing mesh that an inertia comes from.
+    **Raises:** `ValueError` for a file that MuJoCo does not accept, and for a missing mesh that determines an inertia.
     """
     file = file_name(source)
     is_path = isinstance(source, os.PathLike | str) and not is_text(source)
@@ -29,8 +29,8 @@ def compiled(mujoco: Any, source: Any, notes: Notes) -> tuple[Any, str]:
             model.names.decode()
     except UnicodeDecodeError:
         raise ValueError(
-            f"{file}: names must be in UTF-8, whatever encoding a file declares: save it, and those that it includes, "
-            "as UTF-8."
+            f"{file}: names must be in UTF-8, whatever encoding a file declares: save it and its included files as "
+            "UTF-8."
         ) from None
     except ValueError as error:
         notes.finish(file)
@@ -47,7 +47,7 @@ def _specification(mujoco, source):
 
 
 def _compiled(spec, notes):
-    """The model; numbers of shapes do not matter where these are left out."""
+    """The model; wrong numbers of shapes do not matter if shapes are left out."""
     try:
         return spec.compile()
     except ValueError as error:
@@ -62,7 +62,7 @@ def _compiled(spec, notes):
 
 
 def _word(geom):
-    """What leaves a shape out."""
+    """The word that leaves a shape out."""
     return "collisions" if geom.contype or geom.conaffinity else "pictures"
 
 
@@ -96,7 +96,7 @@ def _without_pictures(spec: Any, notes: Notes) -> None:
         notes.say(f"Not read, since they are for pictures only: {', '.join(left_out)}.")
     if spec.sensors:
         notes.say(f"Not read, since they do not act on the motion: {len(spec.sensors)} sensors.")
-    # Sensors may name what is left out below.
+    # Sensors may name elements that are left out below.
     for kind in ("materials", "textures", "skins", "sensors"):
         for element in list(getattr(spec, kind)):
             spec.delete(element)

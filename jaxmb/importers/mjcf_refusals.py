@@ -1,4 +1,4 @@
-"""Elements of MJCF that are refused, and those that have no effect on a motion."""
+"""Elements of MJCF that are refused, and elements without effect on a motion."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from .notes import Notes
 
-# Numbers that must vanish: the fields of the model, what they belong to, and the kind to leave out.
+# Numbers that must vanish: the fields of the model, a description, and the kind to leave out.
 _MUST_VANISH = {
     "jnt_stiffnesspoly": ("joint", "nonlinear stiffness", "springs"),
     "jnt_springyield": ("joint", "plastic springs", "springs"),
@@ -24,7 +24,7 @@ _MUST_VANISH = {
 
 
 def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
-    """Refuse what has no counterpart, and say what is not read because it has no effect on a motion."""
+    """Refuse elements without a counterpart, and note unread elements without effect on a motion."""
     named = lambda kind, k: (
         mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) or f"{kind} {k}"
     )
@@ -41,7 +41,7 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
     if model.nflex:
         notes.refused.append("Deformable bodies (flex) are not modelled; remove them from the file.")
     if model.nplugin:
-        notes.refused.append("Plugins are not known; remove them from the file.")
+        notes.refused.append("Plugins are not supported; remove them from the file.")
     if model.opt.density or model.opt.viscosity:
         notes.refuse("fluid", "", "A fluid is not modelled: set density and viscosity of <option> to zero")
     effectless = {
@@ -68,7 +68,7 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
 
 
 def _set(values):
-    """Numbers of the elements with an entry that is not zero."""
+    """Numbers of the elements with a nonzero entry."""
     values = np.asarray(values)
     return np.flatnonzero(np.any(values.reshape(len(values), -1) != 0, axis=1)) if values.size else ()
 
@@ -85,7 +85,7 @@ def _check_tendon(mujoco, model, notes, k, name):
 
 
 def _colliding(mujoco, model):
-    """Numbers of moving bodies with shapes that may collide with another."""
+    """Numbers of moving bodies whose shapes may collide with another body."""
     types: dict[tuple[int, int, int], set[int]] = {}
     for g in range(model.ngeom):
         mask = int(model.geom_contype[g]), int(model.geom_conaffinity[g])

@@ -108,7 +108,7 @@ def test_joints_in_succession_move_as_in_mujoco():
     check_dynamics(model, 3, scale=0.5)
     assert model.coordinates["k3"] == "k1 k2 k3.angle_3"
     assert any("Joints 'k1', 'k2', 'k3' in succession are the Composite 'k1 k2 k3'" in note for note in model.notes)
-    assert not any("counts in half a turn" in note for note in model.notes)
+    assert not any("limited to half a turn" in note for note in model.notes)
 
 
 @pytest.mark.long
@@ -337,7 +337,7 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
             HINGE,
             '<actuator><plugin joint="hip" plugin="mujoco.pid"><config key="kp" value="1"/></plugin></actuator>',
             '<extension><plugin plugin="mujoco.pid"/></extension>',
-            "Plugins are not known; remove them from the file",
+            "Plugins are not supported; remove them from the file",
         ),
     ],
 )

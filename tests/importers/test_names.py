@@ -133,7 +133,7 @@ def test_a_link_of_sdf_that_is_called_world(inside, bodies, parent, notes):
 
 def test_a_root_of_urdf_that_is_called_world():
     """It is the ground, which is said where its mass is lost."""
-    note = "The root link 'world' is the ground, whatever its mass, though base='free': give it another name."
+    note = "The root link 'world' is the ground, whatever its mass, despite base='free': give it another name."
     for inside, base, notes in (("", "free", ()), (link("x"), "fixed", ()), (link("x"), "free", (note,))):
         text = robot(link("world", inside), link("b"), joint("j", "world", "b")).replace("<link name='x'>", "")
         found = importers.urdf(text.replace("</link></link>", "</link>"), base=base)
