@@ -19,7 +19,7 @@ _ITERATIONS = 50
 
 
 class QuasiVelocities(AbstractKinematics):
-    r"""Velocities that are any functions of the rates, `ω = ω(t, q, q̇)`; those of them that are `dependent` are zero.
+    r"""Velocities that are any functions of the rates, `ω = ω(t, q, q̇)`; the `dependent` velocities are zero.
 
     ```python
     speed_and_heading = lambda t, q, v, p: jnp.array([jnp.hypot(v[0], v[1]) - p["speed"], jnp.arctan2(v[1], v[0])])
@@ -29,16 +29,16 @@ class QuasiVelocities(AbstractKinematics):
     particle = jaxmb.lagrangian.LagrangianSystem(**common, kinematics=held, u=[0.3], parameters={"speed": 1.0})
     ```
 
-    As many functions as coordinates, invertible for the rates. `ω_D = 0` are nonholonomic constraints, also nonlinear
-    ones; virtual displacements are those of Chetaev, along `∂q̇/∂ω_I`. The system's velocities u are the independent
-    ω_I, in their order. The inverse is found by Newton's method from the rates `near`, on whose side of a fold the
-    branch is taken, and differentiated as an implicit function.
+    There are as many functions as coordinates, invertible for the rates. `ω_D = 0` are nonholonomic constraints, also
+    nonlinear; virtual displacements are Chetaev's, along `∂q̇/∂ω_I`. The system's velocities u are the independent ω_I,
+    in their order. Newton's method finds the inverse from the rates `near`, which select the branch at a fold; the
+    inverse is differentiated as an implicit function.
 
     **Arguments:**
 
     - `omega(t, q, v, parameters)`: shape (nq,).
     - `dependent`: indices of the components that are zero.
-    - `near`: rates to begin Newton's method with, shape (nq,), or a function `near(t, q, omega, parameters)`, for
+    - `near`: start of Newton's method, rates of shape (nq,), or a function `near(t, q, omega, parameters)`, for
         branches that turn.
 
     **Reference:**
@@ -75,7 +75,7 @@ class QuasiVelocities(AbstractKinematics):
         return nq - len(self.dependent)
 
     def all_of(self, nq: int, u: Velocities) -> Float[Array, "nq"]:
-        """ω, from the independent ones."""
+        """ω, from the independent components."""
         return jnp.zeros(nq, u.dtype).at[np.delete(np.arange(nq), self.dependent)].set(u)
 
     def rates(self, t, q, u, parameters):
@@ -103,7 +103,7 @@ def _inverse(omega, t, q, target, parameters, near):
 
     far = lambda v, size: size > 8 * jnp.finfo(v.dtype).eps * (1.0 + jnp.max(jnp.abs(v)))
     v, size = newton(correct, far, near, most=_ITERATIONS, dtype=q.dtype)
-    # Where rounding keeps corrections a little larger the inverse is found as well.
+    # The inverse is accepted also if rounding keeps corrections slightly larger.
     found = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
     return jnp.where(found, v, jnp.nan)
 

@@ -210,7 +210,7 @@ def test_joints_and_links_that_are_called_as_those_of_a_universal_joint():
     ids=["urdf", "sdf"],
 )
 def test_joints_of_one_name_are_refused(read, text):
-    with pytest.raises(ValueError, match=r"The text:\d: joint 'j' is there twice"):
+    with pytest.raises(ValueError, match=r"The text:\d: joint 'j' occurs twice"):
         read(text)
 
 

@@ -127,7 +127,7 @@ def test_a_planar_joint():
             robot(link("a"), link("b"), joint("j", "a", "b", inside="<axis xyz='0 0 0'/>")),
             "the axis of joint 'j' is zero",
         ),
-        (robot(link("a"), link("a")), "The text:3: link 'a' is there twice"),
+        (robot(link("a"), link("a")), "The text:3: link 'a' occurs twice"),
         (robot(link("a"), link("b"), joint("j", "a", "b"), joint("k", "a", "b")), "'b' is the child of several joints"),
         (
             robot(link("a"), link("b"), joint("j", "a", "b", inside="<limit lower='1' upper='0'/>")),
