@@ -29,7 +29,7 @@ def bennett(
     from x, obey `tan(θ/2) tan(φ/2) = sin((α + β)/2) / sin((β − α)/2)`.
 
     Source: G. T. Bennett, A new mechanism, Engineering 76, 1903; data of this package. The reference values come from
-    the energy of a model with one coordinate, and from that relation.
+    the energy of a model with one coordinate, and from this relation.
 
     **Arguments:** `lengths` a and b [m]; `twist` β [degree], α is acute; `masses` [kg] of the moving links, uniform
     round rods of radius `section` [m]; `angle` θ [rad] and `speed` [rad/s] of the input at the start; `gravity` [m/s²].

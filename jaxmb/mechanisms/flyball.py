@@ -41,8 +41,8 @@ def flyball(
     **Arguments:** `stiffness` [N/m] and `damping` [N s/m] of each spring; `ball` [kg], mass of a ball; `angle` α [rad],
     between 0 and π/2, and `speed` [rad/s] of the shaft, at the start; `gravity` [m/s²].
 
-    **Labels:** `cos`, `sin` of the shaft's angle, zero at the start; `alpha` [rad] of `arm1`, the one at +x; `s` [m];
-    `omega` [rad/s] of the shaft; `alpha_dot` [rad/s]; `s_dot` [m/s].
+    **Labels:** `cos`, `sin` of the shaft's angle, zero at the start; `alpha` [rad] of `arm1`, at +x; `s` [m]; `omega`
+    [rad/s] of the shaft; `alpha_dot` [rad/s]; `s_dot` [m/s].
     """
     z = np.array([0.0, 0.0, 1.0])
     rod, cube = _DENSITY * _ARM * _SECTION**2, _DENSITY * _CUBE**3

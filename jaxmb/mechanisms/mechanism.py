@@ -35,9 +35,9 @@ class References:
     - `times` [s]: ascending, shape (times,).
     - `labels`: names of the quantities, as in `Mechanism.observe`.
     - `values`: shape (times, labels), in SI units.
-    - `source`: where they come from.
-    - `tolerance`: the relative error up to which the values can be trusted.
-    - `sizes` of the labels that errors are relative to, shape (labels,); default the largest value of each.
+    - `source` of the values.
+    - `tolerance`: relative accuracy of the values.
+    - `sizes` of the labels, the scales of relative errors, shape (labels,); default the largest value of each.
     """
 
     times: np.ndarray
@@ -99,11 +99,11 @@ class Mechanism:
     start: Callable[[Any, State], State] | None = None
 
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
-        """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
+        """Relative errors against the references, by label, at every saved reference time.
 
         Errors are relative to the largest reference value of their label.
 
-        **Raises:** `ValueError` if there are no references, or none of their times was saved.
+        **Raises:** `ValueError` if there are no references, or the trajectory saved none of their times.
         """
         if self.references is None:
             raise ValueError(f"There are no reference values for {self.name!r} with these parameters.")
@@ -133,8 +133,8 @@ class Mechanism:
         return dataclasses.replace(self, t1=float(t1), references=known)
 
     def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
-        """The same mechanism with some parameters replaced and the state computed anew near the present one; also
-        under `jit`.
+        """The same mechanism with some parameters replaced and the state recomputed near the present state; also under
+        `jit`.
 
         **Arguments:** `values`: new numbers by name, as in `jaxmb.with_parameters`.
         """
@@ -190,7 +190,7 @@ def build(
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
-    # A concrete class: only a scene has parts to build on, and is still to be compiled.
+    # A concrete class: only a scene has parts to extend, and must be compiled.
     parts = scene if isinstance(scene, Scene) else None
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
@@ -201,8 +201,8 @@ def build(
 def is_rigid(model: Model, **defaults: bool) -> bool:
     """Whether to build a scene of rigid bodies instead of a system from a Lagrangian.
 
-    **Arguments:** `defaults`: for every parameter that chooses the form of the Lagrangian's equations, whether it has
-    its default value.
+    **Arguments:** `defaults`: whether each parameter that selects the form of the Lagrangian's equations has its
+    default value.
 
     **Raises:** `ValueError` for an unknown model, and for rigid bodies with a form of the Lagrangian's equations.
     """
@@ -210,5 +210,5 @@ def is_rigid(model: Model, **defaults: bool) -> bool:
         raise ValueError(f"The models are {', '.join(get_args(Model))}; got {model!r}.")
     chosen = [name for name, default in defaults.items() if not default]
     if model == "rigid_bodies" and chosen:
-        raise ValueError(f"model='rigid_bodies' has no Lagrangian to write: leave out {', '.join(chosen)}.")
+        raise ValueError(f"model='rigid_bodies' has no Lagrangian: leave out {', '.join(chosen)}.")
     return model == "rigid_bodies"

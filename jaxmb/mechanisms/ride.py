@@ -50,8 +50,8 @@ def arm_travel(trajectory: Trajectory, *, unit: int = 1) -> Float[Array, "times 
 
 
 def wheel_loads(trajectory: Trajectory) -> Float[Array, "times wheels"]:
-    """Vertical forces [N] of the ground, or of the shoes of a track, on the wheels, those of the leading carrier first,
-    damping included.
+    """Vertical forces [N] of the ground, or of a track's shoes, on the wheels, including damping; the leading carrier
+    first.
     """
     rims = [name for name in trajectory.system.catalogue.force_names() if name.endswith("_rim") and "wheel" in name]
     if rims:
