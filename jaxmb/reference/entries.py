@@ -1,9 +1,9 @@
 """The public names, each once, by subject.
 
 A name is public in a module that defines it without an underscore, or that imports it in the form that makes it public
-for type checkers, `from .planar import Body as Body`. Where a module has `__all__`, only names in it are. Lines
-`## Joints` are headings of the names below. Names of plain values, such as those of types, have no entry: the
-docstrings of their modules say what they are.
+for type checkers, `from .planar import Body as Body`. If a module has `__all__`, only its names are public. Lines `##
+Joints` are headings of the names below. Names of plain values, such as types, have no entry: the docstrings of their
+modules explain them.
 """
 
 import ast
@@ -25,10 +25,10 @@ PACKAGE = __name__.split(".")[0]
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A public name: of a module, a class or a function, or of a member of a class.
+    """A public name of a module, a class, a function, or a member of a class.
 
-    **Fields:** `name`, as a user writes it after `jaxmb.`; `thing`, what it stands for, of a field its annotation;
-    `owner`, the class of a member.
+    **Fields:** `name`, as a user writes it after `jaxmb.`; `thing`, the object, or the annotation of a field; `owner`,
+    the class of a member.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Entry:
 
     @property
     def is_part(self) -> bool:
-        """Whether it is a class of parts that a scene takes, and not one to derive such classes from."""
+        """Whether it is a class of parts for scenes, not a base class of parts."""
         return self.kind == "class" and issubclass(self.thing, AbstractPart) and not self.short.startswith("Abstract")
 
     @property
@@ -56,7 +56,7 @@ class Entry:
 
     @property
     def text(self) -> str:
-        """Its docstring; of a class with the arguments that the docstring of its own `__init__` explains."""
+        """Its docstring, with the arguments from the docstring of a class's `__init__`."""
         own = self.thing.__doc__ if self.kind != "field" else f"A field; see `{self.name.rpartition('.')[0]}`."
         texts = [own, vars(self.thing)["__init__"].__doc__] if _explains_arguments(self.thing) else [own]
         return "\n\n".join(inspect.cleandoc(text) for text in texts if text)
@@ -73,8 +73,8 @@ class Entry:
 class Subject:
     """Public names that belong together.
 
-    **Fields:** `title`; `module`, the entry of the module that has them, None for names of the package itself;
-    `groups` of entries by their headings; `others`, entries elsewhere for names that the module has as well.
+    **Fields:** `title`; `module`, the entry of their module, None for names of the package itself; `groups` of entries
+    by their headings; `others`, entries elsewhere for names that the module has as well.
     """
 
     title: str
@@ -84,7 +84,7 @@ class Subject:
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Those of all groups."""
+        """The entries of all groups."""
         return tuple(entry for group in self.groups.values() for entry in group)
 
 
@@ -94,7 +94,7 @@ def _explains_arguments(thing: Any) -> bool:
 
 
 def public_names(module: ModuleType) -> dict[str, str]:
-    """The public names of a module, in its order, each with its heading; those of its stub where it has one."""
+    """The public names of a module or its stub, in order, each with its heading."""
     path = Path(inspect.getfile(module))
     stub = path.with_suffix(".pyi")
     source = (stub if stub.exists() else path).read_text(encoding="utf-8")
@@ -121,7 +121,7 @@ def _defined(node: ast.stmt) -> list[str]:
 
 
 def public_modules() -> dict[str, ModuleType]:
-    """The modules that are public names of the package or of one of them, by name, in the package's order."""
+    """The public modules of the package, at any depth, by name, in the package's order."""
 
     def below(path: str, module: ModuleType) -> Iterator[tuple[str, ModuleType]]:
         for name in public_names(module):
@@ -140,7 +140,7 @@ def _is_described(thing: Any) -> bool:
 
 @functools.cache
 def subjects() -> tuple[Subject, ...]:
-    """All subjects: those of the package, and then its modules."""
+    """All subjects: first the package's, then its modules'."""
     package = importlib.import_module(PACKAGE)
     known: dict[int, Entry] = {}
     made = []
@@ -164,7 +164,7 @@ def subjects() -> tuple[Subject, ...]:
 
 @functools.cache
 def entries() -> dict[str, Entry]:
-    """All entries by name, but for members of classes."""
+    """All entries by name, except members of classes."""
     modules = (subject.module for subject in subjects() if subject.module is not None)
     every = (*modules, *(entry for subject in subjects() for entry in subject.entries))
     return {entry.name: entry for entry in every}
@@ -172,7 +172,7 @@ def entries() -> dict[str, Entry]:
 
 @functools.cache
 def other_names() -> dict[str, Entry]:
-    """Entries by the further names that they have: in other modules, and in another spelling."""
+    """Entries by their further names: in other modules, and in another spelling."""
     known = {id(entry.thing): entry for entry in entries().values()}
     found = {}
     for path, module in {"": importlib.import_module(PACKAGE), **public_modules()}.items():
@@ -185,7 +185,7 @@ def other_names() -> dict[str, Entry]:
 
 @functools.cache
 def members(entry: Entry) -> tuple[Entry, ...]:
-    """The methods and properties of a class that have a docstring and that no public base class has."""
+    """The methods and properties of a class with a docstring that no public base class has."""
     inherited = {name for base in bases(entry) for name in _documented(_of_package(base.thing))}
     own, *others = _of_package(entry.thing)
     public = {id(base.thing) for base in bases(entry)}
@@ -212,20 +212,20 @@ def _fields(cls: type) -> dict[str, str]:
 
 
 def further_fields(entry: Entry, given: Iterable[str]) -> dict[str, str]:
-    """The fields that a class itself has, but for those that are `given` as parameters."""
+    """The fields of a class itself, except those `given` as parameters."""
     return {name: annotation for name, annotation in _annotations(entry.thing).items() if name not in given}
 
 
 @functools.cache
 def signature(entry: Entry) -> inspect.Signature | None:
-    """What a function, class or method is called with, with annotations as the source has them; None for others."""
+    """The signature of a function, class or method, with annotations as in the source; None for others."""
     if entry.kind in ("module", "property", "field"):
         return None
     return signature_of(entry.thing, is_method=entry.kind == "method")
 
 
 def signature_of(thing: Any, *, is_method: bool = False) -> inspect.Signature | None:
-    """The signature of a class or function; of a method without the object. None where Python knows none."""
+    """The signature of a class or function, or of a method without the object; None if Python has none."""
     try:
         made = inspect.signature(thing)
     except (TypeError, ValueError):
@@ -237,7 +237,7 @@ def signature_of(thing: Any, *, is_method: bool = False) -> inspect.Signature | 
     parameters = []
     for name, own in made.parameters.items():
         annotation = _AsWritten(written[name]) if name in written else own.empty
-        # Dots for a default that is made anew or that cannot be typed.
+        # Dots for a default that is computed or cannot be typed.
         dots = own.default is not own.empty and repr(own.default).startswith("<")
         default = _AsWritten("...") if dots else own.default
         if not (is_method and name == "self"):
@@ -247,13 +247,13 @@ def signature_of(thing: Any, *, is_method: bool = False) -> inspect.Signature | 
 
 
 class _AsWritten(str):
-    """A text that stands in a signature as it is."""
+    """A text that a signature shows unchanged."""
 
     __repr__ = str.__str__
 
 
 def _written(function: Any) -> dict[str, str]:
-    """The annotations in the source of a function; none where it has no source, as that of a dataclass."""
+    """The annotations in the source of a function; none without a source, as in a dataclass."""
     try:
         tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(function))).body[0]
     except (OSError, TypeError):
@@ -267,7 +267,7 @@ def _written(function: Any) -> dict[str, str]:
 
 @functools.cache
 def _annotations(cls: type) -> dict[str, str]:
-    """Those in the source of a class itself, but for what its objects share."""
+    """The annotations in the source of a class itself, except class variables."""
     tree = ast.parse(inspect.cleandoc(f"\n{inspect.getsource(cls)}")).body[0]
     assert isinstance(tree, ast.ClassDef)
     found = {}
@@ -285,7 +285,7 @@ def _of_package(cls: type) -> list[type]:
 
 
 def _documented(classes: Iterable[type]) -> dict[str, Any]:
-    """The public methods and properties that some classes define, with docstrings; the first one's of each name."""
+    """The public methods and properties with docstrings that some classes define; the first for each name."""
     found = {}
     for base in classes:
         for name, raw in vars(base).items():
@@ -299,8 +299,8 @@ def _documented(classes: Iterable[type]) -> dict[str, Any]:
 
 
 def find(name: str) -> Entry:
-    """The entry of a public name, with `jaxmb.` or `mb.` before it or not. The module may be left out where no other
-    one has the name, as in `four_bar`.
+    """The entry of a public name, with or without `jaxmb.` or `mb.`. The module may be left out if no other module has
+    the name, as in `four_bar`.
 
     **Raises:** `UnknownNameError` with the nearest names; `ValueError` for a name of several modules.
     """
@@ -354,7 +354,7 @@ def _shortest_names() -> list[str]:
 
 
 def _every_member(entry: Entry) -> tuple[Entry, ...]:
-    """Those of base classes first, so that a dictionary keeps the nearest."""
+    """All members, first from base classes, so that a dictionary keeps the nearest."""
     return tuple(own for base in (*reversed(bases(entry)), entry) for own in members(base))
 
 

@@ -28,20 +28,20 @@ from .work_precision import outcome
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Tolerances of references, the second where round-off does not allow the first; and the times that are saved.
+# Tolerances of references, the second if round-off rules out the first; and the number of saved times.
 _TIGHT = (1e-13, 1e-11)
 _TIMES = 21
 
 
 _WORDS = {
-    "small": "small: below what the reference can tell, ten times the difference of its two methods",
+    "small": "small: below the reference's accuracy, ten times the difference of its two methods",
     "unknown": "unknown: fewer than two of Adams, Dopri8 and Hermite reached the end at a tight tolerance",
 }
 _COLUMNS = {"variant": "", "": "", "error": ".1e", "known to": ".0e", "steps": "d"}
 
 
 class _Case(NamedTuple):
-    """One variant: its error, or a word instead; the error that the reference can tell; why it was refused."""
+    """A variant: its error, or a word instead; the accuracy of the reference; the reason of a refusal."""
 
     kind: str
     case: str
@@ -54,7 +54,7 @@ class _Case(NamedTuple):
 class _Trial(NamedTuple):
     """A variant: `build()` returns system, state and t1.
 
-    `truth`, where the motion is that of the given system, is a tuple of one entry, as `_truth` returns it.
+    `truth`: the result of `_truth` in a tuple, if the exact motion is the given system's.
     """
 
     case: str
@@ -80,19 +80,19 @@ def stress_test(
     print(jaxmb.report.stress_test(system, state, t1=1.0, only=("rtol", "mass")))
     ```
 
-    The error is relative to a known motion where there is one: that of the given system for other tolerances, other
-    lengths (by dimensional analysis) and doubled joints. Otherwise two of the methods `Adams`, `Dopri8` and `Hermite`
-    at a tight tolerance give a reference, and errors below ten times their difference are not known. Variants in which
-    only numbers change share one compiled program.
+    For other tolerances, other lengths (by dimensional analysis) and doubled joints, the reference is the motion of the
+    given system. For other variants, two of the methods `Adams`, `Dopri8` and `Hermite` at a tight tolerance give a
+    reference, and errors below ten times their difference are unknown. Variants that differ in numbers only share a
+    compiled program.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`, or a mechanism of the library alone; `rtol`; `solver`,
-    default `Adams()`; `singular`: coordinates of a singular position by name, as `fix` of `assemble`, near which the
-    motion is started as well; `only`: the kinds of variants to try, default all: "rtol", "long horizon", "stiffness",
-    "mass", "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
+    default `Adams()`; `singular`: coordinates of a singular position by name, as `fix` of `assemble`, near which a
+    variant starts; `only`: the kinds of variants to try, default all: "rtol", "long horizon", "stiffness", "mass",
+    "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
 
-    **Returns:** a `Table` of variants. `error` is that at the end, relative to the largest coordinate and the largest
-    velocity; a word stands in its place where it is "small", that is less than the reference can tell ("known to"),
-    "unknown", or where the variant cannot be built or its run fails, "refused". Notes say why.
+    **Returns:** a `Table` of variants. `error` is the error at the end, relative to the largest coordinate and the
+    largest velocity; or "small" if less than the accuracy of the reference ("known to"), "unknown", or "refused" if the
+    variant cannot be built or its run fails. Notes give the reasons.
     """
     mechanism = subject(system, state, t1)
     solver = Adams() if solver is None else solver
@@ -122,7 +122,7 @@ def stress_test(
 
 
 class _NotHereError(Exception):
-    """Why a kind of variant does not apply."""
+    """The reason why a kind of variant does not apply."""
 
 
 class _Base(NamedTuple):
@@ -217,7 +217,7 @@ def _speeds(base: _Base) -> Iterator[_Trial]:
 def _near_singular(base: _Base) -> Iterator[_Trial]:
     own = base.mechanism
     if not base.singular:
-        raise _NotHereError("left out, no singular position was named; singular={'crank.angle': …} does")
+        raise _NotHereError("left out, no singular position was named, as by singular={'crank.angle': …}")
     for off in 10.0 ** -np.arange(3.0, 13.0, 3.0):
         fix = {name: np.asarray(value) + off for name, value in base.singular.items()}
         build = lambda fix=fix: (own.system, assemble(own.system, own.state, fix=fix), own.t1)
@@ -231,7 +231,7 @@ def _doubled(base: _Base) -> Iterator[_Trial]:
     yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=(base.truth,))
     joint = own.system.constraints.groups[0].group
     if getattr(joint.part, "point_a", None) is None:
-        raise _NotHereError(f"a nearly redundant one is left out, {joint.names[0]!r} has no points of two bodies")
+        raise _NotHereError(f"a nearly redundant joint is left out, {joint.names[0]!r} has no points of two bodies")
     off = 1e-6 * float(own.system.length)
     yield base.trial("1e-06 off", build=lambda: _with(base, doubled(own.system, own.state, off)))
 
@@ -268,7 +268,7 @@ def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> _Case:
 
 
 def _truth(system: Any, state: State, t1: float) -> Any:
-    """The motion in natural units and the difference of two methods; None if no two come to the end."""
+    """The motion in natural units and the difference of two methods; None if fewer than two reach the end."""
     for rtol in _TIGHT:
         found = []
         for solver in (Adams(), diffrax.Dopri8(), Hermite()):
@@ -281,7 +281,7 @@ def _truth(system: Any, state: State, t1: float) -> Any:
 
 
 def _run(system, state, t1, rtol, solver):
-    # Arrays, so that other numbers do not compile anew.
+    # Arrays, so that other numbers do not compile again.
     t1, rtol = (jnp.asarray(x, state.q.dtype) for x in (t1, rtol))
     return _compiled(system, state, t1, rtol, solver)
 

@@ -1,4 +1,4 @@
-"""Run times that can be compared with each other on a machine with other load."""
+"""Comparable run times on a machine with other load."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import jax
 def timed_compile(fn: Callable, *args: Any) -> tuple[Callable, float]:
     """Trace and compile a function for its arguments.
 
-    **Returns:** the compiled function, and the time that took [s].
+    **Returns:** the compiled function, and the time taken [s].
     """
     begin = time.perf_counter()
     compiled = eqx.filter_jit(fn).lower(*args).compile()  # pyright: ignore[reportFunctionMemberAccess]

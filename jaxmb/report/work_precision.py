@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
-# More labels of an axis would overlap.
+# Largest number of labels of an axis without overlap.
 _MOST_TICKS = 7
 
 
@@ -64,20 +64,20 @@ def work_precision(
     print(jaxmb.report.work_precision(system, state, t1=1.0, tolerances=(1e-4, 1e-7), repeats=3))
     ```
 
-    Errors are those of the quantities that a mechanism observes, relative to their sizes; of other systems those of all
-    coordinates, relative to the largest, and of all velocities, in units of the system's size or radians. Reference
-    values are the published ones of a mechanism, or computed by two methods. Every run is compiled before it is timed;
-    then all of them run in turns `repeats` times. Only the end of the motion is saved, so that no run includes
-    interpolation.
+    Errors of a mechanism are errors of the quantities that it observes, relative to their sizes. Errors of other
+    systems are errors of all coordinates and of all velocities, each relative to the largest, in units of the system's
+    size or radians. Reference values are published values of a mechanism, or computed by two methods. Every run is
+    compiled before it is timed; then all run in turns `repeats` times. Only the end of the motion is saved, so that no
+    run includes interpolation.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`; or a mechanism of the library alone; `solvers` by
     name, default `Adams`, and `Tsit5` and `Dopri8` of diffrax with projection; `tolerances`: values of `rtol`, default
     1e-4 … 1e-10; `repeats`: at least 1.
 
-    **Returns:** a `Table` with a row for each solver and tolerance. `error` is the largest one, "small" where it is
-    below the accuracy of the reference, and "failed" where the run did, for which a note says why. Times are the
+    **Returns:** a `Table` with a row for each solver and tolerance. `error` is the largest error, "small" if it is
+    below the accuracy of the reference, and "failed" for a failed run, with a note on the reason. Times are the
     shortest and the median of warm runs, and the time to compile the solver's program, which serves all tolerances, or
-    to read it from disk. `steps` counts rejected ones too; `evaluations` of the accelerations are None if not known.
+    to read it from disk. `steps` includes rejected steps; `evaluations` of the accelerations are None if unknown.
 
     **Raises:** `ValueError` for no solvers, no tolerances or no repeats, and for a system without state or `t1`.
     """
@@ -164,7 +164,7 @@ def _plot(table: Table, title: str, accuracy: float) -> "Figure":
 
 
 def _ticks(low, high):
-    """Round numbers between two limits, as many as have room for their labels."""
+    """Round numbers between two limits, as many as their labels allow."""
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     for digits in ((1, 2, 5), (1, 3), (1,)):
         values = np.sort(np.outer(decades, digits).ravel())

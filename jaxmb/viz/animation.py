@@ -20,9 +20,9 @@ from .stage import SceneNode, page
 Motions = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
 Shapes = Mapping[str, AbstractShape | Sequence[AbstractShape]]
 
-# A motion that lasts for less or more than this [s] is not shown in real time.
+# Shortest and longest motion [s] that is shown in real time.
 _SHORTEST, _LONGEST = 2.0, 60.0
-# An event is named for this long [s] of playing; of those that are to be seen at once at most this many are.
+# The time of playing [s] for which an event is named, and the largest number of simultaneous names.
 _SEEN, _AT_ONCE = 0.5, 3
 
 
@@ -30,8 +30,8 @@ _SEEN, _AT_ONCE = 0.5, 3
 class MovingPicture:
     """A moving picture, which notebooks show.
 
-    **Fields:** `html`: a page of its own, complete without a network; `height` [pixels] in a notebook; `frames`: how
-    many times are shown.
+    **Fields:** `html`: a page that needs no network; `height` [pixels] in a notebook; `frames`: the number of times
+    shown.
     """
 
     html: str = dataclasses.field(repr=False)
@@ -45,7 +45,7 @@ class MovingPicture:
         return path
 
     def _repr_html_(self) -> str:
-        # A frame within the output, since a notebook that is exported or sent keeps that and no files beside it.
+        # A frame within the output, which an exported or sent notebook keeps, unlike separate files.
         style = f"width: 100%; height: {self.height}px; border: 1px solid #ddd"
         return f'<iframe srcdoc="{html.escape(self.html)}" style="{style}"></iframe>'
 
@@ -63,33 +63,32 @@ def show(
     overlay: bool = False,
     height: int = 480,
 ) -> MovingPicture:
-    """A moving picture of one or several motions, to be seen in a notebook, or saved as a page.
+    """A moving picture of one or several motions, for a notebook or saved as a page.
 
     ```python
     picture = jaxmb.viz.show(motion, points="bar", reactions="pin")  # In a notebook it is seen.
     ```
 
-    It has a time slider, a button that plays and pauses, a choice of speeds, and a list of what is shown; the mouse
-    turns, shifts and zooms it. It shows the saved states at their times, with nothing between them: a motion to look
-    at is saved at 30 times a second or more, by `saveat=`.
+    It has a time slider, a button that plays and pauses, a choice of speeds, and a list of the objects; the mouse
+    turns, shifts and zooms it. It shows the saved states at their times only: save the motion at 30 or more times a
+    second, by `saveat=`.
 
-    Bodies are drawn in the shapes of their parts, such as wheels, as bars from their mass centre to the points where
-    parts act on them, or, where there are none, as the cuboid with their inertia; springs, rods and tracks between
-    their points; terrain and planes as far as the motion reaches. Shapes have no effect on the motion.
+    Bodies are drawn in the shapes of their parts, such as wheels, as bars from the mass centre to the points where
+    parts act, or without such points as the cuboid with their inertia. Springs, rods and tracks are drawn between their
+    points, terrain and planes as far as the motion reaches. Shapes have no effect on the motion.
 
     **Arguments:**
 
-    - `trajectory`: a motion of a scene; a list, or a dictionary by name, of several, such as one before and one after a
+    - `trajectory`: a motion of a scene; a list of motions, or a dictionary by name, such as motions before and after a
         change, or members of a sweep.
-    - `points`: the name of a body (its mass centre), frame or joint that leaves a trail, or several.
+    - `points`: the names of bodies (mass centres), frames or joints that leave a trail, or a single name.
     - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale,
         on the last body of a joint, and on each body of a force element.
-    - `shapes`: shapes of bodies by name, one or several from `jaxmb.shapes`, each placed in the frame of its body, in
-        place of the default; `"ground"` as well.
-    - `frames`: how many of the saved times are shown at most.
-    - `speed`: of playing, 1 for real time; the default is 1, but for motions that are over within 2 s or last for more
-        than a minute what makes them last so long. The slider shows the time of playing, the picture that of the
-        motion.
+    - `shapes`: shapes of bodies by name, instead of the default, one or several from `jaxmb.shapes`, each placed in the
+        frame of its body; also of the `"ground"`.
+    - `frames`: the largest number of saved times that are shown.
+    - `speed` of playing, 1 for real time, the default. By default shorter motions last 2 s and longer motions a minute.
+        The slider shows the time of playing, the picture the time of the motion.
     - `overlay`: show several motions in one place, each in a colour, instead of side by side.
     - `height` [pixels], in a notebook.
 
@@ -113,7 +112,7 @@ def show(
     forces_of = [_arrows(own, reactions, forces) for own in motions]
     view = scenery.View.of(motions, overlay)
     strength = _strength(forces_of)
-    # So that the side of a square of the grid is a round force [N].
+    # The side of a square of the grid is then a round force [N].
     square = scenery.round_number(4 * strength * view.cell / view.size) if strength > 0 else 0.0
     scale = view.cell / square if square else 0.0
     first, last = min(own.times[0] for own in motions), max(own.times[-1] for own in motions)
@@ -144,7 +143,7 @@ def save_html(trajectory: Motions, path: str | Path, **options: Any) -> Path:
 
 
 def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
-    """Names without repetitions; a single one counts as several."""
+    """Names without repetitions, from one or several."""
     return tuple(dict.fromkeys((names,) if isinstance(names, str) else names))
 
 
@@ -159,12 +158,12 @@ def _named(trajectory: Motions) -> dict[str, Trajectory]:
         raise ValueError("There is no motion to show.")
     for own in motions.values():
         if not (hasattr(own, "system") and hasattr(own, "ts")):
-            raise ValueError(f"show takes motions as simulate returns them, got {type(own).__name__}.")
+            raise ValueError(f"show takes motions returned by simulate, got {type(own).__name__}.")
     return motions
 
 
 def _marks(motions: Sequence[Motion], clock: np.ndarray, speed: float) -> list[str]:
-    """The events that are named at each time."""
+    """The names of events at each time."""
     found = [
         (event.time, f"{own.name} {event.part}: {event.kind}".strip())
         for own in motions

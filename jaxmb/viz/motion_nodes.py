@@ -29,8 +29,8 @@ _FORCE: Color = (20, 120, 60)
 class Motion:
     """A motion to be shown.
 
-    **Fields:** `name`, "" for the only one; `trajectory`, with the states that are shown; `picture` of it; `solids`:
-    shapes with their bodies; `tint`: the one colour of all bodies, None for one each.
+    **Fields:** `name`, "" for a single motion; `trajectory`, with the shown states; `picture` of it; `solids`: shapes
+    with their bodies; `tint`: a colour for all bodies, None for one each.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Motion:
 
     @property
     def grounds(self) -> list[Any]:
-        """The ground of the motion, which is drawn as far as the motion reaches."""
+        """The ground, drawn as far as the motion reaches."""
         return [shape for _, shape in self.solids if shape.primitive == "ground"]
 
     @functools.cached_property
@@ -72,7 +72,7 @@ class Motion:
     # Points and forces
 
     def point(self, name: str) -> Float[np.ndarray, "times 3"]:
-        """World positions of a body, of a frame, or of the point of a part on the last of its bodies.
+        """World positions of a body, of a frame, or of a part's point on the last of its bodies.
 
         **Raises:** `ValueError` for an unknown name.
         """
@@ -86,14 +86,14 @@ class Motion:
         raise unknown("point, a body, frame or joint,", name, [*places, *parts])
 
     def reaction(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Points and forces [N] of a joint's reaction on the last of its bodies that moves, shape (times, 1, 3)."""
+        """Points and forces [N] of a joint's reaction on the last of its moving bodies, shape (times, 1, 3)."""
         force = _in_space(self.trajectory.reactions[name].force)
         part = self.picture.parts[name]
         last = max(k for k, body in enumerate(part.bodies) if body != GROUND)
         return self._anchor(part.bodies[last], part.points[last])[:, None], force[:, None]
 
     def force(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Points and forces [N] of an applied force on each of its bodies that move, shape (times, bodies, 3)."""
+        """Points and forces [N] of an applied force on each of its moving bodies, shape (times, bodies, 3)."""
         wrenches, part = np.asarray(self.trajectory.forces[name]), self.picture.parts[name]
         own = [k for k, body in enumerate(part.bodies) if body != GROUND]
         points = [self._anchor(part.bodies[k], part.points[k]) for k in own]
@@ -189,7 +189,9 @@ def motion(
 
 
 def check_shapes(system: AbstractSystem, given: Mapping[str, AbstractShape | Sequence[AbstractShape]]) -> None:
-    """Raise a `ValueError` for shapes of unknown bodies and for anything but shapes, before a picture is computed."""
+    """Raise a `ValueError` for shapes of unknown bodies and for other objects than shapes, before a picture is
+    computed.
+    """
     known = (*system.body_names, GROUND)
     for body, own in given.items():
         if body not in known:
@@ -200,7 +202,7 @@ def check_shapes(system: AbstractSystem, given: Mapping[str, AbstractShape | Seq
 
 
 def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
-    """The motion at no more than `frames` of its saved times, in ascending order.
+    """The motion at up to `frames` of its saved times, in ascending order.
 
     **Raises:** `ValueError` for a batch, for a motion saved at fewer than two times, and for states that are not
     finite.
@@ -236,7 +238,7 @@ def _reach(shape):
 
 
 def _trail(points):
-    """Segments of the way so far; those to come have no length yet. Shape (times, times − 1, 2, 3)."""
+    """Segments of the path so far; later segments have zero length. Shape (times, times − 1, 2, 3)."""
     n = len(points)
     ends = np.minimum(np.arange(n)[None, :], np.arange(n)[:, None])
     return np.stack([points[ends[:, :-1]], points[ends[:, 1:]]], axis=2)

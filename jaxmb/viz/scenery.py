@@ -1,4 +1,4 @@
-"""Places of motions in a picture, its camera, and what is around them: ground, grids and labels."""
+"""Places of motions in a picture, its camera, and its ground, grids and labels."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from ..parts.shapes import GROUND, along
 from . import meshes, stage
 from .motion_nodes import Motion
 
-# Vertical fields of view of planar and of spatial pictures; the narrow one shows nearly no perspective.
+# Vertical fields of view of planar and of spatial pictures; the narrow field shows nearly no perspective.
 _FRONT_ANGLE, _ANGLE = np.radians(8.0), np.radians(35.0)
 # Width over height of a picture.
 _ASPECT = 1.6
@@ -20,10 +20,10 @@ _ASPECT = 1.6
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Where motions stand and how they are seen.
+    """The places of motions and the view of them.
 
-    **Fields:** `offsets` [m] of the motions; `low` and `high`: corners [m] of what all of them reach; `size` [m] of one
-    motion; `camera`; `cell` [m] of grids.
+    **Fields:** `offsets` [m] of the motions; `low` and `high`: corners [m] of the region that all reach; `size` [m] of
+    one motion; `camera`; `cell` [m] of grids.
     """
 
     offsets: list[Float[np.ndarray, "3"]]
@@ -35,7 +35,7 @@ class View:
 
     @property
     def grain(self) -> float:
-        """The length [m] below which nothing is seen."""
+        """The length [m] below which nothing is visible."""
         return 2e-5 * self.size
 
     @classmethod
@@ -47,7 +47,7 @@ class View:
         bounds = np.array([own.bounds for own in motions])
         extent = np.max(bounds[:, 1] - bounds[:, 0], axis=0)
         size = float(np.linalg.norm(extent))
-        # The two directions of rows and columns: across the picture, and down it or into its depth.
+        # The directions of rows and columns: across the picture, and down or into its depth.
         right, deep = _across(planar, up)
         n, step = len(motions), 1.15 * extent + 0.1 * size
         columns = _columns(n, abs(step @ right), abs(step @ deep))
@@ -76,7 +76,7 @@ def _across(planar, up):
 
 
 def _columns(n, width, height):
-    """How many columns make rows and columns of a size nearest to the picture's shape."""
+    """The number of columns with which rows and columns are nearest to the picture's shape."""
     shape = lambda columns: columns * width / (np.ceil(n / columns) * height)
     return min(range(1, n + 1), key=lambda columns: abs(np.log(shape(columns) / _ASPECT)))
 
@@ -95,7 +95,7 @@ def _camera(planar, up, low, high):
 
 
 def nodes(motions: Sequence[Motion], view: View) -> list[stage.SceneNode]:
-    """What does not move: the ground, or a grid, and the names of the motions."""
+    """Fixed objects: the ground, or a grid, and the names of the motions."""
     up, planar = motions[0].picture.up, motions[0].picture.planar
     out, surfaces, level = [], [], []
     for own, offset in zip(motions, view.offsets, strict=True):
@@ -118,7 +118,7 @@ def nodes(motions: Sequence[Motion], view: View) -> list[stage.SceneNode]:
 
 
 def _names(motions, view):
-    """Above each motion its name; where they overlap one above the other, with a ball of the motion's colour."""
+    """The name above each motion; names of overlapping motions are stacked, with a ball of the motion's colour."""
     up, out = view.camera.up, []
     for k, (own, offset) in enumerate(zip(motions, view.offsets, strict=True)):
         low, high = own.bounds
@@ -164,7 +164,7 @@ def _wider(low, high, share):
 
 
 def _distinct(groups):
-    """Without those whose arrays equal those of an earlier one."""
+    """The groups without repetitions of equal arrays."""
     out = []
     for own in groups:
         leaves = jax.tree.leaves(own)
@@ -193,7 +193,7 @@ def _surface(name, mesh, position, orientation):
 
 
 def _grid(name, view, position, orientation, *, share=1.7, solid=False):
-    """Squares of the view's cell in a plane through a position; `share`: of its side to what the motions reach."""
+    """Squares of the view's cell in a plane through a position; `share`: its side over the reach of the motions."""
     normal, middle = rotation_matrix(orientation)[:, 2], (view.low + view.high) / 2
     shift = middle - position - ((middle - position) @ normal) * normal
     section = 5 * view.cell

@@ -1,4 +1,6 @@
-"""The shapes by which a picture shows bodies: those given, those of their parts, or bars to where parts act."""
+"""The shapes by which a picture shows bodies: given shapes, shapes of their parts, or bars to the points where parts
+act.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,7 +31,7 @@ Placed = tuple[str, Any]
 def solids(
     picture: Picture, given: Mapping[str, AbstractShape | Sequence[AbstractShape]], tint: Color | None
 ) -> list[Placed]:
-    """All shapes with the names of the bodies that they are fixed in.
+    """All shapes with the names of their bodies.
 
     **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies,
     default one for each.
@@ -68,8 +70,8 @@ def _attachments(picture):
 
 
 def _linkage(points, planar, width):
-    """In the plane a plate through three points and more; else bars from the mass centre to the points, and a ball at
-    the mass centre.
+    """A plate through three or more points in the plane; otherwise bars from the mass centre to the points, and a ball
+    at the mass centre.
     """
     if planar and len(points) > 2:
         corners = hull([np.zeros(3), *points])
