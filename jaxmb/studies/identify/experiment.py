@@ -1,4 +1,4 @@
-"""One measured motion: what was measured, from which initial state, and what was different from other ones."""
+"""One measured motion: its data, its initial state, and its differences from other motions."""
 
 import contextlib
 import dataclasses
@@ -41,13 +41,14 @@ class Experiment:
 
     **Arguments:**
 
-    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.
-        `Measurements` have their own `ts`; `sigma` replaces that of `identify` and of sensors.
-    - `inputs`: as of `simulate`.
-    - `parameters`: what is known for this experiment alone, by name; the estimates of others do not replace it.
+    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as in `identify`.
+        `Measurements` contain their `ts`; `sigma` replaces the noise levels of `identify` and of sensors.
+    - `inputs`: as in `simulate`.
+    - `parameters`: known values for this experiment alone, by name; estimates from other experiments do not replace
+        them.
     - `own`: names of unknowns with a value for this experiment alone: `own=("A.friction",)` makes `"exp2/A.friction"`.
-    - `name`: in front of these unknowns; default `"exp1"`, `"exp2"`, ….
-    - `held_out`: whether the data are only predicted, for `Identification.held_out`, and not fitted.
+    - `name`: prefix of these unknowns; default `"exp1"`, `"exp2"`, ….
+    - `held_out`: whether the data are not fitted, only predicted, for `Identification.held_out`.
     """
 
     measured: Any = None
@@ -75,9 +76,8 @@ class Initial(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a simulation with some parameters shows: the misfit, the predicted readings by sensor, the state at the last
-    time, and how the simulation ended. Where it failed the misfit is infinite. What a residual function returns is a
-    reading of the name `"residual"`.
+    """The outcome of a simulation with some parameters: the misfit, infinite after a failure; the predicted readings by
+    sensor, with a residual function's result as `"residual"`; the last state; and the simulation's result.
     """
 
     rows: Rows
@@ -87,10 +87,10 @@ class Seen(NamedTuple):
 
 
 class ExperimentModel(eqx.Module):
-    """An experiment as a function of its unknowns, which are called without the experiment's name.
+    """An experiment as a function of its unknowns, named without the experiment's prefix.
 
-    **Fields:** `unknowns`: their names and shapes; `changed`: which of them are parameters of the system; `initial`:
-    which are of the initial state; `assembled`: whether the initial state is `state`, whatever they are.
+    **Fields:** `unknowns`: their names and shapes; `changed`: the unknown parameters of the system; `initial`: the
+    unknowns of the initial state; `assembled`: whether the initial state is `state` for all unknowns.
     """
 
     unknowns: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
@@ -110,7 +110,7 @@ class ExperimentModel(eqx.Module):
 
     @property
     def size(self) -> float:
-        """The size of what is measured, in units of the noise."""
+        """The size of the data, in units of the noise."""
         return 1 + max((channel.size for channel in self.channels), default=0.0)
 
     def named(self, flat: Float[Array, "values"]) -> dict[str, Array]:
@@ -126,8 +126,8 @@ class ExperimentModel(eqx.Module):
     def start(
         self, system: AbstractSystem, theta: Mapping[str, Array], throw: bool | None = False
     ) -> tuple[AbstractSystem, State]:
-        """The system with these unknowns, and its initial state; NaN if there is none, or with `throw` as `assemble`
-        has it.
+        """The system with these unknowns, and its initial state; NaN if there is none, or as `throw` of `assemble`
+        specifies.
         """
         system = self.changed_system(system, theta)
         if self.assembled:
@@ -156,11 +156,11 @@ class ExperimentModel(eqx.Module):
         theta: Mapping[str, Array],
         options: Mapping[str, Any],
     ) -> Seen:
-        """What the sensors show of the motion from an initial state."""
+        """The outcome of the motion from an initial state."""
         late = [channel for channel in self.channels if channel.delayed]
         series = [self.ts, *(channel.times(self.ts, self.t0, theta) for channel in late)]
         saved = jnp.concatenate(series) if late else self.ts
-        # Sensors with a delay see the motion at other times: all of them are saved in order.
+        # Sensors with a delay see the motion at other times: all times are saved in order.
         order = jnp.argsort(saved) if late else np.arange(saved.size)
         trajectory = self.simulated(system, state, saved[order] if late else saved, options)
         places = jnp.argsort(order).reshape(len(series), -1) if late else np.arange(saved.size)[None]
@@ -194,7 +194,7 @@ def _of_user(residuals: Array, loss: Loss) -> Rows:
 
 
 def with_times(experiment: Experiment, where: str = "") -> Experiment:
-    """An experiment with what was measured by name, and with times."""
+    """An experiment with measured data by name, and with times."""
     measured: Any = experiment.measured
     if have_times(measured):
         if experiment.ts is not None:
@@ -203,12 +203,12 @@ def with_times(experiment: Experiment, where: str = "") -> Experiment:
     elif measured is not None and not isinstance(measured, Mapping):
         raise ValueError(f"identify: {BY_NAME}; got an object of type {type(measured).__name__}{where}.")
     if experiment.ts is None:
-        raise ValueError(f"ts{where} is missing: the times of what was measured.")
+        raise ValueError(f"ts{where} is missing: the times of the data.")
     return experiment
 
 
 def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, np.ndarray]]:
-    """All times of an experiment in order, and for each measured name which of them are its own."""
+    """All times of an experiment in order, and for each measured name the indices of its times."""
     names: tuple[str, ...] = tuple(experiment.measured or ())
     given: Any = experiment.ts
     if not isinstance(given, Mapping):
@@ -221,14 +221,14 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
             raise unknown("measured name with times", name, names)
     missing = [name for name in names if name not in given]
     if missing:
-        raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all that was measured.")
+        raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all measured quantities.")
     each = {name: np.asarray(measured_times(given[name], experiment.t0, name)) for name in names}
     ts = np.unique(np.concatenate(list(each.values())))
     return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
 
 
 def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
-    """Measured times, of all or of one name, or a `ValueError` that says what is wrong with them."""
+    """Measured times, of all or of one name, or a `ValueError` that explains the mistake."""
     label = f"ts[{name!r}]" if name else "ts"
     times = np.asarray(ts, dtype=float)
     if times.ndim != 1 or times.size == 0:
@@ -260,7 +260,8 @@ def channels_of(
 ) -> tuple[Channel, ...]:
     """The readings of an experiment, checked.
 
-    **Arguments:** `free`: names of unknowns, without the experiment's; `places`: which of `ts` each name has.
+    **Arguments:** `free`: names of unknowns, without the experiment's prefix; `places`: for each name its indices in
+    `ts`.
     """
     measured: Any = experiment.measured
     if (measured is None) == (experiment.residual is None):
@@ -300,13 +301,13 @@ def channels_of(
 def _check_delay(channel, ts, t0):
     """Raise a `ValueError` for readings of the motion before it begins."""
     there = np.asarray(channel.present).reshape(ts.size, -1).any(axis=1)
-    # Times that are computed differ by rounding errors.
+    # Computed times differ by rounding errors.
     rounding = 8 * np.finfo(ts.dtype).eps * np.max(np.abs([t0, *ts]))
     early = ts[there & (ts - float(channel.delay) < t0 - rounding)]
     if early.size:
         raise ValueError(
-            f"Sensor {channel.name!r} has a delay of {float(channel.delay):g} s, so what it reads at {early[0]:g} s is "
-            f"the motion before t0 = {t0:g}. Start t0 earlier, or leave out samples before "
+            f"Sensor {channel.name!r} has a delay of {float(channel.delay):g} s, so its reading at {early[0]:g} s "
+            f"shows the motion before t0 = {t0:g}. Start t0 earlier, or leave out samples before "
             f"{t0 + float(channel.delay):g} s, or put NaN in their place."
         )
 
@@ -333,7 +334,7 @@ def initial_unknown(system: AbstractSystem, name: str) -> Initial:
 
 
 def known_parameters(system: AbstractSystem, experiment: Experiment) -> dict[str, Array]:
-    """The parameters that are known for an experiment alone."""
+    """The known parameters of one experiment."""
     given = experiment.parameters or {}
     known = parameters(with_parameters(system, given))
     return {name: known[name] for name in given}

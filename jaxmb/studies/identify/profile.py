@@ -1,4 +1,4 @@
-"""Profile likelihood: how well the data hold up against every value of one parameter.
+"""Profile likelihood: the fit of the data for every value of one parameter.
 
 Source: D. M. Bates and D. G. Watts, "Nonlinear Regression Analysis and Its Applications", Wiley 1988, chapter 6.
 """
@@ -15,17 +15,17 @@ from ..minimise import Minimum, levenberg_marquardt
 from .fit import Fit
 from .problem import linearise
 
-# Values on either side of the estimate before the search for the ends of the interval is given up.
+# Largest number of values on either side of the estimate in the search for the ends of the interval.
 _MOST = 24
 
 
 @dataclasses.dataclass(frozen=True)
 class Profile:
-    """The likelihood of one parameter, all others fitted anew to each of its values.
+    """The likelihood of one parameter, with all others refitted for each of its values.
 
-    **Fields:** `component`; `values`, in order; `ratios`: twice the logarithm of the ratio between the largest
-    likelihood and that with each value; `interval`: the values within `level`, by the χ² distribution with one degree
-    of freedom, infinite on a side where the data exclude nothing; `fits`: whether each fit converged; `parameters`: the
+    **Fields:** `component`; `values`, in order; `ratios`: twice the logarithm of the ratio of the largest likelihood to
+    the likelihood with each value; `interval`: the values within `level`, by the χ² distribution with one degree of
+    freedom, infinite on a side where the data exclude no value; `fits`: whether each fit converged; `parameters`: the
     values of all parameters, by name, along the first axis.
     """
 
@@ -88,9 +88,9 @@ class _Held:
         self.step = step if np.isfinite(step) and step > 0 else 0.1 * (abs(self.best) or 1.0)
 
     def along(self, values, limit: float = np.inf) -> list[tuple[float, float, Minimum]]:
-        """Values, ratios and fits, each started from the last, up to a ratio beyond the limit.
+        """Values, ratios and fits, each started from the previous fit, up to a ratio beyond the limit.
 
-        **Raises:** `ValueError` for a value out of bounds if there is no limit; otherwise that is the end.
+        **Raises:** `ValueError` for a value out of bounds if there is no limit; otherwise the search ends there.
         """
         out, z = [], self.fit.z
         for value in values:
@@ -129,7 +129,9 @@ class _Held:
 
 
 def _end(values, ratios, best, limit, sign) -> float:
-    """Where the ratio reaches a limit on one side: the root of the signed root of the ratio, which is nearly linear."""
+    """The value at which the ratio reaches a limit on one side, by the signed root of the ratio, which is nearly
+    linear.
+    """
     side = (values - best) * sign >= 0
     distance, root = (values[side] - best) * sign, np.sqrt(np.maximum(ratios[side], 0.0))
     order = np.argsort(distance)
@@ -138,7 +140,7 @@ def _end(values, ratios, best, limit, sign) -> float:
     if beyond.size == 0:
         return sign * np.inf
     k = beyond[0]
-    # Through three neighbours, so that the error of interpolation is small against the interval.
+    # Three neighbours make the error of interpolation small against the interval.
     near = slice(max(k - 2, 0), k + 1)
     fit = np.polynomial.Polynomial.fit(root[near], distance[near], min(2, k))
     return best + sign * float(fit(np.sqrt(limit)))

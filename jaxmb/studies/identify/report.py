@@ -14,7 +14,7 @@ from .prediction import held_out
 from .profile import Profile, profile
 from .residuals import Outlier
 
-# Outliers that are listed.
+# Largest number of listed outliers.
 _MOST = 50
 
 _STYLE = (
@@ -30,7 +30,7 @@ def write_report(
     rows: Sequence[tuple[str, ...]],
     profiles: Sequence[str],
 ) -> Path:
-    """As `Identification.report`; `verdict`: its lines, `rows`: those of the table of estimates."""
+    """As `Identification.report`; `verdict`: its lines, `rows` of the table of estimates."""
     path = Path(path)
     path = path if path.suffix == ".html" else path / "identification.html"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ def _outliers(outliers: Sequence[Outlier]) -> str:
 
 
 def _fit_figure(trial, channel, predicted, fitted, far: Sequence[Outlier]) -> str:
-    """Measured samples and the fit above, what is between them below; residuals beyond 5 σ have a ring."""
+    """Measured samples and the fit above, their difference below; residuals beyond 5 σ have a ring."""
     figure, (above, below) = _axes(2, 5.0)
     own = np.asarray(channel.places)
     ts = np.asarray(trial.ts)[own]
@@ -125,7 +125,7 @@ def _fit_figure(trial, channel, predicted, fitted, far: Sequence[Outlier]) -> st
 
 def _correlations(fit: Fit) -> str:
     deviations = fit.uncertainty.deviations
-    # What is not determined has no correlation: a square without colour.
+    # Undetermined components have no correlation: a square without colour.
     sizes = np.where(np.isfinite(deviations) & (deviations > 0), deviations, np.nan)
     correlations = np.where(np.isfinite(fit.covariance), fit.covariance, np.nan) / np.outer(sizes, sizes)
     figure, (axes,) = _axes(1, 1.5 + 0.4 * len(fit.components))

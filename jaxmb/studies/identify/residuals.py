@@ -9,17 +9,17 @@ from .experiment import RESIDUAL, ExperimentModel
 from .problem import Problem
 from .sensors import Channel
 
-# What is left of a fit does not matter below half a standard deviation of the noise that is known, or, where the noise
-# is not known, below a thousandth of the range of what was measured: about the errors of simulations and instruments.
+# Residuals do not matter below half a standard deviation of known noise, or for unknown noise below a thousandth of the
+# data's range, about the errors of simulations and instruments.
 _SMALL, _SMALL_OF_RANGE = 0.5, 1e-3
-# Residuals beyond so many standard deviations are outliers: one in two million of normal noise.
+# Outliers are residuals beyond this number of standard deviations: one in two million of normal noise.
 _FAR = 5.0
-# From so many samples on, the noise is known from their median, which outliers do not change.
+# Least number of samples whose median, which outliers do not change, estimates the noise.
 _MANY = 20
 
 
 class Bias(NamedTuple):
-    """Whether a sensor's offset is `free`, and if so, whether `components` of the sensor or `experiments` share it."""
+    """Whether a sensor's offset is `free`, and whether `components` of the sensor or `experiments` share it."""
 
     free: bool
     components: bool = False
@@ -30,9 +30,9 @@ class Series(NamedTuple):
     """The residuals of one component of a sensor in order of time, predicted minus measured.
 
     **Fields:** `label`; `experiment`, `sensor` and `component`, an index; `residuals` in units of `sigma` (one each),
-    or of the range where the noise is not known; `known`: whether it is, from before the fit; `small`: the size of
-    residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: the indices in what was measured;
-    `bias` of the sensor. Where a residual function was given, `predicted` and `ts` are empty.
+    or of the range for unknown noise; `known`: whether the noise was known before the fit; `small`: the size of
+    residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: indices in the data; `bias` of the
+    sensor. With a residual function, `predicted` and `ts` are empty.
     """
 
     label: str
@@ -57,8 +57,8 @@ class Series(NamedTuple):
 class Outlier(NamedTuple):
     """A residual beyond five standard deviations of the noise.
 
-    **Fields:** `experiment`, `sensor`; `sample`: the index in what was measured; `t` [s], NaN for what a
-    residual function returns; `residual`: predicted minus measured, in standard deviations.
+    **Fields:** `experiment`, `sensor`; `sample`: the index in the data; `t` [s], NaN for a residual function;
+    `residual`: predicted minus measured, in standard deviations.
     """
 
     experiment: str
@@ -73,7 +73,7 @@ def series(
     values: Mapping[str, np.ndarray],
     readings: Mapping[str, Mapping[str, Any]],
 ) -> tuple[Series, ...]:
-    """The residuals of everything that was fitted, from the unknowns by name and the readings at them."""
+    """The residuals of all fitted data, from the unknowns by name and their readings."""
     out = []
     for number, (name, trial, fitted) in enumerate(zip(problem.names, problem.trials, problem.fitted, strict=True)):
         if fitted and trial.residual is not None:

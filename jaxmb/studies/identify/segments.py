@@ -17,7 +17,7 @@ from .problem import Model, Problem, numbers, values_and_derivatives, weighted
 
 
 class Lanes(NamedTuple):
-    """The segments of one experiment: trials stacked along axis 0, and how many samples each has."""
+    """The segments of one experiment: trials stacked along axis 0, and the number of samples of each."""
 
     number: int
     trials: ExperimentModel
@@ -26,7 +26,7 @@ class Lanes(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The vector of the unknowns, and for each experiment the states at the starts of its segments with charts there.
+    """The vector of the unknowns, and for each experiment the initial states of its segments with charts.
 
     A chart has bases of the tangent spaces, of q and of u, and the map from changes of both to its coordinates.
     """
@@ -41,20 +41,22 @@ class Place(NamedTuple):
         return self.z.size + sum(onto[..., 0].size for *_, onto in self.charts)
 
     def split(self, vector: Any) -> list[Any]:
-        """The coordinates of the charts in such a vector, for each experiment in the shape (segments, coordinates)."""
+        """The coordinates of the charts in a vector of all, for each experiment in the shape (segments,
+        coordinates).
+        """
         ends = np.cumsum([self.z.size, *(onto[..., 0].size for *_, onto in self.charts)])
         each = zip(self.charts, ends[:-1], ends[1:], strict=True)
         return [vector[begin:end].reshape(onto.shape[:2]) for (*_, onto), begin, end in each]
 
 
 def segmented(name: str, number: int, trial: ExperimentModel, segments: int) -> Lanes:
-    """An experiment in segments of nearly as many samples, shorter ones filled up with missing samples."""
+    """An experiment in segments of nearly equal length, shorter segments filled up with missing samples."""
     where = f" of experiment {name!r}" if name else ""
     if trial.residual is not None:
         raise ValueError(f"The residual function{where} looks at the whole motion; multiple shooting needs measured=.")
     late = [channel.name for channel in trial.channels if channel.delayed]
     if late:
-        raise ValueError(f"Sensor {late[0]!r}{where} has a delay, which multiple shooting cannot have.")
+        raise ValueError(f"Sensor {late[0]!r}{where} has a delay, which multiple shooting does not support.")
     if not 1 < segments <= trial.ts.size:
         raise ValueError(f"segments must lie between 1 and the number of times, {trial.ts.size}, got {segments}.")
     groups = np.array_split(np.arange(trial.ts.size), segments)
@@ -82,7 +84,7 @@ def _column(mask: np.ndarray, like: Array) -> np.ndarray:
 
 
 def first_place(problem: Problem, lanes: tuple[Lanes, ...], z: Array) -> Place:
-    """The initial state of each experiment at the starts of all its segments."""
+    """The initial state of each experiment, repeated for all its segments."""
     several = lambda x, count: jnp.broadcast_to(x, (count, *x.shape))
     starts = [(problem.start(lane.number, z)[1], len(lane.samples)) for lane in lanes]
     states = [State(several(state.q, count), several(state.u, count)) for state, count in starts]
@@ -90,7 +92,7 @@ def first_place(problem: Problem, lanes: tuple[Lanes, ...], z: Array) -> Place:
 
 
 def moved(problem: Problem, lanes: tuple[Lanes, ...], place: Place, step: np.ndarray) -> Place:
-    """The place after a step, the states back on the constraints of the new parameters."""
+    """The place after a step, with the states projected on the constraints of the new parameters."""
     change = jnp.asarray(step, place.z.dtype)
     z, states = place.z + change[: place.z.size], []
     each = zip(lanes, place.states, place.charts, place.split(change), strict=True)
@@ -125,7 +127,9 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
         seen, (rows, levels, starts, ends) = numbers(found)
 
         def whole(by_unknowns, by_states, inward=inward, own=own):
-            """Derivatives in the unknowns of the experiment and in each segment's state as those in all unknowns."""
+            """Derivatives in all unknowns, from derivatives in the experiment's unknowns and in each segment's
+            state.
+            """
             out = np.zeros((*by_unknowns.shape[:2], total))
             out[..., :n] = by_unknowns @ inward
             for k, these in enumerate(own):
@@ -163,7 +167,7 @@ def _on_constraints(system, trial, flat, ts, states, tangents, moves) -> State:
 
 
 def _near(system, t, state, tangents, w) -> State:
-    """The state closest to a chart's point; the chart's coordinates are first those of q, then those of u."""
+    """The state closest to a chart's point; the chart's coordinates are first of q, then of u."""
     positions, velocities = tangents
     split = positions.shape[1]
     guess = State(state.q + positions @ w[:split], state.u + velocities @ w[split:])
@@ -214,7 +218,7 @@ def _constraint_jacobians(system, trial, flat, ts, states):
 
 @eqx.filter_jit
 def _linearised_lanes(system, trials, static, options, flat, states, tangents):
-    """What every segment shows; and residuals, scores, start and end with their derivatives, in one batch."""
+    """The outcome of every segment; and residuals, scores, start and end with their derivatives, in one batch."""
 
     def lane(trial, state, along):
         trial = eqx.combine(trial, static)

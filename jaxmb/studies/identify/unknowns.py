@@ -49,7 +49,9 @@ class Priors(eqx.Module):
 
 
 class Unknowns(NamedTuple):
-    """Unknowns, the experiments as functions of theirs, and for each of those the names of its unknowns among all."""
+    """Unknowns, the experiments as functions of their own, and for each experiment the names of its unknowns among
+    all.
+    """
 
     free: FreeParameters
     trials: tuple[ExperimentModel, ...]
@@ -58,7 +60,7 @@ class Unknowns(NamedTuple):
 
 
 class _Unknown(NamedTuple):
-    """One unknown before it has a range: its start, a typical change, whether it is positive, and where it must be."""
+    """One unknown before it has a range: its start, a typical change, whether it is positive, and its bounds."""
 
     start: Any
     like: Array
@@ -68,13 +70,13 @@ class _Unknown(NamedTuple):
 
 
 def experiments_by_name(experiments: Sequence[Experiment]) -> dict[str, Experiment]:
-    """Experiments by their names, which are made where they are missing."""
+    """Experiments by name; missing names are generated."""
     out = {}
     for number, experiment in enumerate(experiments, 1):
         check_kind("An experiment", experiment, Experiment, "a jaxmb.Experiment", BY_NAME)
         name = f"exp{number}" if experiment.name is None else experiment.name
         if name in out or not name or "/" in name:
-            raise ValueError(f"The name {name!r} of an experiment must be its own, not empty and without '/'.")
+            raise ValueError(f"The name {name!r} of an experiment must be unique, not empty and without '/'.")
         out[name] = with_times(experiment, f" of experiment {name!r}")
     if not any(not experiment.held_out for experiment in out.values()):
         raise ValueError("There is no experiment to fit: give one or more that are not held_out.")
@@ -106,7 +108,7 @@ def unknowns(
 ) -> Unknowns:
     """Unknowns with their starts, ranges and priors, and the experiments that depend on them.
 
-    **Arguments:** as of `identify`; the name of a single experiment may be empty, its unknowns then have no prefix.
+    **Arguments:** as in `identify`; the name of a single experiment may be empty, its unknowns then have no prefix.
 
     **Raises:** `ValueError` for unknown names and wrong values.
     """
@@ -137,7 +139,7 @@ def unknowns(
 
 
 def _within_design(system: AbstractSystem, limits: Mapping[str, Bounds], order: Sequence[str]) -> dict[str, Bounds]:
-    """Bounds by name, with those of design variables."""
+    """Bounds by name, including the bounds of design variables."""
     out, declared = dict(limits), design_bounds(system)
     for name in order:
         base = name.rpartition("/")[2]
@@ -147,7 +149,9 @@ def _within_design(system: AbstractSystem, limits: Mapping[str, Bounds], order: 
 
 
 def _with_named(prefix: str, experiment: Experiment, given: Mapping[str, Any]) -> Experiment:
-    """The experiment with those unknowns that `free` names as its own: `"exp2/A.friction"`, `"initial.crank.angle"`."""
+    """The experiment with the unknowns that `free` names with its prefix: `"exp2/A.friction"`,
+    `"initial.crank.angle"`.
+    """
     before = f"{prefix}/" if prefix else ""
     ours = [name.removeprefix(before) for name in given if name.startswith(before or "initial.")]
     initial = [name.removeprefix("initial.") for name in ours if name.startswith("initial.")]
@@ -177,7 +181,7 @@ def _check_names(system, experiments, sensors, given) -> None:
 
 
 def _check_measured(system, experiments, sensors, sigma) -> None:
-    """Refuse sensors and noise levels of what is not measured, and noise levels that are given twice."""
+    """Refuse sensors and noise levels of quantities that are not measured, and noise levels given twice."""
     known = dict.fromkeys((*sensors, *system.quantities()))
     measured = dict.fromkeys(name for own in experiments.values() for name in (own.measured or {}))
     for name in sigma or {}:
@@ -194,7 +198,7 @@ def _check_measured(system, experiments, sensors, sigma) -> None:
 
 
 def _assembled(experiment, system, guess, **prescribed):
-    """The initial state of an experiment, which the error names if it cannot be assembled."""
+    """The initial state of an experiment; an error of assembly names the experiment."""
     try:
         return assemble(system, guess, **prescribed)
     except ValueError as error:
@@ -204,7 +208,7 @@ def _assembled(experiment, system, guess, **prescribed):
 
 
 def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tuple[ExperimentModel, tuple[str, ...]]:
-    """One experiment, whose unknowns are added to those that are found."""
+    """One experiment, whose unknowns are added to `found`."""
     ts, places = times_of(experiment)
     label = lambda name: f"{prefix}/{name}" if prefix else name
     known = known_parameters(system, experiment)
@@ -238,7 +242,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
     guess = system.guess if experiment.state is None else experiment.state
     known_rates = system.rate_names()
     fix = arrays(experiment.fix)
-    # By the names of rates, so that an unknown rate takes the place of one that is given by its coordinate's name.
+    # By the names of rates, so that an unknown rate replaces a rate given by its coordinate's name.
     rates = {
         full if (full := f"{name}_rate") in known_rates else name: x for name, x in arrays(experiment.rates).items()
     }
@@ -257,7 +261,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
     of_bodies = fix.keys() <= system.coordinate_names().keys() and rates.keys() <= known_rates.keys()
     assembled = not initial and of_bodies and not constraints_depend_on(same, experiment.t0, guess, changed)
     if assembled:
-        # What is the same for all values is found, and differentiated, once.
+        # Values that are the same for all trials are computed, and differentiated, once.
         guess = _assembled(prefix, same, guess, fix=fix, rates=rates, t=experiment.t0)
     if not experiment.held_out:
         for source, what in unknown_here.values():
@@ -308,14 +312,14 @@ def _range(name: str, what: _Unknown, bounds: Bounds | None):
         if not float(jnp.max(jnp.asarray(what.start))) < what.below:
             raise ValueError(
                 f"The start of {name!r} must be smaller than {what.below:g} s, the time from t0 to the first sample: "
-                "before t0 there is no motion to see. Start t0 earlier, or leave out the first samples."
+                "there is no motion before t0. Start t0 earlier, or leave out the first samples."
             )
         bounds = low, what.below if high is None else min(float(np.max(high)), what.below)
     return range_of(name, what.start, what.like, bounds, positive=what.positive, scale=what.scale)
 
 
 def _for_each(what: str, given: Mapping[str, Any] | None, names: Sequence[str]) -> dict[str, Any]:
-    """What is given for unknowns, also by the name that those of several experiments have in common."""
+    """Values for unknowns, also by the common name of the unknowns of several experiments."""
     out = {}
     for name, value in (given or {}).items():
         own = [full for full in names if name in (full, full.split("/", 1)[-1])]
