@@ -273,7 +273,7 @@ def test_inertia_names_and_frames():
             "",
             "hip h2 h3",
             "Composite",
-            "counts in half a turn, between the angles at which the three axes lie in one plane: 'h2'",
+            "is limited to half a turn, between the angles at which the three axes lie in one plane: 'h2'",
         ),
     ],
 )
@@ -300,7 +300,12 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
     "joints, more, head, message",
     [
         (TWICE, "", "", "Joints in succession to 'a' are degenerate, hinge 'p1', hinge 'p3' are parallel hinges"),
-        (joint("s1", "slide") + joint("s2", "slide"), "", "", "slide 's1', slide 's2' slide in directions that depend"),
+        (
+            joint("s1", "slide") + joint("s2", "slide"),
+            "",
+            "",
+            "slide 's1', slide 's2' slide in linearly dependent directions",
+        ),
         (FOUR, "", "", "hinge 'h0', hinge 'h1', hinge 'h2', hinge 'h3' have more than three rotations"),
         (FLAT, "", "", "the axes of the hinges 'f1', 'f2', 'f3' lie in one plane in the middle of the range of 'f2'"),
         (
@@ -313,7 +318,7 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
             HINGE,
             '<actuator><muscle name="m" joint="hip" lengthrange="-1 1"/></actuator>',
             "",
-            "Actuator 'm' has dynamics of its own",
+            "Actuator 'm' has dynamics other than a filter",
         ),
         (
             HINGE,

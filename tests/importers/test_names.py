@@ -121,7 +121,7 @@ def test_a_link_of_sdf_that_is_called_ground(static):
             MASS,
             ["world", "b"],
             "world",
-            ("A link called world that has an <inertial> is no ground, and moves as its joints let it: 'world'.",),
+            ("A link called world that has an <inertial> is not the ground, and moves as its joints allow: 'world'.",),
         ),
     ],
     ids=["without mass", "with mass"],
@@ -225,7 +225,7 @@ def test_a_scene_with_names_that_mujoco_has():
     exported = importers.to_mjcf(
         mb.Scene([body], joints=balls, forces=[rubber], frames=[spatial.Frame("rubber a", "ground")]).compile()
     )
-    assert "Bodies have other names, since MuJoCo has these: 'world → world body'." in exported.notes
+    assert "Bodies have other names, since MuJoCo reserves these: 'world → world body'." in exported.notes
     back = importers.mjcf(exported.text)
     assert [own.name for own in back.scene.bodies] == ["world body"]
     assert back.coordinates == {"ball 0": "ball 0.rotation"}
