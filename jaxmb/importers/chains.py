@@ -129,8 +129,8 @@ def _meeting(points, axes):
 
 
 def _second_of_three(joints, axes):
-    """For three hinges: options with the middle of the second angle, and the name of the second hinge if its range
-    contains an angle at which the three axes lie in one plane.
+    """For three hinges: options with the middle of the second angle, and the name of the second hinge if the three axes
+    lie in one plane within its range.
     """
     hinges = [(joint, axis) for joint, axis in zip(joints, axes, strict=True) if joint.kind == "hinge"]
     if len(hinges) < 3:

@@ -66,8 +66,8 @@ class _Writer:
             own.set("quat", numbers(from_matrix(back @ rotation)))
 
     def ahead(self, part, about):
-        """MuJoCo's coordinate minus the part's: full turns [rad] for an angle, which the part wraps to within half a
-        turn of `about`, or the length by which such turns wind up a tendon.
+        """MuJoCo's coordinate minus the part's. For an angle, which the part wraps to within half a turn of `about`, it
+        is a number of full turns [rad]; for a tendon, the length wound up by such turns.
         """
         (coordinate,) = part.acts_on
         joint = self.tree.coordinates.get(coordinate)

@@ -41,8 +41,10 @@ def of_class(table: Mapping[type, Any], part: Any) -> Any:
 
 @dataclasses.dataclass
 class PlacedPart:
-    """A part of the scene with concrete numbers: the names of its bodies, the poses that it sees, the coordinates that
-    it acts on, the values of its scalar coordinates, and the names used in the scene and the file.
+    """A part of the scene with concrete numbers.
+
+    **Fields:** names of its `bodies`; the `poses` that it sees; the coordinates that it `acts_on`; values of its
+    `scalars`, the scalar coordinates; the `names` used in the scene and the file.
     """
 
     name: str

@@ -96,7 +96,7 @@ def _about(link, joint):
 
 
 def fuse(machine: Machine, notes: Notes) -> Fused:
-    """Fuse links that are fixed to each other, the later ones of the file to the earlier ones."""
+    """Fuse links that are fixed to each other, later links of the file to earlier links."""
     links: dict[LinkKey, Link] = {WORLD: Link(GROUND), **machine.links}
     of = bodies_of(machine)
     groups = {name: [links[own] for own in links if of[own] == name] for name in dict.fromkeys(of.values())}
@@ -139,7 +139,7 @@ def _chains(joints, of, light, links, notes):
 
 
 def _summed(frame: Link, links: list[Link]) -> Link:
-    """Several links as one, in the frame of one of them."""
+    """Several links as one, in the frame of the link `frame`."""
     mass = sum(link.mass for link in links)
     if len(links) == 1 or not mass:
         return dataclasses.replace(frame)

@@ -78,8 +78,8 @@ def _take_out(machine, links, joints, notes):
 def with_rotors(machine: Machine, notes: Notes) -> None:
     """Make the armature of free joints, and of ball joints on the ground, a separate link, fixed to the joint's link.
 
-    The velocities of these joints are the link's, so the armature is a weightless point mass in the origin of its
-    frame, and the inertia of a ball about it. No link moves like a ball joint between two moving links.
+    The velocities of these joints are the link's. The armature is therefore a weightless point mass in the origin of
+    the link's frame, and the inertia of a ball about it. No link moves like a ball joint between two moving links.
     """
     of = bodies_of(machine)
     heavy = {of[name] for name, link in machine.links.items() if link.mass}

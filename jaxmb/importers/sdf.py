@@ -53,8 +53,8 @@ def sdf(
 
     Links and joints of several models are prefixed by the model's name, `"arm::hand"`. A model is free unless a joint
     binds it to `world`, or it is static. Before version 1.5 of the format, axes of joints are in the frame of the
-    model. Angles written with few digits, such as 1.5708, are taken as the multiples of π/12 that they round, so that
-    the hinges of a loop are exactly parallel.
+    model. Angles written with few digits, such as 1.5708, are taken as the multiples of π/12 that they round: hinges of
+    a loop are then exactly parallel.
 
     **Arguments:** `source`: a path, or the text of a file; `gravity` [m/s²], shape (3,), if no world in the file
     defines it; `ignore`: elements to leave out, by words such as `"limits"`, `"collisions"` and `"pictures"`, or by
@@ -105,7 +105,7 @@ def _read_model(model, scope, machine, version, notes, files):
     for nested in (*model.all("model"), *model.all("include"), *model.all("frame")):
         notes.refused.append(f"{nested.where}<{nested.tag}> within a model is not read; write the model out.")
     if "placement_frame" in model.attributes:
-        notes.refused.append(f"{model.where}placement_frame is not read: give the pose of the model's own frame.")
+        notes.refused.append(f"{model.where}placement_frame is not read: give the pose of the model's frame.")
     static = model.first("static")
     static = static is not None and _true(static.text)
     for element in model.all("link"):

@@ -52,7 +52,7 @@ def text_of(source: str | os.PathLike[str]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Resources:
-    """Files that a source refers to by `package://`, `model://` or `file://`, or by a path from its own folder.
+    """Files that a source refers to by `package://`, `model://` or `file://`, or by a path from its folder.
 
     **Fields:** `folder` of the source, None for a text; `package_dirs`: folders of packages, or with packages.
     """

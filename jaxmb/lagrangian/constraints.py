@@ -206,7 +206,7 @@ def check_names(constraints: tuple[Any, ...], coordinates: tuple[str, ...]) -> N
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise ValueError(
-            f"The name {', '.join(map(repr, repeated))} is used twice; every constraint needs a name of its own."
+            f"The name {', '.join(map(repr, repeated))} is used twice; every constraint needs a different name."
         )
     for name in names:
         if name in coordinates:

@@ -272,7 +272,7 @@ class AbstractLagrangian(AbstractSystem):
         if self.diagonal:
             left_out.append("factorisation of the mass matrix: it is diagonal")
         if self.applied is None:
-            left_out.append("forces besides those of the Lagrangian: there are none")
+            left_out.append("forces besides the Lagrangian's: there are none")
         return Description(tuple(facts), tables, remarks(self, left_out))
 
 

@@ -28,8 +28,8 @@ else:
 class AbstractNonIdealForce(eqx.Module):
     """The force C of one constraint.
 
-    `constraint` is the name of the constraint, `coefficients` are the names of the system's parameters that the law
-    uses, and `of_multipliers` says whether C depends on the constraint's multipliers.
+    `constraint`: the name of the constraint; `coefficients`: the names of the system's parameters that the law uses;
+    `of_multipliers`: whether C depends on the constraint's multipliers.
     """
 
     constraint: AbstractVar[str]

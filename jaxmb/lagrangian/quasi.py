@@ -1,4 +1,4 @@
-"""Nonlinear quasi-velocities, and the forces that hold the dependent ones at zero."""
+"""Nonlinear quasi-velocities, and the forces that hold the dependent velocities at zero."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar

@@ -71,9 +71,9 @@ class LagrangianSystem(AbstractLagrangian):
 
     Functions keep the values that they read now: after a change of a global variable, make a new system.
 
-    **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
-    that no positions satisfy near the guess, contradictory constraints on velocities or accelerations, names that are
-    not unique, friction of a constraint that others imply, and a guess at a singular position, where a row has no
+    **Raises:** `ValueError` for functions of the wrong shape; an L that is not twice differentiable in q̇; constraints
+    that no positions satisfy near the guess; contradictory constraints on velocities or accelerations; names that are
+    not unique; friction of a constraint that others imply; and a guess at a singular position, where a row has no
     gradient or is implied by others, unlike nearby.
     """
 
@@ -166,7 +166,7 @@ def _names(coordinates: Sequence[str] | None, count: int) -> tuple[str, ...]:
     for name in names:
         if f"{name}_rate" in names:
             raise ValueError(
-                f"'{name}_rate' is the name of the rate of {name!r}; choose another one for the coordinate."
+                f"'{name}_rate' is the name of the rate of {name!r}; choose another name for the coordinate."
             )
         if name in _TAKEN:
             raise ValueError(f"In a saved motion {name!r} has another meaning; choose another name for the coordinate.")

@@ -6,8 +6,8 @@ Virtual displacements δq always satisfy the constraints. The variation of veloc
 
 bilinear in the last two, if the principle compensates for it: `∫ (δ_W L − p · W + Q · δq) dt = 0`. With Hölder's
 choice, W = 0, varied motions violate the constraints; with Suslov's they satisfy them. All choices give the equations
-of Lagrange and d'Alembert. Without the term p · W, different equations would result, those of a variational problem
-with constraints (vakonomic).
+of Lagrange and d'Alembert. Without the term p · W, the different equations of a variational problem with constraints
+(vakonomic) would result.
 
 Source: J. Papastavridis, Analytical Mechanics, World Scientific, 2014, §3.8; A. M. Bloch, Nonholonomic Mechanics and
 Control, Springer, 2015.

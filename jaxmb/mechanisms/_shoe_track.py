@@ -137,8 +137,8 @@ def shoe_track(
 
 
 def running(system, guess, speed):
-    """A vehicle on tracks of shoes that has nearly come to rest, and then moves forward, with rolling wheels and shoes
-    that lie on the ground.
+    """The state of a vehicle on tracks of shoes, from near rest, that moves forward with rolling wheels and shoes that
+    lie on the ground.
 
     Without drive, shoes hang down, and vehicle and tracks lose their motion in a second. They go on to creep, since dry
     friction is regularised: there are many equilibria in which friction holds the shoes.
@@ -174,7 +174,7 @@ def undriven(system):
 
 
 def _circulation(poses, speed, pitch):
-    """Velocities of shoes that run through the shape of their track at a speed [m/s], backwards along the ground, from
+    """Velocities of shoes that run through the shape of their track at a speed [m/s], backwards along the ground; from
     their poses, both of shape (shoes, 3), and their pitch [m].
     """
     turn = lambda v: jnp.stack([-v[:, 1], v[:, 0]], axis=1)

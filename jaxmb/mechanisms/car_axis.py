@@ -25,7 +25,7 @@ def car_axis(
     """A chassis on two stiff springs, one wheel on a flat road and the other on a bumpy one.
 
     Two point masses `left` and `right` of `mass epsilon² / 2`, joined by a massless bar, on springs of unit stiffness
-    over the wheels (0, 0) and (x_b, y_b), `y_b = amplitude sin(frequency t)`, `x_b = √(length² − y_b²)`; the left
+    over the wheels (0, 0) and (x_b, y_b), `y_b = amplitude sin(frequency t)`, `x_b = √(length² − y_b²)`. The left
     spring stays perpendicular to the line between the wheels, a rheonomic constraint: `x_l x_b + y_l y_b = 0`.
 
     Source: S. Schneider, "Intégration de systèmes d'équations différentielles raides et différentielles-algébriques par

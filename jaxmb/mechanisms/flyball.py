@@ -30,8 +30,8 @@ def flyball(
 
     The shaft, 1 m high, stands in the origin on its axis z. The arms, 1 m long, hang on hinges along the shaft's y axis
     at (±0.05, 0, 1) m in its frame, and point away from the axis, α below the horizontal. A spring and a damper act
-    between the middle of each arm and the point (±0.05, 0, s) m of the cube, s the height of its centre; they are 0.5 m
-    long and free of force at the start, where all parts turn together. Shaft and arms are bars of 0.01 m × 0.01 m, the
+    between the middle of each arm and the point (±0.05, 0, s) m of the cube, s the height of its centre. They are 0.5 m
+    long and free of force at the start, and all parts turn together. Shaft and arms are bars of 0.01 m × 0.01 m, the
     cube has 0.1 m, their density is 3000 kg/m³; the balls are points at the arms' ends. The fastest motion of the
     springs decays at 8100 / s, the slowest at 20 / s.
 

@@ -62,23 +62,23 @@ def tracked_vehicle(
     hitch_damping: float = 2e4,
     gravity: float = 9.81,
 ) -> Mechanism:
-    """A tracked carrier that drives over a bump: a hull on trailing road arms with torsion bars and bump stops, road
-    wheels on compliant ground, and the track as an elastic loop around wheels, sprocket and idler, all of one radius; 3
-    + 2 n_wheels degrees of freedom. With `units=2` it tows another carrier by a hitch, which removes two degrees of
-    freedom.
+    """A tracked carrier that drives over a bump, with 3 + 2 n_wheels degrees of freedom. The hull rests on trailing
+    road arms with torsion bars and bump stops, and road wheels on compliant ground. The track is an elastic loop around
+    wheels, sprocket and idler, all of one radius. With `units=2` it tows another carrier by a hitch, which removes two
+    degrees of freedom.
 
     It starts in static equilibrium without drive, moving forward with rolling wheels. One body represents a left and
     right pair; x is forward, y up.
 
     With `track="shoes"` every shoe is a body. Shoes on pins run in a closed loop around a driven sprocket, an idler on
-    a tensioner and the wheels, with compliant contact and friction on these and on the ground. With n shoes there are n
+    a tensioner and the wheels. Contact on these and on the ground is compliant, with friction. With n shoes there are n
     + 6 + 2 n_wheels degrees of freedom. The shoes are laid around the discs without sag. A simulation without drive
     brings them nearly to rest, hanging down, and then they run at the vehicle's speed.
 
     Source: the kind of vehicle of R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension
     Reduction in Analysis of Constrained Dynamic Systems", J. Mech. Design 104(1), 1982, with 13 and 24 degrees of
-    freedom; dimensions and masses close to those of the M113 model of Project Chrono. The reference values were
-    computed in minimal coordinates by a Runge–Kutta method of order 8.
+    freedom; dimensions and masses close to the M113 model of Project Chrono. The reference values were computed in
+    minimal coordinates by a Runge–Kutta method of order 8.
 
     **Arguments:** `n_wheels` ≥ 1; `track`: `"loop"`, `"shoes"`, or `Shoes(...)` with numbers; `speed` [m/s]; `torque`
     [N m], of the drive of each unit, shared by its wheels, or on its sprocket, with its reaction on the hull;

@@ -1,9 +1,8 @@
 """Base classes of the parts of a scene: a name, the bodies that the part acts on, and a pure residual or force law.
 
-A user-defined part derives from one of these classes and declares its fields with the helpers of `fields`. It is then
-treated like the parts of the library: parts of one type are stacked and `vmap`ped, the Jacobian and γ follow from the
-residual, numbers become named, differentiable parameters, and redundant rows, reactions and pictures need no further
-code.
+A user-defined part derives from a class here and declares its fields with the helpers of `fields`. It is then treated
+like the parts of the library. Parts of a type are stacked and `vmap`ped; the Jacobian and γ follow from the residual;
+numbers become named, differentiable parameters. Redundant rows, reactions and pictures need no further code.
 
 A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes the poses of that part's bodies, shape
 `(len(bodies), pose size)`; `space` converts them to points, directions and wrenches.
@@ -264,20 +263,20 @@ class AbstractActor(AbstractPart):
         """The part in a scene, with every number filled in, and the numbers of its bodies."""
 
     def seen_poses(self, space: AbstractSpace, poses: Poses) -> Poses:
-        """The poses that the kernels see, from those of the bodies."""
+        """The poses that the kernels see, from poses of the bodies."""
         return type(self)._on_frames(self, lambda frame, x: frame.pose(space, x), poses)
 
     def seen(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> tuple[Poses, Velocities]:
-        """The poses and velocities that the kernels see, from those of the bodies."""
+        """The poses and velocities that the kernels see, from poses and velocities of the bodies."""
         seen = self._on_frames(lambda frame, x, v: frame.velocity(space, x, v), poses, velocities)
         return self.seen_poses(space, poses), seen
 
     def seen_wrenches(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
-        """The wrenches that the kernels see, from those on the bodies."""
+        """The wrenches that the kernels see, from wrenches on the bodies."""
         return self._on_frames(lambda frame, x, w: frame.wrench_on_frame(space, x, w), poses, wrenches)
 
     def wrenches_on_bodies(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
-        """The wrenches on the bodies that are equivalent to those that the kernels return."""
+        """The wrenches on the bodies that are equivalent to the kernels' wrenches."""
         return self._on_frames(lambda frame, x, w: frame.wrench(space, x, w), poses, wrenches)
 
     def _on_frames(self, of_frame: Callable[..., Any], *rows: Any) -> Any:
@@ -429,7 +428,7 @@ class AbstractPair(AbstractLink):
 
 
 class AbstractPointPair(AbstractPair):
-    """A part that acts between a point of one body and a point of another one.
+    """A part that acts between points of two bodies.
 
     **Arguments:**
 
@@ -607,8 +606,8 @@ class AbstractPotentialForce(AbstractForce):
 class AbstractDynamicForce(AbstractForce):
     """A force law with internal states of first order: a motor with lag, a tyre with relaxation, a filter.
 
-    Each state is a field declared with `fields.internal_state`, in which the kernels `wrenches`, `state_rates` and, of
-    a part with a potential, `energy` find its current value. `State.z` holds the internal states of all parts; their
+    Each state is a field declared with `fields.internal_state`. It holds the current value in the kernels `wrenches`,
+    `state_rates` and `energy` (for a part with a potential). `State.z` holds the internal states of all parts; their
     names are `"motor.torque"`.
     """
 

@@ -15,7 +15,7 @@ from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
 from .coordinate_parts import AbstractOfCoordinates, shortest, turns
 
-# Points of a tendon coincide if they are no farther apart than this share of its length.
+# Largest distance of coinciding points of a tendon, relative to its length.
 _APART = 1e-9
 
 
@@ -42,8 +42,8 @@ class AbstractCombination(AbstractOfCoordinates):
 
 
 class JointCoupling(AbstractCombination, AbstractConstraint):
-    """A coordinate that is a polynomial of another one, or a sum of polynomials of several others. Rows 1:
-    `(x − zero) − Σᵢ Σₖ coefficients[i, k] (yᵢ − other_zero[i])ᵏ`.
+    """A coordinate that is a polynomial of another coordinate, or a sum of polynomials of several. Rows 1: `(x − zero)
+    − Σᵢ Σₖ coefficients[i, k] (yᵢ − other_zero[i])ᵏ`.
 
     ```python
     link = planar.Body("link", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(1.5, 0.0))

@@ -173,7 +173,7 @@ class Janosi(AbstractFrictionLaw):
 
 class AbstractContact(AbstractPotentialForce):
     """Base class of contacts with one terrain. Subclasses define the distance from the ground (`distance`, `outward`)
-    and the onset of damping (`onset`); the fields are those of `Contact`.
+    and the onset of damping (`onset`); fields as in `Contact`.
     """
 
     name: str = fields.name()

@@ -167,7 +167,7 @@ class DryFriction(AbstractDryFriction):
 
     Several contacts in space that stick, such as the feet of a table, share undetermined forces. These are as small as
     possible, and where a contact reaches its limit others take more. If the normal forces are undetermined too, as with
-    four feet, the motion in slip may be undetermined, and the run may end with a failure. In the plane the run finds a
+    four feet, the motion in slip may be as well, and the run may end with a failure. In the plane the run finds a
     possible distribution, in which a foot of a body at rest may be at its limit: its mode is slip, at velocity zero,
     and another foot bears the rest. The motion and the sum of the forces are determined.
 

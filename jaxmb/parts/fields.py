@@ -126,7 +126,7 @@ def as_parameter(value: Any) -> Any:
 
     It is a JAX array if any entry is traced, otherwise a read-only NumPy array: building a scene compiles nothing.
 
-    **Raises:** `ValueError` for anything but a real number or an array of real numbers.
+    **Raises:** `ValueError` unless it is a real number or an array of real numbers.
     """
     dtype = default_float()
     if is_traced(value):
@@ -440,8 +440,8 @@ def module() -> Any:
     net: Any = jaxmb.parts.module()
     ```
 
-    The weights are all arrays of floating-point numbers in it; everything else, such as sizes and functions, is static.
-    The kernels of the part call it as the module, `self.net(x)`; `self.net.module` is the module itself.
+    The weights are all arrays of floating-point numbers in it; the rest, such as sizes and functions, is static. The
+    kernels of the part call it as the module, `self.net(x)`; `self.net.module` is the module itself.
     """
     return _field(_MODULE_FIELD, converter=_MODULE, kw_only=True)
 

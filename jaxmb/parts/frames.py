@@ -26,7 +26,7 @@ class AbstractFrame(AbstractPart):
 
     @abc.abstractmethod
     def own_pose(self, space: AbstractSpace, pose: Pose) -> Pose:
-        """The frame's pose from that of its base, with or without prepared quantities."""
+        """The frame's pose from its base's, with or without prepared quantities."""
 
     @abc.abstractmethod
     def own_velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
@@ -48,7 +48,7 @@ class AbstractFrame(AbstractPart):
     # From the body itself.
 
     def pose(self, space: AbstractSpace, pose: Pose) -> Pose:
-        """The frame's pose from that of the body; with prepared quantities if the body's has them."""
+        """The frame's pose from the body's; with prepared quantities if the body's has them."""
         found = self.own_pose(space, pose if self.base is None else self.base.pose(space, pose))
         return space.prepare(found) if pose.shape[0] > found.shape[0] else found
 
@@ -70,7 +70,7 @@ class AbstractFrame(AbstractPart):
             pose, wrench = self.base.pose(space, pose), self.base.wrench_on_frame(space, pose, wrench)
         d = space.dimension
         at_origin = space.point_force(pose, self.own_point(jnp.zeros(d, wrench.dtype)), wrench[:d])
-        # Components of moments change like those of angular velocities.
+        # Moments transform like angular velocities.
         moment = jnp.concatenate([jnp.zeros_like(wrench[:d]), wrench[d:] - at_origin[d:]])
         return jnp.concatenate([wrench[:d], self.own_velocity(space, pose, moment)[d:]])
 

@@ -1,10 +1,10 @@
 """Modes of contacts and of dry friction: coordinates that select their laws.
 
 A contact is open (0), closed (1), or closed while other closed contacts imply it and take the force (2). Dry friction
-in one direction does nothing (0), slips forwards or backwards (1, -1), sticks (2), or sticks while other sticking
-friction implies it and takes the force (3). Friction in two directions has two modes. Both have the same number if it
-does nothing or sticks. In slip they are the components of a vector near the direction of slip: of length one, or one
-half if slip has just begun from rest and is not visible yet.
+in one direction is inactive (0), slips forwards or backwards (1, -1), sticks (2), or sticks while other friction
+implies it and takes the force (3). Friction in two directions has two modes. Both have the same number if it is
+inactive or sticks. In slip they are the components of a vector near the direction of slip: of length one, or one half
+if slip has just begun from rest and is not visible yet.
 """
 
 from typing import NamedTuple
@@ -33,8 +33,8 @@ def kind_of(mode: Float[Array, "..."]) -> Float[Array, "..."]:
 def slip_direction(modes: Float[Array, "rows"], slip: Float[Array, "rows"]) -> Float[Array, "rows"]:
     """The unit vector against which dry friction acts, by its modes; zero where it sticks or is free.
 
-    In two directions it is the direction of the slip, on the side of the modes, so that the force does not jump where
-    slip passes through zero. It is the direction of the modes if slip has just begun, or is zero.
+    In two directions it is the direction of the slip, on the side of the modes: the force does not jump where slip
+    passes through zero. It is the direction of the modes if slip has just begun, or is zero.
     """
     if modes.size == 1:
         return jnp.where(jnp.abs(jnp.round(modes)) == FORWARD, jnp.round(modes), 0.0)
@@ -138,7 +138,7 @@ class Modes(NamedTuple):
         return SlipInPlane(modes, norm(modes))
 
     def slips(self, slip: Float[Array, "frictions"]) -> Float[Array, "frictions"]:
-        """The directions of slip, from its velocities; zero where nothing slips."""
+        """The directions of slip, from its velocities; zero without slip."""
         slips = jnp.where(self.slides, self.of_friction, FREE)
         if not self.pairs:
             return slips

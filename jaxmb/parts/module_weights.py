@@ -14,7 +14,7 @@ from ..linalg.arrays import ARRAYS, is_traced
 
 
 class ModuleWeights(eqx.Module):
-    """A module as the vector of its weights, and the rest, which is static. A call is one of the module.
+    """A module as the vector of its weights, and the rest, which is static. A call calls the module.
 
     The weights are all arrays of floating-point numbers, raveled one after the other in the order of `jax.tree.leaves`.
 
@@ -36,7 +36,7 @@ class ModuleWeights(eqx.Module):
 
 @functools.singledispatch
 def as_weights(module: Any) -> ModuleWeights:
-    """A module as its weights and the rest; `ModuleWeights` stay as they are.
+    """A module as its weights and the rest; `ModuleWeights` are returned unchanged.
 
     **Raises:** `ValueError` for a module without weights, and for arrays that are not of floating-point numbers, which
     are neither weights nor static.

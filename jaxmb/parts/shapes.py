@@ -123,7 +123,7 @@ class Sphere(AbstractShape):
 class Ellipsoid(AbstractShape):
     """An ellipsoid with its centre at the position.
 
-    **Arguments:** `radii` [m], shape (3,), along its own axes.
+    **Arguments:** `radii` [m], shape (3,), along its axes.
     """
 
     radii: VectorLike
@@ -137,7 +137,7 @@ class Ellipsoid(AbstractShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cylinder(AbstractShape):
-    """A cylinder along its own z axis, with its centre at the position; see also `cylinder_between` and `wheel`.
+    """A cylinder along its z axis, with its centre at the position; see also `cylinder_between` and `wheel`.
 
     **Arguments:** `radius` [m]; `length` [m].
     """
@@ -156,7 +156,7 @@ class Cylinder(AbstractShape):
 class Mesh(AbstractShape):
     """A surface of triangles; `Mesh.read` reads one from a file.
 
-    **Arguments:** `vertices` [m], shape (n, 3), in the shape's own axes; `faces`, shape (m, 3): the vertices of each
+    **Arguments:** `vertices` [m], shape (n, 3), in the shape's axes; `faces`, shape (m, 3): the vertices of each
     triangle, counter-clockwise seen from outside.
     """
 
@@ -188,7 +188,7 @@ class Mesh(AbstractShape):
         `position`, `orientation` and `color` as for all shapes.
 
         **Raises:** `ImportError` without trimesh, which `jaxmb[view]` installs; `ValueError` for a file that trimesh
-        cannot read, such as one without an extension, which tells its format.
+        cannot read, such as without an extension, which specifies its format.
         """
         try:
             import trimesh
@@ -211,7 +211,7 @@ class Mesh(AbstractShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ground(AbstractShape):
-    """Ground that reaches as far as the motion; a picture draws the part of it that it shows.
+    """Ground without limits; a picture draws the visible part.
 
     **Arguments:** `height(place)`: height [m] above the shape's plane z = 0 at the place, shape (2,), in its axes; in
     the plane above y = 0, shape (1,). None for level ground.
@@ -242,7 +242,7 @@ def cylinder_between(start: VectorLike, end: VectorLike, radius: float, **place:
 
 
 def capsule(radius: float, length: float, **place: Any) -> tuple[AbstractShape, ...]:
-    """A cylinder along its own z axis with a half ball at either end; `length` [m]: without these."""
+    """A cylinder along its z axis with a half ball at either end; `length` [m] without the half balls."""
     middle = Cylinder(radius, length, **place)
     top: Any = np.array([0.0, 0.0, 0.5 * length])
     half = rot.rotate(middle.orientation, top)

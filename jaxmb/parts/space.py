@@ -91,7 +91,7 @@ class AbstractSpace(abc.ABC):
 
     @abc.abstractmethod
     def normalize(self, pose: Pose) -> Pose:
-        """The nearest pose that satisfies the pose's own invariant (unit Euler parameters)."""
+        """The nearest pose with unit Euler parameters."""
 
     @abc.abstractmethod
     def placement(self, pose: Pose) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
@@ -170,8 +170,8 @@ def rate_of(
 
 
 def with_drift(part: Any, rate: Array, function: Callable[[Any], Array]) -> Array:
-    """The `rate` of `function(part)` by the motion of the bodies, plus its rate by the part's numbers that are inputs,
-    such as a point that moves in its body.
+    """The `rate` of `function(part)` by the motion of the bodies, plus its rate by inputs, such as a point that moves
+    in its body.
     """
     if part.drift is None:
         return rate

@@ -32,7 +32,7 @@ class Tyre(AbstractDynamicForce, AbstractPotentialForce):
     ```
 
     The tread deflects in each direction as `ḋ = −v_s − (V/σ) d`, with the slip velocity v_s of the wheel's lowest point
-    and the rolling speed `V = √(v² + transition_speed²)` of its centre, so that in steady rolling the slips `d/σ` are
+    and the rolling speed `V = √(v² + transition_speed²)` of its centre. In steady rolling the slips `d/σ` are thus
     `−v_s/V`; the lateral slip is the tangent of the slip angle. With `s = c d/(σ μ)`, the force on the wheel at its
     lowest point is `μ N tanh(|s|) s/|s|`, with the load N: `c N d/σ` for small slips, and friction for large ones. The
     wheel's inclination only moves the contact; there is no aligning torque or rolling resistance.
@@ -157,8 +157,8 @@ class Tyre(AbstractDynamicForce, AbstractPotentialForce):
         return over_ground(self, space.point(pose, self.centre), space.point_velocity(pose, velocity, point))
 
     def _contact(self, space, pose, velocity):
-        """The ground's normal, the wheel's lowest point fixed in the body, the directions along the ground, the slip
-        velocities along them, and the rolling speed, regularised.
+        """The ground's normal, the wheel's lowest point in the body's frame, the directions along the ground, the slip
+        velocities along them, and the regularised rolling speed.
         """
         centre = space.point(pose, self.centre)
         normal = outward(self.terrain, centre)

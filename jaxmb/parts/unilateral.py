@@ -1,8 +1,8 @@
 """Unilateral constraints: gaps that close at an instant, with an impact, and open again.
 
-A gap is a function of the poses of bodies that stays non-negative. Where it is open the part does nothing; where it is
-closed, `gap = 0` is a constraint like that of a joint, whose force pushes and never pulls. `simulate` finds the times
-of impacts and of loss of contact within its steps. Every pair that may touch must be named; no others are searched for.
+A gap is a function of the poses of bodies that stays non-negative. An open gap has no effect; a closed gap is a
+constraint `gap = 0`, as in a joint, whose force pushes and never pulls. `simulate` finds the times of impacts and of
+loss of contact within its steps. Every pair that may touch must be named; no others are searched for.
 """
 
 import abc

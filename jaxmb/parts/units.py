@@ -25,7 +25,7 @@ def power_of_length(unit: str) -> float:
     """The power of the metre in a unit such as `"N m/rad"` or `"kg m²"`, written in metres, kilograms, seconds and
     amperes.
 
-    **Raises:** `ValueError` for anything but a product of powers of SI units over another one.
+    **Raises:** `ValueError` unless it is a product of powers of SI units, perhaps over another product.
     """
     power = 0.0
     for sign, side in zip((1, -1), unit.split("/", 1), strict=False):

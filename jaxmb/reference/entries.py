@@ -212,7 +212,7 @@ def _fields(cls: type) -> dict[str, str]:
 
 
 def further_fields(entry: Entry, given: Iterable[str]) -> dict[str, str]:
-    """The fields of a class itself, except those `given` as parameters."""
+    """The fields of a class itself, except the `given` parameters."""
     return {name: annotation for name, annotation in _annotations(entry.thing).items() if name not in given}
 
 

@@ -82,7 +82,7 @@ def stress_test(
 
     For other tolerances, other lengths (by dimensional analysis) and doubled joints, the reference is the motion of the
     given system. For other variants, two of the methods `Adams`, `Dopri8` and `Hermite` at a tight tolerance give a
-    reference, and errors below ten times their difference are unknown. Variants that differ in numbers only share a
+    reference; errors below ten times their difference are unknown. Variants that differ in numbers only share a
     compiled program.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`, or a mechanism of the library alone; `rtol`; `solver`,

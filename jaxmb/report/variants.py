@@ -40,7 +40,7 @@ def _unit(part: Any, field: str, declared: Declaration) -> str | None:
 
 
 def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State]:
-    """All lengths of a system times a factor, with masses and times as they are.
+    """All lengths of a system times a factor, with unchanged masses and times.
 
     Every parameter is scaled by its unit, so the motion is the same in units of the system's size.
 

@@ -76,8 +76,8 @@ def work_precision(
 
     **Returns:** a `Table` with a row for each solver and tolerance. `error` is the largest error, "small" if it is
     below the accuracy of the reference, and "failed" for a failed run, with a note on the reason. Times are the
-    shortest and the median of warm runs, and the time to compile the solver's program, which serves all tolerances, or
-    to read it from disk. `steps` includes rejected steps; `evaluations` of the accelerations are None if unknown.
+    shortest and the median of warm runs, and the time to compile the solver's program (or read it from disk), which
+    serves all tolerances. `steps` includes rejected steps; `evaluations` of the accelerations are None if unknown.
 
     **Raises:** `ValueError` for no solvers, no tolerances or no repeats, and for a system without state or `t1`.
     """

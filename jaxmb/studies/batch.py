@@ -50,10 +50,10 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
 
     - `function`: of any arguments by position, pytrees of arrays, to a pytree of arrays; it is traced by JAX.
     - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
-        which the numbers that the largest loop of the function carries from step to step stay in the cache of a core.
-        It is 1 if that loop becomes one kernel, by `setup(compile="for speed")`: this is as fast, and no member waits
-        for another. It is 8 by `setup(compile="for batches")`, with members side by side in the registers of a
-        processor. A function without loops has one block, and so have all functions on other devices than a CPU.
+        which the numbers carried by the function's largest loop stay in the cache of a core. It is 1 if that loop
+        becomes one kernel, by `setup(compile="for speed")`: this is as fast, and no member waits for another. It is 8
+        by `setup(compile="for batches")`, with members side by side in the registers of a processor. A function without
+        loops has one block, and so have all functions on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array. Its results have members
     along axis 0 as well. It is compiled at its first call. Values other than arrays, such as names, are the same for

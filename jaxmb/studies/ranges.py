@@ -21,8 +21,8 @@ else:
 
 Bounds = tuple[ArrayLike | None, ArrayLike | None]
 
-# An estimate is at an end of its range if its distance is smaller than this, relative to the start's distance, and
-# smaller than `_INDISTINCT` standard deviations.
+# An estimate is at an end of its range if its distance from it is below this fraction of the start's distance, and
+# below `_INDISTINCT` standard deviations.
 _NEAR, _INDISTINCT = 1e-3, 0.1
 
 

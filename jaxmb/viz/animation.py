@@ -73,17 +73,17 @@ def show(
     turns, shifts and zooms it. It shows the saved states at their times only: save the motion at 30 or more times a
     second, by `saveat=`.
 
-    Bodies are drawn in the shapes of their parts, such as wheels, as bars from the mass centre to the points where
-    parts act, or without such points as the cuboid with their inertia. Springs, rods and tracks are drawn between their
-    points, terrain and planes as far as the motion reaches. Shapes have no effect on the motion.
+    Bodies are drawn in the shapes of their parts, such as wheels, or as bars from the mass centre to the points where
+    parts act. Without such points a body is the cuboid with its inertia. Springs, rods and tracks are drawn between
+    their points, terrain and planes as far as the motion reaches. Shapes have no effect on the motion.
 
     **Arguments:**
 
     - `trajectory`: a motion of a scene; a list of motions, or a dictionary by name, such as motions before and after a
         change, or members of a sweep.
     - `points`: the names of bodies (mass centres), frames or joints that leave a trail, or a single name.
-    - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale,
-        on the last body of a joint, and on each body of a force element.
+    - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale.
+        Arrows act on the last body of a joint, and on each body of a force element.
     - `shapes`: shapes of bodies by name, instead of the default, one or several from `jaxmb.shapes`, each placed in the
         frame of its body; also of the `"ground"`.
     - `frames`: the largest number of saved times that are shown.

@@ -32,9 +32,9 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     jaxmb.viz.plot_mechanism(motion, frames=4).savefig("poses.png")
     ```
 
-    Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars from their mass centre to
-    the points where parts act on them, in space as lines; springs, rods and tracks between their points; in the plane
-    with terrain. Up to 8 bodies have paths and a legend.
+    Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars (in space lines) from the
+    mass centre to the points where parts act. Springs, rods and tracks are drawn between their points, and in the plane
+    the terrain. Up to 8 bodies have paths and a legend.
 
     **Arguments:** `trajectory`: a motion of a planar or spatial scene; `frames`: the number of poses, at least 1.
 

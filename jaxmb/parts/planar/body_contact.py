@@ -1,7 +1,7 @@
 """Compliant contact between bodies in the plane: a disc of one body on plates or discs of others.
 
-The laws are those of contact with terrain: the force is a function of the depth to which the disc has entered the other
-body, so contact adds no constraint and no event.
+The laws are the same as for contact with terrain. The force is a function of the penetration depth, so contact adds no
+constraint or event.
 """
 
 import abc
@@ -44,9 +44,9 @@ class _Disc:
 
 
 class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
-    """Base class of contacts of one disc with other bodies. Subclasses define numbers for each other body (`surfaces`).
-    From these and the place of the disc's centre in the other body's frame, they define the distance from the surface
-    (`distance`) and the fraction of the force that acts (`share`).
+    """Base class of contacts of one disc with other bodies. Subclasses define numbers for each other body (`surfaces`),
+    the distance from its surface (`distance`) and the fraction of the force that acts (`share`). Both are functions of
+    these numbers and of the disc's centre in the other body's frame.
 
     The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
 
@@ -188,10 +188,9 @@ class PlateContact(AbstractBodyContact):
     ```
 
     A plate bears on both sides: it pushes a disc to the side of the disc's centre. A disc whose centre is driven across
-    the line leaves on the other side. Near the ends the force fades. The depth is measured from the plate's line, and
-    the potential is the energy of `normal` times a step with two continuous derivatives, from one at the distance
-    `edge` before the end to zero as far behind it. Two plates in line thus bear a disc like a single plate, at any
-    depth.
+    the line leaves on the other side. Near the ends the force fades. The depth is measured from the plate's line; the
+    potential is the energy of `normal` times a C² step, from one at the distance `edge` before the end to zero as far
+    behind it. Two plates in line thus bear a disc like a single plate, at any depth.
 
     In a chain that bends away from the disc, neither plate bears at a corner. With `chain=True` the plates form a
     closed chain, each beginning at the end of the previous plate, and the corners bear as well. The depth at a corner

@@ -1,7 +1,7 @@
 """Spatial joints.
 
-In their classes `A` and `B` are the world positions of the two points, `d = B − A`, `a` and `b` the two axes, `u` and
-`v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
+In their classes `A` and `B` are the world positions of the two points, `d = B − A`, and `a` and `b` the two axes. `u`
+and `v` are unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
 
 Parallel axes point the same way. Their rows are the tilt: the components along u and v of `2 sin(θ/2)` times the unit
 vector of `b` across `a`, with the angle θ between the axes. The tilt vanishes only if the axes agree, not if they are
@@ -161,8 +161,9 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     ```
 
     Its coordinates [rad] are `angle_a`, the turn of the cross in `body_a` about `axis_a`, and `angle_b`, the turn of
-    `body_b` on the cross about `axis_b`, both zero at the given poses. The relative attitude is the product of the turn
-    by `angle_a`, the attitude at zero, and the turn by `angle_b`. The angles are smooth in every position of the joint.
+    `body_b` on the cross about `axis_b`; both are zero at the given poses. The relative attitude is the product of the
+    turn by `angle_a`, the attitude at zero, and the turn by `angle_b`. The angles are smooth in every position of the
+    joint.
 
     **Arguments:**
 
@@ -228,9 +229,9 @@ class Gimbal(AbstractOriented):
     system = jaxmb.Scene([arm], joints=[gimbal]).compile()
     ```
 
-    Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the first axis, which is fixed in
-    `body_a`, the second and the third, which is fixed in `body_b`; all are zero at the given poses, unless
-    `orientation` is given. They are smooth except where the second is a quarter turn, in (−π/2, π/2).
+    Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the three axes; the first is fixed in
+    `body_a`, the third in `body_b`. All are zero at the given poses, unless `orientation` is given. They are smooth
+    except where the second is a quarter turn, in (−π/2, π/2).
 
     **Arguments:**
 

@@ -37,9 +37,8 @@ class Identification(Printed, Fit):
     - `deviations`: standard deviations by name, of the same shapes, from the residuals' Jacobian at the solution.
         Without `sigma`, or with a robust loss, the noise is estimated from the residuals; a robust loss gives the
         deviations of Huber's M-estimate, valid for any distribution of the noise. Infinite for parameters that the data
-        do not determine. NaN if meaningless: the iteration did not converge, the residuals are not noise of the size of
-        `sigma`, the estimate is at an end of its range, or the noise must be estimated from no more residuals than
-        parameters.
+        do not determine. NaN if meaningless: the iteration did not converge; the residuals are not noise of the size of
+        `sigma`; the estimate is at an end of its range; or unknown noise has no more residuals than parameters.
     - `covariance` of all components, in the order of `components`, the names of all scalar components; from the problem
         linearised at the solution, also if meaningless.
     - `undetermined`: names of components that can change, alone or together, without changing the residuals;
@@ -107,8 +106,8 @@ class Identification(Printed, Fit):
         steps of half a standard deviation from the estimate, until beyond the ends of the interval.
 
         **Returns:** a `Profile`. Without known noise levels, the ratios are likelihood ratios with the most likely
-        noise level for each value. With a robust loss, twice the differences of the objective are divided by the ratio
-        of the mean square of its slopes to its mean curvature, which makes them χ² distributed.
+        noise level for each value. With a robust loss, twice the differences of the objective are divided by the mean
+        square of its slopes over its mean curvature, which makes them χ² distributed.
 
         **Raises:** `ValueError` for an unknown component, a level that is not between 0 and 1, values out of bounds,
         and after multiple shooting.

@@ -30,7 +30,7 @@ from .unknowns import Prior, experiments_by_name, sensors_by_name, unknowns
 _NO_EFFECT = 1e-10
 
 
-@functools.partial(names_arguments, gone={"method": "it is Levenberg–Marquardt; optax needs a loss of your own"})
+@functools.partial(names_arguments, gone={"method": "it is Levenberg–Marquardt; optax needs a user-defined loss"})
 def identify(
     system: AbstractSystem,
     measured: Any = None,
@@ -99,11 +99,11 @@ def identify(
     - `prior`: `(mean, deviation)` by name, of a normal distribution. Needs the noise levels, known or free.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of residuals in units of
         their noise, with time as axis 0.
-    - `loss`: the weight of residuals r, in units of σ. The fit minimises `½ Σ ρ(r²)`, with ρ of "linear", least
-        squares, or for data with outliers "soft_l1", `2 (√(1 + r²) − 1)`, or "huber", `r²` up to one σ and `2 |r| − 1`
-        beyond, as in `scipy.optimize.least_squares`. The robust losses need `sigma` in numbers, or a residual function.
-        A residual beyond about one σ then has the influence of one σ, and deviations are estimated from the residuals
-        (Huber's M-estimate).
+    - `loss`: the weight of residuals r, in units of σ. The fit minimises `½ Σ ρ(r²)`, as in
+        `scipy.optimize.least_squares`: "linear" is least squares; for data with outliers, "soft_l1" is `2 (√(1 + r²) −
+        1)`, and "huber" is `r²` up to one σ and `2 |r| − 1` beyond. The robust losses need `sigma` in numbers, or a
+        residual function. A residual beyond about one σ then has the influence of one σ, and deviations are estimated
+        from the residuals (Huber's M-estimate).
     - `starts`: the number of starting points. The first is `free`; the others are drawn with `seed` between the bounds
         or, without bounds, from a normal distribution of the size of the start. Or further starting values, one mapping
         for each start. They are simulated in one batch, and the best minimum is returned.

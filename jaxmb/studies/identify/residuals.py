@@ -9,8 +9,8 @@ from .experiment import RESIDUAL, ExperimentModel
 from .problem import Problem
 from .sensors import Channel
 
-# Residuals do not matter below half a standard deviation of known noise, or for unknown noise below a thousandth of the
-# data's range, about the errors of simulations and instruments.
+# Negligible residuals, in standard deviations of known noise, and for unknown noise relative to the data's range: about
+# the errors of simulations and instruments.
 _SMALL, _SMALL_OF_RANGE = 0.5, 1e-3
 # Outliers are residuals beyond this number of standard deviations: one in two million of normal noise.
 _FAR = 5.0

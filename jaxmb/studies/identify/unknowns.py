@@ -49,9 +49,7 @@ class Priors(eqx.Module):
 
 
 class Unknowns(NamedTuple):
-    """Unknowns, the experiments as functions of their own, and for each experiment the names of its unknowns among
-    all.
-    """
+    """Unknowns, the experiments as functions of theirs, and for each experiment the names of its unknowns among all."""
 
     free: FreeParameters
     trials: tuple[ExperimentModel, ...]
@@ -161,7 +159,7 @@ def _with_named(prefix: str, experiment: Experiment, given: Mapping[str, Any]) -
     starts = dict.fromkeys(initial) | (dict(named) if isinstance(named, Mapping) else dict.fromkeys(named))
     own = tuple(dict.fromkeys((*experiment.own, *own)))
     if experiment.held_out and (own or starts):
-        raise ValueError(f"Experiment {prefix!r} is held out and can have no unknowns of its own; give their values.")
+        raise ValueError(f"Experiment {prefix!r} is held out and cannot have its own unknowns; give their values.")
     return dataclasses.replace(experiment, own=own, free_initial=starts)
 
 

@@ -127,8 +127,8 @@ def body_index(system: AbstractSystem) -> BodyIndex:
 
 class Bodies(AbstractCarrier):
     """Bodies turn with `turning` Ω [rad/s] about the world's origin and travel with `travel` [m/s], both in world axes,
-    (3,) and (bodies, 3), and spin in addition with `spins` [rad/s], in body axes, (bodies that rotate, 3). Scalar
-    coordinates and counts of turns `advance` at constant rates.
+    (3,) and (bodies, 3). They also spin with `spins` [rad/s], in body axes, (bodies that rotate, 3). Scalar coordinates
+    and counts of turns `advance` at constant rates.
 
     `ṙ = travel + Ω × r`, `ṗ = ½ (Ω p + p s)`, `v̇ = Ω × v`, `ω̇ = ω × s`.
     """

@@ -186,7 +186,7 @@ def remaining(system: AbstractSystem, residual) -> str:
         )
     if listed:
         return f"accelerations remain along {listed}, in m/s² and rad/s²"
-    return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from those of a uniform motion"
+    return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from the rates of a uniform motion"
 
 
 def _not_steady(system, found):

@@ -216,7 +216,7 @@ def _remaining(rows: Float[Array, "m k"]) -> tuple[Float[Array, "k f"], Bool[Arr
 
 
 def _picked(rows: Float[Array, "c f"], weight: Float[Array, "c"]) -> Int[Array, "f"]:
-    """The rows that determine all free directions best, by full pivoting, in their own order."""
+    """The rows that determine all free directions best, by full pivoting, in ascending order."""
     pivots: PivotSearch = full_pivot(rows.T, scale=weight)
     return jnp.sort(pivots.order.columns[: rows.shape[1]])
 

@@ -84,9 +84,8 @@ def root_locus(
 
     **Returns:** a `RootLocus`, with NumPy arrays.
 
-    **Raises:** `ValueError` for an unknown parameter or a parameter that is not a number, fewer than two values, a
-    missing or superfluous `state`, refusals of `linearise` at the first value, and for values without an equilibrium or
-    steady motion.
+    **Raises:** `ValueError` for an unknown or non-scalar parameter, fewer than two values, a missing or superfluous
+    `state`, refusals of `linearise` at the first value, and values without an equilibrium or steady motion.
     """
     case = _case(system, name, state)
     given = np.asarray(real_array("root_locus: values", values, np.result_type(float), None))

@@ -75,8 +75,8 @@ def steady_motion(
 
     **Returns:** a `State` on the constraints, differentiable with respect to parameters and prescribed values.
 
-    **Raises:** `ValueError` for unknown names, for a system with dry friction that may stick, if there is no such
-    motion, with the remaining accelerations, and if an open contact would overlap or a closed contact would have to
+    **Raises:** `ValueError` for unknown names; for a system with dry friction that may stick; if there is no such
+    motion, with the remaining accelerations; and if an open contact would overlap or a closed contact would have to
     pull. Under `jit` the result is NaN instead.
     """
     check_system("steady_motion", system)

@@ -184,7 +184,7 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
 def with_derivatives(program: Program, rows: int) -> Program:
     """The program in the cheaper mode of derivatives that the function allows.
 
-    **Raises:** `ValueError` where the function has no derivatives.
+    **Raises:** `ValueError` for a function without derivatives.
     """
     cheaper = program.space.size <= _TANGENTS_A_ROW * rows
     first: Exception | None = None

@@ -85,9 +85,9 @@ class Optimum(Printed):
     - `iterations`: the log of the local optimisation that gave the result; `trials`: the number of its trials with
         derivatives; `failed`: the number of rejected trials.
     - `attempts`: all local optimisations, the best first, if there were several.
-    - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. Not a
-        minimum are a maximum, a saddle, a point where the objective changes in steps, and an edge beyond which trials
-        fail or the objective leaps up; `message`: the reason of the end.
+    - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. A maximum,
+        a saddle and steps of the objective are not minima, nor an edge beyond which trials fail or the objective leaps
+        up; `message`: the reason of the end.
     - `derivatives`: the mode, `"forward"` or `"reverse"`.
     """
 
@@ -212,8 +212,8 @@ def optimise(
     **Returns:** an `Optimum`: the feasible trial (violation ≤ 1e-6 of the bound) with the smallest objective. If SLSQP
     converged, it is its final point, unless another trial is better and no less feasible.
 
-    **Raises:** `ValueError` for unknown names, bounds that are reversed, a start out of bounds, an objective that is
-    not a number, a function without derivatives, and a start that fails if no constraint leads away from it.
+    **Raises:** `ValueError` for unknown names, reversed bounds, a start out of bounds, an objective that is not a
+    number, a function without derivatives, and a start that fails if no constraint leads away from it.
     """
     where = space(start, bounds, system)
     shapes = output_shapes(Program(function, where, (), False))

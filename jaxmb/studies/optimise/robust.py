@@ -32,7 +32,7 @@ def robust(
     - `function`: as for `optimise`, of named parameters to named outputs, or a number.
     - `samples`: numbers by name with samples as axis 0, the same number for all. For a parameter of the call they are
         deviations from its value; other names are additional parameters, with the samples as values.
-    - `weight`: if given, each output also has its own name: its mean plus `weight` times its spread.
+    - `weight`: if given, each output also appears under its name: mean plus `weight` times spread.
 
     **Returns:** a function of the same parameters, with outputs `"comfort.mean"` and `"comfort.spread"`, the standard
     deviation of the samples, for an output `"comfort"`. All samples are evaluated in one program, in blocks as by
