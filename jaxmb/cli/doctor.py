@@ -122,9 +122,9 @@ def _facts() -> Iterable[tuple[str, str]]:
     yield "jaxmb", f"{__version__}, Python {platform.python_version()}"
     yield "needed", ", ".join(f"{name} {_version(name)}" for name in _NEEDED)
     for extra, names in _OPTIONAL.items():
-        found = {name: _version(name) for name in names}
-        text = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
-        yield f"for {extra}", text if all(found.values()) else f'{text}; pip install "jaxmb[{extra}]"'
+        versions = {name: _version(name) for name in names}
+        text = ", ".join(f"{name} {version or 'missing'}" for name, version in versions.items())
+        yield f"for {extra}", text if all(versions.values()) else f'{text}; pip install "jaxmb[{extra}]"'
     yield "machine", f"{platform.system()} {platform.machine()}, {_processor()}, {_cores()}"
     faults = [fault for name in (*_NEEDED, *sum(_OPTIONAL.values(), ())) if (fault := fault_of(name))]
     if faults:
@@ -175,8 +175,8 @@ def _kept() -> str:
 def _first_calls() -> list[list[str]]:
     """The waiting times of two processes; the second finds the programs of the first in the cache."""
     with tempfile.TemporaryDirectory() as folder:
-        own = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
-        environment = own | {VARIABLE: folder}
+        kept = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+        environment = kept | {VARIABLE: folder}
         both = [_durations(environment) for _ in range(2)]
     rows = [[name, *(f"{durations[place]:.3f}" for durations in both)] for name, place in _SHOWN.items()]
     return [["", "first", "second"], *rows]
@@ -192,16 +192,16 @@ def _durations(environment: dict[str, str]) -> list[float]:
 def _steps() -> list[list[str]]:
     """Numbers of steps of some motions, and the time of a step."""
     motions = [mechanisms.get(name) for name in _STEPPED]
-    runs = [functools.partial(_motion, own.system, own.state, own.t1) for own in motions]
+    runs = [functools.partial(_motion, single.system, single.state, single.t1) for single in motions]
     rows = [["", "bodies", "t1 [s]", "steps", "run [ms]", "step [µs]"]]
-    for own, run, times in zip(motions, runs, interleaved(runs, _REPEATS), strict=True):
+    for single, run, times in zip(motions, runs, interleaved(runs, _REPEATS), strict=True):
         stats, result, _ = run()
         if result != RESULTS.successful:
-            raise RuntimeError(f"{own.name}: {RESULTS[result]}")
+            raise RuntimeError(f"{single.name}: {RESULTS[result]}")
         steps, seconds = int(stats["num_steps"]), min(times)
-        bodies = str(len(own.system.body_names))
+        bodies = str(len(single.system.body_names))
         rows.append(
-            [own.name, bodies, f"{own.t1:g}", str(steps), f"{1e3 * seconds:.1f}", f"{1e6 * seconds / steps:.1f}"]
+            [single.name, bodies, f"{single.t1:g}", str(steps), f"{1e3 * seconds:.1f}", f"{1e6 * seconds / steps:.1f}"]
         )
     return rows
 

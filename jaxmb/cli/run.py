@@ -102,24 +102,24 @@ def _residuals(trajectory: Trajectory) -> str:
 
 
 def _compare(mechanism: Mechanism, trajectory: Trajectory) -> None:
-    known = mechanism.references
-    if known is None:
+    references = mechanism.references
+    if references is None:
         print("There are no reference values for this motion.")
         return
-    print(f"Relative error at {known.times[-1]:g} s against reference values:")
-    print(f"  {known.source}; good to {known.tolerance:.0e}")
+    print(f"Relative error at {references.times[-1]:g} s against reference values:")
+    print(f"  {references.source}; good to {references.tolerance:.0e}")
     errors = mechanism.errors(trajectory)
     width = max(map(len, errors))
     for k, (label, error) in enumerate(errors.items()):
-        print(f"  {label:{width}}  {known.values[-1, k]:20.12g}  {error[-1]:.1e}")
+        print(f"  {label:{width}}  {references.values[-1, k]:20.12g}  {error[-1]:.1e}")
 
 
 def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
     """Estimate the parameter to which the motion is most sensitive, from a noisy sample of the motion."""
     system = mechanism.system
     saved = np.asarray(trajectory.ts)
-    own = np.flatnonzero((saved > 0) & (saved <= _FIT_SHARE * mechanism.t1))[1::2]
-    ts = saved[own]
+    indices = np.flatnonzero((saved > 0) & (saved <= _FIT_SHARE * mechanism.t1))[1::2]
+    ts = saved[indices]
     name = _most_sensitive(mechanism, ts)
     if name is None:
         print("\nNo single number among the parameters has an effect on the motion; there is nothing to identify.")
@@ -127,7 +127,7 @@ def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
     random = np.random.default_rng(0)
     measured, sigma = {}, {}
     for place in system.catalogue.position_quantities():
-        exact = np.asarray(trajectory.quantity(place))[own]
+        exact = np.asarray(trajectory.quantity(place))[indices]
         noise = _NOISE * np.ptp(exact)
         if noise > 0:
             measured[place] = exact + noise * random.standard_normal(exact.shape)
@@ -154,22 +154,22 @@ def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
 
 def _most_sensitive(mechanism: Mechanism, ts) -> str | None:
     """The scalar parameter whose relative change moves positions or coordinates most; None without any effect."""
-    known = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}
-    if not known:
+    scalars = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}
+    if not scalars:
         return None
 
     @eqx.filter_jit
     def positions(system, state, factors):
-        values = {name: value * factor for (name, value), factor in zip(known.items(), factors, strict=True)}
+        values = {name: value * factor for (name, value), factor in zip(scalars.items(), factors, strict=True)}
         changed = with_parameters(system, values)
         start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
         motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-8, throw=False)
         return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.catalogue.position_quantities()])
 
     # Differences suffice for a choice, and compile in a third of the time of derivatives.
-    factors = 1 + _CHANGE * np.eye(len(known) + 1, len(known), -1)
+    factors = 1 + _CHANGE * np.eye(len(scalars) + 1, len(scalars), -1)
     of_all = jax.vmap(positions, in_axes=(None, None, 0))
     first, *others = np.asarray(of_all(mechanism.system, mechanism.state, factors))
-    moved = np.linalg.norm(np.stack(others) - first, axis=1) / _CHANGE
+    changes = np.linalg.norm(np.stack(others) - first, axis=1) / _CHANGE
     size = float(mechanism.system.length)
-    return list(known)[int(np.nanargmax(moved))] if np.nanmax(moved, initial=0.0) > 1e-4 * size else None
+    return list(scalars)[int(np.nanargmax(changes))] if np.nanmax(changes, initial=0.0) > 1e-4 * size else None

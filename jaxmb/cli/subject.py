@@ -20,11 +20,13 @@ from ..states.assembly import assemble
 def mechanism_of(arguments: argparse.Namespace) -> Mechanism:
     """The mechanism, with end and reference values limited to `--t1`."""
     parameters = dict(arguments.set)
-    own = _function(arguments.mechanism) if ":" in arguments.mechanism else None
+    function = _function(arguments.mechanism) if ":" in arguments.mechanism else None
     try:
-        mechanism = mechanisms.get(arguments.mechanism, **parameters) if own is None else _made(own, arguments)
+        mechanism = (
+            mechanisms.get(arguments.mechanism, **parameters) if function is None else _made(function, arguments)
+        )
     except Exception as error:
-        if own is not None or not parameters:
+        if function is not None or not parameters:
             raise
         # A value of the wrong type may fail anywhere in the mechanism.
         given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())

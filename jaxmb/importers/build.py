@@ -121,8 +121,8 @@ class _Builder:
         """A name that is unused in the scene: the file's, or a name that no other element of this kind has in the
         file.
         """
-        own = name.replace(".", "_") or kind
-        tries = itertools.chain([own, f"{own} {kind}".strip()], (f"{own} {k}" for k in itertools.count(2)))
+        plain = name.replace(".", "_") or kind
+        tries = itertools.chain([plain, f"{plain} {kind}".strip()], (f"{plain} {k}" for k in itertools.count(2)))
         is_free = lambda each: each not in self.names and (each == name or each not in self.given.get(kind, ()))
         out = next(each for each in tries if is_free(each))
         self.names.add(out)
@@ -148,7 +148,7 @@ class _Builder:
         a, b = self.fused.placed(chain.parent), self.fused.placed(chain.child)
         name = self._named(" ".join(joint.name for joint in joints), "joint")
         try:
-            found = chains.joint_of(joints, a, b, name)
+            result = chains.joint_of(joints, a, b, name)
         except ValueError as why:
             self.notes.refused.append(
                 f"{joints[0].where}Joints in succession to {b.name!r} are degenerate, {why}: put a link with mass "
@@ -157,15 +157,15 @@ class _Builder:
             return
         if len(joints) > 1:
             listed = ", ".join(f"{joint.name!r}" for joint in joints)
-            self.notes.say(f"Joints {listed} in succession are the {found.parts[0].kind} {name!r}.")
-        if found.half_turn:
+            self.notes.say(f"Joints {listed} in succession are the {result.parts[0].kind} {name!r}.")
+        if result.half_turn:
             self.notes.say(
                 "The second of three hinges in succession is limited to half a turn, between the angles at which the "
                 "three axes lie in one plane: {}.",
-                found.half_turn,
+                result.half_turn,
             )
-        self.joints += found.parts
-        self.coordinates |= found.coordinates
+        self.joints += result.parts
+        self.coordinates |= result.coordinates
         for joint in joints:
             self._passive(joint, a.name, b)
 
@@ -242,7 +242,7 @@ class _Builder:
         if turns and upper - lower >= 2 * np.pi:
             self.notes.say("Limits that allow more than a full turn are left out: {}.", name)
             return
-        own: dict[str, Any] = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
+        law: dict[str, Any] = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
         self.forces.append(
             JointStop(
                 self._named(f"{name} stop"),
@@ -250,7 +250,7 @@ class _Builder:
                 lower=lower,
                 upper=upper,
                 smoothing=_ROUNDING * (upper - lower),
-                **own,
+                **law,
             )
         )
         self.notes.say(
@@ -284,10 +284,10 @@ class _Builder:
     def _say_if_open(self, loop):
         """Note a loop that does not close in the file's pose."""
         a, b = self.fused.links[loop.link_a], self.fused.links[loop.link_b]
-        ends = [own.position + own.rotation @ at for own, at in ((a, loop.point_a), (b, loop.point_b))]
+        ends = [link.position + link.rotation @ at for link, at in ((a, loop.point_a), (b, loop.point_b))]
         off = np.zeros((3, 3)) if loop.rotation is None else a.rotation @ loop.rotation - b.rotation
         gap, angle = np.linalg.norm(ends[1] - ends[0]), 2 * np.arcsin(min(np.linalg.norm(off) / np.sqrt(8), 1.0))
-        size = max(float(np.linalg.norm(own.position)) for own in self.fused.links.values())
+        size = max(float(np.linalg.norm(link.position)) for link in self.fused.links.values())
         shown = [f"{gap:.3g} m"] * bool(gap > _OPEN * max(size, np.linalg.norm(ends))) + [f"{angle:.3g} rad"] * bool(
             angle > _OPEN
         )
@@ -301,10 +301,10 @@ class _Builder:
         for coupling in self.machine.couplings:
             if self.notes.leaves_out("couplings", coupling.name):
                 continue
-            known = self.tendons if coupling.of_tendons else self.coordinates
+            table = self.tendons if coupling.of_tendons else self.coordinates
             ends = coupling.joint, *(other for other, _, _ in coupling.others)
-            found = [self._coordinate(end, "couplings", coupling.name, known) for end in ends]
-            names = [name for name in found if name is not None]
+            resolved = [self._coordinate(end, "couplings", coupling.name, table) for end in ends]
+            names = [name for name in resolved if name is not None]
             if len(names) < len(ends):
                 continue
             name = self._named(coupling.name, "coupling")
@@ -317,11 +317,11 @@ class _Builder:
             for row, (_, powers, _) in zip(coefficients, coupling.others, strict=True):
                 row[1 : 1 + len(powers)] = powers[:size]
             zeros = [zero for _, _, zero in coupling.others]
-            own: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros}
+            numbers: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros}
             if len(ends) == 2:
-                own = {field: values[0] for field, values in own.items()}
+                numbers = {field: values[0] for field, values in numbers.items()}
             self.joints.append(
-                JointCoupling(name, coordinate=names[0], other=tuple(names[1:]), zero=coupling.zero, **own)
+                JointCoupling(name, coordinate=names[0], other=tuple(names[1:]), zero=coupling.zero, **numbers)
             )
             for other, powers, zero in coupling.others:
                 if not coupling.of_tendons and not self._turns_without_end(coupling.joint, powers):
@@ -331,9 +331,9 @@ class _Builder:
         """Whether full turns of another hinge are full turns of this one."""
         return self.of_name[joint].kind == "hinge" and not np.any(powers[1:]) and float(powers[0]).is_integer()
 
-    def _coordinate(self, what, kind, of, known=None):
+    def _coordinate(self, what, kind, of, table=None):
         """The coordinate of a joint, or of another element in `known`."""
-        name = (self.coordinates if known is None else known).get(what)
+        name = (self.coordinates if table is None else table).get(what)
         if name is None:
             self.notes.refuse(kind, of, f"{of!r} acts on {what!r}, which has no coordinate")
         return name
@@ -360,12 +360,12 @@ class _Builder:
 
     def _of_tendon(self, tendon, coordinate):
         if tendon.stiffness or tendon.damping:
-            own: dict[str, Any] = {
+            numbers: dict[str, Any] = {
                 "stiffness": tendon.stiffness,
                 "damping": tendon.damping,
                 "free": tendon.free,
             }
-            self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **own))
+            self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **numbers))
         if tendon.armature and not self.notes.leaves_out("armature", tendon.name):
             self._inertia(tendon.name, coordinate, tendon.armature, of_tendon=True)
         if tendon.friction and not self.notes.leaves_out("friction", tendon.name):
@@ -378,8 +378,8 @@ class _Builder:
         for actuator in self.machine.actuators:
             if self.notes.leaves_out("actuators", actuator.name):
                 continue
-            known = self.tendons if actuator.on_tendon else self.coordinates
-            coordinate = self._coordinate(actuator.of, "actuators", actuator.name, known)
+            table = self.tendons if actuator.on_tendon else self.coordinates
+            coordinate = self._coordinate(actuator.of, "actuators", actuator.name, table)
             if coordinate is None:
                 continue
             if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
@@ -425,13 +425,13 @@ class _Builder:
 
     def _marks(self):
         for name, (carrier, position, rotation) in self.fused.frames().items():
-            own = {"position": position, "orientation": from_matrix(rotation)}
-            self.frames.append(Frame(self._named(name, "link"), carrier, **own))
+            place = {"position": position, "orientation": from_matrix(rotation)}
+            self.frames.append(Frame(self._named(name, "link"), carrier, **place))
         for mark in self.machine.marks:
             carrier, position = self.fused.point(mark.link, mark.position)
             rotation = self.fused.rotation(mark.link) @ mark.rotation
-            own = {"position": position, "orientation": from_matrix(rotation)}
-            self.frames.append(Frame(self._named(mark.name, "frame"), carrier, **own))
+            place = {"position": position, "orientation": from_matrix(rotation)}
+            self.frames.append(Frame(self._named(mark.name, "frame"), carrier, **place))
 
     def _buoyancy(self, name, share):
         link = self.machine.links[name]
@@ -464,7 +464,7 @@ def _names(machine: Machine):
         "actuator": machine.actuators,
         "frame": machine.marks,
     }
-    return {kind: {own.name for own in of_kind} for kind, of_kind in elements.items()}
+    return {kind: {element.name for element in of_kind} for kind, of_kind in elements.items()}
 
 
 def _range(joint: Joint):

@@ -88,8 +88,8 @@ def _composite(joints, a, b, name):
         axes.append(axis)
         points.append(point)
         if joint.kind == "hinge":
-            own = turn_about(axis, joint.reference)
-            turn, shift = turn @ own, turn @ (point - own @ point) + shift
+            rotation = turn_about(axis, joint.reference)
+            turn, shift = turn @ rotation, turn @ (point - rotation @ point) + shift
         elif joint.kind == "slide":
             shift = turn @ (joint.reference * axis) + shift
     sequence = [joint.kind for joint in joints]

@@ -190,7 +190,11 @@ class Machine:
 
 def unused(name: str, is_used: Callable[[str], bool]) -> str:
     """A name, followed by a number if it is already used."""
-    return next(own for own in itertools.chain([name], (f"{name} {k}" for k in itertools.count(2))) if not is_used(own))
+    return next(
+        candidate
+        for candidate in itertools.chain([name], (f"{name} {k}" for k in itertools.count(2)))
+        if not is_used(candidate)
+    )
 
 
 # Rotations

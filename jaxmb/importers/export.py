@@ -75,19 +75,19 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
 
 def _body(parent, node: TreeBody, tree: Tree, mass, inertia):
     above: Any = tree.poses[node.parent]
-    own: Any = tree.poses[node.body]
+    pose: Any = tree.poses[node.body]
     back = rotation_of(above[3:]).T
     element = ElementTree.SubElement(
-        parent, "body", name=tree.bodies[node.body], pos=numbers(back @ (own[:3] - above[:3]))
+        parent, "body", name=tree.bodies[node.body], pos=numbers(back @ (pose[:3] - above[:3]))
     )
-    element.set("quat", numbers(multiply(conjugate(above[3:]), own[3:])))
+    element.set("quat", numbers(multiply(conjugate(above[3:]), pose[3:])))
     full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] if np.any(inertia) else np.array([mass] * 3 + [0.0] * 3)
     ElementTree.SubElement(element, "inertial", pos="0 0 0", mass=numbers(mass), fullinertia=numbers(full))
     for joint in node.joints:
         written = ElementTree.SubElement(element, "joint", name=joint.name, type=joint.kind)
-        turn = rotation_of(own[3:]).T
+        turn = rotation_of(pose[3:]).T
         if joint.kind != "free":
-            written.set("pos", numbers(turn @ (joint.point - own[:3])))
+            written.set("pos", numbers(turn @ (joint.point - pose[:3])))
         if joint.kind in ("hinge", "slide"):
             written.set("axis", numbers(turn @ joint.axis))
             written.set("ref", numbers(joint.value))

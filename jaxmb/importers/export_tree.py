@@ -115,21 +115,21 @@ def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPar
     names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
     for group in groups:
         for k, name in enumerate(group.group.names):
-            own = group.group.single(k, jnp.zeros(()))
+            single = group.group.single(k, jnp.zeros(()))
             bodies = tuple(names[body] for body in group.group.bodies[k] if body in names)
             values = tuple(
                 float(tree.scalars[n - len(system.body_names)]) for n in group.group.bodies[k] if n not in names
             )
             places = np.stack([tree.poses[body] for body in bodies])
-            places = np.asarray(own.seen_poses(SPACE, places))
-            out.append(PlacedPart(name, own, bodies, places, _acts_on(group.group, own, k), values, tree.names))
+            places = np.asarray(single.seen_poses(SPACE, places))
+            out.append(PlacedPart(name, single, bodies, places, _acts_on(group.group, single, k), values, tree.names))
     return out
 
 
 def _acts_on(group, part, k):
     """The coordinates that a part acts on: stacked parts know their joints by number only."""
-    names = [own[k] for keys, own in group.inner if len(keys) == 2 and keys[0] == "joints"]
-    return tuple(f"{name}.{own}" for name, own in zip(names, getattr(part, "within", ()), strict=False))
+    names = [joints[k] for keys, joints in group.inner if len(keys) == 2 and keys[0] == "joints"]
+    return tuple(f"{name}.{coordinate}" for name, coordinate in zip(names, getattr(part, "within", ()), strict=False))
 
 
 def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree:
@@ -157,7 +157,7 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
             tree.nodes.append(TreeBody(body, GROUND, joints))
         else:
             waiting.remove(part)
-            parent, body = sorted(part.bodies, key=lambda own: own not in reached)
+            parent, body = sorted(part.bodies, key=lambda body_name: body_name not in reached)
             tree.nodes.append(TreeBody(body, parent, _oriented(part, tree, body)))
         reached.add(body)
         left.remove(body)
@@ -204,9 +204,12 @@ def _oriented(part, tree, child):
     """A joint as joints of MuJoCo, from the parent to the child."""
     back, single = child == part.bodies[0], len(part.joints) == 1
     joints = []
-    for own in part.joints:
-        joint = own._replace(name=part.name if single else part.named(own.name), axis=-own.axis if back else own.axis)
-        tree.coordinates[f"{part.name}.{own.name}"] = joint
+    for elementary in part.joints:
+        joint = elementary._replace(
+            name=part.name if single else part.named(elementary.name),
+            axis=-elementary.axis if back else elementary.axis,
+        )
+        tree.coordinates[f"{part.name}.{elementary.name}"] = joint
         joints.append(joint)
     return joints[::-1] if back else joints
 
@@ -245,27 +248,27 @@ def _close_weld(part, tree):
 
 
 def _close_coupling(part, tree):
-    own = part.part
+    coupling = part.part
     joints = [tree.coordinates.get(name) for name in part.acts_on]
-    if None in joints or own.coefficients.ndim > 1 or own.coefficients.size > 5:
+    if None in joints or coupling.coefficients.ndim > 1 or coupling.coefficients.size > 5:
         return None
     x, y = joints
-    seen = y.value - float(own.other_zero)
+    seen = y.value - float(coupling.other_zero)
     shift = np.polynomial.Polynomial([seen - part.turns(seen, 0.0, 1), 1.0])
-    polynomial = np.polynomial.Polynomial(np.asarray(own.coefficients))(shift)
+    polynomial = np.polynomial.Polynomial(np.asarray(coupling.coefficients))(shift)
     powers = np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))
-    powers[0] += float(own.zero) - x.value
+    powers[0] += float(coupling.zero) - x.value
     # The row is taken up to full turns of x as well.
     powers[0] -= part.turns(powers[0], 0.0)
     return [("joint", {"name": part.name, "joint1": x.name, "joint2": y.name, "polycoef": numbers(powers)})]
 
 
 def _close_driver(part, tree):
-    own = part.part
+    driver = part.part
     joint = tree.coordinates.get(part.acts_on[0])
-    if joint is None or joint.kind == "ball" or np.any(np.asarray(own.rate)):
+    if joint is None or joint.kind == "ball" or np.any(np.asarray(driver.rate)):
         return None
-    off = float(np.reshape(own.value, -1)[0]) - joint.value
+    off = float(np.reshape(driver.value, -1)[0]) - joint.value
     constant = [off - part.turns(off, 0.0), *itertools.repeat(0.0, 4)]
     return [("joint", {"name": part.name, "joint1": joint.name, "polycoef": numbers(constant)})]
 

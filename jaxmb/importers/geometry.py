@@ -42,15 +42,15 @@ def read_shapes(
                 element.skip()
                 continue
             try:
-                own = place(element)
-                shapes = _read_geometry(element, notes, files, own)
+                placement = place(element)
+                shapes = _read_geometry(element, notes, files, placement)
             except ValueError as error:
                 element.skip()
                 notes.refuse(word, name, str(error))
                 continue
             if tag == "collision":
                 machine.collisions += [(name, shape) for shape in shapes]
-            elif own["color"] is not None:
+            elif placement["color"] is not None:
                 machine.shapes += [(name, shape) for shape in shapes]
 
 
@@ -63,8 +63,8 @@ def _read_geometry(element, notes, files, place):
     try:
         return _read(shape, notes, files, place)
     except ValueError as error:
-        said = str(error)
-        raise ValueError(said if said.startswith(shape.where) else f"{shape.where}{said}") from None
+        text = str(error)
+        raise ValueError(text if text.startswith(shape.where) else f"{shape.where}{text}") from None
 
 
 def _read(shape, notes, files, place) -> tuple[AbstractShape, ...]:

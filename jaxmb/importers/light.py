@@ -16,7 +16,7 @@ def bodies_of(machine: Machine) -> dict[LinkKey, LinkKey]:
     """For each link and the world, the first link of the file that it is fixed to."""
     names: tuple[LinkKey, ...] = (WORLD, *machine.links)
     number = {name: k for k, name in enumerate(names)}
-    welds = [(number[own.parent], number[own.child]) for own in machine.joints if own.kind == "fixed"]
+    welds = [(number[joint.parent], number[joint.child]) for joint in machine.joints if joint.kind == "fixed"]
     return {name: names[k] for name, k in zip(names, connected(len(names), welds), strict=True)}
 
 
@@ -52,7 +52,7 @@ def _alone(machine, notes, joint):
     """Whether no force on a joint can reach another joint."""
     acting = [actuator for actuator in machine.actuators if not actuator.on_tendon and actuator.of == joint.name]
     along = [tendon for tendon in machine.tendons if any(name == joint.name for name, _ in tendon.joints)]
-    coupled = [own for own in machine.couplings if joint.name in _coupled(own)]
+    coupled = [coupling for coupling in machine.couplings if joint.name in _coupled(coupling)]
     if acting or along or len(coupled) > 1:
         return False
     return not coupled or notes.ignore.issuperset(joint.passive)
@@ -67,12 +67,12 @@ def _take_out(machine, links, joints, notes):
     notes.say("Links without mass at the ends of the machine take no force and are left out: {}.", *links)
     machine.links = {name: link for name, link in machine.links.items() if name not in links}
     hangs = lambda joint: joint.child in links or (joint.kind != "fixed" and joint.name in joints)
-    machine.joints = [own for own in machine.joints if not hangs(own)]
+    machine.joints = [element for element in machine.joints if not hangs(element)]
     machine.buoyancy = {name: share for name, share in machine.buoyancy.items() if name not in links}
-    machine.couplings = [own for own in machine.couplings if not _coupled(own) & joints]
-    machine.marks = [own for own in machine.marks if own.link not in links]
-    machine.shapes = [own for own in machine.shapes if own[0] not in links]
-    machine.collisions = [own for own in machine.collisions if own[0] not in links]
+    machine.couplings = [element for element in machine.couplings if not _coupled(element) & joints]
+    machine.marks = [element for element in machine.marks if element.link not in links]
+    machine.shapes = [element for element in machine.shapes if element[0] not in links]
+    machine.collisions = [element for element in machine.collisions if element[0] not in links]
 
 
 def with_rotors(machine: Machine, notes: Notes) -> None:

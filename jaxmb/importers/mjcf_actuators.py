@@ -29,7 +29,7 @@ def _read(mujoco, model, names, notes, k, name):
     transmissions, kind = mujoco.mjtTrn, mujoco.mjtTrn(int(model.actuator_trntype[k]))
     target = int(model.actuator_trnid[k][0])
     # Before MuJoCo 4 every actuator has one control and one force.
-    control, out = (int(getattr(model, f"actuator_{own}adr", range(model.nu))[k]) for own in ("ctrl", "out"))
+    control, out = (int(getattr(model, f"actuator_{word}adr", range(model.nu))[k]) for word in ("ctrl", "out"))
     gear = float(model.actuator_gear[out][0])
     control_range = tuple(model.actuator_ctrlrange[control]) if model.actuator_ctrllimited[control] else None
     if kind == transmissions.mjTRN_BODY:
@@ -74,9 +74,9 @@ def _read(mujoco, model, names, notes, k, name):
     if kind != transmissions.mjTRN_TENDON and model.jnt_actfrclimited[target]:
         if len(_acting_on(mujoco, model, target)) > 1:
             return refuse(f"shares the limit of the actuator force of joint {of!r} with others")
-        own = np.sort(np.array(model.jnt_actfrcrange[target]) / gear)
-        given = own if force_range is None else np.array(force_range)
-        force_range = (max(own[0], given[0]), min(own[1], given[1]))
+        limits = np.sort(np.array(model.jnt_actfrcrange[target]) / gear)
+        given = limits if force_range is None else np.array(force_range)
+        force_range = (max(limits[0], given[0]), min(limits[1], given[1]))
     if kind == transmissions.mjTRN_TENDON:
         for joint in np.flatnonzero(model.jnt_actfrclimited):
             if k in _acting_on(mujoco, model, joint):
@@ -96,7 +96,7 @@ def _read(mujoco, model, names, notes, k, name):
 
 def _acting_on(mujoco, model, joint):
     """Numbers of the actuators that may act on a joint, directly or through a tendon."""
-    kinds, found = mujoco.mjtTrn, []
+    kinds, numbers = mujoco.mjtTrn, []
     for k, (number, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
         kind = kinds(int(number))
         if kind == kinds.mjTRN_BODY:
@@ -105,10 +105,10 @@ def _acting_on(mujoco, model, joint):
             wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
             is_other = lambda w: model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT and model.wrap_objid[w] != joint
             if not all(is_other(w) for w in wraps):
-                found.append(k)
+                numbers.append(k)
         elif kind not in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT) or target == joint:
-            found.append(k)
-    return found
+            numbers.append(k)
+    return numbers
 
 
 def _within(control_range, activation_range):

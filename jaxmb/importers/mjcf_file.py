@@ -51,7 +51,7 @@ def _compiled(spec, notes):
     try:
         return spec.compile()
     except ValueError as error:
-        left_out = [own for own in spec.geoms if _is_weightless(own) and _word(own) in notes.ignore]
+        left_out = [shape for shape in spec.geoms if _is_weightless(shape) and _word(shape) in notes.ignore]
         for geom in left_out:
             notes.say("Shapes are not read, since some of them have wrong numbers: {}.", geom.parent.name)
             spec.delete(geom)
@@ -101,10 +101,10 @@ def _without_pictures(spec: Any, notes: Notes) -> None:
         for element in list(getattr(spec, kind)):
             spec.delete(element)
     folder = Path(spec.modelfiledir or ".") / (spec.meshdir or "")
-    is_missing = lambda own: own.file and not (folder / own.file).exists()
-    for field in [own for own in spec.hfields if is_missing(own)]:
+    is_missing = lambda item: item.file and not (folder / item.file).exists()
+    for field in [item for item in spec.hfields if is_missing(item)]:
         notes.refuse("collisions", field.name, f"The file {field.file!r} of the height field {field.name!r} is missing")
-        for geom in [own for own in spec.geoms if own.hfieldname == field.name]:
+        for geom in [item for item in spec.geoms if item.hfieldname == field.name]:
             spec.delete(geom)
         spec.delete(field)
     missing = {_named(mesh): mesh for mesh in spec.meshes if is_missing(mesh)}

@@ -59,11 +59,11 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
         )
     if model.neq:
         notes.say("Equalities hold exactly: their solref and solimp have no effect.")
-    moved = np.flatnonzero(model.body_mocapid >= 0)
-    if moved.size:
+    mocap = np.flatnonzero(model.body_mocapid >= 0)
+    if mocap.size:
         notes.say(
             "Mocap bodies are held by a joint, whose point_a and orientation may be inputs: {}.",
-            *(named("body", k) for k in moved),
+            *(named("body", k) for k in mocap),
         )
 
 
@@ -75,7 +75,7 @@ def _set(values):
 
 def _check_tendon(mujoco, model, notes, k, name):
     start = model.tendon_adr[k]
-    wraps = {int(own) for own in model.wrap_type[start : start + model.tendon_num[k]]}
+    wraps = {int(wrap) for wrap in model.wrap_type[start : start + model.tendon_num[k]]}
     plain = {int(mujoco.mjtWrap.mjWRAP_JOINT), int(mujoco.mjtWrap.mjWRAP_SITE)}
     if wraps - plain:
         notes.refuse("tendons", name, f"Tendon {name!r} wraps around shapes or pulleys")
@@ -92,8 +92,8 @@ def _colliding(mujoco, model):
         if any(mask):
             body = int(model.geom_bodyid[g])
             types.setdefault((int(model.body_weldid[body]), *mask), set()).add(body)
-    excluded = {int(own) for own in np.asarray(model.exclude_signature)}
-    found = set()
+    excluded = {int(pair) for pair in np.asarray(model.exclude_signature)}
+    colliding = set()
     for (i, type_i, affinity_i), bodies_i in types.items():
         for (j, type_j, affinity_j), bodies_j in types.items():
             if i == j or not (type_i & affinity_j or type_j & affinity_i):
@@ -101,7 +101,7 @@ def _colliding(mujoco, model):
             for a in bodies_i:
                 for b in bodies_j:
                     if (min(a, b) << 16) + max(a, b) not in excluded:
-                        found |= {k for k in (a, b) if model.body_weldid[k]}
+                        colliding |= {k for k in (a, b) if model.body_weldid[k]}
     for k in range(model.npair):
-        found |= {int(model.geom_bodyid[geom]) for geom in (model.pair_geom1[k], model.pair_geom2[k])} - {0}
-    return found
+        colliding |= {int(model.geom_bodyid[geom]) for geom in (model.pair_geom1[k], model.pair_geom2[k])} - {0}
+    return colliding

@@ -42,8 +42,8 @@ class Notes:
 
     def say(self, sentence: str, *names: str | int) -> None:
         """Note a sentence once; names of elements, or their lines in the file, take the place of `{}`."""
-        own = self.said.setdefault(sentence, [])
-        own += [repr(name) for name in dict.fromkeys(names) if repr(name) not in own]
+        listed = self.said.setdefault(sentence, [])
+        listed += [repr(name) for name in dict.fromkeys(names) if repr(name) not in listed]
 
     def leaves_out(self, kind: str, name: str = "") -> bool:
         """Whether a kind of element, or the element of this name, is to be left out; an omission is noted."""
@@ -72,7 +72,7 @@ class Notes:
             listed = "".join(f"\n- {sentence}" for sentence in self.refused)
             raise ValueError(f"{file} has elements that {what}:{listed}")
         # Names in a sentence may contain braces.
-        return {said.replace("{}", _listed(names)): tuple(names) for said, names in self.said.items()}
+        return {note.replace("{}", _listed(names)): tuple(names) for note, names in self.said.items()}
 
 
 def _listed(names):

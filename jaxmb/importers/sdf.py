@@ -93,10 +93,10 @@ def _scopes(models, notes):
     for model in models:
         name = model.attributes.get("name", "model")
         tries = itertools.chain([name], (f"{name} {k}" for k in itertools.count(2)))
-        own = next(own for own in tries if f"{own}::" not in out)
-        if own != name:
-            notes.say("Models have other names, since the file's names are not unique: {}.", f"{name} → {own}")
-        out.append(f"{own}::")
+        unique = next(unique for unique in tries if f"{unique}::" not in out)
+        if unique != name:
+            notes.say("Models have other names, since the file's names are not unique: {}.", f"{name} → {unique}")
+        out.append(f"{unique}::")
     return out
 
 
@@ -132,16 +132,16 @@ def _true(word: str) -> bool:
 
 def _pose(element: Element, notes: Notes):
     """Position and rotation of a `<pose>`."""
-    own = element.first("pose")
-    if own is None:
+    pose = element.first("pose")
+    if pose is None:
         return np.zeros(3), np.eye(3)
-    relative = own.attributes.get("relative_to", own.attributes.get("frame", ""))
+    relative = pose.attributes.get("relative_to", pose.attributes.get("frame", ""))
     if relative not in ("", "__model__"):
-        raise ValueError(f"{own.where}a pose relative to {relative!r}: give it in the model's frame.")
-    words = own.text.split()
-    numbers = own.numbers(count=6)
-    angles = [_rounded(word, value, own, notes) for word, value in zip(words[3:], numbers[3:], strict=True)]
-    if _true(own.attributes.get("degrees", "")):
+        raise ValueError(f"{pose.where}a pose relative to {relative!r}: give it in the model's frame.")
+    words = pose.text.split()
+    numbers = pose.numbers(count=6)
+    angles = [_rounded(word, value, pose, notes) for word, value in zip(words[3:], numbers[3:], strict=True)]
+    if _true(pose.attributes.get("degrees", "")):
         angles = [np.deg2rad(value) for value in numbers[3:]]
     return numbers[:3], roll_pitch_yaw(angles)
 
@@ -170,9 +170,9 @@ def _read_link(element, scope, machine, place, notes, files):
     if inertial is not None:
         link.centre, turn = _pose(inertial, notes)
         link.mass = inertial.number("mass", 1.0)
-        own = inertial.first("inertia")
+        moments = inertial.first("inertia")
         xx, xy, xz, yy, yz, zz = (
-            default if own is None else own.number(moment, default) for moment, default in _INERTIA.items()
+            default if moments is None else moments.number(moment, default) for moment, default in _INERTIA.items()
         )
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
         if _true(inertial.attributes.get("auto", "")):
@@ -201,18 +201,18 @@ def _read_link(element, scope, machine, place, notes, files):
 def _read_joint(element, scope, machine, of_model, version, notes, names):
     name, kind = f"{scope}{element.need('name')}", element.need("type")
     if kind not in _KINDS:
-        known = ", ".join(_KINDS)
+        kinds = ", ".join(_KINDS)
         if kind in ("gearbox", "screw", "revolute2"):
             element.skip()
             notes.refuse("gearboxes", name, f"{element.where}joint {name!r} is of type {kind!r}")
             return
-        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
+        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {kinds}.")
     if names[name] > 1:
         raise ValueError(f"{element.where}joint {name!r} occurs twice.")
     ends = []
     for tag in ("parent", "child"):
-        own = element.first(tag)
-        given = "" if own is None else own.text.strip()
+        reference = element.first(tag)
+        given = "" if reference is None else reference.text.strip()
         link = f"{scope}{given}"
         if link not in machine.links:
             if given != _WORLD:
@@ -225,7 +225,7 @@ def _read_joint(element, scope, machine, of_model, version, notes, names):
     position, rotation = _pose(element, notes)
     frame = child.rotation @ rotation
     point = child.position + child.rotation @ position
-    axes = [own for tag in ("axis", "axis2") if (own := element.first(tag)) is not None]
+    axes = [axis_element for tag in ("axis", "axis2") if (axis_element := element.first(tag)) is not None]
     if kind == "universal" and len(axes) == 2:
         between = machine.add(Link(f"{name} cross", position=point, rotation=frame, where=element.where))
         one, two = (unused(f"{name} {k}", names.__contains__) for k in (1, 2))

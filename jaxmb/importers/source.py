@@ -35,8 +35,8 @@ def text_of(source: str | os.PathLike[str]) -> str:
     if not Path(source).is_file():
         raise ValueError(f"{source} does not exist.")
     content, declared = Path(source).read_bytes(), "utf-8"
-    if (found := _DECLARED.match(content)) is not None:
-        declared = found[1].decode()
+    if (declaration := _DECLARED.match(content)) is not None:
+        declared = declaration[1].decode()
     declared = next((encoding for mark, encoding in _MARKS if content.startswith(mark)), declared)
     try:
         return content.decode(declared)
@@ -66,10 +66,10 @@ class Resources:
     ) -> "Resources":
         """**Raises:** `ValueError` for a package folder that does not exist."""
         given = [package_dirs] if isinstance(package_dirs, str | os.PathLike) else package_dirs
-        folders = tuple(Path(own) for own in given)
-        for own in folders:
-            if not own.is_dir():
-                raise ValueError(f"package_dirs: {own} is not a folder.")
+        folders = tuple(Path(folder) for folder in given)
+        for folder in folders:
+            if not folder.is_dir():
+                raise ValueError(f"package_dirs: {folder} is not a folder.")
         return cls(None if is_text(source) else Path(source).resolve().parent, folders)
 
     def find(self, uri: str) -> Path | None:
@@ -86,7 +86,7 @@ class Resources:
         if kind not in ("package", "model"):
             return None
         package, _, inside = rest.partition("/")
-        return next((own for own in (_file(base / inside) for base in self._packages(package)) if own), None)
+        return next((file for file in (_file(base / inside) for base in self._packages(package)) if file), None)
 
     def _packages(self, name: str) -> Iterator[Path]:
         """Possible folders of a package."""
@@ -110,5 +110,5 @@ def _is_package(folder: Path, name: str) -> bool:
     manifest = _file(folder / "package.xml")
     if manifest is None:
         return False
-    own = re.search(rb"<name>\s*([^<\s]+)\s*</name>", manifest.read_bytes())
-    return own is not None and own[1].decode("utf-8", "replace") == name
+    tag = re.search(rb"<name>\s*([^<\s]+)\s*</name>", manifest.read_bytes())
+    return tag is not None and tag[1].decode("utf-8", "replace") == name

@@ -74,7 +74,7 @@ def urdf(
     _place(machine, joints, base, root, notes)
     for joint, element, _ in joints:
         machine.joints.append(joint)
-        _read_mimic(joint, element, machine, [own.name for own, _, _ in joints], notes)
+        _read_mimic(joint, element, machine, [other.name for other, _, _ in joints], notes)
     if any(element.first("limit") is not None for element in root.all("joint")):
         notes.say("Limits of efforts and speeds are not read: the joints have no actuators.")
     return model_of(root, machine, notes, file, _EFFECTLESS)
@@ -82,11 +82,11 @@ def urdf(
 
 def _origin(element: Element | None):
     """Position and rotation of an `<origin>`."""
-    own = None if element is None else element.first("origin")
-    if own is None:
+    origin = None if element is None else element.first("origin")
+    if origin is None:
         return np.zeros(3), np.eye(3)
-    position = own.numbers(own.attributes.get("xyz", "0 0 0"))
-    return position, roll_pitch_yaw(own.numbers(own.attributes.get("rpy", "0 0 0")))
+    position = origin.numbers(origin.attributes.get("xyz", "0 0 0"))
+    return position, roll_pitch_yaw(origin.numbers(origin.attributes.get("rpy", "0 0 0")))
 
 
 def _read_link(element, machine, notes, files):
@@ -120,12 +120,12 @@ def _read_joint(element, machine, notes):
     """A joint, its element, and place and rotation of its frame in the parent link."""
     name, kind = element.need("name"), element.need("type")
     if kind not in (*_KINDS, "planar"):
-        known = ", ".join((*_KINDS, "planar"))
-        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
+        kinds = ", ".join((*_KINDS, "planar"))
+        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {kinds}.")
     ends = []
     for tag in ("parent", "child"):
-        own = element.first(tag)
-        link = None if own is None else own.need("link")
+        end = element.first(tag)
+        link = None if end is None else end.need("link")
         if link not in machine.links:
             raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, but there is no such link.")
         ends.append(link)
@@ -183,8 +183,8 @@ def _place(machine, joints, base, root, notes):
     else:
         machine.joints.append(Joint(unused("base", names.__contains__), "free", WORLD, roots[0]))
     of_parent: dict[str, list[Any]] = {}
-    for own in joints:
-        of_parent.setdefault(own[0].parent, []).append(own)
+    for each in joints:
+        of_parent.setdefault(each[0].parent, []).append(each)
     queue, unreached = [roots[0]], set(machine.links)
     while queue:
         parent = machine.links[queue.pop()]

@@ -25,14 +25,14 @@ def model_of(root: Element, machine: Machine, notes: Notes, file: str, effectles
         notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
     built = build_scene(machine, notes)
     coordinates = {joint: name for joint, name in built.coordinates.items() if name is not None}
-    said = notes.finish(file)
+    sentences = notes.finish(file)
     return ImportedModel(
         machine.name,
         built.scene,
-        tuple(said),
+        tuple(sentences),
         coordinates,
         built.controls,
         shapes=built.shapes,
         collision_shapes=built.collision_shapes,
-        named=said,
+        named=sentences,
     )

@@ -72,10 +72,10 @@ class Hamel(AbstractEquations):
         X, v = columns(t, q), system.rates(t, q, u)
         sigma = u.size
         # [X_b, X_c] for all columns c, summed over the velocities of b with the drift: d X_c / dt − ∂v/∂q X_c.
-        _, moved = jax.jvp(columns, (t, q), (one, v))
+        _, column_rates = jax.jvp(columns, (t, q), (one, v))
         turned = jax.vmap(lambda x: jax.jvp(lambda q: system.rates(t, q, u), (q,), (x,))[1], in_axes=1, out_axes=1)(X)
         inverse = inverse_of(complete(X))
-        structure = inverse @ (moved - turned)
+        structure = inverse @ (column_rates - turned)
 
         ell = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), system.parameters_at(t))
         momenta = system.momentum(t, q, v) @ complete(X)

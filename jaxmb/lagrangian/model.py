@@ -130,13 +130,13 @@ class AbstractLagrangian(AbstractSystem):
 
     def parameters_at(self, t: Scalar) -> Parameters:
         """The parameters at a time, the last argument of every function."""
-        driven = ((name, x) for own in self.inputs for name, x in zip(own.names, own.at(t), strict=True))
+        driven = ((name, x) for group in self.inputs for name, x in zip(group.names, group.at(t), strict=True))
         return self.parameters | {name: jnp.asarray(x, self.parameters[name].dtype) for name, x in driven}
 
-    def kernel(self, own: Any, name: str) -> Callable[..., Array]:
+    def kernel(self, item: Any, name: str) -> Callable[..., Array]:
         """A method of a constraint, of a non-ideal force or of the kinematics."""
-        known = dict(self.known).get(type(own))
-        return getattr(own, name) if known is None else functools.partial(known, own)
+        trace = dict(self.known).get(type(item))
+        return getattr(item, name) if trace is None else functools.partial(trace, item)
 
     def value(self, constraint: AbstractCoordinateConstraint, t: Scalar, *motion: Array) -> Array:
         """The residual of a constraint, from coordinates, rates and accelerations."""
@@ -180,8 +180,8 @@ class AbstractLagrangian(AbstractSystem):
             mine = jnp.array([name == law.constraint for name, _ in self.rows])
             reaction = self._on_coordinates(t, q, v, jnp.where(mine, multipliers, 0.0))
             first = [name for name, _ in self.rows].index(law.constraint)
-            own = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
-            total = total + self.kernel(law, "force")(t, q, v, reaction, own, self.parameters_at(t))
+            law_multipliers = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
+            total = total + self.kernel(law, "force")(t, q, v, reaction, law_multipliers, self.parameters_at(t))
         return pull(total)[0]
 
     def _on_coordinates(self, t, q, v, multipliers):

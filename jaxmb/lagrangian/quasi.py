@@ -104,8 +104,8 @@ def _inverse(omega, t, q, target, parameters, near):
     far = lambda v, size: size > 8 * jnp.finfo(v.dtype).eps * (1.0 + jnp.max(jnp.abs(v)))
     v, size = newton(correct, far, near, most=_ITERATIONS, dtype=q.dtype)
     # The inverse is accepted also if rounding keeps corrections slightly larger.
-    found = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
-    return jnp.where(found, v, jnp.nan)
+    converged = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
+    return jnp.where(converged, v, jnp.nan)
 
 
 @_inverse.def_jvp
@@ -113,9 +113,9 @@ def _inverse_jvp(primals, tangents):
     omega, t, q, target, parameters, near = primals
     _, dt, dq, dtarget, dparameters, _ = tangents
     v = _inverse(omega, t, q, target, parameters, near)
-    _, moved = eqx.filter_jvp(lambda t, q, p: omega(t, q, v, p), (t, q, parameters), (dt, dq, dparameters))
-    moved = jnp.zeros_like(v) if moved is None else moved
-    change = -moved if dtarget is None else dtarget - moved
+    _, drift = eqx.filter_jvp(lambda t, q, p: omega(t, q, v, p), (t, q, parameters), (dt, dq, dparameters))
+    drift = jnp.zeros_like(v) if drift is None else drift
+    change = -drift if dtarget is None else dtarget - drift
     return v, _solve(jax.jacfwd(omega, 2)(t, q, v, parameters), change)
 
 

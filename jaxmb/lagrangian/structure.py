@@ -53,9 +53,9 @@ def constraint_sizes(
     for name, energy in energies.items():
         if energy is None:
             continue
-        found = _shape(name, None, energy, t, q, *(() if name == "potential" else (q,)), p)
-        if math.prod(found) != 1:
-            raise ValueError(f"{name} must be a scalar, got shape {found}.")
+        shape = _shape(name, None, energy, t, q, *(() if name == "potential" else (q,)), p)
+        if math.prod(shape) != 1:
+            raise ValueError(f"{name} must be a scalar, got shape {shape}.")
     if applied is not None:
         _shape("force", (q.size,), applied, t, q, q, p)
     return tuple(math.prod(_shape(c.name, None, c.value, t, q, q, q, p)) for c in constraints)
@@ -97,15 +97,15 @@ def with_programs(system: Unanalysed) -> Unanalysed:
     eqx.filter_eval_shape(evaluated, system, *given)
     for function in functions:
         function.keep()
-    parts = [(own, "value") for own in system.constraints] + [(own, "force") for own in system.nonideal]
-    own = {
+    parts = [(item, "value") for item in system.constraints] + [(item, "force") for item in system.nonideal]
+    programs = {
         type(part): Captured(getattr(type(part), name))
         for part, name in [*parts, (system.kinematics, "rates")]
         if is_of_user(part)
     }
-    system = changed(system, known=tuple(own.items()))
+    system = changed(system, known=tuple(programs.items()))
     eqx.filter_eval_shape(evaluated, system, *given)
-    for function in own.values():
+    for function in programs.values():
         function.keep()
     return system
 
@@ -246,7 +246,7 @@ def _row_counts(system):
 
 
 def _rows_of(system, name):
-    return np.array([own == name for own, _ in system.rows], bool)
+    return np.array([row_name == name for row_name, _ in system.rows], bool)
 
 
 def _independent(jacobian):
@@ -267,7 +267,7 @@ def _check_consistent(
         return
     left_over = np.abs(right - jacobian @ np.linalg.lstsq(jacobian, right, rcond=None)[0])
     bound = left_over[rows] > 1e-8 * (1.0 + np.max(np.abs(right)))
-    wrong = dict.fromkeys(name for (name, _), own in zip(system.rows[rows], bound, strict=True) if own)
+    wrong = dict.fromkeys(name for (name, _), is_wrong in zip(system.rows[rows], bound, strict=True) if is_wrong)
     if wrong:
         raise ValueError(
             f"The constraints {', '.join(wrong)} contradict each other: no {what} satisfy them together at the guess."

@@ -132,9 +132,9 @@ class LagrangianSystem(AbstractLagrangian):
         self.equations.check(self)
 
     def on_host(self, t):
-        known = not is_traced((self, t)) and self.guess.q.dtype == np.float64
+        is_concrete = not is_traced((self, t)) and self.guess.q.dtype == np.float64
         small = 0 < self.acceleration_rows <= MOST and self.nq <= MOST
-        return HostLagrangian(self, t) if known and small else None
+        return HostLagrangian(self, t) if is_concrete and small else None
 
 
 def _number(name: str, value: Any) -> Array | ModuleWeights:

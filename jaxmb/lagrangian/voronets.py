@@ -64,8 +64,8 @@ class Voronets(AbstractEquations):
         columns = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
         along = lambda fn: jax.vmap(lambda x: jax.jvp(fn, (q,), (x,))[1], in_axes=1, out_axes=1)(columns)
         # B_αβ ṙ^β + B_α0 = d A_α / dt along the motion less the change of ṡ, as a function of q alone, along column α.
-        _, moved = jax.jvp(A, (t, q), (one, v))
-        curvature = moved + along(lambda q: system.rates(t, q, u)[fibre])
+        _, matrix_rate = jax.jvp(A, (t, q), (one, v))
+        curvature = matrix_rate + along(lambda q: system.rates(t, q, u)[fibre])
 
         at = system.parameters_at
         constrained = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), at(t))

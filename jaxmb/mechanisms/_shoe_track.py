@@ -88,8 +88,8 @@ def shoe_track(
     inertia = planar.box(shoes.mass, shoes.pitch, shoes.height)
     for name, start, end in zip(names, pins, ends, strict=True):
         way = end - start
-        own = {"position": (start + end) / 2, "angle": np.arctan2(way[1], way[0])}
-        bodies.append(planar.Body(name, mass=shoes.mass, inertia=inertia, **own))
+        pose = {"position": (start + end) / 2, "angle": np.arctan2(way[1], way[0])}
+        bodies.append(planar.Body(name, mass=shoes.mass, inertia=inertia, **pose))
 
     half = (shoes.pitch / 2, 0.0)
     spring = 4 * stiffness
@@ -118,12 +118,12 @@ def shoe_track(
         (f"{p}idler", shoes.idler_radius, friction),
         *((f"{p}wheel{k}", radius, friction) for k in range(1, len(wheels) + 1)),
     ]
-    for body, own, coefficient in rims:
+    for body, rim_radius, coefficient in rims:
         forces.append(
             planar.PlateContact(
                 f"{body}_rim",
                 (body, *names),
-                radius=own,
+                radius=rim_radius,
                 start=(-half[0], shoes.height / 2),
                 end=(half[0], shoes.height / 2),
                 edge=shoes.pitch / 4,
@@ -143,27 +143,27 @@ def running(system, guess, speed):
     Without drive, shoes hang down, and vehicle and tracks lose their motion in a second. They go on to creep, since dry
     friction is regularised: there are many equilibria in which friction holds the shoes.
     """
-    names, known = system.body_names, parameters(system)
-    still = undriven(system)
-    start = assemble(still, State(guess.q, jnp.zeros_like(guess.u)))
-    q = simulate(still, start, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
-    discs = {name: _rolling_radius(name, known) for name in names if f"{name}_rim.radius" in known}
+    names, values = system.body_names, parameters(system)
+    undriven_system = undriven(system)
+    start = assemble(undriven_system, State(guess.q, jnp.zeros_like(guess.u)))
+    q = simulate(undriven_system, start, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
+    discs = {name: _rolling_radius(name, values) for name in names if f"{name}_rim.radius" in values}
     radii = jnp.stack([discs.get(name, jnp.ones(())) for name in names])
     turn = jnp.where(np.array([name in discs for name in names]), -speed / radii, 0.0)
     u = jnp.stack([jnp.full_like(turn, speed), jnp.zeros_like(turn), turn], axis=1)
     for p in PREFIXES:
-        own = np.array([k for k, name in enumerate(names) if name.startswith(f"{p}shoe")])
-        if own.size:
-            pitch = -2 * known[f"{p}idler_rim.start"][0]
-            u = u.at[own].add(_circulation(q.reshape(-1, 3)[own], speed, pitch))
+        places = np.array([k for k, name in enumerate(names) if name.startswith(f"{p}shoe")])
+        if places.size:
+            pitch = -2 * values[f"{p}idler_rim.start"][0]
+            u = u.at[places].add(_circulation(q.reshape(-1, 3)[places], speed, pitch))
     return assemble(system, State(q, u.reshape(-1)))
 
 
-def _rolling_radius(name, known):
+def _rolling_radius(name, values):
     """Length of track per angle [m/rad] of a disc: straight under wheels, and around sprocket and idler a polygon whose
     sides touch the disc in their middle.
     """
-    radius, (start, height) = known[f"{name}_rim.radius"], known[f"{name}_rim.start"]
+    radius, (start, height) = values[f"{name}_rim.radius"], values[f"{name}_rim.start"]
     return radius if "wheel" in name else -start / jnp.arctan2(-start, radius + height)
 
 

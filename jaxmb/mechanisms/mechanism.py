@@ -109,15 +109,15 @@ class Mechanism:
             raise ValueError(f"There are no reference values for {self.name!r} with these parameters.")
         times, saved = self.references.times, np.asarray(trajectory.ts)
         near = np.isclose(saved[None, :], times[:, None], rtol=0.0, atol=1e-12 * max(1.0, float(times[-1])))
-        own, where = np.nonzero(near)
-        if own.size == 0:
+        rows, where = np.nonzero(near)
+        if rows.size == 0:
             raise ValueError(
                 f"The trajectory of {self.name!r} was saved at none of the reference times {times.tolist()}; "
                 "use simulate(..., saveat=mechanism.references.times)."
             )
         observed = self.observe(trajectory)
         return {
-            label: np.abs(np.asarray(observed[label])[where] - self.references.values[own, k]) / scale
+            label: np.abs(np.asarray(observed[label])[where] - self.references.values[rows, k]) / scale
             for k, (label, scale) in enumerate(zip(self.references.labels, self.references.scales, strict=True))
         }
 
@@ -125,12 +125,12 @@ class Mechanism:
         """The same motion with another end `t1` [s], and the reference values up to there."""
         if not 0 < t1 < float("inf"):
             raise ValueError(f"t1 must be positive and finite, got {t1:g}.")
-        known = self.references
-        if known is not None:
-            keep = known.times <= t1
-            own = dataclasses.replace(known, times=known.times[keep], values=known.values[keep])
-            known = own if keep.any() else None
-        return dataclasses.replace(self, t1=float(t1), references=known)
+        references = self.references
+        if references is not None:
+            keep = references.times <= t1
+            kept = dataclasses.replace(references, times=references.times[keep], values=references.values[keep])
+            references = kept if keep.any() else None
+        return dataclasses.replace(self, t1=float(t1), references=references)
 
     def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
         """The same mechanism with some parameters replaced and the state recomputed near the present state; also under

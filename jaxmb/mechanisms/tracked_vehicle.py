@@ -145,7 +145,7 @@ def tracked_vehicle(
             forces.append(planar.Track(f"{p}track", path, **loop))
             driven = (hull, *(f"{p}wheel{k}" for k in wheels))
         else:
-            own, pins, laws = shoe_track(
+            shoe_bodies, pins, laws = shoe_track(
                 shoes,
                 p,
                 place=place,
@@ -159,7 +159,7 @@ def tracked_vehicle(
                 speed=transition_speed,
                 damping=ground_damping,
             )
-            bodies, joints, forces = [*bodies, *own], [*joints, *pins], [*forces, *laws]
+            bodies, joints, forces = [*bodies, *shoe_bodies], [*joints, *pins], [*forces, *laws]
             driven = (hull, f"{p}sprocket")
         forces.append(Force(f"{p}drive", driven, _drive, parameters={"torque": torque}))
         place = place + np.asarray(hitch_rear) - np.asarray(hitch_front)

@@ -132,8 +132,8 @@ class AbstractPart(eqx.Module):
 
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
-        own = fields.values_of(self)
-        missing = {name: fields.as_parameter(value) for name, value in values.items() if own[name] is None}
+        current = fields.values_of(self)
+        missing = {name: fields.as_parameter(value) for name, value in values.items() if current[name] is None}
         return type(self).with_fields(self, **missing) if missing else self
 
     def named(self, name: str) -> Self:
@@ -209,7 +209,9 @@ class _Bodies:
         if part is None:
             return self
         values = fields.values_of(part)
-        return tuple(values[name] for name, own in fields.declarations(type(part)).items() if own.kind == "body")
+        return tuple(
+            values[name] for name, declaration in fields.declarations(type(part)).items() if declaration.kind == "body"
+        )
 
 
 class AbstractLaw(eqx.Module):
@@ -284,8 +286,8 @@ class AbstractActor(AbstractPart):
         frames = self.body_frames
         if not frames:
             return rows[-1]
-        own = enumerate(zip(*rows, strict=True))
-        out = [of_frame(frames[str(k)], *row) if str(k) in frames else row[-1] for k, row in own]
+        numbered = enumerate(zip(*rows, strict=True))
+        out = [of_frame(frames[str(k)], *row) if str(k) in frames else row[-1] for k, row in numbered]
         return namespace(*out).stack(out)
 
 
@@ -355,14 +357,14 @@ class AbstractLink(AbstractActor):
 
     def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
         cls, names = type(self), self.bodies
-        own = tuple(known.numbers[name] for name in names)
-        moving = [k for k in cls.distinct(own) if k != known.numbers[GROUND]]
+        numbers = tuple(known.numbers[name] for name in names)
+        moving = [k for k in cls.distinct(numbers) if k != known.numbers[GROUND]]
         if len({*moving}) < len(moving):
             raise ValueError(f"{self.label} connects two frames of one body: {', '.join(names)}.")
         frames = {str(k): known.frames[name] for k, name in enumerate(names) if name in known.frames}
         part = cls.with_fields(self, body_frames=frames)
-        part = cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(own)]))
-        return part, (*own, *known.scalars.get(self.name, ()))
+        part = cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(numbers)]))
+        return part, (*numbers, *known.scalars.get(self.name, ()))
 
     def components(self) -> tuple["AbstractLink", ...]:
         """Hook: the component parts, by default itself; called after the numbers have been filled in."""
@@ -380,8 +382,8 @@ class AbstractLink(AbstractActor):
 
     def anchor(self, k: int) -> Array | None:
         """The part's point [m] on its k-th body, in that body's frame; None if it has none."""
-        for name, own in fields.declarations(type(self)).items():
-            point = getattr(self, name) if own.is_point and own.body == k else None
+        for name, declaration in fields.declarations(type(self)).items():
+            point = getattr(self, name) if declaration.is_point and declaration.body == k else None
             if point is not None:
                 frame = self.body_frames.get(str(k))
                 return point if frame is None else frame.point(point)
@@ -638,11 +640,11 @@ class AbstractNonIdeal(AbstractActor):
         return (self.joint,)
 
     def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
-        joint, own = known.joints[self.joint]
+        joint, bodies = known.joints[self.joint]
         # The law sees what its joint sees.
         law = self.with_fields(body_frames=joint.body_frames)
-        poses = law.seen_poses(known.space, known.poses[list(own)])
-        return law.resolve(known.space, joint.with_fields(body_frames={}), poses), own
+        poses = law.seen_poses(known.space, known.poses[list(bodies)])
+        return law.resolve(known.space, joint.with_fields(body_frames={}), poses), bodies
 
     def resolve(self, space: AbstractSpace, joint: AbstractLink, poses: Poses) -> Self:
         """A checked copy with every number filled in, from its joint and the poses of the joint's bodies.
@@ -671,24 +673,24 @@ class AbstractNonIdeal(AbstractActor):
 def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
     """A copy with world points and directions made body-fixed, and directions normalised."""
     declared, given, values = fields.declarations(type(part)), fields.values_of(part), {}
-    for name, own in declared.items():
+    for name, declaration in declared.items():
         value = given[name]
-        if own.at_origin and value is None:
+        if declaration.at_origin and value is None:
             values[name] = fields.as_parameter(np.zeros(space.dimension))
-        elif own.gives:
-            _check_given(part, name, own)
+        elif declaration.gives:
+            _check_given(part, name, declaration)
             if value is None:
                 continue
             values[name] = None
-            for fixed in own.gives:
+            for fixed in declaration.gives:
                 pose = poses[declared[fixed].body]
-                convert = space.body_point if own.is_point else space.body_direction
-                in_body = lambda row, own=own, pose=pose, convert=convert: convert(
-                    pose, row if own.is_point else _unit(row)
+                convert = space.body_point if declaration.is_point else space.body_direction
+                in_body = lambda row, declaration=declaration, pose=pose, convert=convert: convert(
+                    pose, row if declaration.is_point else _unit(row)
                 )
                 several = value.ndim > 1
                 values[fixed] = namespace(pose, value).stack([*map(in_body, value)]) if several else in_body(value)
-        elif (own.is_direction or own.is_attitude) and value is not None:
+        elif (declaration.is_direction or declaration.is_attitude) and value is not None:
             values[name] = _unit(value)
     return type(part).with_fields(part, **values) if values else part
 
@@ -697,23 +699,23 @@ def _unit(value: Any) -> Any:
     return value / np.linalg.norm(value, axis=-1, keepdims=True)
 
 
-def _check_given(part: Any, world: str, own: fields.Declaration) -> None:
+def _check_given(part: Any, world: str, declaration: fields.Declaration) -> None:
     """Check that a point or direction is given either in the world or in the body frames."""
     values = fields.values_of(part)
-    given = [name for name in own.gives if values[name] is not None]
+    given = [name for name in declaration.gives if values[name] is not None]
     in_world = values[world] is not None
-    if len(own.gives) == 1:
-        if in_world == bool(given) and (in_world or own.needed):
-            (fixed,) = own.gives
+    if len(declaration.gives) == 1:
+        if in_world == bool(given) and (in_world or declaration.needed):
+            (fixed,) = declaration.gives
             body = part.bodies[fields.declarations(type(part))[fixed].body]
             raise ValueError(
                 f"{part.label}: give {fixed} (fixed in {body!r}) or {world} (world), and only one of them."
             )
         return
-    listed = " and ".join(own.gives)
+    listed = " and ".join(declaration.gives)
     if in_world and given:
         raise ValueError(f"{part.label}: give either {world} (world) or {listed} (body-fixed), not both.")
-    if not in_world and len(given) < len(own.gives):
+    if not in_world and len(given) < len(declaration.gives):
         raise ValueError(f"{part.label}: give {listed} (body-fixed), or {world} (world).")
 
 

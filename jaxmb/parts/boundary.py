@@ -44,7 +44,7 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
             f"{part.label} has internal states; derive it from AbstractDynamicForce, which declares their rates."
         )
     for name, shape, given in _kernels(part, space, bodies):
-        kernel = lambda *own, name=name: getattr(part, name)(space, *own)
+        kernel = lambda *arguments, name=name: getattr(part, name)(space, *arguments)
         if name == "gaps":
             _check_gaps(part, kernel, given)
         elif shape is None:
@@ -85,14 +85,14 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         yield "mass", (lambda part: part.mass, [])
         yield "inertia", (lambda part: part.inertia, [])
     for name, _, given in _kernels(part, space, bodies):
-        yield name, (lambda part, *own, name=name: getattr(part, name)(space, *own), given)
+        yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):
         yield "elements", (lambda part: part.elements, [])
     if isinstance(part, AbstractLink):
         poses, velocities, t = _arguments(space, bodies)
         yield "coordinates", (lambda part, poses: part.coordinates(space, poses), [poses])
         if part.of_time:
-            moving = lambda part, *own: part.given_in_time(space, *own)
+            moving = lambda part, *arguments: part.given_in_time(space, *arguments)
             yield "given_in_time", (moving, [poses, velocities, t])
 
 
@@ -117,28 +117,30 @@ def with_captured(module: T) -> tuple[T, list[Captured]]:
 
     Modules whose weights are a number stay: other functions call them.
     """
-    found: list[Captured] = []
+    functions: list[Captured] = []
 
-    def own(value: Any, is_static: bool) -> Any:
+    def convert(value: Any, is_static: bool) -> Any:
         if isinstance(value, eqx.Module) and not is_static:
-            return with_values(type(value), vars(value) | {name: own(*held) for name, held in _held(value).items()})
+            return with_values(type(value), vars(value) | {name: convert(*held) for name, held in _held(value).items()})
         if isinstance(value, dict):
-            return {name: own(x, is_static) for name, x in value.items()}
+            return {name: convert(x, is_static) for name, x in value.items()}
         if type(value) is tuple:
-            return tuple(own(x, is_static) for x in value)
+            return tuple(convert(x, is_static) for x in value)
         if callable(value) and not isinstance(value, type):
-            found.append(Captured(value))
-            return found[-1]
+            functions.append(Captured(value))
+            return functions[-1]
         return value
 
-    new = own(module, False)
-    return (new if found else module), found
+    new = convert(module, False)
+    return (new if functions else module), functions
 
 
 def _held(module: eqx.Module) -> dict[str, tuple[Any, bool]]:
     """The values of a module's fields that are not its parameters, by name, and whether they are static."""
     static = {field.name: field.metadata.get("static", False) for field in dataclasses.fields(module)}
-    numbers = {name for name, own in declarations(type(module)).items() if own.kind in ("numbers", "module")}
+    numbers = {
+        name for name, declaration in declarations(type(module)).items() if declaration.kind in ("numbers", "module")
+    }
     return {name: (value, static.get(name, False)) for name, value in vars(module).items() if name not in numbers}
 
 
@@ -181,21 +183,23 @@ def _arguments(space: AbstractSpace, bodies: int) -> tuple[Any, Any, Any]:
 def _check_state_rates(part: AbstractDynamicForce, kernel: Callable[..., Any], given: list[Any]) -> None:
     """The same for the rates of internal states: each must have the shape of its state."""
     states = internal_states(part)
-    found = _evaluated(part.label, "state_rates", kernel, tuple(given))
-    if not isinstance(found, dict) or set(found) != set(states):
+    rates = _evaluated(part.label, "state_rates", kernel, tuple(given))
+    if not isinstance(rates, dict) or set(rates) != set(states):
         names = ", ".join(states) or "none"
         raise ValueError(f"{part.label}: state_rates must return a dictionary of the internal states, {names}.")
     for name, keys in states.items():
         shape = np.shape(entry(part, keys))
-        check_returns(part.label, f"state_rates[{name!r}]", shape, lambda *own, name=name: kernel(*own)[name], *given)
+        check_returns(
+            part.label, f"state_rates[{name!r}]", shape, lambda *arguments, name=name: kernel(*arguments)[name], *given
+        )
 
 
 def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:
     """Raise a `ValueError` unless a kernel of NumPy arrays returns this shape, and the dtype of its first argument."""
-    out = _evaluated(label, name, lambda *own: _as_array(kernel(*own)), given)
+    out = _evaluated(label, name, lambda *arguments: _as_array(kernel(*arguments)), given)
     if not hasattr(out, "shape") or out.shape != shape:
-        found = getattr(out, "shape", type(out).__name__)
-        raise ValueError(f"{label}: {name} must return shape {shape}, got {found}.")
+        got = getattr(out, "shape", type(out).__name__)
+        raise ValueError(f"{label}: {name} must return shape {shape}, got {got}.")
     if out.dtype != given[0].dtype:
         raise ValueError(f"{label}: {name} must return {given[0].dtype} numbers, got {out.dtype}.")
 

@@ -38,7 +38,7 @@ class AbstractCombination(AbstractOfCoordinates):
 
     def values(self, space, poses) -> list[Float[Array, ""]]:
         """The coordinates."""
-        return [self.coordinates_of(k, space, poses)[own].reshape(()) for k, own in enumerate(self.within)]
+        return [self.coordinates_of(k, space, poses)[name].reshape(()) for k, name in enumerate(self.within)]
 
 
 class JointCoupling(AbstractCombination, AbstractConstraint):
@@ -199,8 +199,10 @@ class FixedTendon(AbstractCombination, AbstractTendon):
     def scalar_coordinates(self, space, parts):
         del space
         split = [name.partition(".") for name in self.along]
-        periodic = (own in parts[joint].periodic if joint in parts else False for joint, _, own in split)
-        return tuple(ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k, own in enumerate(periodic) if own)
+        periodic = (within in parts[joint].periodic if joint in parts else False for joint, _, within in split)
+        return tuple(
+            ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k, is_periodic in enumerate(periodic) if is_periodic
+        )
 
     def residual(self, space, poses, t):
         values = self.values(space, poses)

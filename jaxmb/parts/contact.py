@@ -217,7 +217,7 @@ class AbstractContact(AbstractPotentialForce):
         return keys[0] not in ("radius", "centres")
 
     def wrenches(self, space, poses, velocities, t):
-        return self._each(space, lambda *own: self._wrench(space, *own), poses, velocities)
+        return self._each(space, lambda *arguments: self._wrench(space, *arguments), poses, velocities)
 
     def energy(self, space, poses, t):
         single = lambda pose, point, radius: self.normal.energy(self._depth(space.point(pose, point), radius))
@@ -241,8 +241,8 @@ class AbstractContact(AbstractPotentialForce):
     def shapes(self, space, size):
         n = len(self.bodies)
         radii, centres = np.broadcast_to(self.radius, n), np.broadcast_to(self.centres, (n, space.dimension))
-        own = (round_shapes(space, k, radii[k], centres[k]) for k in range(n))
-        return (None, Ground(height=self.terrain.height)), *itertools.chain(*own)
+        solids = (round_shapes(space, k, radii[k], centres[k]) for k in range(n))
+        return (None, Ground(height=self.terrain.height)), *itertools.chain(*solids)
 
     def _each(self, space, single, *of_bodies):
         """`single(…, point, radius)` of every body."""

@@ -86,9 +86,9 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
             raise ValueError(f"{self.label}: acts_on names at least one coordinate of a joint.")
         if len(set(self.acts_on)) < len(self.acts_on):
             raise ValueError(f"{self.label}: acts_on names a coordinate twice, got {self.acts_on}.")
-        taken = set(self.states) & set(self.parameters)
-        if taken:
-            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a state and of a parameter; rename one.")
+        repeated = set(self.states) & set(self.parameters)
+        if repeated:
+            raise ValueError(f"{self.label}: {repeated.pop()!r} is the name of a state and of a parameter; rename one.")
 
     @property
     def sources(self):
@@ -126,16 +126,20 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     def _check_names(self, space):
         for name in (*dict(self.measures).values(), *self.acts_on):
             source, quantity = name.split(".")
-            known = self._known(source, space)
+            available = self._known(source, space)
             acted = name in self.acts_on
-            allowed = known if acted or not self._is_joint(source) else [*known, *(f"{own}_rate" for own in known)]
+            allowed = (
+                available
+                if acted or not self._is_joint(source)
+                else [*available, *(f"{entry}_rate" for entry in available)]
+            )
             if acted and not self._is_joint(source):
                 raise ValueError(
                     f"{self.label}: it acts on coordinates of joints, and {self.source_names[int(source)]!r} is not a "
                     "joint."
                 )
             if quantity not in allowed:
-                listed = [self._called(f"{source}.{own}") for own in allowed]
+                listed = [self._called(f"{source}.{entry}") for entry in allowed]
                 raise unknown("quantity", self._called(name), listed, self.label)
 
     def _called(self, name):
@@ -184,8 +188,8 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         if not isinstance(forces, dict) or set(forces) != set(names) or isinstance(forces[names[0]], dict):
             raise ValueError(f"the function of {self.label} must return the force on {' and '.join(names)}.")
         rows = []
-        for name, own in zip(names, self.acts_on, strict=True):
-            shape, force = self._coordinate(space, poses, own).shape, jnp.asarray(forces[name], poses.dtype)
+        for name, coordinate in zip(names, self.acts_on, strict=True):
+            shape, force = self._coordinate(space, poses, coordinate).shape, jnp.asarray(forces[name], poses.dtype)
             if force.shape != shape:
                 raise ValueError(
                     f"the function of {self.label} must return a force of shape {shape} on {name!r}, got {force.shape}."

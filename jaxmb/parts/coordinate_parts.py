@@ -49,10 +49,10 @@ class AbstractOfJoints(AbstractLink):
 
     def settled(self, known: KnownParts):
         held = [known.source(name) for name in self.sources]
-        own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
-        places = [tuple(own.index(k) for k in bodies) for _, bodies in held]
+        numbers = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
+        places = [tuple(numbers.index(k) for k in bodies) for _, bodies in held]
         part = self.of_sources([source for source, _ in held], places)
-        return part.resolve(known.space, known.poses[list(own)]), (*own, *known.scalars.get(self.name, ()))
+        return part.resolve(known.space, known.poses[list(numbers)]), (*numbers, *known.scalars.get(self.name, ()))
 
     def of_sources(self, parts: Sequence[AbstractPart | None], places: Sequence[tuple[int, ...]]) -> Any:
         """A copy that holds its sources.
@@ -69,12 +69,12 @@ class AbstractOfJoints(AbstractLink):
         **Raises:** `ValueError` if its class does not say so.
         """
         joint = self.joints[str(k)]
-        if (known := joint.is_length(within)) is None:
+        if (is_length := joint.is_length(within)) is None:
             raise ValueError(
                 f"{self.label}: {joint.label} does not say whether its coordinate {within!r} is an angle or a length; "
                 f"declare quantities = {{{within!r}: 'angle'}} or 'length' in the class {joint.kind}."
             )
-        return known
+        return is_length
 
     def coordinates_of(self, k: int, space, poses) -> dict[str, Array]:
         """The coordinates of a source, by their names within it."""
@@ -88,14 +88,14 @@ class AbstractOfJoints(AbstractLink):
 
         **Raises:** `ValueError` if the joint has no such coordinate; its class lists them.
         """
-        known = self.coordinates_of(k, space, poses)
+        values = self.coordinates_of(k, space, poses)
         name, _, within = coordinate.partition(".")
-        if within not in known:
-            names = [f"{name}.{own}" for own in known]
+        if within not in values:
+            names = [f"{name}.{key}" for key in values]
             if not names:
                 raise ValueError(f"{self.label}: {self.joints[str(k)].label} has no coordinate.")
             raise unknown("coordinate", coordinate, names, self.label)
-        return np.asarray(known[within])
+        return np.asarray(values[within])
 
 
 class AbstractOfCoordinates(AbstractOfJoints):
@@ -124,8 +124,8 @@ class AbstractOfCoordinates(AbstractOfJoints):
 
     def are_lengths(self, numbers: Iterable[int]) -> Any:
         """Whether each of the coordinates with these numbers is a length; None if unknown."""
-        known = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
-        return None if None in known else np.array(known if len(known) > 1 else known[0])
+        lengths = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
+        return None if None in lengths else np.array(lengths if len(lengths) > 1 else lengths[0])
 
     def is_periodic(self, k: int = 0) -> bool:
         """Whether a coordinate is an angle known up to full turns."""

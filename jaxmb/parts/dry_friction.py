@@ -269,8 +269,8 @@ class DryFriction(AbstractDryFriction):
         return rate_of(space, self, lambda part, x: part._lengths(space, x), poses, velocities)[1]
 
     def _lengths(self, space, poses):
-        own = self.joints["0"].coordinates_at(space, poses)
-        return jnp.concatenate([self._length(name, own[name].reshape(-1)) for name in self.within])
+        coordinates = self.joints["0"].coordinates_at(space, poses)
+        return jnp.concatenate([self._length(name, coordinates[name].reshape(-1)) for name in self.within])
 
     def _length(self, name, value):
         return value if self.radius is None or self.joints["0"].is_length(name) else self.radius * value

@@ -617,7 +617,7 @@ def anonymous(part: Any) -> Any:
         elif kind in ("part", "law"):
             value = None if value is None else anonymous(value)
         elif kind == "parts":
-            value = {key: anonymous(own) for key, own in value.items()}
+            value = {key: anonymous(inner) for key, inner in value.items()}
         out[field] = value
     return with_values(type(part), out)
 
@@ -635,18 +635,18 @@ def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple
 
 @functools.cache
 def _fields_of_parts(cls: type) -> tuple[str, ...]:
-    return tuple(name for name, own in declarations(cls).items() if own.kind in ("part", "parts"))
+    return tuple(name for name, declaration in declarations(cls).items() if declaration.kind in ("part", "parts"))
 
 
 def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
     """The paths of keys to the internal states of a part, by their names."""
-    found = {}
+    states = {}
     for name, declared in declarations(type(part)).items():
         if declared.kind == "internal" and getattr(part, name) is not None:
-            found[name] = (name,)
+            states[name] = (name,)
         elif declared.kind == "internals":
-            found |= {key: (name, key) for key in getattr(part, name)}
-    return found
+            states |= {key: (name, key) for key in getattr(part, name)}
+    return states
 
 
 def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
@@ -657,9 +657,9 @@ def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declara
     """
     declared = declarations(type(part))
     for field in field_names(type(part)):
-        own = declared.get(field, _ANY_NUMBER)
-        if own.kind not in ("state", "internal", "internals", "part", "parts"):
-            yield from _paths(getattr(part, field), (field,), (field,), own)
+        declaration = declared.get(field, _ANY_NUMBER)
+        if declaration.kind not in ("state", "internal", "internals", "part", "parts"):
+            yield from _paths(getattr(part, field), (field,), (field,), declaration)
 
 
 _ANY_NUMBER = Declaration("number")
@@ -675,8 +675,8 @@ def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], declared: 
             is_module = declared.kind == "numbers" and isinstance(entry, eqx.Module)
             yield from _paths(entry, (*keys, key), (*shown[:-1], key), _MODULE_FIELD if is_module else _ANY_NUMBER)
     elif isinstance(value, eqx.Module):
-        for inner, name, own in paths(value):
-            yield (*keys, *inner), (*shown, *name), own
+        for inner, name, declaration in paths(value):
+            yield (*keys, *inner), (*shown, *name), declaration
 
 
 def entry(value: Any, keys: tuple[str, ...]) -> Any:

@@ -49,8 +49,8 @@ class AbstractFrame(AbstractPart):
 
     def pose(self, space: AbstractSpace, pose: Pose) -> Pose:
         """The frame's pose from the body's; with prepared quantities if the body's has them."""
-        found = self.own_pose(space, pose if self.base is None else self.base.pose(space, pose))
-        return space.prepare(found) if pose.shape[0] > found.shape[0] else found
+        placed = self.own_pose(space, pose if self.base is None else self.base.pose(space, pose))
+        return space.prepare(placed) if pose.shape[0] > placed.shape[0] else placed
 
     def velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
         """The frame's velocity from pose and velocity of the body."""
@@ -76,8 +76,8 @@ class AbstractFrame(AbstractPart):
 
     def point(self, point: Point) -> Point:
         """The point of the body [m] at a point of the frame."""
-        own = self.own_point(point)
-        return own if self.base is None else self.base.point(own)
+        in_base = self.own_point(point)
+        return in_base if self.base is None else self.base.point(in_base)
 
 
 class LinkFrame(AbstractFrame):
@@ -112,10 +112,10 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
 
     **Raises:** `ValueError` for frames on unknown bodies, and frames that are fixed in themselves.
     """
-    given, known = {frame.name: frame for frame in frames}, {body.name: body for body in bodies}
+    given, bodies_by_name = {frame.name: frame for frame in frames}, {body.name: body for body in bodies}
     out: dict[str, Any] = {
         name: LinkFrame(name=name, body=name, centre=centre)
-        for name, body in known.items()
+        for name, body in bodies_by_name.items()
         if (centre := body.mass_centre) is not None
     }
 
@@ -125,8 +125,8 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
         frame = given[name]
         if name in path:
             raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
-        if frame.body not in (*given, *known, GROUND):
-            raise unknown("body", frame.body, [*known, GROUND, *given], frame.label)
+        if frame.body not in (*given, *bodies_by_name, GROUND):
+            raise unknown("body", frame.body, [*bodies_by_name, GROUND, *given], frame.label)
         based(frame.body, (*path, name))
         frame.check(bodies[0].dimension)
         out[name] = frame.with_fields(base=out.get(frame.body))

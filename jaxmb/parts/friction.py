@@ -63,7 +63,7 @@ class Friction(AbstractNonIdeal):
 
     def _check_slip(self, space, joint, poses):
         columns = poses.shape[0] * space.velocity_size
-        rows = [np.asarray(rows_of(own, space, poses)).reshape(-1, columns) for own in joint.components()]
+        rows = [np.asarray(rows_of(component, space, poses)).reshape(-1, columns) for component in joint.components()]
         _, sizes, directions = np.linalg.svd(np.concatenate(rows))
         allowed = directions[np.sum(sizes > 1e-9 * sizes[0]) :].reshape(-1, poses.shape[0], space.velocity_size)
         slips = jax.vmap(lambda v: self.slip(space, poses, v))(jnp.asarray(allowed))

@@ -14,21 +14,21 @@ def with_inherited_arguments(cls: type) -> str | None:
     for base in cls.__bases__:
         inherited = _arguments(base.__doc__ or "") | inherited
     text = inspect.cleandoc(cls.__doc__)
-    own = _arguments(text)
-    if not inherited.keys() - own.keys():
+    explained = _arguments(text)
+    if not inherited.keys() - explained.keys():
         return cls.__doc__
     # The name of the part comes first, whichever base has it.
-    items = [own.get("name", inherited.get("name")), *(inherited | own | {"name": None}).values()]
+    items = [explained.get("name", inherited.get("name")), *(inherited | explained | {"name": None}).values()]
     section = "**Arguments:**\n\n" + "\n".join(item for item in items if item is not None)
-    return _ARGUMENTS.sub(lambda _: section, text, 1) if own else f"{text}\n\n{section}"
+    return _ARGUMENTS.sub(lambda _: section, text, 1) if explained else f"{text}\n\n{section}"
 
 
 def _arguments(text: str) -> dict[str, str]:
     """The items of the list of arguments in a docstring, by their first names; a paragraph is one item."""
-    found = _ARGUMENTS.search(inspect.cleandoc(text))
-    if found is None:
+    section = _ARGUMENTS.search(inspect.cleandoc(text))
+    if section is None:
         return {}
-    body = found.group(1)
+    body = section.group(1)
     items = (
         re.split(r"^(?=- )", body, flags=re.MULTILINE)[1:]
         if body.startswith("- ")

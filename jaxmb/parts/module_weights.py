@@ -77,8 +77,8 @@ def with_weights(like: eqx.Module, values: Float[Array, "n"]) -> eqx.Module:
     """
     leaves, structure = jax.tree.flatten(like)
     sizes = [leaf.size if _is_shape(leaf) else 0 for leaf in leaves]
-    own = jnp.split(values, np.cumsum(sizes)[:-1])
-    filled = [part.reshape(leaf.shape) if _is_shape(leaf) else leaf for leaf, part in zip(leaves, own, strict=True)]
+    pieces = jnp.split(values, np.cumsum(sizes)[:-1])
+    filled = [part.reshape(leaf.shape) if _is_shape(leaf) else leaf for leaf, part in zip(leaves, pieces, strict=True)]
     return jax.tree.unflatten(structure, filled)
 
 
@@ -87,14 +87,14 @@ def weights_of(module: eqx.Module, like: eqx.Module) -> Float[Array, "n"]:
 
     **Raises:** `ValueError` that names the difference.
     """
-    found = as_weights(module)
-    if found.like == like:
-        return found.values
+    weights = as_weights(module)
+    if weights.like == like:
+        return weights.values
     kinds = type(like).__name__, type(module).__name__
     if kinds[0] != kinds[1]:
         raise ValueError(f"expected a module {kinds[0]}, got {kinds[1]}")
     flat = lambda module: jax.tree_util.tree_flatten_with_path(module)[0]
-    wanted, given = ({_place(path): leaf for path, leaf in flat(x)} for x in (like, found.like))
+    wanted, given = ({_place(path): leaf for path, leaf in flat(x)} for x in (like, weights.like))
     for place in wanted | given:
         old, new = (leaves.get(place) for leaves in (wanted, given))
         if old != new:

@@ -37,8 +37,8 @@ class AbstractSignal(eqx.Module):
 
     def shape(self, t: Scalar) -> Any:
         """The shape of the value at a time [s], or the value itself if it is not an array."""
-        found = eqx.filter_eval_shape(self, t)
-        return getattr(found, "shape", found)
+        result = eqx.filter_eval_shape(self, t)
+        return getattr(result, "shape", result)
 
     def keep(self) -> None:
         """Hook: keep the trace of a call; see `Captured`."""
@@ -235,8 +235,8 @@ def of_one_kind(signals: Sequence[AbstractSignal]) -> list[tuple[tuple[int, ...]
 
 def of_each(signals: AbstractSignal, count: int) -> list[AbstractSignal]:
     """The signals that `of_one_kind` has put together."""
-    taken = lambda x, k: x[k] if is_traced(x) else np.asarray(x)[k]
-    return [signals] if count == 1 else [jax.tree.map(lambda x, k=k: taken(x, k), signals) for k in range(count)]
+    take = lambda x, k: x[k] if is_traced(x) else np.asarray(x)[k]
+    return [signals] if count == 1 else [jax.tree.map(lambda x, k=k: take(x, k), signals) for k in range(count)]
 
 
 def _spline_slopes(ts, values):

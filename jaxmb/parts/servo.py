@@ -42,9 +42,9 @@ class Servo(AbstractLink):
                 f"{self.program.kind} acts on coordinates of joints. Prescribe a coordinate of a body with a Driver, "
                 "or write the coordinate's residual as a Constraint."
             )
-        taken = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))
-        if taken:
-            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a gain; rename that parameter.")
+        repeated = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))
+        if repeated:
+            raise ValueError(f"{self.label}: {repeated.pop()!r} is the name of a gain; rename that parameter.")
 
     @property
     def name(self):

@@ -77,10 +77,10 @@ class AbstractShape(abc.ABC):
     def scale(self) -> np.ndarray:
         """Lengths [m] by which the mesh of unit size is stretched along its axes, shape (3,)."""
 
-    def moved(self, position: Any, orientation: Any) -> Self:
+    def shifted(self, position: Any, orientation: Any) -> Self:
         """The shape in another frame, given the position and orientation of the present frame in it."""
-        moved = position + rot.rotate(orientation, self.position)
-        return dataclasses.replace(self, position=moved, orientation=rot.multiply(orientation, self.orientation))
+        shifted = position + rot.rotate(orientation, self.position)
+        return dataclasses.replace(self, position=shifted, orientation=rot.multiply(orientation, self.orientation))
 
     def colored(self, color: Color) -> Self:
         """The shape in this colour, if it has none."""

@@ -117,11 +117,11 @@ def separation(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> P
     return points[1] - points[0]
 
 
-def _of_both(function, part, *own):
+def _of_both(function, part, *rows):
     """`function(…, point)` of both bodies in one kernel, from rows of some arrays and points A and B."""
-    xp = namespace(*own, part.point_a, part.point_b)
-    own = *own, xp.stack([part.point_a, part.point_b])
-    return xp.stack([function(*x) for x in zip(*own, strict=True)]) if xp is np else jax.vmap(function)(*own)
+    xp = namespace(*rows, part.point_a, part.point_b)
+    rows = *rows, xp.stack([part.point_a, part.point_b])
+    return xp.stack([function(*x) for x in zip(*rows, strict=True)]) if xp is np else jax.vmap(function)(*rows)
 
 
 def nearest_to_origin(point: Point, axis: Point) -> Point:
@@ -175,8 +175,8 @@ def with_drift(part: Any, rate: Array, function: Callable[[Any], Array]) -> Arra
     """
     if part.drift is None:
         return rate
-    still = part.with_fields(drift=None)
-    moving = eqx.filter_jvp(function, (still,), (part.drift,))[1]
+    plain = part.with_fields(drift=None)
+    moving = eqx.filter_jvp(function, (plain,), (part.drift,))[1]
     return rate if moving is None else rate + moving
 
 

@@ -171,8 +171,8 @@ class AbstractRigidContact(AbstractGeometricContact):
 
     def outward(self, space: AbstractSpace, poses: Poses) -> Float[Array, "d"]:
         """The unit vector along which the contact pushes the last body."""
-        moved = lambda x: self.gap(space, poses.at[-1, : space.dimension].set(x))
-        out = jax.grad(moved)(poses[-1, : space.dimension])
+        gap_at = lambda x: self.gap(space, poses.at[-1, : space.dimension].set(x))
+        out = jax.grad(gap_at)(poses[-1, : space.dimension])
         return out / norm(out)
 
     def tangents(self, space: AbstractSpace, poses: Poses, pole: int = 0) -> Float[Array, "n d"]:
@@ -289,8 +289,8 @@ class RigidBallContact(AbstractRigidContact, AbstractPointPair):
         return space.point(poses[1], self.point_b) - self.radius_b * self.outward(space, poses)
 
     def shapes(self, space, size):
-        own = round_shapes(space, 0, self.radius_a, self.point_a)
-        return own + round_shapes(space, 1, self.radius_b, self.point_b)
+        first = round_shapes(space, 0, self.radius_a, self.point_a)
+        return first + round_shapes(space, 1, self.radius_b, self.point_b)
 
 
 class RigidPlaneContact(AbstractRigidContact, AbstractPointPair):

@@ -52,28 +52,28 @@ def listed(width: int = 80, styled: bool = False) -> str:
 
 def _heading(entry: Entry, width: int) -> str:
     """The call of a name, with a line for each parameter if one line is too short."""
-    name, own = f"jaxmb.{entry.name}", signature(entry)
+    name, call = f"jaxmb.{entry.name}", signature(entry)
     if entry.kind == "field":
         return f"**{name}**: {entry.thing}"
-    if own is None:
+    if call is None:
         return f"**{name}**"
-    line = f"{name}{own}"
+    line = f"{name}{call}"
     if len(line) <= width:
         return line.replace(name, f"**{name}**", 1)
-    parameters = list(own.parameters.values())
+    parameters = list(call.parameters.values())
     lines = [str(parameter) for parameter in parameters]
     kinds = [parameter.kind for parameter in parameters]
     if inspect.Parameter.KEYWORD_ONLY in kinds and inspect.Parameter.VAR_POSITIONAL not in kinds:
         lines.insert(kinds.index(inspect.Parameter.KEYWORD_ONLY), "*")
-    returns = str(own.replace(parameters=[])).removeprefix("()")
+    returns = str(call.replace(parameters=[])).removeprefix("()")
     return "\n".join([f"**{name}**(", *(f"    {parameter}," for parameter in lines), f"){returns}"])
 
 
 def _of_module(entry: Entry, width: int) -> Iterable[str]:
-    (own,) = [subject for subject in subjects() if subject.module == entry]
-    for heading, group in own.groups.items():
+    (of_module,) = [subject for subject in subjects() if subject.module == entry]
+    for heading, group in of_module.groups.items():
         yield from _section(heading or "Names", group, width)
-    yield from _section("Of other modules", own.others, width)
+    yield from _section("Of other modules", of_module.others, width)
 
 
 def _of_class(entry: Entry, width: int) -> Iterable[str]:
@@ -84,7 +84,7 @@ def _of_class(entry: Entry, width: int) -> Iterable[str]:
         yield "\n".join(["**Further fields**", *lines])
     yield from _section("Methods and properties", members(entry), width)
     for base in bases(entry):
-        inherited = ", ".join(own.short for own in members(base))
+        inherited = ", ".join(member.short for member in members(base))
         if inherited:
             yield "\n".join([f"**From {base.name}**", _hanging(inherited, 4, 4, width)])
 
@@ -96,7 +96,7 @@ def _section(title: str, entries: tuple[Entry, ...], width: int) -> Iterable[str
 
 def _table(entries: Iterable[Entry], width: int) -> str:
     """Names with their first sentences beside them."""
-    return _rows(((own.name if own.owner is None else own.short, own.summary) for own in entries), width)
+    return _rows(((entry.name if entry.owner is None else entry.short, entry.summary) for entry in entries), width)
 
 
 def _rows(rows: Iterable[tuple[str, str]], width: int) -> str:

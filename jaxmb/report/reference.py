@@ -36,9 +36,11 @@ def reference(mechanism: Mechanism, tolerance: float) -> References:
     sizes = np.max(np.abs(values), axis=0)
     if mechanism.observe is natural_coordinates:
         # One size for all coordinates, and one for all velocities.
-        sizes = np.array([max(size for size, own in zip(sizes, labels, strict=True) if own[0] == x[0]) for x in labels])
+        sizes = np.array(
+            [max(size for size, other in zip(sizes, labels, strict=True) if other[0] == x[0]) for x in labels]
+        )
     projected = " with projection" if mechanism.system.acceleration_rows else ""
     source = f"Adams at rtol {rtol:.0e}, checked by Dopri8{projected}"
-    known = References(ts[-1:], labels, values[-1:], source, 0.0, sizes)
-    difference = float(np.max(np.abs(values - check)[-1] / known.scales))
-    return References(known.times, labels, known.values, source, difference, sizes)
+    provisional = References(ts[-1:], labels, values[-1:], source, 0.0, sizes)
+    difference = float(np.max(np.abs(values - check)[-1] / provisional.scales))
+    return References(provisional.times, labels, provisional.values, source, difference, sizes)

@@ -115,7 +115,7 @@ def stress_test(
     for case in cases:
         if case.message:
             refused.setdefault(case.message, []).append(f"{case.kind} {case.case}")
-    notes += [f"{', '.join(own)}: {text}" for text, own in refused.items()]
+    notes += [f"{', '.join(variants)}: {text}" for text, variants in refused.items()]
     name = f"{mechanism.name}, {mechanism.t1:g} s, {type(solver).__name__} at rtol {rtol:g}"
     draw = functools.partial(_plot, title=name, rtol=rtol)
     return Table(f"{name}: relative error at the end", _COLUMNS, [case[:5] for case in cases], notes + remarks, draw)
@@ -132,11 +132,11 @@ class _Base(NamedTuple):
     truth: Any
 
     def trial(self, case, *, system=None, state=None, t1=None, rtol=None, build=None, truth=None) -> _Trial:
-        own = self.mechanism
+        mechanism = self.mechanism
         given = (
-            own.system if system is None else system,
-            own.state if state is None else state,
-            own.t1 if t1 is None else t1,
+            mechanism.system if system is None else system,
+            mechanism.state if state is None else state,
+            mechanism.t1 if t1 is None else t1,
         )
         return _Trial(case, build or (lambda: given), self.rtol if rtol is None else rtol, truth)
 
@@ -156,7 +156,7 @@ def _scaled(base: _Base, names: Collection[str], factors: Collection[float]) -> 
     values = {name: np.asarray(value) for name, value in parameters(system).items() if name in names}
     for factor in factors:
         changed = {name: factor * value for name, value in values.items()}
-        yield base.trial(f"× {factor:.0e}", build=lambda own=changed: _with(base, with_parameters(system, own)))
+        yield base.trial(f"× {factor:.0e}", build=lambda numbers=changed: _with(base, with_parameters(system, numbers)))
 
 
 def _with(base: _Base, system: Any) -> tuple[Any, State, float]:
@@ -196,44 +196,46 @@ def _inertial(base: _Base, bodies: Collection[str]) -> list[str]:
 
 
 def _lengths(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
+    mechanism = base.mechanism
     for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6):
         try:
-            scaled = scaled_lengths(own.system, own.state, factor)
+            scaled = scaled_lengths(mechanism.system, mechanism.state, factor)
         except ValueError as reason:
             raise _NotHereError(f"left out, {str(reason).rstrip('.')}") from None
         yield base.trial(f"× {factor:.0e}", system=scaled[0], state=scaled[1], truth=(base.truth,))
 
 
 def _speeds(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
-    if not (np.any(np.asarray(own.state.u)) and own.system.linear and own.system.drift_free):
+    mechanism = base.mechanism
+    if not (np.any(np.asarray(mechanism.state.u)) and mechanism.system.linear and mechanism.system.drift_free):
         raise _NotHereError("left out, the motion starts from rest, or velocities are prescribed")
     for factor in (1e-6, 1e-3, 10.0, 1e3):
-        fast = dataclasses.replace(own.state, u=factor * own.state.u)
-        yield base.trial(f"× {factor:.0e}", state=fast, t1=own.t1 / max(factor, 1.0))
+        fast = dataclasses.replace(mechanism.state, u=factor * mechanism.state.u)
+        yield base.trial(f"× {factor:.0e}", state=fast, t1=mechanism.t1 / max(factor, 1.0))
 
 
 def _near_singular(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
+    mechanism = base.mechanism
     if not base.singular:
         raise _NotHereError("left out, no singular position was named, as by singular={'crank.angle': …}")
     for off in 10.0 ** -np.arange(3.0, 13.0, 3.0):
         fix = {name: np.asarray(value) + off for name, value in base.singular.items()}
-        build = lambda fix=fix: (own.system, assemble(own.system, own.state, fix=fix), own.t1)
+        build = lambda fix=fix: (mechanism.system, assemble(mechanism.system, mechanism.state, fix=fix), mechanism.t1)
         yield base.trial(f"{off:.0e} off", build=build)
 
 
 def _doubled(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
-    if not (own.system.body_names and own.system.velocity_rows):
+    mechanism = base.mechanism
+    if not (mechanism.system.body_names and mechanism.system.velocity_rows):
         raise _NotHereError("left out, there are no joints of bodies")
-    yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=(base.truth,))
-    joint = own.system.constraints.groups[0].group
+    yield base.trial(
+        "the same", build=lambda: _with(base, doubled(mechanism.system, mechanism.state)), truth=(base.truth,)
+    )
+    joint = mechanism.system.constraints.groups[0].group
     if getattr(joint.part, "point_a", None) is None:
         raise _NotHereError(f"a nearly redundant joint is left out, {joint.names[0]!r} has no points of two bodies")
-    off = 1e-6 * float(own.system.length)
-    yield base.trial("1e-06 off", build=lambda: _with(base, doubled(own.system, own.state, off)))
+    off = 1e-6 * float(mechanism.system.length)
+    yield base.trial("1e-06 off", build=lambda: _with(base, doubled(mechanism.system, mechanism.state, off)))
 
 
 _KINDS: dict[str, Callable[[_Base], Iterator[_Trial]]] = {
@@ -259,10 +261,10 @@ def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> _Case:
     steps = int(trajectory.stats["num_steps"])
     if not bool(trajectory.result == RESULTS.successful):
         return refused(outcome(trajectory.result), steps)
-    known = _truth(system, state, t1) if trial.truth is None else trial.truth[0]
-    if known is None:
+    reference = _truth(system, state, t1) if trial.truth is None else trial.truth[0]
+    if reference is None:
         return _Case(kind, trial.case, "unknown", None, steps)
-    truth, difference = known
+    truth, difference = reference
     error, known_to = _distance(_natural(system, trajectory.ys), truth), MARGIN * difference
     return _Case(kind, trial.case, "small" if error < known_to else error, known_to, steps)
 
@@ -270,13 +272,13 @@ def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> _Case:
 def _truth(system: Any, state: State, t1: float) -> Any:
     """The motion in natural units and the difference of two methods; None if fewer than two reach the end."""
     for rtol in _TIGHT:
-        found = []
+        motions = []
         for solver in (Adams(), diffrax.Dopri8(), Hermite()):
             trajectory = _run(system, state, t1, rtol, solver)
             if bool(trajectory.result == RESULTS.successful):
-                found.append(_natural(system, trajectory.ys))
-            if len(found) == 2:
-                return found[0], _distance(*found)
+                motions.append(_natural(system, trajectory.ys))
+            if len(motions) == 2:
+                return motions[0], _distance(*motions)
     return None
 
 
@@ -294,8 +296,8 @@ def _compiled(system, state, t1, rtol, solver):
 
 def _natural(system: Any, ys: State) -> tuple[np.ndarray, ...]:
     scaled = lambda values, scale: np.asarray(values) / np.asarray(scale)
-    own = scaled(ys.q, system.coordinate_scale()), scaled(ys.u, system.velocity_scale())
-    return own if ys.z is None else (*own, scaled(ys.z, system.state_scale()))
+    natural = scaled(ys.q, system.coordinate_scale()), scaled(ys.u, system.velocity_scale())
+    return natural if ys.z is None else (*natural, scaled(ys.z, system.state_scale()))
 
 
 def _distance(motion: Any, truth: Any) -> float:

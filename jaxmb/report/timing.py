@@ -29,8 +29,8 @@ def interleaved(runs: Sequence[Callable[[], Any]], repeats: int) -> list[tuple[f
         jax.block_until_ready(run())
     times: list[list[float]] = [[] for _ in runs]
     for _ in range(repeats):
-        for own, run in zip(times, runs, strict=True):
+        for durations, run in zip(times, runs, strict=True):
             begin = time.perf_counter()
             jax.block_until_ready(run())
-            own.append(time.perf_counter() - begin)
-    return [tuple(own) for own in times]
+            durations.append(time.perf_counter() - begin)
+    return [tuple(durations) for durations in times]

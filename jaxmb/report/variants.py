@@ -49,19 +49,19 @@ def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State
     if system.nz:
         raise ValueError(f"the internal states {', '.join(system.state_names())} have an unknown power of length.")
     functions = [name for g in _groups(system) if _has_function(g.group.part) for name in g.group.names]
-    known = units(system)
-    unknown = [*functions, *(name for name, unit in known.items() if unit is None)]
+    declared = units(system)
+    unknown = [*functions, *(name for name, unit in declared.items() if unit is None)]
     if unknown or not system.body_names:
         raise ValueError(f"the units of {', '.join(unknown[:3]) or 'a Lagrangian'} are not known")
     values = {}
     for name, value in parameters(system).items():
-        exponents = np.array([power_of_length(unit) for unit in (known[name] or "").split(", ")])
+        exponents = np.array([power_of_length(unit) for unit in (declared[name] or "").split(", ")])
         values[name] = np.asarray(value) * float(factor) ** np.squeeze(exponents)
     scaled = with_parameters(system, values)
     scaled = eqx.tree_at(lambda s: s.length, scaled, system.length * factor)
     natural = lambda s: (s.coordinate_scale(), s.velocity_scale())
-    own = [new / old for new, old in zip(natural(scaled), natural(system), strict=True)]
-    return scaled, State(state.q * own[0], state.u * own[1])
+    factors = [new / old for new, old in zip(natural(scaled), natural(system), strict=True)]
+    return scaled, State(state.q * factors[0], state.u * factors[1])
 
 
 def _has_function(part: Any) -> bool:

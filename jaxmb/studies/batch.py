@@ -72,8 +72,8 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     @eqx.filter_jit
     def of_all(members, count):
         arrays, shared = eqx.partition(members, lambda x: isinstance(x, ARRAYS))
-        member = Member(lambda own: function(*eqx.combine(own, shared)), jax.tree.map(lambda x: x[0], arrays))
-        together = lambda own: member.block(jax.tree.leaves(own)[0].shape[0])(own)
+        member = Member(lambda block: function(*eqx.combine(block, shared)), jax.tree.map(lambda x: x[0], arrays))
+        together = lambda block: member.block(jax.tree.leaves(block)[0].shape[0])(block)
         return in_blocks(together, arrays, min(size or member.block_size(count), count))
 
     @functools.wraps(function)
@@ -152,8 +152,8 @@ def _loops(program: Any) -> Iterator[tuple[int, int]]:
         if equation.primitive.name in ("while", "scan"):
             # A scan does not carry the results of single steps.
             yield _bytes(equation.outvars[: _loop_values(equation)]), sum(map(_written, inner))
-        for own in inner:
-            yield from _loops(own)
+        for inner_program in inner:
+            yield from _loops(inner_program)
 
 
 def _loop_values(equation: Any) -> int:
@@ -164,8 +164,8 @@ def _loop_values(equation: Any) -> int:
 
 def _written(program: Any) -> int:
     """The bytes that the equations of a program write, with one turn of each loop."""
-    found = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
-    return sum(sum(map(_written, inner)) if inner else _bytes(equation.outvars) for equation, inner in found)
+    pairs = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
+    return sum(sum(map(_written, inner)) if inner else _bytes(equation.outvars) for equation, inner in pairs)
 
 
 def _inner(equation: Any) -> list[Any]:
@@ -201,9 +201,9 @@ def _count(members: tuple[Any, ...]) -> int:
     if not counts:
         raise ValueError("A batch needs an array with members along axis 0, got none.")
     (first, count), *others = counts.items()
-    for name, own in others:
-        if own != count:
-            raise ValueError(f"{first} has {count} members, but {name} has {own}.")
+    for name, number in others:
+        if number != count:
+            raise ValueError(f"{first} has {count} members, but {name} has {number}.")
     if count == 0:
         raise ValueError(f"A batch needs at least one member, and {first} has none.")
     return count

@@ -92,16 +92,16 @@ def minimise_together(
     """`levenberg_marquardt` from several starts, whose trials are evaluated together."""
     runs = [_trials(z, tol, limit, held, move, size) for z in starts]
     points = [next(run) for run in runs]
-    found: dict[int, Minimum] = {}
-    while len(found) < len(runs):
+    minima: dict[int, Minimum] = {}
+    while len(minima) < len(runs):
         models = linearised(points)
         for k, run in enumerate(runs):
-            if k not in found:
+            if k not in minima:
                 try:
                     points[k] = run.send(Linearised(*models[k]))
                 except StopIteration as end:
-                    found[k] = end.value
-    return [found[k] for k in range(len(runs))]
+                    minima[k] = end.value
+    return [minima[k] for k in range(len(runs))]
 
 
 def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size) -> Generator[Any, Linearised, Minimum]:
@@ -119,7 +119,7 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
         whole[slice(None) if held is None else ~held] = step
         point = move(z, whole)
         trial, objective = _numbers((yield point), held), model.value
-        gap, later = (np.sum(np.abs(own.gaps)) for own in (model, trial))
+        gap, later = (np.sum(np.abs(either.gaps)) for either in (model, trial))
         decrease = objective - trial.value + weight * (gap - later)
         change = model.jacobian @ step
         predicted = weight * share * gap - model.residuals @ change - 0.5 * change @ change
@@ -153,7 +153,7 @@ def _numbers(model: Linearised, held: np.ndarray | None) -> Linearised:
     residuals, jacobian = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
     gaps = np.zeros(0) if model.gaps is None else np.asarray(model.gaps)
     closing = np.zeros((0, jacobian.shape[1])) if model.closing is None else np.asarray(model.closing)[:, free]
-    finite = all(np.all(np.isfinite(own)) for own in (jacobian, gaps, closing))
+    finite = all(np.all(np.isfinite(array)) for array in (jacobian, gaps, closing))
     return Linearised(residuals, jacobian, model.value if finite else np.inf, np.where(finite, gaps, 0.0), closing)
 
 

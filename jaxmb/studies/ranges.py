@@ -194,15 +194,15 @@ class Inertia(AbstractRange):
         return lower + jnp.diag(jnp.exp(diagonal) - diagonal)
 
     def locate(self, value):
-        start, own = (jnp.linalg.cholesky(second_moments(inertia)) for inertia in (self.start, value))
-        lower = jnp.linalg.solve(start, own)
+        start, target = (jnp.linalg.cholesky(second_moments(inertia)) for inertia in (self.start, value))
+        lower = jnp.linalg.solve(start, target)
         diagonal = jnp.diag(lower)
         return (lower + jnp.diag(jnp.log(diagonal) - diagonal))[self._below]
 
     def at_end(self, z, deviations):
         # The squared singular values of T are the remaining fractions of the start in some directions.
-        there = np.linalg.svd(np.asarray(self._factor(z)), compute_uv=False)
-        near = there[-1] < _NEAR or there[0] > 1 / _NEAR
+        factors = np.linalg.svd(np.asarray(self._factor(z)), compute_uv=False)
+        near = factors[-1] < _NEAR or factors[0] > 1 / _NEAR
         return np.full(self.start.shape, near)
 
     def free_components(self, value):
@@ -251,8 +251,8 @@ class FreeParameters(eqx.Module):
     def at_end(self, z: Float[Array, "n"], deviations: Float[np.ndarray, "values"]) -> np.ndarray:
         """Whether each of all values, raveled one after the other, is at an end of its range."""
         out, ends = [], np.cumsum([r.start.size for r in self.ranges])
-        for name, r, own in zip(self.names, self.ranges, np.split(deviations, ends[:-1]), strict=True):
-            out.append(np.ravel(r.at_end(z[self.place(name)], own.reshape(r.start.shape))))
+        for name, r, part in zip(self.names, self.ranges, np.split(deviations, ends[:-1]), strict=True):
+            out.append(np.ravel(r.at_end(z[self.place(name)], part.reshape(r.start.shape))))
         return np.concatenate(out)
 
     def ends(self) -> list[tuple[float, float] | None]:

@@ -103,33 +103,33 @@ def show(
             raise ValueError(f"{name} must be a positive number, got {value!r}.")
     points, reactions, forces = (_listed(names) for names in (points, reactions, forces))
     shapes = shapes or {}
-    for own in _named(trajectory).values():
-        check_shapes(own.system, shapes)
+    for single in _named(trajectory).values():
+        check_shapes(single.system, shapes)
     motions = [
-        motion(name, chosen(own, frames), shapes, COLORS[k % len(COLORS)] if overlay else None)
-        for k, (name, own) in enumerate(_named(trajectory).items())
+        motion(name, chosen(single, frames), shapes, COLORS[k % len(COLORS)] if overlay else None)
+        for k, (name, single) in enumerate(_named(trajectory).items())
     ]
-    forces_of = [_arrows(own, reactions, forces) for own in motions]
+    forces_of = [_arrows(single, reactions, forces) for single in motions]
     view = scenery.View.of(motions, overlay)
     strength = _strength(forces_of)
     # The side of a square of the grid is then a round force [N].
     square = scenery.round_number(4 * strength * view.cell / view.size) if strength > 0 else 0.0
     scale = view.cell / square if square else 0.0
-    first, last = min(own.times[0] for own in motions), max(own.times[-1] for own in motions)
+    first, last = min(single.times[0] for single in motions), max(single.times[-1] for single in motions)
     speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST))
     played: list[tuple[np.ndarray, Sequence[SceneNode]]] = []
-    for own, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
+    for single, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
         drawn = {"points": points, "arrows": arrows, "scale": scale, "thickness": 0.0035 * view.size}
-        nodes = own.nodes(offset, view.grain, **drawn)
-        played.append(((own.times - first) / speed, nodes))
-    still, clock = scenery.nodes(motions, view), np.unique(np.concatenate([own.times for own in motions]))
+        nodes = single.nodes(offset, view.grain, **drawn)
+        played.append(((single.times - first) / speed, nodes))
+    background, clock = scenery.nodes(motions, view), np.unique(np.concatenate([single.times for single in motions]))
     notes = [f"{speed:.3g} × real time"] if speed != 1 else []
     notes += [f"arrows {square:g} N a square"] if square else []
     played += [
-        (np.zeros(1), still),
+        (np.zeros(1), background),
         ((clock - first) / speed, [scenery.clock(clock, notes, _marks(motions, clock, speed), view)]),
     ]
-    return MovingPicture(page(played, view.camera), height, max(own.times.size for own in motions))
+    return MovingPicture(page(played, view.camera), height, max(single.times.size for single in motions))
 
 
 def save_html(trajectory: Motions, path: str | Path, **options: Any) -> Path:
@@ -149,44 +149,46 @@ def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
 
 def _named(trajectory: Motions) -> dict[str, Trajectory]:
     if isinstance(trajectory, Mapping):
-        motions = {str(name): own for name, own in trajectory.items()}
+        motions = {str(name): single for name, single in trajectory.items()}
     elif isinstance(trajectory, Sequence):
-        motions = {str(k): own for k, own in enumerate(trajectory, 1)}
+        motions = {str(k): single for k, single in enumerate(trajectory, 1)}
     else:
         motions = {"": trajectory}
     if not motions:
         raise ValueError("There is no motion to show.")
-    for own in motions.values():
-        if not (hasattr(own, "system") and hasattr(own, "ts")):
-            raise ValueError(f"show takes motions returned by simulate, got {type(own).__name__}.")
+    for single in motions.values():
+        if not (hasattr(single, "system") and hasattr(single, "ts")):
+            raise ValueError(f"show takes motions returned by simulate, got {type(single).__name__}.")
     return motions
 
 
 def _marks(motions: Sequence[Motion], clock: np.ndarray, speed: float) -> list[str]:
     """The names of events at each time."""
-    found = [
-        (event.time, f"{own.name} {event.part}: {event.kind}".strip())
-        for own in motions
-        if own.trajectory.found_events is not None
-        for event in own.trajectory.events
+    events = [
+        (event.time, f"{single.name} {event.part}: {event.kind}".strip())
+        for single in motions
+        if single.trajectory.found_events is not None
+        for event in single.trajectory.events
     ]
     out = []
     for t in clock:
-        own = dict.fromkeys(text for time, text in found if time <= t < time + _SEEN * speed)
-        out.append(", ".join(list(own)[-_AT_ONCE:]))
+        names = dict.fromkeys(text for time, text in events if time <= t < time + _SEEN * speed)
+        out.append(", ".join(list(names)[-_AT_ONCE:]))
     return out
 
 
-def _arrows(own: Motion, reactions: Sequence[str], forces: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    out = {f"reactions/{name}": own.reaction(name) for name in reactions}
-    return out | {f"forces/{name}": own.force(name) for name in forces}
+def _arrows(
+    single: Motion, reactions: Sequence[str], forces: Sequence[str]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    out = {f"reactions/{name}": single.reaction(name) for name in reactions}
+    return out | {f"forces/{name}": single.force(name) for name in forces}
 
 
 def _strength(forces_of: Sequence[Mapping[str, tuple[np.ndarray, np.ndarray]]]) -> float:
     """The force [N] that the largest arrow exceeds for a tenth of the time."""
     largest = [
-        np.max([np.linalg.norm(force, axis=-1).max(axis=-1) for _, force in own.values()], axis=0)
-        for own in forces_of
-        if own
+        np.max([np.linalg.norm(force, axis=-1).max(axis=-1) for _, force in arrows.values()], axis=0)
+        for arrows in forces_of
+        if arrows
     ]
     return float(np.quantile(np.concatenate(largest), 0.9)) if largest else 0.0

@@ -60,10 +60,12 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     axes: Any = figure.add_subplot(projection=None if picture.planar else "3d")
     draw = _draw_areas if picture.planar else _draw_edges
     # Objects on the ground are drawn once.
-    draw(axes, picture, [own for own in shapes if own[0] == GROUND and own[1].primitive != "ground"], 0, 1.0)
+    draw(
+        axes, picture, [placed for placed in shapes if placed[0] == GROUND and placed[1].primitive != "ground"], 0, 1.0
+    )
     for order, time in enumerate(shown):
         fade = (order + 1) / len(shown)
-        draw(axes, picture, [own for own in shapes if own[0] != GROUND], time, fade)
+        draw(axes, picture, [placed for placed in shapes if placed[0] != GROUND], time, fade)
         _draw_paths(axes, picture, time, fade)
     bodies = [name for name in picture.positions if name != GROUND]
     if len(bodies) <= _FEW:
@@ -90,7 +92,7 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
 
 def _draw_areas(axes, picture, shapes, time, fade):
     areas = [(_in_world(picture, body, area(shape), time), shape.color) for body, shape in shapes]
-    for corners, color in sorted(areas, key=lambda own: float(np.mean(own[0][:, 2]))):
+    for corners, color in sorted(areas, key=lambda polygon: float(np.mean(polygon[0][:, 2]))):
         axes.fill(
             *corners[:, :2].T, facecolor=_faded(color, fade), edgecolor=_faded(_EDGE, fade), linewidth=0.4, zorder=2
         )

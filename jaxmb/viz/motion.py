@@ -104,9 +104,9 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
 
 def _default(system) -> list[str]:
     """The quantities that describe a motion."""
-    known = system.quantities()
+    quantities = system.quantities()
     # In space a body has no angle: angles of joints are shown.
-    flat = any(f"{name}.angle" in known for name in system.catalogue.motion_names())
+    flat = any(f"{name}.angle" in quantities for name in system.catalogue.motion_names())
     kinds = ("displacement",) if flat else ("angle", "displacement")
     of_bodies = _quantities(system, system.catalogue.motion_names())
     of_bodies = [name for name in of_bodies if flat or _kind(system, name) != _RATES["angle"]]
@@ -116,19 +116,19 @@ def _default(system) -> list[str]:
 
 def _quantities(system, names: Iterable[str]) -> list[str]:
     """The quantities selected by names."""
-    known = system.quantities()
+    quantities = system.quantities()
     out: dict[str, None] = {}
     for name in names:
-        of_part = [own for own in known if own.startswith(f"{name}.") and not known[own].of_forces]
+        of_part = [key for key in quantities if key.startswith(f"{name}.") and not quantities[key].of_forces]
         shown = (name,) if "." in name else (name, f"{name}_rate")
         # Plots of Euler parameters are hard to read.
-        found = [quantity for quantity in shown if quantity in known]
-        found += [quantity for quantity in of_part if not quantity.endswith(".orientation")]
-        if not found:
+        selected = [quantity for quantity in shown if quantity in quantities]
+        selected += [quantity for quantity in of_part if not quantity.endswith(".orientation")]
+        if not selected:
             what = "body, joint or quantity" if system.body_names else "coordinate"
-            parts = dict.fromkeys(quantity.split(".")[0] for quantity in known)
-            raise unknown(what, name, (*parts, *known, *_CHECKS))
-        out |= dict.fromkeys(found)
+            parts = dict.fromkeys(quantity.split(".")[0] for quantity in quantities)
+            raise unknown(what, name, (*parts, *quantities, *_CHECKS))
+        out |= dict.fromkeys(selected)
     return list(out)
 
 
@@ -169,9 +169,9 @@ def _moving(panels: dict[str, list[_Line]]) -> dict[str, list[_Line]]:
     for kind in _WITH_RATES:
         if kind in panels:
             size = max(float(np.max(np.abs(line.values))) for line in panels[kind])
-            still = {line[:2] for line in panels[kind] if np.ptp(line.values) <= _STILL * size}
-            for own in (kind, _RATES[kind]):
-                out[own] = [line for line in panels[own] if line[:2] not in still]
+            constant = {line[:2] for line in panels[kind] if np.ptp(line.values) <= _STILL * size}
+            for group in (kind, _RATES[kind]):
+                out[group] = [line for line in panels[group] if line[:2] not in constant]
     return {kind: lines for kind, lines in out.items() if lines}
 
 
@@ -202,12 +202,12 @@ def _draw_events(places: Sequence["Axes"], t: np.ndarray, trajectory: Trajectory
     """Vertical lines in all panels, named by the legend of the first panel."""
     from matplotlib.collections import LineCollection
 
-    found = [] if trajectory.found_events is None else trajectory.events
+    events = [] if trajectory.found_events is None else trajectory.events
     for style, struck in (("-", True), (":", False)):
-        own = [event for event in found if (event.impulse != 0) == struck and t[0] <= event.time <= t[-1]]
-        kinds = ", ".join(sorted({event.kind for event in own}))
-        lines = [[(event.time, 0.0), (event.time, 1.0)] for event in own]
-        for k, axes in enumerate(places if own else ()):
+        drawn = [event for event in events if (event.impulse != 0) == struck and t[0] <= event.time <= t[-1]]
+        kinds = ", ".join(sorted({event.kind for event in drawn}))
+        lines = [[(event.time, 0.0), (event.time, 1.0)] for event in drawn]
+        for k, axes in enumerate(places if drawn else ()):
             # In units of the panel's height, so that the limits still follow the motion.
             across = axes.get_xaxis_transform()
             label = kinds if k == 0 else None

@@ -21,14 +21,14 @@ def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
             "jax.tree.map(lambda leaf: leaf[0], trajectory), and show them one by one; viz.show takes a list or a "
             "dictionary of them."
         )
-    found = trajectory.trimmed()
-    if found.ts.shape[0] < least:
+    trimmed = trajectory.trimmed()
+    if trimmed.ts.shape[0] < least:
         count = ("one time", "two times")[least - 1]
-        if found.ts.shape[0] < trajectory.ts.shape[0] and not bool(trajectory.result == RESULTS.successful):
+        if trimmed.ts.shape[0] < trajectory.ts.shape[0] and not bool(trajectory.result == RESULTS.successful):
             why = RESULTS[trajectory.result]  # pyright: ignore[reportInvalidTypeArguments]
             raise ValueError(f"{name} needs a motion that reached {count} or more at which it is saved: {why}")
         raise ValueError(f"{name} needs a motion saved at {count} or more; give simulate saveat=…")
-    return found
+    return trimmed
 
 
 def check_finite(trajectory: Trajectory) -> None:

@@ -43,19 +43,21 @@ def solids(
     out: list[Placed] = []
     for k, name in enumerate(picture.positions):
         if name in given:
-            own = given[name]
-            own = [own] if isinstance(own, AbstractShape) else list(own)
+            body_shapes = given[name]
+            body_shapes = [body_shapes] if isinstance(body_shapes, AbstractShape) else list(body_shapes)
             if name in picture.centres:
                 # Bodies are placed by their mass centres.
-                own = [shape.moved(-picture.centres[name], np.array([1.0, 0.0, 0.0, 0.0])) for shape in own]
+                body_shapes = [
+                    shape.moved(-picture.centres[name], np.array([1.0, 0.0, 0.0, 0.0])) for shape in body_shapes
+                ]
         elif name == GROUND:
-            own = [_support(point, picture.up, width) for point in points[name]]
+            body_shapes = [_support(point, picture.up, width) for point in points[name]]
         else:
-            own = _linkage(points[name], picture.planar, width)
-            if not own and not of_parts[name]:
-                own = _equivalent(*picture.inertias[name], width)
+            body_shapes = _linkage(points[name], picture.planar, width)
+            if not body_shapes and not of_parts[name]:
+                body_shapes = _equivalent(*picture.inertias[name], width)
         color = _GROUND if name == GROUND else tint or COLORS[k % len(COLORS)]
-        out += [(name, shape.colored(color)) for shape in (*own, *of_parts[name])]
+        out += [(name, shape.colored(color)) for shape in (*body_shapes, *of_parts[name])]
     return out
 
 
@@ -66,7 +68,7 @@ def _attachments(picture):
         for body, point in zip(part.bodies, part.points, strict=True):
             if point is not None:
                 points[body][tuple(np.round(point, 9))] = point
-    return {name: list(own.values()) for name, own in points.items()}
+    return {name: list(distinct.values()) for name, distinct in points.items()}
 
 
 def _linkage(points, planar, width):

@@ -52,8 +52,8 @@ def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[SceneNode]]]
         scene.configure_default_lights(True, cast_shadow=camera.shadows)
         handles = [
             (times, node, node.add(scene, **{name: values[0] for name, values in node.varying.items()}))
-            for times, own in nodes
-            for node in own
+            for times, group in nodes
+            for node in group
         ]
         recording = server.get_scene_serializer()
         now = 0.0

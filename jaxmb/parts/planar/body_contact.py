@@ -92,19 +92,19 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
 
     def wrenches(self, space, poses, velocities, t):
         disc = _Disc(poses[0], velocities[0], self.centre, space)
-        own = lambda *other: self._pair(space, disc, *other)
-        on_disc, on_others = jax.vmap(own)(poses[1:], velocities[1:], self.surfaces())
+        pair = lambda *other: self._pair(space, disc, *other)
+        on_disc, on_others = jax.vmap(pair)(poses[1:], velocities[1:], self.surfaces())
         return jnp.concatenate([jnp.sum(on_disc, axis=0, keepdims=True), on_others])
 
     def energy(self, space, poses, t):
         centre = space.point(poses[0], self.centre)
-        own = lambda pose, surface: self._energy(space.body_point(pose, centre), surface)
-        return jnp.sum(jax.vmap(own)(poses[1:], self.surfaces()))
+        energy_of = lambda pose, surface: self._energy(space.body_point(pose, centre), surface)
+        return jnp.sum(jax.vmap(energy_of)(poses[1:], self.surfaces()))
 
     def gaps(self, space, poses, t):
         centre = space.point(poses[0], self.centre)
-        own = lambda pose, surface: self.clearance(space.body_point(pose, centre), surface)
-        return jax.vmap(own)(poses[1:], self.surfaces())
+        clearance_of = lambda pose, surface: self.clearance(space.body_point(pose, centre), surface)
+        return jax.vmap(clearance_of)(poses[1:], self.surfaces())
 
     @property
     def gap_width(self):
@@ -224,7 +224,7 @@ class PlateContact(AbstractBodyContact):
 
     def complete(self, space, poses):
         if self.chain:
-            starts, ends = (jax.vmap(space.point)(poses[1:], own) for own in self.surfaces())
+            starts, ends = (jax.vmap(space.point)(poses[1:], end_points) for end_points in self.surfaces())
             apart = norm(jnp.roll(starts, -1, axis=0) - ends)
             k = int(jnp.argmax(apart))
             if apart[k] > self.edge:
@@ -259,7 +259,7 @@ class PlateContact(AbstractBodyContact):
         if not self.chain:
             return out
         disc = _Disc(poses[0], velocities[0], self.centre, space)
-        corner = lambda *own: self._corner(space, disc, *own)
+        corner = lambda *arguments: self._corner(space, disc, *arguments)
         on_disc, on_ends, on_starts = jax.vmap(corner)(*_corners(poses[1:], velocities[1:], *self.surfaces()))
         return out + jnp.concatenate(
             [jnp.sum(on_disc, axis=0, keepdims=True), on_ends + jnp.roll(on_starts, 1, axis=0)]
@@ -271,11 +271,11 @@ class PlateContact(AbstractBodyContact):
             return out
         middle = space.point(poses[0], self.centre)
 
-        def own(poses, _, starts, ends):
+        def corner_energy(poses, _, starts, ends):
             first, second = (space.body_point(pose, middle) for pose in poses)
             return self._corner_energy(first, second, middle - _between(space, poses, starts, ends), starts, ends)
 
-        return out + jnp.sum(jax.vmap(own)(*_corners(poses[1:], poses[1:], *self.surfaces())))
+        return out + jnp.sum(jax.vmap(corner_energy)(*_corners(poses[1:], poses[1:], *self.surfaces())))
 
     def _fade(self, inside):
         return step(0.5 * (inside / self.edge + 1.0))

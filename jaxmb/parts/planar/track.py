@@ -102,10 +102,10 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         return namespace(points).roll(points, -1, axis=0) - points
 
     def _centres(self, space, poses) -> Any:
-        own = poses[np.array(self.owners)], self.points
-        if namespace(*own) is np:
-            return np.stack([space.point(*pair) for pair in zip(*own, strict=True)])
-        return jax.vmap(space.point)(*own)
+        pairs = poses[np.array(self.owners)], self.points
+        if namespace(*pairs) is np:
+            return np.stack([space.point(*pair) for pair in zip(*pairs, strict=True)])
+        return jax.vmap(space.point)(*pairs)
 
     def length(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
         """Length of the track [m]."""
@@ -165,8 +165,8 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         tension = self.pretension + self.stiffness * (length - self.free_length)
         # The length of a taut line changes only with the ends of its straight parts, also around circles.
         pull = tension * (along - jnp.roll(along, 1, axis=0))
-        own = jax.vmap(space.point_force)(poses[np.array(self.owners)], self.points, pull)
-        return placed_sums(np.array(self.owners), len(self.bodies))(own)
+        forces = jax.vmap(space.point_force)(poses[np.array(self.owners)], self.points, pull)
+        return placed_sums(np.array(self.owners), len(self.bodies))(forces)
 
     def energy(self, space, poses, t):
         stretch = self.length(space, poses) - self.free_length

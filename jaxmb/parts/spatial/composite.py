@@ -130,8 +130,8 @@ class Composite(AbstractSpatialPart, AbstractJoint):
             values["slide"] = iter(_components(ways, at - start))
         if "ball" in self.sequence:
             values["ball"] = iter([rotation_vector(self, poses)])
-        own = zip(coordinate_names(self.sequence), self.sequence, strict=True)
-        return {name: next(values[word]) for name, word in own}
+        named = zip(coordinate_names(self.sequence), self.sequence, strict=True)
+        return {name: next(values[word]) for name, word in named}
 
     def elementary_joints(self, space, poses):
         """The first is fixed in A; the coordinates of the previous joints place the others."""
@@ -163,7 +163,7 @@ class Composite(AbstractSpatialPart, AbstractJoint):
 
     def _of(self, word, rows):
         """The rows that belong to the joints of one kind."""
-        return [row for own, row in zip(self.sequence, rows, strict=True) if own == word]
+        return [row for kind, row in zip(self.sequence, rows, strict=True) if kind == word]
 
     # Below, the turn is the rotation of B in A from zero coordinates.
 
@@ -253,7 +253,7 @@ def degenerate(sequence: Sequence[str], axes: Float[ArrayLike, "n 3"], names: Se
     **Arguments:** `axes` at zero coordinates; `names` of the joints.
     """
     axes = np.asarray(axes)
-    kinds = {word: [k for k, own in enumerate(sequence) if own == word] for word in _COORDINATES}
+    kinds = {word: [k for k, kind in enumerate(sequence) if kind == word] for word in _COORDINATES}
     listed = lambda which: ", ".join(str(names[k]) for k in which)
     hinges, slides, balls = kinds["hinge"], kinds["slide"], kinds["ball"]
     if len(hinges) + 3 * len(balls) > 3:
@@ -261,8 +261,8 @@ def degenerate(sequence: Sequence[str], axes: Float[ArrayLike, "n 3"], names: Se
     for a, b in itertools.pairwise(hinges):
         if not np.linalg.norm(np.cross(axes[a], axes[b])) > _INDEPENDENT:
             return f"{listed([a, b])} are parallel hinges in succession"
-    own = axes[slides].reshape(-1, 3)
-    if len(slides) > 3 or not np.linalg.det(own @ own.T) > _INDEPENDENT**2:
+    directions = axes[slides].reshape(-1, 3)
+    if len(slides) > 3 or not np.linalg.det(directions @ directions.T) > _INDEPENDENT**2:
         return f"{listed(slides)} slide in linearly dependent directions"
     return None
 

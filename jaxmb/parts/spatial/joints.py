@@ -265,8 +265,8 @@ class Gimbal(AbstractOriented):
         triad = jnp.stack([self.axis_1, self.axis_2, self.axis_3])
         # The second and third axes, turned with B.
         turned = multiply(relative_orientation(poses), conjugate(self.orientation))
-        moved = jnp.stack([rotate(turned, own) for own in triad], axis=1)
-        c = jnp.sum(triad[:, :, None] * moved[None], axis=1)
+        turned_axes = jnp.stack([rotate(turned, axis) for axis in triad], axis=1)
+        c = jnp.sum(triad[:, :, None] * turned_axes[None], axis=1)
         # With a left-handed triad the turns about its axes, and so all sines, have the other sign.
         hand = jnp.where(dot(cross(self.axis_1, self.axis_2), self.axis_3) > 0, 1.0, -1.0)
         return {
@@ -282,8 +282,8 @@ class Gimbal(AbstractOriented):
             rotate(first, self.axis_2),
             direction_in_a(space, poses, unrotate(self.orientation, self.axis_3)),
         )
-        own = {f"angle_{k}": space.direction(poses[0], axis) for k, axis in enumerate(axes, 1)}
-        return joints_through_b(space, self, poses, **own)
+        directions = {f"angle_{k}": space.direction(poses[0], axis) for k, axis in enumerate(axes, 1)}
+        return joints_through_b(space, self, poses, **directions)
 
 
 class AbstractSliding(AbstractAxial):

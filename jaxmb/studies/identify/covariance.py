@@ -97,7 +97,7 @@ def combinations(components: tuple[str, ...], values: np.ndarray, found: Covaria
         row, column = np.unravel_index(np.argmax(np.abs(left)), left.shape)
         direction = left[:, column] / left[row, column]
         left = np.delete(left - np.outer(direction, left[row]), column, axis=1)
-        basis = [own - own[row] * direction for own in basis] + [direction]
+        basis = [other - other[row] * direction for other in basis] + [direction]
     out = []
     for direction in basis:
         direction = direction / direction[np.argmax(np.abs(direction))]

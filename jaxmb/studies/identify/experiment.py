@@ -132,8 +132,8 @@ class ExperimentModel(eqx.Module):
         system = self.changed_system(system, theta)
         if self.assembled:
             return system, self.state
-        fix = self.fix | {own.name: theta[label] for label, own in self.initial if not own.is_rate}
-        rates = self.rates | {own.name: theta[label] for label, own in self.initial if own.is_rate}
+        fix = self.fix | {entry.name: theta[label] for label, entry in self.initial if not entry.is_rate}
+        rates = self.rates | {entry.name: theta[label] for label, entry in self.initial if entry.is_rate}
         return system, assemble(system, self.state, fix=fix, rates=rates, t=self.t0, throw=throw)
 
     def simulated(
@@ -144,10 +144,10 @@ class ExperimentModel(eqx.Module):
         options: Mapping[str, Any],
     ) -> Trajectory:
         """The motion from an initial state."""
-        own = {} if self.inputs is None else {"inputs": self.inputs}
+        inputs = {} if self.inputs is None else {"inputs": self.inputs}
         moves = any(channel.delayed for channel in self.channels)
         with contextlib.nullcontext() if moves else frozen_times():
-            return simulate(system, state, t0=self.t0, t1=ts[-1], saveat=ts, throw=False, **(dict(options) | own))
+            return simulate(system, state, t0=self.t0, t1=ts[-1], saveat=ts, throw=False, **(dict(options) | inputs))
 
     def seen(
         self,
@@ -166,19 +166,19 @@ class ExperimentModel(eqx.Module):
         places = jnp.argsort(order).reshape(len(series), -1) if late else np.arange(saved.size)[None]
         readings, rows = {}, []
         for channel in self.channels:
-            own = places[1 + late.index(channel) if channel.delayed else 0]
+            places_of_sensor = places[1 + late.index(channel) if channel.delayed else 0]
             quantity = trajectory.quantity(channel.quantity)
-            readings[channel.name] = channel.read(quantity[own] if late else quantity, theta)
+            readings[channel.name] = channel.read(quantity[places_of_sensor] if late else quantity, theta)
             rows.append(channel.rows(readings[channel.name], theta, self.loss))
         if self.residual is not None:
             with traced_by_jax("the residual function", "the motion"):
                 readings[RESIDUAL] = jnp.asarray(self.residual(trajectory))
             rows.append(_of_user(readings[RESIDUAL], self.loss))
         joined = Rows(
-            jnp.concatenate([own.residuals for own in rows]),
-            jnp.concatenate([own.present for own in rows]),
-            jnp.concatenate([own.scores for own in rows]),
-            jnp.sum(jnp.stack([own.objective for own in rows])),
+            jnp.concatenate([part.residuals for part in rows]),
+            jnp.concatenate([part.present for part in rows]),
+            jnp.concatenate([part.scores for part in rows]),
+            jnp.sum(jnp.stack([part.objective for part in rows])),
         )
         ok = (trajectory.result == RESULTS.successful) & jnp.isfinite(joined.objective)
         fails = lambda x: jnp.where(ok, x, jnp.inf)
@@ -224,7 +224,7 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
         raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all measured quantities.")
     each = {name: np.asarray(measured_times(given[name], experiment.t0, name)) for name in names}
     ts = np.unique(np.concatenate(list(each.values())))
-    return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
+    return jnp.asarray(ts), {name: np.searchsorted(ts, times) for name, times in each.items()}
 
 
 def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
@@ -272,19 +272,19 @@ def channels_of(
         return ()
     if not measured:
         raise ValueError("measured is empty: give at least one quantity by name.")
-    shapes = {name: own.shape for name, own in system.quantities().items()}
-    known = dict.fromkeys((*sensors, *shapes))
+    shapes = {name: quantity.shape for name, quantity in system.quantities().items()}
+    available = dict.fromkeys((*sensors, *shapes))
     for name in (*measured, *(experiment.sigma or {})):
-        if name not in known:
-            raise unknown("quantity", name, known)
+        if name not in available:
+            raise unknown("quantity", name, available)
     for name in experiment.sigma or {}:
         if name not in measured:
             raise ValueError(f"sigma is given for {name!r}, which is not measured.")
-    own = dict(sigma or {}) | dict(experiment.sigma or {})
+    deviations = dict(sigma or {}) | dict(experiment.sigma or {})
     out, levels = [], {}
     for name, data in measured.items():
         sensor = sensors.get(name, Sensor(name))
-        deviation = own.get(name, sensor.sigma)
+        deviation = deviations.get(name, sensor.sigma)
         levels[name] = deviation is not None or f"{name}.sigma" in free
         shape = shapes[sensor.quantity]
         late = f"{name}.delay" in free
@@ -293,17 +293,17 @@ def channels_of(
             _check_delay(channel, np.asarray(ts), float(np.asarray(experiment.t0)))
         out.append(channel)
     if any(levels.values()) and not all(levels.values()):
-        missing = next(name for name, there in levels.items() if not there)
+        missing = next(name for name, is_given in levels.items() if not is_given)
         raise ValueError(f"sigma is given for other quantities but not for {missing!r}; give all or none.")
     return tuple(out)
 
 
 def _check_delay(channel, ts, t0):
     """Raise a `ValueError` for readings of the motion before it begins."""
-    there = np.asarray(channel.present).reshape(ts.size, -1).any(axis=1)
+    is_present = np.asarray(channel.present).reshape(ts.size, -1).any(axis=1)
     # Computed times differ by rounding errors.
     rounding = 8 * np.finfo(ts.dtype).eps * np.max(np.abs([t0, *ts]))
-    early = ts[there & (ts - float(channel.delay) < t0 - rounding)]
+    early = ts[is_present & (ts - float(channel.delay) < t0 - rounding)]
     if early.size:
         raise ValueError(
             f"Sensor {channel.name!r} has a delay of {float(channel.delay):g} s, so its reading at {early[0]:g} s "
@@ -336,8 +336,8 @@ def initial_unknown(system: AbstractSystem, name: str) -> Initial:
 def known_parameters(system: AbstractSystem, experiment: Experiment) -> dict[str, Array]:
     """The known parameters of one experiment."""
     given = experiment.parameters or {}
-    known = parameters(with_parameters(system, given))
-    return {name: known[name] for name in given}
+    values = parameters(with_parameters(system, given))
+    return {name: values[name] for name in given}
 
 
 def arrays(values: Mapping[str, VectorLike] | None) -> dict[str, Bool[Array, "..."]]:

@@ -92,7 +92,7 @@ class Identification(Printed, Fit):
         out[[self.reasons.get(name, UNDETERMINED) != UNDETERMINED for name in self.components]] = np.nan
         ends = np.cumsum([value.size for value in self.parameters.values()])
         each = zip(self.parameters.items(), np.split(out, ends[:-1]), strict=True)
-        return {name: own.reshape(value.shape) for (name, value), own in each}
+        return {name: part.reshape(value.shape) for (name, value), part in each}
 
     @property
     def held_out(self) -> dict[str, HeldOut]:
@@ -179,7 +179,10 @@ class Identification(Printed, Fit):
             [
                 headline,
                 *(f"- {reason}" for reason in reasons),
-                *(f"{name:{width}}  {start:>12}  {value:>12}  {own:>12}" for name, start, value, own in table),
+                *(
+                    f"{name:{width}}  {start:>12}  {value:>12}  {deviation:>12}"
+                    for name, start, value, deviation in table
+                ),
                 f"{self.size_of_residuals}, {self.iterations} iterations",
             ]
         )

@@ -125,8 +125,17 @@ def identify(
     **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, fewer data than unknowns,
     and if the simulation with the starting values fails or a free parameter has no effect on the residuals there.
     """
-    own = {"ts": ts, "state": state, "fix": fix, "rates": rates, "residual": residual, "free_initial": free_initial}
-    problem = _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss_named(loss), options)
+    per_experiment = {
+        "ts": ts,
+        "state": state,
+        "fix": fix,
+        "rates": rates,
+        "residual": residual,
+        "free_initial": free_initial,
+    }
+    problem = _problem(
+        system, measured, per_experiment, t0, sensors, sigma, free, bounds, prior, loss_named(loss), options
+    )
     limit, segments = whole_number("max_iterations", max_iterations), whole_number("segments", segments)
     points = _starts(problem, starts, seed)
     if segments > 1:
@@ -155,16 +164,16 @@ def identify(
     )
 
 
-def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> Problem:
+def _problem(system, measured, per_experiment, t0, sensors, sigma, free, bounds, prior, loss, options) -> Problem:
     for argument, value in (("sigma", sigma), ("bounds", bounds), ("prior", prior)):
         if value is not None and not isinstance(value, Mapping):
             raise ValueError(f"identify: {argument} is given by name, such as {{'crank.angle': …}}; got {value!r}.")
     several = [measured] if hasattr(measured, "held_out") else measured
     if have_times(measured) or not isinstance(several, list | tuple):
-        experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
+        experiments = {"": with_times(Experiment(measured, **per_experiment, t0=t0))}
     else:
-        given = [name for name, value in own.items() if value is not None and name != "free_initial"]
-        given += [name for name, value in (("free_initial", own["free_initial"]), ("t0", t0)) if value]
+        given = [name for name, value in per_experiment.items() if value is not None and name != "free_initial"]
+        given += [name for name, value in (("free_initial", per_experiment["free_initial"]), ("t0", t0)) if value]
         if given:
             arguments = ", ".join(f"{name}=…" for name in dict.fromkeys(("ts", given[0])))
             raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, {arguments}).")
@@ -238,16 +247,16 @@ def _least_squares(problem: Problem, points: list[Array], tol: float, limit: int
         return minimise_together(linearised, points, tol, limit)
     # First the motion is fitted with fixed noise levels, then both, from the levels that the first fit shows.
     coarse = 1e-3 if levels.sum() < levels.size else np.inf
-    found = minimise_together(linearised, points, coarse, limit, levels) if np.isfinite(coarse) else None
-    starts = points if found is None else [minimum.z for minimum in found]
+    coarse_minima = minimise_together(linearised, points, coarse, limit, levels) if np.isfinite(coarse) else None
+    starts = points if coarse_minima is None else [minimum.z for minimum in coarse_minima]
     starts = [with_likely_levels(problem, z, linearise(problem, z).readings) for z in starts]
     refined = minimise_together(linearised, starts, tol, limit)
-    before = [0] * len(points) if found is None else [minimum.iterations for minimum in found]
-    return [own._replace(iterations=own.iterations + more) for own, more in zip(refined, before, strict=True)]
+    before = [0] * len(points) if coarse_minima is None else [minimum.iterations for minimum in coarse_minima]
+    return [result._replace(iterations=result.iterations + more) for result, more in zip(refined, before, strict=True)]
 
 
 def _check_start(problem: Problem, model: Model) -> None:
-    fitted = [number for number, own in enumerate(problem.fitted) if own]
+    fitted = [number for number, is_fitted in enumerate(problem.fitted) if is_fitted]
     for number, result in zip(fitted, model.results, strict=True):
         if not bool(result == RESULTS.successful):
             text = RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]

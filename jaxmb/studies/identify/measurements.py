@@ -72,11 +72,15 @@ def read_measurements(
     if not columns:
         raise ValueError(f"{label} has no column except time.")
     values = {}
-    for name, own in columns.items():
-        for column in (own,) if isinstance(own, str) else own:
+    for name, column_names in columns.items():
+        for column in (column_names,) if isinstance(column_names, str) else column_names:
             if column not in named:
                 raise unknown("column", column, named)
-        values[name] = named[own] if isinstance(own, str) else np.stack([named[column] for column in own], axis=1)
+        values[name] = (
+            named[column_names]
+            if isinstance(column_names, str)
+            else np.stack([named[column] for column in column_names], axis=1)
+        )
     ts = named[time]
     if ts.size < 2:
         raise ValueError(f"{label} has {ts.size} rows; there are too few data.")

@@ -63,16 +63,16 @@ def predict(
     columns = problem.columns(number)
     flat = jnp.asarray(np.asarray(problem.free.flat(fit.z))[columns])
     jacobians, values = _predicted(problem.system, trial, problem.options, names, ts, flat)
-    found = fit.uncertainty
+    uncertainty = fit.uncertainty
     width = float(ndtri((1 + level) / 2))
     out, deviations = {}, {}
     for name in names:
         jacobian = np.asarray(jacobians[name])
         out[name] = np.asarray(values[name])
-        deviation = np.linalg.norm(jacobian @ found.root[columns], axis=-1)
-        if found.lost.shape[1]:
-            along = np.max(np.abs(jacobian @ found.lost[columns]), axis=-1)
-            size = np.max(np.abs(jacobian)[..., None] * np.abs(found.lost[columns]), initial=0.0)
+        deviation = np.linalg.norm(jacobian @ uncertainty.root[columns], axis=-1)
+        if uncertainty.lost.shape[1]:
+            along = np.max(np.abs(jacobian @ uncertainty.lost[columns]), axis=-1)
+            size = np.max(np.abs(jacobian)[..., None] * np.abs(uncertainty.lost[columns]), initial=0.0)
             deviation = np.where(along > 1e-6 * size, np.inf, deviation)
         deviations[name] = deviation if trusted else np.full_like(deviation, np.nan)
     low = {name: out[name] - width * deviations[name] for name in names}
@@ -113,8 +113,8 @@ def held_out(fit: Fit) -> dict[str, HeldOut]:
             continue
         seen = _seen(problem.system, problem.trials[number], problem.options, problem.own(number, values))
         residuals = np.asarray(seen.rows.residuals)[np.asarray(seen.rows.present)]
-        own = {channel.name: np.asarray(channel.places) for channel in problem.trials[number].channels}
-        readings = {sensor: np.asarray(reading)[own.get(sensor, ...)] for sensor, reading in seen.readings.items()}
+        places = {channel.name: np.asarray(channel.places) for channel in problem.trials[number].channels}
+        readings = {sensor: np.asarray(reading)[places.get(sensor, ...)] for sensor, reading in seen.readings.items()}
         out[name] = HeldOut(residuals, float(np.sqrt(np.mean(residuals**2))), readings)
     return out
 

@@ -75,8 +75,8 @@ class Problem(eqx.Module):
         """The indices of an experiment's unknowns among the components of all."""
         ends = np.cumsum([0, *(r.start.size for r in self.free.ranges)])
         places = {name: np.arange(*ends[k : k + 2]) for k, name in enumerate(self.free.names)}
-        own = [places[name] for name in self.sources[number]]
-        return np.concatenate(own) if own else np.zeros(0, int)
+        indices = [places[name] for name in self.sources[number]]
+        return np.concatenate(indices) if indices else np.zeros(0, int)
 
 
 class Model(NamedTuple):
@@ -105,13 +105,13 @@ def linearise(problem: Problem, z: Float[Array, "n"]) -> Model:
 def linearise_batch(problem: Problem, zs: Sequence[Float[Array, "n"]]) -> list[Model]:
     """The same at several points, simulated as one batch."""
     charts = [values_and_derivatives(problem, z) for z in zs]
-    found = {}
+    outcomes = {}
     for number, trial in enumerate(problem.trials):
         if problem.fitted[number]:
             columns = problem.columns(number)
             flats = [jnp.asarray(values[columns]) for values, *_ in charts]
-            found[number] = list(map(numbers, linearised_trials(problem.system, trial, problem.options, flats)))
-    return [_joined(problem, chart, {n: seen[k] for n, seen in found.items()}) for k, chart in enumerate(charts)]
+            outcomes[number] = list(map(numbers, linearised_trials(problem.system, trial, problem.options, flats)))
+    return [_joined(problem, chart, {n: seen[k] for n, seen in outcomes.items()}) for k, chart in enumerate(charts)]
 
 
 def values_and_derivatives(problem: Problem, z: Float[Array, "n"]) -> tuple[np.ndarray, ...]:
@@ -167,10 +167,10 @@ def numbers(tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)
 
 
-def _joined(problem, chart, found) -> Model:
+def _joined(problem, chart, outcomes) -> Model:
     _, derivatives, prior_rows, prior_jacobian = chart
     residuals, jacobians, scores, score_jacobians, objective = [], [], [], [], 0.5 * prior_rows @ prior_rows
-    for number, (seen, (of_residuals, of_scores)) in found.items():
+    for number, (seen, (of_residuals, of_scores)) in outcomes.items():
         inward, rows = derivatives[problem.columns(number)], seen.rows
         residuals.append(rows.residuals[rows.present])
         jacobians.append(of_residuals[rows.present] @ inward)
@@ -182,9 +182,9 @@ def _joined(problem, chart, found) -> Model:
         np.vstack([*jacobians, prior_jacobian, *score_jacobians]),
         objective,
     )
-    data = sum(own.size for own in residuals)
-    results = tuple(seen.result for seen, _ in found.values())
-    readings = {problem.names[n]: seen.readings for n, (seen, _) in found.items()}
+    data = sum(part.size for part in residuals)
+    results = tuple(seen.result for seen, _ in outcomes.values())
+    readings = {problem.names[n]: seen.readings for n, (seen, _) in outcomes.items()}
     return Model(weighted(problem, plain, data), plain, data, results, readings)
 
 
@@ -208,9 +208,9 @@ def with_likely_levels(
         if problem.fitted[number]:
             level = channel.level(readings[problem.names[number]][channel.name], values[source])
             squares.setdefault(source, []).append((level**2, int(np.sum(channel.present))))
-    for source, own in squares.items():
-        total = sum(count for _, count in own)
-        level = np.sqrt(sum(square * count for square, count in own) / total)
+    for source, terms in squares.items():
+        total = sum(count for _, count in terms)
+        level = np.sqrt(sum(square * count for square, count in terms) / total)
         if np.all(level > 0) and np.all(np.isfinite(level)):
             place, number = problem.free.place(source), problem.free.names.index(source)
             z = z.at[place].set(problem.free.ranges[number].locate(jnp.asarray(level, z.dtype)))

@@ -45,18 +45,18 @@ def profile(fit: Fit, component: str, *, level: float = 0.95, values=None) -> Pr
         raise unknown("component", component, fit.components)
     fit.whole_motions("A profile")
     held, limit = _Held(fit, component), float(ndtri((1 + level) / 2)) ** 2
-    found = [(held.best, 0.0, Minimum(fit.z, 0, fit.success, fit.objective))]
+    points = [(held.best, 0.0, Minimum(fit.z, 0, fit.success, fit.objective))]
     if values is None:
         for sign in (1, -1):
-            found += held.along(held.best + sign * held.step * np.arange(1, _MOST + 1), 1.2 * limit)
+            points += held.along(held.best + sign * held.step * np.arange(1, _MOST + 1), 1.2 * limit)
     else:
         values = np.sort(np.asarray(values, float))
-        found += held.along(values[values >= held.best]) + held.along(values[values < held.best][::-1])
-    found = sorted(found, key=lambda own: own[0])
-    places, ratios = (np.array([own[k] for own in found]) for k in (0, 1))
+        points += held.along(values[values >= held.best]) + held.along(values[values < held.best][::-1])
+    points = sorted(points, key=lambda point: point[0])
+    places, ratios = (np.array([point[k] for point in points]) for k in (0, 1))
     low, high = (_end(places, ratios, held.best, limit, sign) for sign in (-1, 1))
     keep = np.ones(places.size, bool) if values is None else np.isin(places, values)
-    minima = [minimum for (*_, minimum), there in zip(found, keep, strict=True) if there]
+    minima = [minimum for (*_, minimum), is_kept in zip(points, keep, strict=True) if is_kept]
     each = [fit.problem.free(minimum.z) for minimum in minima]
     return Profile(
         component=component,
@@ -65,7 +65,7 @@ def profile(fit: Fit, component: str, *, level: float = 0.95, values=None) -> Pr
         interval=(low, high),
         level=level,
         fits=np.array([minimum.success for minimum in minima]),
-        parameters={name: np.stack([np.asarray(own[name]) for own in each]) for name in fit.parameters},
+        parameters={name: np.stack([np.asarray(fitted[name]) for fitted in each]) for name in fit.parameters},
     )
 
 
@@ -80,7 +80,7 @@ class _Held:
             raise ValueError(
                 f"{self.name!r} is a matrix whose components cannot be held alone; profile another parameter."
             )
-        self.number = [own for own in fit.components if own.split("[")[0] == self.name].index(component)
+        self.number = [other for other in fit.components if other.split("[")[0] == self.name].index(component)
         self.mask = np.zeros(free.size, bool)
         self.mask[free.place(self.name).start + self.number] = True
         self.best = float(np.ravel(fit.parameters[self.name])[self.number])

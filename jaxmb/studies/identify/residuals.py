@@ -92,8 +92,8 @@ def _bias(problem: Problem, number: int, channel: Channel) -> Bias:
     if name not in shapes:
         return Bias(free=False)
     source = problem.sources[number][list(shapes).index(name)]
-    fitted = [own for own, fitted in zip(problem.sources, problem.fitted, strict=True) if fitted]
-    shared = sum(source in own for own in fitted) > 1
+    fitted = [names for names, fitted in zip(problem.sources, problem.fitted, strict=True) if fitted]
+    shared = sum(source in names for names in fitted) > 1
     return Bias(free=True, components=not shapes[name] and channel.values.ndim > 1, experiments=shared)
 
 
@@ -102,17 +102,17 @@ def _of_channel(
 ) -> Iterator[Series]:
     ts, measured, present = (np.asarray(x) for x in (trial.ts, channel.values, channel.present))
     sigma = np.broadcast_to(np.asarray(channel.sigma if level is None else level), measured.shape)
-    own = np.full(ts.size, -1)
-    own[np.asarray(channel.places)] = np.arange(channel.places.size)
-    known = known_noise and level is None
+    sample_index = np.full(ts.size, -1)
+    sample_index[np.asarray(channel.places)] = np.arange(channel.places.size)
+    is_known = known_noise and level is None
     for component in np.ndindex(measured.shape[1:]):
-        there = present[(slice(None), *component)]
-        at = (there, *component)
-        if not there.any():
+        is_present = present[(slice(None), *component)]
+        at = (is_present, *component)
+        if not is_present.any():
             continue
         label = " ".join(filter(None, (experiment, channel.name + _indices(component))))
         unit = sigma[at]
-        small = _SMALL if known else _SMALL_OF_RANGE * float(channel.range) / float(np.max(unit))
+        small = _SMALL if is_known else _SMALL_OF_RANGE * float(channel.range) / float(np.max(unit))
         yield Series(
             label=label,
             experiment=experiment,
@@ -120,11 +120,11 @@ def _of_channel(
             component=component,
             residuals=(predicted[at] - measured[at]) / unit,
             sigma=unit,
-            known=known,
+            known=is_known,
             small=small,
             predicted=predicted[at],
-            ts=ts[there],
-            samples=own[there],
+            ts=ts[is_present],
+            samples=sample_index[is_present],
             bias=bias,
         )
 
@@ -152,19 +152,19 @@ def _of_user(experiment: str, trial: ExperimentModel, residuals: np.ndarray) -> 
         )
 
 
-def outliers(found: tuple[Series, ...]) -> tuple[Outlier, ...]:
+def outliers(all_series: tuple[Series, ...]) -> tuple[Outlier, ...]:
     """The residuals beyond five standard deviations, in order of experiments, sensors and times."""
     out = []
-    for own in found:
-        sizes = np.abs(own.residuals)
+    for single in all_series:
+        sizes = np.abs(single.residuals)
         level = 1.0
-        if not own.known:
-            middle = np.median(sizes) / 0.6745 if sizes.size >= _MANY else np.sqrt(own.square)
-            level = max(float(middle), own.small)
+        if not single.known:
+            middle = np.median(sizes) / 0.6745 if sizes.size >= _MANY else np.sqrt(single.square)
+            level = max(float(middle), single.small)
         for k in np.flatnonzero(sizes > _FAR * level):
-            t = float(own.ts[k]) if own.ts.size else np.nan
-            sample = (int(own.samples[k]), *map(int, own.component))
-            out.append(Outlier(own.experiment, own.sensor, sample, t, float(own.residuals[k] / level)))
+            t = float(single.ts[k]) if single.ts.size else np.nan
+            sample = (int(single.samples[k]), *map(int, single.component))
+            out.append(Outlier(single.experiment, single.sensor, sample, t, float(single.residuals[k] / level)))
     return tuple(out)
 
 

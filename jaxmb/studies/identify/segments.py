@@ -64,18 +64,22 @@ def segmented(name: str, number: int, trial: ExperimentModel, segments: int) -> 
     out, before = [], trial.t0
     for group in groups:
         index = np.append(group, np.full(longest - len(group), group[-1]))
-        there = np.arange(longest) < len(group)
+        is_used = np.arange(longest) < len(group)
         channels = [
             eqx.tree_at(
                 lambda c: (c.values, c.present, c.sigma),
                 channel,
-                (channel.values[index], channel.present[index] & _column(there, channel.present), channel.sigma[index]),
+                (
+                    channel.values[index],
+                    channel.present[index] & _column(is_used, channel.present),
+                    channel.sigma[index],
+                ),
             )
             for channel in trial.channels
         ]
         out.append(eqx.tree_at(lambda t: (t.ts, t.t0, t.channels), trial, (trial.ts[index], before, tuple(channels))))
         before = trial.ts[group[-1]]
-    arrays, static = zip(*(eqx.partition(own, eqx.is_array) for own in out), strict=True)
+    arrays, static = zip(*(eqx.partition(element, eqx.is_array) for element in out), strict=True)
     return Lanes(number, jax.tree.map(lambda *x: jnp.stack(x), *arrays), static[0], tuple(map(len, groups)))
 
 
@@ -120,19 +124,19 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     residuals, jacobian, scores, score_rows, gaps, closing = [], [], [], [], [], []
     readings, objective = {}, 0.5 * prior_rows @ prior_rows
     columns = place.split(np.arange(total))
-    for lane, state, charts, own in zip(lanes, place.states, place.charts, columns, strict=True):
+    for lane, state, charts, lane_columns in zip(lanes, place.states, place.charts, columns, strict=True):
         trial, flat = problem.trials[lane.number], _own_values(problem, lane, place.z)
         inward = derivatives[problem.columns(lane.number)]
-        found = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
-        seen, (rows, levels, starts, ends) = numbers(found)
+        outcome = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
+        seen, (rows, levels, starts, ends) = numbers(outcome)
 
-        def whole(by_unknowns, by_states, inward=inward, own=own):
+        def whole(by_unknowns, by_states, inward=inward, lane_columns=lane_columns):
             """Derivatives in all unknowns, from derivatives in the experiment's unknowns and in each segment's
             state.
             """
             out = np.zeros((*by_unknowns.shape[:2], total))
             out[..., :n] = by_unknowns @ inward
-            for k, these in enumerate(own):
+            for k, these in enumerate(lane_columns):
                 out[k][:, these] = by_states[k]
             return out
 
@@ -155,7 +159,7 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     prior_whole = np.pad(prior_jacobian, ((0, 0), (0, total - n)))
     whole_rows = np.concatenate([*residuals, prior_rows, *scores])
     plain = Linearised(whole_rows, np.vstack([*jacobian, prior_whole, *score_rows]), objective)
-    data = sum(own.size for own in residuals)
+    data = sum(part.size for part in residuals)
     linearised = weighted(problem, plain, data)._replace(gaps=np.concatenate(gaps), closing=np.vstack(closing))
     return Model(linearised, plain, data, (), readings)
 

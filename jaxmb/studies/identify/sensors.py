@@ -154,9 +154,9 @@ def readings_of(
         data = np.asarray(data, dtype=dtype)
     except (TypeError, ValueError):
         raise ValueError(f"Measured {name!r} must be an array of numbers, NaN where a sample is missing.") from None
-    own = places.size
-    if data.shape != (own, *shape):
-        raise ValueError(f"Measured {name!r} must have shape {(own, *shape)} for {own} times, got {data.shape}.")
+    count = places.size
+    if data.shape != (count, *shape):
+        raise ValueError(f"Measured {name!r} must have shape {(count, *shape)} for {count} times, got {data.shape}.")
     if np.any(np.isinf(data)):
         raise ValueError(f"Measured {name!r} is infinite at sample {np.argwhere(np.isinf(data))[0][0]}.")
     present = ~np.isnan(data)
@@ -180,10 +180,10 @@ def readings_of(
     )
 
 
-def _among_all(own: np.ndarray, places: np.ndarray, times: int, otherwise: Any) -> np.ndarray:
+def _among_all(values: np.ndarray, places: np.ndarray, times: int, otherwise: Any) -> np.ndarray:
     """Values at a sensor's times, expanded to the times of all sensors."""
-    out = np.full((times, *own.shape[1:]), otherwise, own.dtype)
-    out[places] = own
+    out = np.full((times, *values.shape[1:]), otherwise, values.dtype)
+    out[places] = values
     return out
 
 

@@ -89,8 +89,8 @@ def _at_ends(fit: Fit) -> Iterator[tuple[str, str]]:
     free = fit.problem.free
     reached = free.at_end(fit.z, fit.uncertainty.deviations)
     each = zip(fit.components, reached, flat(fit.start), flat(fit.parameters), free.ends(), strict=True)
-    for name, there, start, value, bounds in each:
-        if not there:
+    for name, is_reached, start, value, bounds in each:
+        if not is_reached:
             continue
         cure = "restrict it to plausible values (bounds=)"
         if bounds is not None:
@@ -104,27 +104,29 @@ def _at_ends(fit: Fit) -> Iterator[tuple[str, str]]:
 
 def _of_other_starts(fit: Fit) -> Iterator[str]:
     others = [(value, np.asarray(fit.problem.free.flat(z))) for value, z in fit.ends if np.isfinite(value)]
-    known, noise = fit.problem.known_noise, fit.uncertainty.noise
+    known_noise, noise = fit.problem.known_noise, fit.uncertainty.noise
     # The estimated noise has a lower bound, since otherwise rounding would distinguish two ends.
     least = max(part.small for part in fit.series) / noise if noise > 0 else np.inf
-    least = 1.0 if known and not fit.problem.loss.robust else max(1.0, least)
-    count = None if known else fit.residuals.size
+    least = 1.0 if known_noise and not fit.problem.loss.robust else max(1.0, least)
+    count = None if known_noise else fit.residuals.size
     return of_starts(others, fit.components, fit.uncertainty.deviations * least, count, fit.dispersion * least**2)
 
 
 def of_residuals(
-    found: Sequence[Series], far: Sequence[Outlier], directions: int, loss: Loss, tried: Tried
+    series: Sequence[Series], far: Sequence[Outlier], directions: int, loss: Loss, tried: Tried
 ) -> list[str]:
     """The objections of the residuals to a fit, with remedies that were not tried yet.
 
     **Arguments:** `directions`: the number of fitted combinations of unknowns; `loss`: a robust loss expects some large
     residuals.
     """
-    known, unknown = ([own for own in found if own.known is there] for there in (True, False))
+    with_known_noise, unknown = (
+        [single for single in series if single.known is is_known] for is_known in (True, False)
+    )
     out = [
-        *(_beyond(known, len(far), directions, loss.robust) if known else ()),
+        *(_beyond(with_known_noise, len(far), directions, loss.robust) if with_known_noise else ()),
         *(_explains_nothing(unknown) if unknown else ()),
-        *_no_noise(found, directions, loss),
+        *_no_noise(series, directions, loss),
     ]
     return [*out[:-1], f"{out[-1]}. {_cures(tried)}"] if out else []
 
@@ -142,14 +144,14 @@ def _cures(tried: Tried) -> str:
     )
 
 
-def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Iterator[str]:
+def _beyond(series: list[Series], far: int, directions: int, robust: bool) -> Iterator[str]:
     """The test of the sum of squares against its χ² distribution, for all residuals and for each series; for a robust
     loss the sign test of the median against normal noise.
     """
-    whole = np.concatenate([own.residuals for own in found])
+    whole = np.concatenate([single.residuals for single in series])
     groups = {"": (whole, directions)}
-    if len(found) > 1:
-        groups |= {f"those of {own.label}": (own.residuals, 0) for own in found}
+    if len(series) > 1:
+        groups |= {f"those of {single.label}": (single.residuals, 0) for single in series}
     worst = None
     for label, (residuals, fitted) in groups.items():
         count, squares = residuals.size - fitted, float(np.sum(residuals**2))
@@ -174,15 +176,15 @@ def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Ite
     yield text
 
 
-def _explains_nothing(found: list[Series]) -> Iterator[str]:
+def _explains_nothing(series: list[Series]) -> Iterator[str]:
     """Whether constants, one for each series, are closer to the data: an F test."""
     left = right = 0.0
-    for own in found:
-        measured = own.residuals - own.predicted / own.sigma
-        left += float(np.sum(own.residuals**2))
+    for single in series:
+        measured = single.residuals - single.predicted / single.sigma
+        left += float(np.sum(single.residuals**2))
         right += float(np.sum((measured - np.mean(measured)) ** 2))
-    small = sum(own.residuals.size * own.small**2 for own in found)
-    constants, rest = len(found), sum(own.residuals.size for own in found) - len(found)
+    small = sum(single.residuals.size * single.small**2 for single in series)
+    constants, rest = len(series), sum(single.residuals.size for single in series) - len(series)
     # Both sums of squares are χ² distributed if the residuals are noise and the truth is constant; otherwise the test
     # rejects less often.
     if rest > 0 and left - right > small and special.betainc(rest / 2, constants / 2, right / left) < _LEVEL:
@@ -190,20 +192,20 @@ def _explains_nothing(found: list[Series]) -> Iterator[str]:
         yield f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g})"
 
 
-def _no_noise(found: Sequence[Series], directions: int, loss: Loss) -> Iterator[str]:
+def _no_noise(series: Sequence[Series], directions: int, loss: Loss) -> Iterator[str]:
     """Whether residuals are predictable: from their signs, from earlier residuals, or from the prediction."""
     told = []
-    for own in found:
+    for single in series:
         # Correlations between outliers do not matter: each counts by its influence on the estimates.
-        residuals = loss.influence(own.residuals)[0]
+        residuals = loss.influence(single.residuals)[0]
         square = float(np.mean(residuals**2))
-        if square <= own.small**2 or residuals.size < 3:
+        if square <= single.small**2 or residuals.size < 3:
             continue
-        for reason, share, chance in dependences(own, residuals, directions):
+        for reason, share, chance in dependences(single, residuals, directions):
             # `share` of the mean square is not noise.
-            matters = share > _SHARE and share * square > own.small**2
-            if matters and chance * len(found) < _LEVEL:
-                told.append(f"those of {own.label} {reason}{_offset(own)}")
+            matters = share > _SHARE and share * square > single.small**2
+            if matters and chance * len(series) < _LEVEL:
+                told.append(f"those of {single.label} {reason}{_offset(single)}")
                 break
     hidden = len(told) - 3
     if told:
@@ -211,7 +213,7 @@ def _no_noise(found: Sequence[Series], directions: int, loss: Loss) -> Iterator[
         yield f"the residuals are not noise: {', '.join(told[:3])}{more}"
 
 
-def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
+def dependences(series: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
     """How residuals depend on others, the dependent fraction of their mean square, and the probability under noise."""
     n = r.size
     changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
@@ -233,8 +235,8 @@ def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[s
         float(sizes[lag]),
         lags.size * _correlation(float(sizes[lag]), n),
     )
-    if own.predicted.size:
-        follows = (own.predicted - np.mean(own.predicted)) / own.sigma
+    if series.predicted.size:
+        follows = (series.predicted - np.mean(series.predicted)) / series.sigma
         norm = float(np.sum(follows**2))
         if norm > 0:
             correlation = float(np.sum(follows * r)) / np.sqrt(norm * total)
@@ -245,18 +247,18 @@ def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[s
             )
 
 
-def _offset(own: Series) -> str:
+def _offset(series: Series) -> str:
     """A hint if the residuals are mostly an offset: how to free it."""
-    differences = own.residuals * own.sigma
+    differences = series.residuals * series.sigma
     mean = float(np.mean(differences))
-    if not own.ts.size or mean**2 < 0.5 * float(np.mean(differences**2)):
+    if not series.ts.size or mean**2 < 0.5 * float(np.mean(differences**2)):
         return ""
-    text, bias = f" and are {mean:.3g} on average", f"'{own.sensor}.bias'"
-    if not own.bias.free:
+    text, bias = f" and are {mean:.3g} on average", f"'{series.sensor}.bias'"
+    if not series.bias.free:
         return f"{text} (does the sensor count from another zero? Its offset, {bias}, can be free)"
-    if own.bias.components:
+    if series.bias.components:
         return f"{text} (its offset, {bias}, is one number for all components: start from one for each)"
-    if own.bias.experiments:
+    if series.bias.experiments:
         return f"{text} (its offset, {bias}, is one for all experiments: name it in their own=, not in free)"
     return f"{text}, though the offset, {bias}, is free"
 

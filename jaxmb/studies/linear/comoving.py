@@ -67,8 +67,8 @@ class AbstractCarrier(eqx.Module):
         start = jnp.concatenate([unit, jnp.zeros((n, 1), unit.dtype)], axis=1)
         first = time * jnp.concatenate([rate, constant[:, None]], axis=1)
         orders = jnp.arange(2, _TERMS, dtype=unit.dtype)
-        (moved, _), _ = lax.scan(add, (start + first, first), orders)
-        turn, shift = moved[:, :n], moved[:, n]
+        (sums, _), _ = lax.scan(add, (start + first, first), orders)
+        turn, shift = sums[:, :n], sums[:, n]
         if like.z is not None:
             none, same = jnp.zeros((like.z.size,) * 2, unit.dtype), jnp.eye(like.z.size, dtype=unit.dtype)
             rate, turn = block_diag(rate, none), block_diag(turn, same)
@@ -172,7 +172,7 @@ def carriers(system: AbstractSystem, state: State, rates: State, length: Any) ->
     attitude, spin, spin_change = _attitudes(index, state, rates)
     none = jnp.zeros(3, state.q.dtype)
     advance = rates.q[np.array(index.scalars, int)]
-    own = Bodies(none, speed, spin, advance, index)
+    separate = Bodies(none, speed, spin, advance, index)
     # Rows of ṙ = V + Ω × r, v̇ = Ω × v and ω̇ = Ω × ω (all in world axes) for (Ω, V / length), in units of their sizes.
     fastest = jnp.maximum(jnp.max(jnp.abs(speed)) / length, jnp.max(jnp.abs(spin), initial=0.0))
     fastest = lax.stop_gradient(jnp.where(fastest > 0, fastest, 1.0))
@@ -198,7 +198,7 @@ def carriers(system: AbstractSystem, state: State, rates: State, length: Any) ->
         travel = jnp.broadcast_to(length * w[None, 3:], speed.shape)
         return Bodies(w[:3], travel, spin - jax.vmap(lambda p: unrotate(p, w[:3]))(attitude), advance, index)
 
-    return jax.tree.map(lambda *x: jnp.stack(x), own, of_twist(slow), of_twist(together))
+    return jax.tree.map(lambda *x: jnp.stack(x), separate, of_twist(slow), of_twist(together))
 
 
 def _spatial(x):

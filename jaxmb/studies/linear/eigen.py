@@ -31,14 +31,14 @@ def eigen(
     largest = jnp.argmax(jnp.abs(vectors), axis=0)
     vectors = vectors / jnp.take_along_axis(vectors, largest[None, :], axis=0)
     # A row and a column of zeros have a unit vector as eigenvector.
-    own = jnp.sum(jnp.where(kept[:, None], 0.0, jnp.abs(vectors)), axis=0) < 0.5
-    return values, vectors, own
+    of_block = jnp.sum(jnp.where(kept[:, None], 0.0, jnp.abs(vectors)), axis=0) < 0.5
+    return values, vectors, of_block
 
 
 @eigen.defjvp
 def _eigen_jvp(primals, tangents) -> Any:
     (A, kept), (dA, _) = primals, tangents
-    values, vectors, own = eigen(A, kept)
+    values, vectors, inside = eigen(A, kept)
     both = kept[:, None] & kept[None, :]
     A, dA = (jnp.where(both, x, 0.0).astype(vectors.dtype) for x in (A, dA))
     largest = jnp.argmax(jnp.abs(lax.stop_gradient(vectors)), axis=0)
@@ -55,5 +55,5 @@ def _eigen_jvp(primals, tangents) -> Any:
         change = jnp.where(of_block, change, jnp.zeros_like(change))
         return change[n], change[:n]
 
-    dvalues, dvectors = jax.vmap(of_one, in_axes=(0, 1, 0, 0), out_axes=(0, 1))(values, vectors, largest, own)
-    return (values, vectors, own), (dvalues, dvectors, np.zeros(own.shape, jax.dtypes.float0))
+    dvalues, dvectors = jax.vmap(of_one, in_axes=(0, 1, 0, 0), out_axes=(0, 1))(values, vectors, largest, inside)
+    return (values, vectors, inside), (dvalues, dvectors, np.zeros(inside.shape, jax.dtypes.float0))

@@ -132,15 +132,15 @@ def floquet(
     names = check_state_names(system, t, state, coordinates, rates)
     free = [_indices(system, name) for name in checked_names("coordinate", ignorable)]
     state = consistent(system, t, State(system.normalize(state.q), state.u))
-    own = eqx.filter_jit(perturbations)(system, t, state, names)
-    if not is_traced((system, state, own.regular)) and not np.all(np.asarray(own.regular)):
+    perturbed = eqx.filter_jit(perturbations)(system, t, state, names)
+    if not is_traced((system, state, perturbed.regular)) and not np.all(np.asarray(perturbed.regular)):
         raise ValueError("The state is singular, or the named coordinates or rates are not independent in it.")
-    end, pushed = _flow(system, state, own.basis, t, period, rtol, solver)
+    end, pushed = _flow(system, state, perturbed.basis, t, period, rtol, solver)
     distance, pushed = _return(system, state, end, pushed, np.concatenate([np.zeros(0, int), *free]))
     sizes = jnp.concatenate([system.coordinate_scale(), system.velocity_scale() * 2 * np.pi / period])
     far = jnp.abs(distance) / sizes > jnp.maximum(_CLOSED, _OF_TOLERANCE * jnp.asarray(rtol))
-    bad = jnp.any(far) | ~jnp.all(own.regular) | ~jnp.all(jnp.isfinite(pushed))
-    monodromy = own.reading @ pushed
+    bad = jnp.any(far) | ~jnp.all(perturbed.regular) | ~jnp.all(jnp.isfinite(pushed))
+    monodromy = perturbed.reading @ pushed
     if is_traced((monodromy, bad)):
         monodromy = nan_where(bad, monodromy, (system, state, t, period))
     elif not bool(jnp.all(jnp.isfinite(pushed))):
@@ -149,7 +149,7 @@ def floquet(
         )
     elif bad:
         raise ValueError(_open(system, period, np.asarray(distance), np.asarray(far)))
-    return Floquet(monodromy, state_labels(system, names, own), own.coordinates, own.basis, period)
+    return Floquet(monodromy, state_labels(system, names, perturbed), perturbed.coordinates, perturbed.basis, period)
 
 
 def _indices(system, name):

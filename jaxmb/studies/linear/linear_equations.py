@@ -87,7 +87,7 @@ def linear_equations(
     inputs: tuple[tuple[str, int], ...],
     outputs: tuple[tuple[str, int], ...],
 ) -> LinearEquations:
-    own = perturbations(system, t, state, names)
+    directions = perturbations(system, t, state, names)
     field, _ = vector_field(system, t, state)
     rate = fastest(system, state, field)
     moving = rate > 0
@@ -97,21 +97,21 @@ def linear_equations(
     moves = jax.vmap(lambda carrier: carrier.displacement(state, later))(carriers(system, state, field, system.length))
     at = joined(state)
     points = jnp.concatenate([at[None], jax.vmap(lambda move: move.turn @ at + move.shift)(moves)])
-    bases = jnp.concatenate([own.basis[None], jax.vmap(lambda move: move.turn @ own.basis)(moves)])
+    bases = jnp.concatenate([directions.basis[None], jax.vmap(lambda move: move.turn @ directions.basis)(moves)])
     times = jnp.concatenate([t[None], jnp.broadcast_to(t + later, (len(points) - 1,))])
     local = jax.vmap(lambda t, x, basis: _local(system, t, x, basis, inputs, outputs))
-    found = local(times, points, bases)
-    here = jax.tree.map(lambda x: x[0], found)
+    values = local(times, points, bases)
+    here = jax.tree.map(lambda x: x[0], values)
 
     # The residuals in the frame of each displacement, in units of the states' sizes and the fastest rate.
     scales = State(system.coordinate_scale(), system.velocity_scale(), system.state_scale() if system.nz else None)
-    sizes, kq, last = joined(scales), own.coordinates, own.basis.shape[1] - system.nz
-    widths = jnp.max(jnp.abs(own.basis) / sizes[:, None], axis=0)
+    sizes, kq, last = joined(scales), directions.coordinates, directions.basis.shape[1] - system.nz
+    widths = jnp.max(jnp.abs(directions.basis) / sizes[:, None], axis=0)
     entries = jnp.abs(parted(system, here.by_states).u) / (scales.u[:, None] * widths[None, :])
     omega = rate + jnp.max(entries[:, kq:last], initial=0.0) + jnp.sqrt(jnp.max(entries[:, :kq], initial=0.0))
     omega = jnp.where(omega > 0, omega, 1.0)
     units = joined(dataclasses.replace(scales, u=omega * scales.u))
-    widths = jnp.max(jnp.abs(own.basis) / units[:, None], axis=0)
+    widths = jnp.max(jnp.abs(directions.basis) / units[:, None], axis=0)
     single = jnp.finfo(at.dtype).eps > 1e-10
     unbalanced, rounding, same = (3e-4, 1e-5, 1e-3) if single else (_UNBALANCED, _ROUNDING, _SAME)
     allowed = unbalanced * (_applied(system, t, state) + rate**2) / omega**2 + rounding
@@ -131,19 +131,19 @@ def linear_equations(
         constant = jnp.concatenate([jnp.all(states)[None], inputs, outputs & through])
         return residual, largest, largest <= allowed, constant
 
-    residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], found))
+    residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], values))
     # The first displacement with the motion's field that leaves the equations unchanged; otherwise the nearest.
     good = steady & constant[:, 0]
     nearest = jnp.where(jnp.any(steady), jnp.argmax(steady), jnp.argmin(largest))
     best = jnp.where(jnp.any(good), jnp.argmax(good), nearest)
     bound = jnp.max(jnp.abs(here.rows_by_inputs), axis=0, initial=0.0) > 0
-    ok = jnp.all(own.regular) & steady[best] & jnp.all(constant[best]) & ~jnp.any(bound)
+    ok = jnp.all(directions.regular) & steady[best] & jnp.all(constant[best]) & ~jnp.any(bound)
     return LinearEquations(
-        own.reading @ (here.by_states - moves.rate[best] @ own.basis),
-        own.reading @ here.by_inputs,
+        directions.reading @ (here.by_states - moves.rate[best] @ directions.basis),
+        directions.reading @ here.by_inputs,
         here.outputs_by_states,
         here.outputs_by_inputs,
-        own,
+        directions,
         residuals[best],
         steady[best],
         moving,
@@ -157,10 +157,10 @@ def _local(system, t, x, basis, inputs, outputs):
     """Values and derivatives at a state, by one forward derivative."""
     k = basis.shape[1]
     names = tuple(dict.fromkeys(name for name, _ in inputs))
-    known = parameters(system) if names else {}
+    numbers = parameters(system) if names else {}
 
     def evaluate(changes):
-        values = {name: known[name] for name in names}
+        values = {name: numbers[name] for name in names}
         for (name, place), change in zip(inputs, changes[k:], strict=True):
             value = values[name]
             values[name] = jnp.ravel(value).at[place].add(change.astype(value.dtype)).reshape(value.shape)

@@ -48,8 +48,8 @@ class Mode(eqx.Module):
         phase, amplitude = (jnp.asarray(real_array(f"Mode.at: {name}", x, dtype)) for name, x in given)
         shown = lambda shape: amplitude * (jnp.cos(phase) * shape.real - jnp.sin(phase) * shape.imag)
         z = None if self.state.z is None else self.state.z + shown(self.z)
-        moved = State(self.state.q + shown(self.q), self.state.u + shown(self.u), z)
-        return project_normalized(self.system, self.t, moved)
+        displaced = State(self.state.q + shown(self.q), self.state.u + shown(self.u), z)
+        return project_normalized(self.system, self.t, displaced)
 
 
 class Linearisation(eqx.Module):
@@ -177,8 +177,8 @@ class Linearisation(eqx.Module):
             from control import ss
         except ImportError as error:
             raise ImportError("to_control needs python-control; install it with: pip install control") from error
-        own = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
-        names = {kind: [name.replace(".", "_") for name in of_kind] for kind, of_kind in own.items()}
+        names_by_kind = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        names = {kind: [name.replace(".", "_") for name in of_kind] for kind, of_kind in names_by_kind.items()}
         return ss(*map(np.asarray, (self.A, self.B, self.C, self.D)), **names)
 
     def __repr__(self) -> str:
@@ -203,8 +203,8 @@ class Linearisation(eqx.Module):
             text = f"{value.real:.5g}" + (f" ± {value.imag:.5g}i" if value.imag > 0 else "")
             # A change of speed alone displaces nothing at first.
             displaced = np.any(shares[: self.coordinates, k])
-            own = shares[: self.coordinates, k] if displaced else shares[:, k]
-            largest = [self.states[j] for j in np.argsort(-own)[:3] if own[j] > 0.05 * own.max()]
+            weights = shares[: self.coordinates, k] if displaced else shares[:, k]
+            largest = [self.states[j] for j in np.argsort(-weights)[:3] if weights[j] > 0.05 * weights.max()]
             lines.append(f"{k:>4}  {text:>24}  {size:>9.5g}  {ratio:>8.4f}  {', '.join(largest)}")
         return "\n".join(lines)
 
@@ -254,10 +254,10 @@ def _effective(linear):
 def _spectrum(linear):
     """Eigenvalues, and eigenvectors in all states."""
     kept = lax.stop_gradient(_effective(linear))
-    values, vectors, own = eigen(linear.A, kept)
+    values, vectors, of_block = eigen(linear.A, kept)
     A, unit = linear.A.astype(values.dtype), jnp.eye(len(linear.states), dtype=values.dtype)
     size = lax.stop_gradient(jnp.abs(values))
-    quick = own & (size > _NO_EFFECT * jnp.max(size, initial=0.0))
+    quick = of_block & (size > _NO_EFFECT * jnp.max(size, initial=0.0))
 
     def complete(value, vector, quick):
         # States without effect on others follow the others: (λ − A_ii) v_i = A_ik v_k.

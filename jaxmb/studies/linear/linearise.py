@@ -92,35 +92,37 @@ def linearise(
             f"linearise: {', '.join(closed)} may open, which no linear equation describes. Replace closed contacts by "
             "joints."
         )
-    found = linear_equations(system, t, state, names, chosen, observed)
+    equations = linear_equations(system, t, state, names, chosen, observed)
     labels = tuple(_label(item, shapes) for item in chosen), tuple(_label(item, seen) for item in observed)
-    matrices = found.A, found.B, found.C, found.D
-    if is_traced((matrices, found.ok)):
-        matrices = nan_where(~(found.ok & jnp.all(opens)), matrices, (system, state, t))
-    elif not found.ok:
-        raise ValueError(_refusal(system, t, state, names, found, labels))
+    matrices = equations.A, equations.B, equations.C, equations.D
+    if is_traced((matrices, equations.ok)):
+        matrices = nan_where(~(equations.ok & jnp.all(opens)), matrices, (system, state, t))
+    elif not equations.ok:
+        raise ValueError(_refusal(system, t, state, names, equations, labels))
     return Linearisation(
         *matrices,
-        states=state_labels(system, names, found.perturbations),
+        states=state_labels(system, names, equations.perturbations),
         inputs=labels[0],
         outputs=labels[1],
-        coordinates=found.perturbations.coordinates,
-        basis=found.perturbations.basis,
+        coordinates=equations.perturbations.coordinates,
+        basis=equations.perturbations.basis,
         system=system,
         state=state,
         t=t,
     )
 
 
-def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations) -> tuple[str, ...]:
+def state_labels(system: AbstractSystem, names: StateNames, perturbed: Perturbations) -> tuple[str, ...]:
     """The names of the states; numbers for chosen states under a trace, where the choice is unknown."""
-    coordinates, rates = found.picked
-    own = [_rate_label(system, name) for name in names.rates or ()]
-    if is_traced(found.picked):
+    coordinates, rates = perturbed.picked
+    named_rates = [_rate_label(system, name) for name in names.rates or ()]
+    if is_traced(perturbed.picked):
         chosen = [f"coordinate {k}" for k in range(coordinates.size)], [f"rate {k}" for k in range(rates.size)]
     else:
         lists = displacement_names(system), rate_candidates(system, names)
-        chosen = tuple([known[int(k)] for k in picked] for known, picked in zip(lists, found.picked, strict=True))
+        chosen = tuple(
+            [candidates[int(k)] for k in picked] for candidates, picked in zip(lists, perturbed.picked, strict=True)
+        )
     internal = {k: name for name, index in system.state_names().items() for k in index if len(index) == 1}
     internal |= {
         k: f"{name}[{place}]"
@@ -128,7 +130,7 @@ def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations
         for place, k in enumerate(index)
         if len(index) > 1
     }
-    return (*names.coordinates, *chosen[0], *own, *chosen[1], *(internal[k] for k in range(system.nz)))
+    return (*names.coordinates, *chosen[0], *named_rates, *chosen[1], *(internal[k] for k in range(system.nz)))
 
 
 def _rate_label(system, name):
@@ -141,17 +143,17 @@ def _label(item, shapes):
     return component_names(name, shapes[name])[place]
 
 
-def _refusal(system, t, state, names, found: LinearEquations, labels):
+def _refusal(system, t, state, names, equations: LinearEquations, labels):
     """The reason why there are no linear equations."""
-    full, coordinates, rates = map(bool, found.perturbations.regular)
+    full, coordinates, rates = map(bool, equations.perturbations.regular)
     if not full:
         return "The state is singular: fewer constraint rows are independent than elsewhere. Choose another state."
     for kind, good, given in (("coordinates", coordinates, names.coordinates), ("rates", rates, names.rates or ())):
         if not good:
             return f"The {kind} {', '.join(given)} are not independent in this state. Name fewer of them, or others."
-    if not found.steady:
-        return _not_steady(system, found)
-    constant = np.asarray(found.constant)
+    if not equations.steady:
+        return _not_steady(system, equations)
+    constant = np.asarray(equations.constant)
     if not constant[0]:
         return (
             "The linear equations change along this motion, or with time: it is not a steady motion, since moving "
@@ -164,7 +166,7 @@ def _refusal(system, t, state, names, found: LinearEquations, labels):
             f"The effects of {', '.join(changing)} change along this motion, since their directions do not turn with "
             "it. Choose quantities or forces whose directions are fixed in a body that is carried along."
         )
-    moves = [name for name, own in zip(labels[0], np.asarray(found.bound), strict=True) if own]
+    moves = [name for name, is_bound in zip(labels[0], np.asarray(equations.bound), strict=True) if is_bound]
     return (
         f"{', '.join(moves)} cannot be an input: it moves the constraints, and the state would have to follow. Use a "
         "force, a torque, or a parameter of either."
@@ -189,9 +191,9 @@ def remaining(system: AbstractSystem, residual) -> str:
     return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from the rates of a uniform motion"
 
 
-def _not_steady(system, found):
-    left = remaining(system, found.residual)
-    if found.moving:
+def _not_steady(system, equations):
+    left = remaining(system, equations.residual)
+    if equations.moving:
         return (
             f"The state is not a steady motion: {left}, unlike in any uniform motion of all bodies. "
             "jaxmb.steady_motion finds a steady motion near it; about a periodic motion use jaxmb.floquet."
@@ -205,5 +207,5 @@ def _moving(system, t, state):
     names = system.coordinate_names()
     index = {name: names.get(f"{name}.position", names.get(name, [])) for name in system.catalogue.motion_names()}
     turning = lambda name: names.get(f"{name}.orientation", names.get(f"{name}.angle", []))
-    index = {name: [*own, *turning(name)] for name, own in index.items()}
-    return [name for name, own in index.items() if np.any(speeds[own] > 0)] or ["none"]
+    index = {name: [*indices, *turning(name)] for name, indices in index.items()}
+    return [name for name, indices in index.items() if np.any(speeds[indices] > 0)] or ["none"]

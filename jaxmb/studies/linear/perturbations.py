@@ -118,28 +118,28 @@ def coordinate_function(system: AbstractSystem, t: Scalar, at: State | None, nam
     """A coordinate as a function of the state: an entry of q, a displacement from the state `at` if given, or a
     quantity.
     """
-    known = system.coordinate_names()
-    if name in known and len(known[name]) == 1:
-        return lambda state: state.q[known[name][0]]
+    entries = system.coordinate_names()
+    if name in entries and len(entries[name]) == 1:
+        return lambda state: state.q[entries[name][0]]
     displacements = [] if at is None else displacement_names(system)
     if at is not None and name in displacements:
         place = displacements.index(name)
         return lambda state: _displacements(system, t, at)[place] @ (state.q - at.q)
-    return _quantity(system, t, name, "coordinate", [*(k for k, v in known.items() if len(v) == 1), *displacements])
+    return _quantity(system, t, name, "coordinate", [*(k for k, v in entries.items() if len(v) == 1), *displacements])
 
 
 def rate_function(system: AbstractSystem, t: Scalar, at: State, name: str) -> Callable[[State], Array]:
     """A rate as a function of the state: an entry of u, the rate of a coordinate, or a quantity."""
-    known = {name: index for name, index in rates_of(system.rate_names()).items() if len(index) == 1}
-    if name in known:
-        return lambda state: state.u[known[name][0]]
+    entries = {name: index for name, index in rates_of(system.rate_names()).items() if len(index) == 1}
+    if name in entries:
+        return lambda state: state.u[entries[name][0]]
     base = name.removesuffix("_rate")
     coordinates = {*system.coordinate_names(), *displacement_names(system), *system.quantities()}
     if name in system.joint_coordinates() or (base != name and base.split("[")[0] in coordinates):
         function = coordinate_function(system, t, at, base)
         if not _depends_on_velocities(function, at):
             return lambda state: _rate(system, t, function, state)
-    return _quantity(system, t, name, "rate", known)
+    return _quantity(system, t, name, "rate", entries)
 
 
 def tangent_basis(system: AbstractSystem, t: Scalar, state: State) -> tuple[Array, Array, Array, Bool[Array, ""]]:
@@ -179,8 +179,8 @@ def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateN
 
     if names.rates is None:
         given = jnp.zeros((0, nq + system.nu), state.q.dtype)
-        own = [coordinate_function(system, t, state, name) for name in names.coordinates]
-        preferred = _gradients([lambda x, f=f: _rate(system, t, f, x) for f in own], state)
+        functions = [coordinate_function(system, t, state, name) for name in names.coordinates]
+        preferred = _gradients([lambda x, f=f: _rate(system, t, f, x) for f in functions], state)
     else:
         given = _gradients([rate_function(system, t, state, name) for name in names.rates], state)
         preferred = given[:0]
@@ -201,8 +201,8 @@ def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateN
     reading = jnp.concatenate([rows_q, rows_u])
     basis = tangent @ jnp.linalg.inv(reading @ tangent)
     if system.nz:
-        own = jnp.eye(system.nz, dtype=basis.dtype)
-        basis, reading = block_diag(basis, own), block_diag(reading, own)
+        identity = jnp.eye(system.nz, dtype=basis.dtype)
+        basis, reading = block_diag(basis, identity), block_diag(reading, identity)
     return Perturbations(basis, reading, kq, (picked, picked_rates), jnp.stack([regular, coordinates_ok, rates_ok]))
 
 
@@ -269,12 +269,12 @@ def _sizes(system):
 
 def _turns(system, rates=False):
     """Whether each displacement, or rate, is a turn of a body."""
-    own = system.rate_names() if rates or _has_invariants(system) else system.coordinate_names()
+    entries = system.rate_names() if rates or _has_invariants(system) else system.coordinate_names()
     count = system.nu if rates or _has_invariants(system) else system.nq
     turns = np.zeros(count, bool)
     for body in system.body_names:
         for name in (f"{body}.angle", f"{body}.angle_rate", f"{body}.angular_velocity"):
-            turns[own.get(name, [])] = True
+            turns[entries.get(name, [])] = True
     return turns
 
 

@@ -25,10 +25,10 @@ def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...
             out += [(name, k) for k in range(int(np.prod(shapes[name], dtype=int)))]
             continue
         base = name.split("[")[0]
-        own = component_names(base, shapes[base]) if base in shapes else []
-        if name not in own:
-            raise unknown(kind, name, own or shapes)
-        out.append((base, own.index(name)))
+        names_of_array = component_names(base, shapes[base]) if base in shapes else []
+        if name not in names_of_array:
+            raise unknown(kind, name, names_of_array or shapes)
+        out.append((base, names_of_array.index(name)))
     if len(set(out)) < len(out):
         raise ValueError(f"Every {kind} is named once, got {', '.join(names)}.")
     return tuple(out)
@@ -54,8 +54,10 @@ def measured(
     system: AbstractSystem, chosen: Sequence[tuple[str, int]], t: Scalar, state: State, solved: Solved | None
 ) -> Float[Array, "k"]:
     """Components of quantities at one state; `solved`: the solution of the equations there, for forces."""
-    known = system.quantities()
+    quantities = system.quantities()
     along = jnp.asarray(t, state.q.dtype)[None], jax.tree.map(lambda x: x[None], state)
     forces = jax.tree.map(lambda x: x[None], solved)
-    values = {name: jnp.ravel(known[name].value(*along, forces)[0]) for name in dict.fromkeys(n for n, _ in chosen)}
+    values = {
+        name: jnp.ravel(quantities[name].value(*along, forces)[0]) for name in dict.fromkeys(n for n, _ in chosen)
+    }
     return jnp.stack([values[name][k] for name, k in chosen]) if chosen else jnp.zeros(0, state.q.dtype)

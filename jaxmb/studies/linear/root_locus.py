@@ -102,8 +102,8 @@ def root_locus(
     # A loop: in a batch, two LAPACK routines at once may wait for each other's threads for ever, on two cores.
     of_all = eqx.filter_jit(lambda values: jax.lax.map(of_one, values))
 
-    found, shapes = map(np.asarray, of_all(given.astype(first.A.dtype)))
-    bad = ~np.all(np.isfinite(found), axis=1)
+    eigenvalues, shapes = map(np.asarray, of_all(given.astype(first.A.dtype)))
+    bad = ~np.all(np.isfinite(eigenvalues), axis=1)
     if np.any(bad):
         listed = ", ".join(f"{value:.6g}" for value in given[bad][:8])
         raise ValueError(
@@ -113,7 +113,7 @@ def root_locus(
     sizes = np.concatenate([np.asarray(first.system.coordinate_scale()), np.asarray(first.system.velocity_scale())])
     shapes = shapes / sizes[None, :, None]
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
-    return RootLocus(name, given, *_followed(found, shapes), first.states)
+    return RootLocus(name, given, *_followed(eigenvalues, shapes), first.states)
 
 
 def _case(system: Any, name: str, state: Any) -> Any:
@@ -126,11 +126,11 @@ def _case(system: Any, name: str, state: Any) -> Any:
         if state is not None:
             raise ValueError("root_locus: the function returns a system and its state, so `state` is not needed.")
         return system
-    known = parameters(system)
-    if name not in known:
-        raise unknown("parameter", name, known)
-    if known[name].shape != ():
-        shape = known[name].shape
+    values = parameters(system)
+    if name not in values:
+        raise unknown("parameter", name, values)
+    if values[name].shape != ():
+        shape = values[name].shape
         raise ValueError(f"root_locus: {name!r} has shape {shape}, and values are numbers; give a function.")
     if state is None:
         raise ValueError("root_locus needs the state of each system: state=jaxmb.equilibrium, or another function.")

@@ -91,16 +91,16 @@ def steady_motion(
     t = jnp.asarray(checked_time("steady_motion", t, guess.q.dtype))
     chosen, values = _conditions(system, t, guess, {} if fix is None else fix, {} if rates is None else rates)
     advancing = _indices(system, ignorable)
-    found = _search(system, t, State(system.normalize(guess.q), guess.u), chosen, values, advancing)
-    holds = True if found.against is None else ~jnp.any(found.against[0] | found.against[1])
-    if is_traced(found) or not throw:
-        return nan_where(~(found.ok & holds), found.state, (system, guess, values, t))
-    if not found.ok:
-        raise ValueError(_not_found(system, found, [*chosen[0], *chosen[1]]))
-    if found.against is not None and not holds:
-        against, change = about_contacts("The motion is steady", system, *found.against)
+    solution = _search(system, t, State(system.normalize(guess.q), guess.u), chosen, values, advancing)
+    holds = True if solution.against is None else ~jnp.any(solution.against[0] | solution.against[1])
+    if is_traced(solution) or not throw:
+        return nan_where(~(solution.ok & holds), solution.state, (system, guess, values, t))
+    if not solution.ok:
+        raise ValueError(_not_found(system, solution, [*chosen[0], *chosen[1]]))
+    if solution.against is not None and not holds:
+        against, change = about_contacts("The motion is steady", system, *solution.against)
         raise ValueError(f"{against}For example jaxmb.steady_motion(system, jaxmb.assemble(system, guess, {change})).")
-    return found.state
+    return solution.state
 
 
 class _Found(NamedTuple):
@@ -227,9 +227,9 @@ def _bodies(system, unknowns, rates):
     """Bodies that turn and travel together; their spins are the remainders of their angular velocities."""
     index = body_index(system)
     travel = jnp.broadcast_to(unknowns.travel[None, :], (len(index.rotates), 3))
-    still = jnp.zeros((len(index.spin), 3), travel.dtype)
+    no_spin = jnp.zeros((len(index.spin), 3), travel.dtype)
     advance = rates[np.array(index.scalars, int)]
-    without = Bodies(unknowns.turning, travel, still, advance, index)
+    without = Bodies(unknowns.turning, travel, no_spin, advance, index)
     if not index.spin:
         return without
     spins = unknowns.state.u[np.array(index.spin)]
@@ -237,8 +237,8 @@ def _bodies(system, unknowns, rates):
         spins = jnp.pad(spins - unknowns.turning[2], ((0, 0), (2, 0)))
         return Bodies(unknowns.turning, travel, spins, advance, index)
     attitude = unknowns.state.q[np.array(index.attitude)]
-    own = jax.vmap(lambda p: unrotate(p, unknowns.turning))(attitude)
-    return Bodies(unknowns.turning, travel, spins - own, advance, index)
+    turning_in_body = jax.vmap(lambda p: unrotate(p, unknowns.turning))(attitude)
+    return Bodies(unknowns.turning, travel, spins - turning_in_body, advance, index)
 
 
 def _residual(system, t, values, chosen, advancing, unknowns, units, later):

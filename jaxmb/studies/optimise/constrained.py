@@ -74,9 +74,9 @@ def _run(trials: Trials, here: Trial, size: float, tol: float, left: int) -> tup
     values, slopes, equal = _one_sided(trials, unit)
     kept = _independent(slopes(here.z / unit), equal)
     constraints = [
-        {"type": kind, "fun": lambda y, own=own: values(y)[own], "jac": lambda y, own=own: slopes(y)[own]}
-        for kind, own in (("eq", kept & equal), ("ineq", kept & ~equal))
-        if own.any()
+        {"type": kind, "fun": lambda y, mask=mask: values(y)[mask], "jac": lambda y, mask=mask: slopes(y)[mask]}
+        for kind, mask in (("eq", kept & equal), ("ineq", kept & ~equal))
+        if mask.any()
     ]
     with warnings.catch_warnings():
         # SciPy warns of linear functions and of steps to a bound; the result has the status.
@@ -134,14 +134,14 @@ def balance_at(trials: Trials, trial: Trial) -> Balance:
     # The solver's tolerance is absolute: all gradients are normalised. A constraint without a gradient, such as a
     # closed gap, balances nothing.
     length, lengths = (x + (x == 0) for x in (np.linalg.norm(gradient), np.linalg.norm(inwards, axis=1)))
-    found = np.zeros(0)
+    multipliers = np.zeros(0)
     # SciPy's solver crashes without unknowns.
     if inwards.size:
-        found = optimize.nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
+        multipliers = optimize.nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
     sides, bounds = np.zeros((2, low.size)), np.zeros((2, trial.z.size))
     ends = np.cumsum([below.sum(), above.sum(), at_low.sum()])
-    sides[0, below], sides[1, above], bounds[0, at_low], bounds[1, at_high] = np.split(found, ends)
-    return Balance(sides[0] - sides[1], below | above, bounds[0] - bounds[1], gradient - inwards.T @ found)
+    sides[0, below], sides[1, above], bounds[0, at_low], bounds[1, at_high] = np.split(multipliers, ends)
+    return Balance(sides[0] - sides[1], below | above, bounds[0] - bounds[1], gradient - inwards.T @ multipliers)
 
 
 def _one_sided(trials: Trials, unit: float):

@@ -127,15 +127,15 @@ def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
     **Raises:** `ValueError` for outputs that are not real numbers.
     """
     with traced_by_jax("the function of optimise", "a parameter"):
-        found = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
-    found = found if isinstance(found, Mapping) else {OBJECTIVE: found}
+        outputs = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
+    outputs = outputs if isinstance(outputs, Mapping) else {OBJECTIVE: outputs}
     shapes = {}
-    for name, own in found.items():
-        if not isinstance(name, str) or not hasattr(own, "shape") or not jnp.issubdtype(own.dtype, jnp.number):
+    for name, output in outputs.items():
+        if not isinstance(name, str) or not hasattr(output, "shape") or not jnp.issubdtype(output.dtype, jnp.number):
             raise ValueError(
-                f"The function must return a number, or numbers and arrays by name; got {own!r} under {name!r}."
+                f"The function must return a number, or numbers and arrays by name; got {output!r} under {name!r}."
             )
-        shapes[name] = own.shape
+        shapes[name] = output.shape
     return shapes
 
 

@@ -113,7 +113,7 @@ class Optimum(Printed):
         rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
         for name, value in self.parameters.items():
             each = zip(component_names(name, value.shape), self.start[name].flat, value.flat, strict=True)
-            rows += [(own, *numbers(a, b)) for own, a, b in each]
+            rows += [(word, *numbers(a, b)) for word, a, b in each]
         rows += [(), ("output", "before", "after")]
         rows += [(name, *numbers(self.before[name], x)) for name, x in self.outputs.items() if x.ndim == 0]
         if self.constraints:
@@ -124,7 +124,9 @@ class Optimum(Printed):
         if len(self.attempts) > 1:
             rows += [(), ("attempt", "before", "after", "violation")]
             each = enumerate(self.attempts, 1)
-            rows += [(str(k), *numbers(own.before, own.after), f"{own.violation:.1e}") for k, own in each]
+            rows += [
+                (str(k), *numbers(attempt.before, attempt.after), f"{attempt.violation:.1e}") for k, attempt in each
+            ]
         rows += [(), ("iteration", "objective", "violation", "step", "trials", "failed")]
         log = [
             (str(i.number), f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}", str(i.trials), str(i.failed))
@@ -330,6 +332,6 @@ def _constraints(trials: Trials, balance: Balance, first: Trial) -> tuple[Constr
         *(balance.active, np.abs(balance.pull), HOLDS * np.min(trials.scales, axis=0)),
     )
     return tuple(
-        ConstrainedOutput(own, float(low), float(high), float(a), float(b), bool(on), float(pull), float(within))
-        for own, low, high, a, b, on, pull, within in zip(*columns, strict=True)
+        ConstrainedOutput(component, float(low), float(high), float(a), float(b), bool(on), float(pull), float(within))
+        for component, low, high, a, b, on, pull, within in zip(*columns, strict=True)
     )

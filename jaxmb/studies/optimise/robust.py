@@ -51,26 +51,27 @@ def robust(
 
     @functools.wraps(function)
     def scattered(values: Mapping[str, Array], **options: Any) -> dict[str, Array]:
-        for name, own in arrays.items():
-            if name in values and jnp.shape(values[name]) != own.shape[1:]:
+        for name, drawn in arrays.items():
+            if name in values and jnp.shape(values[name]) != drawn.shape[1:]:
                 raise ValueError(
-                    f"Samples of {name!r} have shape {own.shape[1:]} each, but the parameter {jnp.shape(values[name])}."
+                    f"Samples of {name!r} have shape {drawn.shape[1:]} each, but the parameter "
+                    f"{jnp.shape(values[name])}."
                 )
 
         def of_sample(sample):
-            moved = {name: values[name] + x if name in values else x for name, x in sample.items()}
+            shifted = {name: values[name] + x if name in values else x for name, x in sample.items()}
             try:
-                out = function({**values, **moved}, **options)
+                out = function({**values, **shifted}, **options)
             except KeyError as error:
                 if asked_argument(error) is None:
                     raise
                 raise unknown("parameter", str(error.args[0]), [*values, *arrays]) from None
             return out if isinstance(out, Mapping) else {"objective": out}
 
-        found = batch(of_sample)({name: jnp.asarray(x) for name, x in arrays.items()})
+        outputs = batch(of_sample)({name: jnp.asarray(x) for name, x in arrays.items()})
         out: dict[str, Array] = {}
-        for name, own in found.items():
-            mean, spread = jnp.mean(own, axis=0), _deviation(own)
+        for name, of_samples in outputs.items():
+            mean, spread = jnp.mean(of_samples, axis=0), _deviation(of_samples)
             out |= {f"{name}.mean": mean, f"{name}.spread": spread}
             if weight is not None:
                 out[name] = mean + weight * spread

@@ -34,7 +34,7 @@ class Space(FreeParameters):
     def at_bounds(self, z: np.ndarray) -> list[str]:
         """The names of components at a bound."""
         near = np.min(np.abs(np.array(self.box) - z), axis=0) < _NEAR
-        return [name for name, own in zip(self.components(), near, strict=True) if own]
+        return [name for name, is_near in zip(self.components(), near, strict=True) if is_near]
 
     def unbounded(self, z: Float[Array, "n"]) -> FreeParameters:
         """The same parameters as a function of an unbounded vector, zero at `z`.
@@ -43,13 +43,13 @@ class Space(FreeParameters):
         some of its components only.
         """
         ranges = []
-        for (name, start), own in zip(self(z).items(), self.ranges, strict=True):
-            sides = [np.isfinite(np.asarray(bound)) for bound in own.ends]
+        for (name, start), bounds in zip(self(z).items(), self.ranges, strict=True):
+            sides = [np.isfinite(np.asarray(bound)) for bound in bounds.ends]
             if any(side.any() and not side.all() for side in sides):
                 raise ValueError(f"This method needs bounds for all components of {name!r}, or for none.")
-            if np.any(start <= own.low) or np.any(start >= own.high):
+            if np.any(start <= bounds.low) or np.any(start >= bounds.high):
                 raise ValueError(f"This method keeps bounds by a change of variables: start {name!r} strictly within.")
-            ranges.append(range_between(start, own.low, own.high, own.scale))
+            ranges.append(range_between(start, bounds.low, bounds.high, bounds.scale))
         return FreeParameters(self.names, tuple(ranges))
 
     def sample(self, count: int, seed: int) -> Float[Array, "count n"]:
@@ -77,38 +77,44 @@ def space(
     **Raises:** `ValueError` for unknown names, values that are not finite numbers, reversed bounds, and starts out of
     bounds.
     """
-    known = {} if system is None else parameters(system)
+    present = {} if system is None else parameters(system)
     if isinstance(start, str):
         start = (start,)
     if not isinstance(start, Mapping):
         if system is None:
             raise ValueError(f"Give starting values by name, or names alone with their system=; got {start!r}.")
         for name in start:
-            if name not in known:
-                raise unknown("parameter", name, known)
-        start = {name: known[name] for name in start}
+            if name not in present:
+                raise unknown("parameter", name, present)
+        start = {name: present[name] for name in start}
     if not start:
         raise ValueError("There is nothing to optimise: start is empty.")
     for name in bounds or {}:
         if name not in start:
             raise unknown("parameter with bounds", name, start)
     bounds = dict(bounds or {}) if system is None else design_bounds(system, bounds)
-    declared = {} if system is None else {name: own for layer in system.design for name, own in layer.variables}
+    declared = (
+        {} if system is None else {name: variable for layer in system.design for name, variable in layer.variables}
+    )
     ranges = []
     for name, given in start.items():
         if is_traced(given):
             raise ValueError(f"The start of {name!r} must be a concrete number, not a traced one.")
         value = real_array(f"The start of {name!r}", given, np.result_type(jnp.result_type(float)), None)
-        if name in known and value.shape != known[name].shape:
-            raise ValueError(f"Parameter {name!r} has shape {known[name].shape}, got a start of shape {value.shape}.")
+        if name in present and value.shape != present[name].shape:
+            raise ValueError(f"Parameter {name!r} has shape {present[name].shape}, got a start of shape {value.shape}.")
         if not np.all(np.isfinite(value)):
             raise ValueError(f"The start of {name!r} must be finite, got {given}.")
         limits = bounds.get(name, (None, None))
         low, high = bounds_of(f"The bounds of {name!r}", limits, value.shape, value.dtype)
         if np.any(value < low) or np.any(value > high):
             raise ValueError(f"The start of {name!r}, {value}, is not within its bounds {limits}.")
-        own = declared[name].scale if name in declared else None
-        scale = _scale(value, low, high) if own is None else np.broadcast_to(np.asarray(own, value.dtype), value.shape)
+        given_scale = declared[name].scale if name in declared else None
+        scale = (
+            _scale(value, low, high)
+            if given_scale is None
+            else np.broadcast_to(np.asarray(given_scale, value.dtype), value.shape)
+        )
         ranges.append(Box(*map(jnp.asarray, (value, scale, low, high))))
     return Space(tuple(start), tuple(ranges))
 

@@ -33,8 +33,8 @@ def starting_points(
         chosen = _best(program, limits, starts, seed)
     if chosen:
         return chosen, 0
-    found, spent = _from_nowhere(program, limits, shapes, first, most)
-    return [found.z], spent
+    trial, spent = _from_nowhere(program, limits, shapes, first, most)
+    return [trial.z], spent
 
 
 def _best(program: Program, limits: Limits, starts: int, seed: int) -> list[np.ndarray]:
@@ -64,9 +64,9 @@ def _from_nowhere(program: Program, limits: Limits, shapes, first: Trial, most: 
     )
     if not finite:
         raise ValueError(f"{what}. {cure}")
-    own = np.concatenate([np.full(int(np.prod(shapes[name])), name in finite) for name in limits.names])
-    components = tuple(c for c, k in zip(limits.components, own, strict=True) if k)
-    kept = Limits(tuple(finite), components, limits.low[own], limits.high[own])
+    mask = np.concatenate([np.full(int(np.prod(shapes[name])), name in finite) for name in limits.names])
+    components = tuple(c for c, k in zip(limits.components, mask, strict=True) if k)
+    kept = Limits(tuple(finite), components, limits.low[mask], limits.high[mask])
     # In forward mode, since a reverse pass through a NaN is NaN, whatever its weight.
     part = Program(program.function, program.space, tuple(finite), True)
     start = evaluate(part, first.z)
@@ -111,19 +111,19 @@ def _first_feasible(
         step = -np.linalg.lstsq(slope[violated], excess[violated], rcond=1e-8)[0]
         # No step is longer than half the scale of a parameter.
         step *= min(1.0, 0.5 / max(np.max(np.abs(step)), 1e-300))
-        length, moved = 1.0, None
+        length, better = 1.0, None
         while length > 1e-3 and count < most:
             trial = evaluate(program, np.clip(here.z + length * step, low, high))
             count += 1
             smaller = np.linalg.norm(limits.excess(trial.rows, scales)) < (1 - 1e-3 * length) * np.linalg.norm(excess)
             if trial.good and smaller:
-                moved = trial
+                better = trial
                 break
             length *= 0.5
-        if moved is None:
+        if better is None:
             break
-        beyond = moved.z - here.z
-        here = moved
+        beyond = better.z - here.z
+        here = better
         if np.max(limits.excess(here.rows, scales)) < 1e-2:
             break
     # The last steps, lengthened until the objective has a value.

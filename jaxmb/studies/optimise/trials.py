@@ -131,11 +131,11 @@ def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
     For a bound of zero, the first value, or if larger its change for a change of a parameter by its scale, but at most
     the other bound. A bound of almost zero has a size far above rounding errors of these.
     """
-    known = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
-    own = known(np.abs([limits.low, limits.high]))
-    first = known(np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0)))
-    size = np.where(np.isfinite(own), own, np.minimum(own[::-1], first))
-    size = np.minimum(size, known(limits.high - limits.low))
+    or_infinite = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
+    of_bounds = or_infinite(np.abs([limits.low, limits.high]))
+    first = or_infinite(np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0)))
+    size = np.where(np.isfinite(of_bounds), of_bounds, np.minimum(of_bounds[::-1], first))
+    size = np.minimum(size, or_infinite(limits.high - limits.low))
     size = np.maximum(size, np.where(np.isfinite(first), _ROUNDED * first, 0.0))
     return np.where(np.isfinite(size), size, 1.0)
 
@@ -163,6 +163,6 @@ def nearer(trials: Trials, here: Trial, aside: float, most: int) -> Trial:
     excess = lambda z: limits.excess(trials(z).rows[1:], trials.scales)
     if excess(start.z).any():
         options: dict[str, Any] = {"jac": slopes, "bounds": trials.box, "ftol": _STALLED, "max_nfev": most}
-        found = optimize.least_squares(excess, start.z, **options)
-        start = trials(found.x)
+        result = optimize.least_squares(excess, start.z, **options)
+        start = trials(result.x)
     return start

@@ -36,8 +36,8 @@ def objection(at: Callable[[np.ndarray], Trial], trials: Trials, balance: Balanc
     **Arguments:** `at(z)`: a trial; `components`: the names of z's components.
     """
     best = trials.best
-    if (found := _steep(at, trials, balance)) is not None:
-        return found
+    if (reason := _steep(at, trials, balance)) is not None:
+        return reason
     if not best.jacobian[0].any() and not trials.start.jacobian[0].any():
         others = [at(z) for z in _around(trials)]
         if not any(other.jacobian[0].any() for other in others):
@@ -71,7 +71,7 @@ def _steep(at, trials: Trials, balance: Balance) -> str | None:
 def _around(trials: Trials) -> Iterator[np.ndarray]:
     """Points about the best trial, within half the scale of parameters."""
     step = np.random.default_rng(0).uniform(-0.5, 0.5, (4, trials.best.z.size))
-    return (np.clip(trials.best.z + own, *trials.box) for own in step)
+    return (np.clip(trials.best.z + offset, *trials.box) for offset in step)
 
 
 def _flat(best: Trial, others: list[float]) -> str | None:
