@@ -332,7 +332,7 @@ class _Builder:
         return self.of_name[joint].kind == "hinge" and not np.any(powers[1:]) and float(powers[0]).is_integer()
 
     def _coordinate(self, what, kind, of, table=None):
-        """The coordinate of a joint, or of another element in `known`."""
+        """The coordinate of a joint, or of another element in `table`."""
         name = (self.coordinates if table is None else table).get(what)
         if name is None:
             self.notes.refuse(kind, of, f"{of!r} acts on {what!r}, which has no coordinate")

@@ -206,13 +206,13 @@ class DryFriction(AbstractDryFriction):
             )
         if isinstance(held, AbstractUnilateralConstraint):
             return part._of_contact(space, held, poses)
-        within = part._own_coordinates(space, held, poses)
+        within = part._slip_coordinates(space, held, poses)
         if all(self.source_is_length(0, name) for name in within) != (self.radius is None):
             needs = "slides and has no radius" if self.radius is not None else "turns: give the radius of its pin"
             raise ValueError(f"{self.label}: {held.label} {needs}.")
         return part.with_fields(within=within)
 
-    def _own_coordinates(self, space, held, poses) -> tuple[str, ...]:
+    def _slip_coordinates(self, space, held, poses) -> tuple[str, ...]:
         """The coordinates of the joint whose rates are the slip."""
         coordinates = self.coordinates_of(0, space, poses)
         numbers = [name for name, value in coordinates.items() if value.size == 1]

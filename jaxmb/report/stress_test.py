@@ -107,7 +107,7 @@ def stress_test(
         try:
             for trial in trials(base):
                 cases.append(_judge(kind, trial, solver))
-        except _NotHereError as reason:
+        except _NotApplicableError as reason:
             remarks.append(f"{kind}: {reason}.")
     words = {case.error for case in cases}
     notes = [text for word, text in _WORDS.items() if word in words]
@@ -121,7 +121,7 @@ def stress_test(
     return Table(f"{name}: relative error at the end", _COLUMNS, [case[:5] for case in cases], notes + remarks, draw)
 
 
-class _NotHereError(Exception):
+class _NotApplicableError(Exception):
     """The reason why a kind of variant does not apply."""
 
 
@@ -169,7 +169,7 @@ def _stiffness(base: _Base) -> Iterator[_Trial]:
         n for n, unit in units(base.mechanism.system).items() if n.endswith("stiffness") and (unit or "")[:1] == "N"
     ]
     if not any(np.any(values[name]) for name in springs):
-        raise _NotHereError("left out, there are no springs")
+        raise _NotApplicableError("left out, there are no springs")
     yield from _scaled(base, springs, 10.0 ** np.arange(2, 15, 2))
 
 
@@ -177,7 +177,7 @@ def _masses(base: _Base) -> Iterator[_Trial]:
     body = base.mechanism.system.catalogue.motion_names()[0]
     masses = _inertial(base, [body])
     if not masses:
-        raise _NotHereError("left out, there is no body whose mass is a parameter")
+        raise _NotApplicableError("left out, there is no body whose mass is a parameter")
     for trial in _scaled(base, masses, 10.0 ** np.array([-8, -4, -2, 2, 4, 8])):
         yield trial._replace(case=f"{body} {trial.case}")
 
@@ -185,7 +185,7 @@ def _masses(base: _Base) -> Iterator[_Trial]:
 def _alternating_masses(base: _Base) -> Iterator[_Trial]:
     every_other = _inertial(base, base.mechanism.system.catalogue.motion_names()[1::2])
     if not every_other:
-        raise _NotHereError("left out, there are no two bodies whose masses are parameters")
+        raise _NotApplicableError("left out, there are no two bodies whose masses are parameters")
     yield from _scaled(base, every_other, 10.0 ** np.array([-8, -6, -3, 3, 6, 8]))
 
 
@@ -201,14 +201,14 @@ def _lengths(base: _Base) -> Iterator[_Trial]:
         try:
             scaled = scaled_lengths(mechanism.system, mechanism.state, factor)
         except ValueError as reason:
-            raise _NotHereError(f"left out, {str(reason).rstrip('.')}") from None
+            raise _NotApplicableError(f"left out, {str(reason).rstrip('.')}") from None
         yield base.trial(f"× {factor:.0e}", system=scaled[0], state=scaled[1], truth=(base.truth,))
 
 
 def _speeds(base: _Base) -> Iterator[_Trial]:
     mechanism = base.mechanism
     if not (np.any(np.asarray(mechanism.state.u)) and mechanism.system.linear and mechanism.system.drift_free):
-        raise _NotHereError("left out, the motion starts from rest, or velocities are prescribed")
+        raise _NotApplicableError("left out, the motion starts from rest, or velocities are prescribed")
     for factor in (1e-6, 1e-3, 10.0, 1e3):
         fast = dataclasses.replace(mechanism.state, u=factor * mechanism.state.u)
         yield base.trial(f"× {factor:.0e}", state=fast, t1=mechanism.t1 / max(factor, 1.0))
@@ -217,7 +217,7 @@ def _speeds(base: _Base) -> Iterator[_Trial]:
 def _near_singular(base: _Base) -> Iterator[_Trial]:
     mechanism = base.mechanism
     if not base.singular:
-        raise _NotHereError("left out, no singular position was named, as by singular={'crank.angle': …}")
+        raise _NotApplicableError("left out, no singular position was named, as by singular={'crank.angle': …}")
     for off in 10.0 ** -np.arange(3.0, 13.0, 3.0):
         fix = {name: np.asarray(value) + off for name, value in base.singular.items()}
         build = lambda fix=fix: (mechanism.system, assemble(mechanism.system, mechanism.state, fix=fix), mechanism.t1)
@@ -227,13 +227,13 @@ def _near_singular(base: _Base) -> Iterator[_Trial]:
 def _doubled(base: _Base) -> Iterator[_Trial]:
     mechanism = base.mechanism
     if not (mechanism.system.body_names and mechanism.system.velocity_rows):
-        raise _NotHereError("left out, there are no joints of bodies")
+        raise _NotApplicableError("left out, there are no joints of bodies")
     yield base.trial(
         "the same", build=lambda: _with(base, doubled(mechanism.system, mechanism.state)), truth=(base.truth,)
     )
     joint = mechanism.system.constraints.groups[0].group
     if getattr(joint.part, "point_a", None) is None:
-        raise _NotHereError(f"a nearly redundant joint is left out, {joint.names[0]!r} has no points of two bodies")
+        raise _NotApplicableError(f"a nearly redundant joint is left out, {joint.names[0]!r} has no points of two bodies")
     off = 1e-6 * float(mechanism.system.length)
     yield base.trial("1e-06 off", build=lambda: _with(base, doubled(mechanism.system, mechanism.state, off)))
 

@@ -101,18 +101,18 @@ def moved(problem: Problem, lanes: tuple[Lanes, ...], place: Place, step: np.nda
     z, states = place.z + change[: place.z.size], []
     each = zip(lanes, place.states, place.charts, place.split(change), strict=True)
     for lane, state, charts, move in each:
-        trial, flat = problem.trials[lane.number], _own_values(problem, lane, z)
+        trial, flat = problem.trials[lane.number], _values_of(problem, lane, z)
         states.append(_on_constraints(problem.system, trial, flat, lane.trials.t0, state, charts[:2], move))
     return _placed(problem, lanes, z, states)
 
 
 def _placed(problem, lanes, z, states) -> Place:
     each = zip(lanes, states, strict=True)
-    charts = tuple(_charts(problem, lane, _own_values(problem, lane, z), state) for lane, state in each)
+    charts = tuple(_charts(problem, lane, _values_of(problem, lane, z), state) for lane, state in each)
     return Place(z, tuple(states), charts)
 
 
-def _own_values(problem, lane, z):
+def _values_of(problem, lane, z):
     """The unknowns of one experiment, one after the other."""
     return jnp.asarray(values_and_derivatives(problem, z)[0][problem.columns(lane.number)])
 
@@ -125,7 +125,7 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     readings, objective = {}, 0.5 * prior_rows @ prior_rows
     columns = place.split(np.arange(total))
     for lane, state, charts, lane_columns in zip(lanes, place.states, place.charts, columns, strict=True):
-        trial, flat = problem.trials[lane.number], _own_values(problem, lane, place.z)
+        trial, flat = problem.trials[lane.number], _values_of(problem, lane, place.z)
         inward = derivatives[problem.columns(lane.number)]
         outcome = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
         seen, (rows, levels, starts, ends) = numbers(outcome)

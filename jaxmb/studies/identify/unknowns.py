@@ -208,7 +208,7 @@ def _assembled(experiment, system, guess, **prescribed):
 def _trial(
     system, prefix, experiment, sensors, given, sigma, loss, collected
 ) -> tuple[ExperimentModel, tuple[str, ...]]:
-    """One experiment, whose unknowns are added to `found`."""
+    """One experiment, whose unknowns are added to `collected`."""
     ts, places = times_of(experiment)
     label = lambda name: f"{prefix}/{name}" if prefix else name
     known_values = known_parameters(system, experiment)

@@ -126,7 +126,7 @@ def of_residuals(
     out = [
         *(_beyond(with_known_noise, len(far), directions, loss.robust) if with_known_noise else ()),
         *(_explains_nothing(unknown) if unknown else ()),
-        *_no_noise(series, directions, loss),
+        *_not_noise(series, directions, loss),
     ]
     return [*out[:-1], f"{out[-1]}. {_cures(tried)}"] if out else []
 
@@ -192,7 +192,7 @@ def _explains_nothing(series: list[Series]) -> Iterator[str]:
         yield f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g})"
 
 
-def _no_noise(series: Sequence[Series], directions: int, loss: Loss) -> Iterator[str]:
+def _not_noise(series: Sequence[Series], directions: int, loss: Loss) -> Iterator[str]:
     """Whether residuals are predictable: from their signs, from earlier residuals, or from the prediction."""
     told = []
     for single in series:

@@ -33,7 +33,7 @@ def starting_points(
         chosen = _best(program, limits, starts, seed)
     if chosen:
         return chosen, 0
-    trial, spent = _from_nowhere(program, limits, shapes, first, most)
+    trial, spent = _feasible_start(program, limits, shapes, first, most)
     return [trial.z], spent
 
 
@@ -52,7 +52,7 @@ def _best(program: Program, limits: Limits, starts: int, seed: int) -> list[np.n
     return [np.asarray(z[k], float) for k in order[:_LOCAL] if good[k]]
 
 
-def _from_nowhere(program: Program, limits: Limits, shapes, first: Trial, most: int) -> tuple[Trial, int]:
+def _feasible_start(program: Program, limits: Limits, shapes, first: Trial, most: int) -> tuple[Trial, int]:
     """A feasible trial from a start that fails, by the constraints that are finite there."""
     finite = [name for name in limits.names if name in first.outputs and np.all(np.isfinite(first.outputs[name]))]
     lost = [name for name in program.names if name not in finite]
