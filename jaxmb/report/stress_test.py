@@ -233,7 +233,9 @@ def _doubled(base: _Base) -> Iterator[_Trial]:
     )
     joint = mechanism.system.constraints.groups[0].group
     if getattr(joint.part, "point_a", None) is None:
-        raise _NotApplicableError(f"a nearly redundant joint is left out, {joint.names[0]!r} has no points of two bodies")
+        raise _NotApplicableError(
+            f"a nearly redundant joint is left out, {joint.names[0]!r} has no points of two bodies"
+        )
     off = 1e-6 * float(mechanism.system.length)
     yield base.trial("1e-06 off", build=lambda: _with(base, doubled(mechanism.system, mechanism.state, off)))
 

@@ -63,7 +63,7 @@ def levenberg_marquardt(
     """Minimise an objective from its linearised residuals; trials that fail are rejected.
 
     A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt), subject to `c + C s =
-    0` if there are gaps c; then the merit function is `f + ν |c|₁`, and a rejected step is halved first. The damping μ
+    0` for gaps c. With gaps the merit function is `f + ν |c|₁`, and a rejected step is halved first. The damping μ
     follows the gain, the ratio of the actual decrease to the linear model's.
 
     If the model promises a decrease of less than `tol` times the objective, the varying errors of the motions exceed
