@@ -101,7 +101,7 @@ class Mechanism:
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
         """Relative errors against the references, by label, at every saved reference time.
 
-        Errors are relative to the largest reference value of their label.
+        Errors are relative to `references.scales`: the sizes of the labels, by default their largest reference values.
 
         **Raises:** `ValueError` if there are no references, or the trajectory saved none of their times.
         """

@@ -90,9 +90,9 @@ def stress_test(
     variant starts; `only`: the kinds of variants to try, default all: "rtol", "long horizon", "stiffness", "mass",
     "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
 
-    **Returns:** a `Table` of variants. `error` is the error at the end, relative to the largest coordinate and the
-    largest velocity; or "small" if less than the accuracy of the reference ("known to"), "unknown", or "refused" if the
-    variant cannot be built or its run fails. Notes give the reasons.
+    **Returns:** a `Table` of variants. `error` is the largest error at the end of coordinates, velocities and internal
+    states, each relative to their largest value; or "small" if less than the accuracy of the reference ("known to"),
+    "unknown", or "refused" if the variant cannot be built or its run fails. Notes give the reasons.
     """
     mechanism = subject(system, state, t1)
     solver = Adams() if solver is None else solver

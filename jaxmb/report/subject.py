@@ -15,7 +15,8 @@ from ..trajectory import Trajectory
 def subject(system: AbstractSystem | Mechanism, state: State | None = None, t1: float | None = None) -> Mechanism:
     """The motion of a report. Every parameter counts separately, so a system loses its design variables.
 
-    **Arguments:** a compiled system, a state of it and the end `t1` [s] of the motion; or a mechanism alone.
+    **Arguments:** a compiled system, a state of it and the end `t1` [s] of the motion; or a mechanism, perhaps with
+    another end `t1`.
 
     **Raises:** `ValueError` for a missing or superfluous argument.
     """

@@ -104,9 +104,10 @@ def identify(
         1)`, and "huber" is `r²` up to one σ and `2 |r| − 1` beyond. The robust losses need `sigma` in numbers, or a
         residual function. A residual beyond about one σ then has the influence of one σ, and deviations are estimated
         from the residuals (Huber's M-estimate).
-    - `starts`: the number of starting points. The first is `free`; the others are drawn with `seed` between the bounds
-        or, without bounds, from a normal distribution of the size of the start. Or further starting values, one mapping
-        for each start. They are simulated in one batch, and the best minimum is returned.
+    - `starts`: the number of starting points. The first is `free`; the others are drawn with `seed`: between two
+        bounds, or from a normal distribution of the size of the start (log-normal for positive parameters and a single
+        bound). Or further starting values, one mapping for each start. They are simulated in one batch, and the best
+        minimum is returned.
     - `segments`: more than one is multiple shooting, for chaotic or unstable motions that a simulation over the whole
         time does not follow. Each experiment is cut into this number of segments of nearly equal numbers of samples.
         They are simulated in one batch from separate initial states, which the iteration joins.

@@ -178,7 +178,7 @@ def _independent(slopes: np.ndarray, equal: np.ndarray) -> np.ndarray:
 
 
 def objective_size(trial: Trial) -> float:
-    """The size of the objective, or if larger of its change for changes of parameters by their scales."""
+    """The size of the objective, or if larger of its change when a parameter changes by its scale."""
     size = max(abs(float(trial.rows[0])), float(np.max(np.abs(trial.jacobian[0]), initial=0.0)))
     return size if size > 0 else 1.0
 

@@ -205,8 +205,8 @@ def optimise(
     warning: if the best designs lie there, constrain a margin as well, such as the sine of the transmission angle.
 
     **Constraints hold** to a millionth of their bound, or of the distance of both bounds if smaller. For a bound of
-    zero it is a millionth of the output at the start, or of its change for a change of a parameter by its scale,
-    whichever is larger. `Optimum.constraints` has the tolerances.
+    zero it is a millionth of the output at the start, or if larger of its change when a parameter changes by its scale.
+    `Optimum.constraints` has the tolerances.
 
     **A minimum** is distinguished from a maximum, a saddle and a flat objective by some trials beside the result, which
     `trials` does not count.

@@ -128,8 +128,8 @@ def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
     """Sizes of the lower and the upper side of constraints: each side's bound, so that a far bound does not loosen the
     other, or the distance of both if smaller.
 
-    For a bound of zero, the first value, or if larger its change for a change of a parameter by its scale, but at most
-    the other bound. A bound of almost zero has a size far above rounding errors of these.
+    For a bound of zero, the first value, or if larger its change when a parameter changes by its scale, but at most the
+    other bound. A bound of almost zero has a size far above rounding errors of these.
     """
     or_infinite = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
     of_bounds = or_infinite(np.abs([limits.low, limits.high]))
