@@ -48,9 +48,9 @@ class AbstractRange(eqx.Module):
     def at_end(self, z: Float[Array, "n"], deviations: np.ndarray) -> np.ndarray:
         """Whether each component of the value is at an end of the range, a bound or infinity, as far as the data tell.
 
-        Its distance has shrunk to a thousandth of the start's (to a thousandth of the width between two bounds), and is
-        small against its standard `deviations`. A component close to a bound, but distinguishable from it by the data,
-        is not at the bound.
+        Its distance from the end has shrunk to a thousandth of the start's (to a thousandth of the width between two
+        bounds), and is small against its standard `deviations`. A component close to a bound, but distinguishable from
+        it by the data, is not at the bound.
         """
 
     @property

@@ -87,8 +87,8 @@ def show(
     - `shapes`: shapes of bodies by name, instead of the default, one or several from `jaxmb.shapes`, each placed in the
         frame of its body; also of the `"ground"`.
     - `frames`: the largest number of saved times that are shown.
-    - `speed` of playing, 1 for real time, the default. By default shorter motions last 2 s and longer motions a minute.
-        The slider shows the time of playing, the picture the time of the motion.
+    - `speed` of playing, 1 for real time. By default motions play in real time, but for at least 2 s and at most a
+        minute. The slider shows the time of playing, the picture the time of the motion.
     - `overlay`: show several motions in one place, each in a colour, instead of side by side.
     - `height` [pixels], in a notebook.
 

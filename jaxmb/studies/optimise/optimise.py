@@ -271,7 +271,7 @@ def _optimum(first: Trial, shapes: Mapping[str, tuple[int, ...]], runs: list[_Ru
     if against:
         message = against if ok else f"{message}; {against}"
     if spent:
-        message = f"{message}; {spent} trials led from the failed start to a feasible start"
+        message = f"{message}; {spent} trials led from the failed start to a valid start"
     holds = trials.violation(best) <= HOLDS
     if not holds:
         message += f"; constraints are violated, most of all {trials.limits.worst(best.rows[1:], trials.scales)}"
