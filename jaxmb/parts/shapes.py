@@ -77,7 +77,7 @@ class AbstractShape(abc.ABC):
     def scale(self) -> np.ndarray:
         """Lengths [m] by which the mesh of unit size is stretched along its axes, shape (3,)."""
 
-    def shifted(self, position: Any, orientation: Any) -> Self:
+    def moved(self, position: Any, orientation: Any) -> Self:
         """The shape in another frame, given the position and orientation of the present frame in it."""
         shifted = position + rot.rotate(orientation, self.position)
         return dataclasses.replace(self, position=shifted, orientation=rot.multiply(orientation, self.orientation))

@@ -117,7 +117,7 @@ def test_a_planar_joint():
         (robot(link("a"), joint("j", "a", "b")), r"The text:3: joint 'j' has the child 'b', but there is no such link"),
         (
             robot(link("a"), link("b", ""), joint("j", "a", "b")),
-            "There is no moving link .base='free' sets.* no mass: 'b'. Give them an <inertial>",
+            "There is no moving link .base='free' sets.* Massless links were left out: 'b'. Give them an <inertial>",
         ),
         (
             robot(link("a"), link("b", INERTIAL.replace('"2"', '"0"')), joint("j", "a", "b")),
