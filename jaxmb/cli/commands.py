@@ -1,4 +1,4 @@
-"""The commands, and how they end."""
+"""The commands and their exit codes."""
 
 import argparse
 import os
@@ -12,7 +12,7 @@ from .._setup import VARIABLE, setup
 from .._traced_functions import is_of_user
 from . import doctor, help, run, sweep
 
-# Commands of before, which are one line elsewhere.
+# Removed commands, each with its replacement.
 _ELSEWHERE = {
     "report": "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python; mb.report.stress_test is the other",
     "reference": "python -m sphinx -c tests/pages . FOLDER in a checkout of jaxmb",
@@ -22,10 +22,10 @@ _ELSEWHERE = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
-    **Arguments:** `argv`: the words after `jaxmb`, default those of the process.
+    **Arguments:** `argv`: the words after `jaxmb`, default from the process.
 
-    **Returns:** the exit code: 0; with a message on stderr 1 if a simulation failed or a file could not be written, 2
-    for a name or value that does not fit, and 130 after Ctrl-C. Errors of a user's file have their tracebacks.
+    **Returns:** the exit code: 0; or, with a message on stderr, 1 if a simulation failed or a file could not be
+    written, 2 for an invalid name or value, and 130 after Ctrl-C. Errors in a user's file have their tracebacks.
     """
     words = sys.argv[1:] if argv is None else list(argv)
     if words and words[0] in _ELSEWHERE:
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.command(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        # What reads a pipe, such as head, has enough; nothing is left to be written when the process ends.
+        # The reader of a pipe, such as head, has closed it; nothing must remain to be written when the process ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, RuntimeError, OSError) as error:
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
         prog="jaxmb",
         description="Accurate, differentiable dynamics of constrained mechanical systems.",
         epilog="Compiled programs are kept in the user's cache folder for later runs; the environment variable "
-        f"{VARIABLE} names another folder, or is off. `jaxmb doctor` says where they are.",
+        f"{VARIABLE} names another folder, or is off. `jaxmb doctor` shows the folder.",
     )
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
@@ -68,7 +68,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _prepare() -> None:
-    """Double precision, short waits for programs, and programs that are kept."""
+    """Double precision, fast compilation, and the cache of programs."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         setup()

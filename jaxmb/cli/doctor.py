@@ -1,4 +1,4 @@
-"""`jaxmb doctor`: the machine, what is installed on it, and, with `--measure`, how long first calls and steps take."""
+"""`jaxmb doctor`: the machine, its installed packages, and, with `--measure`, the times of first calls and steps."""
 
 import argparse
 import functools
@@ -29,7 +29,7 @@ from ..report.timing import interleaved
 from ..simulate import simulate
 
 _NEEDED = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "numpy")
-# What the extras of the package install.
+# The packages of each extra.
 _OPTIONAL = {
     "docs": ("furo", "myst-nb", "sphinx"),
     "plot": ("matplotlib",),
@@ -39,8 +39,8 @@ _OPTIONAL = {
 }
 _STEPPED = ("four_bar", "andrews", "rod_chain", "tracked_vehicle")
 _RTOL, _REPEATS = 1e-8, 5
-# What a user waits for in a new process [s]: imports, and of some machines the first value with its scene, the first
-# gradient, and a second one of each.
+# Waiting times in a new process [s]: imports, and for some machines the first value with its scene, the first gradient,
+# and the second call of each.
 _FIRST_CALLS = """
 import time
 times = [time.perf_counter()]
@@ -79,13 +79,13 @@ for name, body, joints, solver in machines:
 import json
 print(json.dumps([after - before for before, after in zip(times, times[1:])]))
 """
-# The durations among those that it prints, in the order of the table.
+# The durations of the table, among all that it prints.
 _SHOWN = {"import jax, diffrax": 0, "import jaxmb": 1} | {
     f"{name}: {call}": 3 + 5 * k + place
     for k, name in enumerate(("four_bar", "spatial_slider_crank", "slider_crank with a stop", "stiff_four_bar"))
     for call, place in {"first value": 0, "first gradient": 2, "another value": 1, "another gradient": 3}.items()
 }
-# How facts are printed: names and paths are for copying.
+# The format of facts: names and paths are for copying.
 _INDENT = 18
 _FILLED = textwrap.TextWrapper(80, subsequent_indent=" " * _INDENT, break_long_words=False, break_on_hyphens=False)
 
@@ -94,7 +94,7 @@ def add_to(commands: Any) -> None:
     """Add the command to a parser's commands."""
     command = commands.add_parser(
         "doctor",
-        help="say what is installed, where compiled programs are kept, and, with --measure, how long things take here",
+        help="show installed packages, the cache of compiled programs, and, with --measure, waiting times here",
     )
     command.add_argument("--measure", action="store_true", help="measure first calls and steps, some minutes")
     command.add_argument("--quick", action="store_true", help=argparse.SUPPRESS)
@@ -109,7 +109,8 @@ def _doctor(arguments: argparse.Namespace) -> None:
     if not arguments.measure:
         return
     print(
-        "\nCalls in a new process [s], values with their scenes; the second finds the programs that the first kept:\n"
+        "\nCalls in a new process [s], values with their scenes; the second process finds the first one's programs in "
+        "the cache:\n"
     )
     print("\n".join(aligned(_first_calls())))
     print(f"\nWarm steps under jit at rtol {_RTOL:g}, the shortest of {_REPEATS} runs:\n")
@@ -117,13 +118,13 @@ def _doctor(arguments: argparse.Namespace) -> None:
 
 
 def _facts() -> Iterable[tuple[str, str]]:
-    """The machine, and what is installed."""
+    """The machine and its installed packages."""
     yield "jaxmb", f"{__version__}, Python {platform.python_version()}"
     yield "needed", ", ".join(f"{name} {_version(name)}" for name in _NEEDED)
     for extra, names in _OPTIONAL.items():
-        found = {name: _version(name) for name in names}
-        text = ", ".join(f"{name} {version or 'missing'}" for name, version in found.items())
-        yield f"for {extra}", text if all(found.values()) else f'{text}; pip install "jaxmb[{extra}]"'
+        versions = {name: _version(name) for name in names}
+        text = ", ".join(f"{name} {version or 'missing'}" for name, version in versions.items())
+        yield f"for {extra}", text if all(versions.values()) else f'{text}; pip install "jaxmb[{extra}]"'
     yield "machine", f"{platform.system()} {platform.machine()}, {_processor()}, {_cores()}"
     faults = [fault for name in (*_NEEDED, *sum(_OPTIONAL.values(), ())) if (fault := fault_of(name))]
     if faults:
@@ -142,7 +143,7 @@ def _version(package: str) -> str | None:
 
 
 def _processor() -> str:
-    """Its name, which Linux has in a file."""
+    """The processor's name, which Linux has in a file."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -152,10 +153,10 @@ def _processor() -> str:
 
 
 def _cores() -> str:
-    """Those that this process may use."""
+    """The cores that this process may use."""
     count, limit, given = cores(), limit_of_threads(), os.environ.get("NPROC", "").strip()
-    told = f", NPROC={given}, which is no number: all of them" if given else ""
-    return f"{count} core{'s' * (count > 1)}" + (told if limit is None else f", of which computations take {limit}")
+    told = f", NPROC={given}, which is not a number: all of them" if given else ""
+    return f"{count} core{'s' * (count > 1)}" + (told if limit is None else f"; computations take {limit}")
 
 
 def _kept() -> str:
@@ -172,10 +173,10 @@ def _kept() -> str:
 
 
 def _first_calls() -> list[list[str]]:
-    """What two processes wait for, the second of which finds what the first has compiled."""
+    """The waiting times of two processes; the second finds the programs of the first in the cache."""
     with tempfile.TemporaryDirectory() as folder:
-        own = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
-        environment = own | {VARIABLE: folder}
+        kept = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+        environment = kept | {VARIABLE: folder}
         both = [_durations(environment) for _ in range(2)]
     rows = [[name, *(f"{durations[place]:.3f}" for durations in both)] for name, place in _SHOWN.items()]
     return [["", "first", "second"], *rows]
@@ -189,18 +190,18 @@ def _durations(environment: dict[str, str]) -> list[float]:
 
 
 def _steps() -> list[list[str]]:
-    """Steps of some motions, and the time of one."""
+    """Numbers of steps of some motions, and the time of a step."""
     motions = [mechanisms.get(name) for name in _STEPPED]
-    runs = [functools.partial(_motion, own.system, own.state, own.t1) for own in motions]
+    runs = [functools.partial(_motion, single.system, single.state, single.t1) for single in motions]
     rows = [["", "bodies", "t1 [s]", "steps", "run [ms]", "step [µs]"]]
-    for own, run, times in zip(motions, runs, interleaved(runs, _REPEATS), strict=True):
+    for single, run, times in zip(motions, runs, interleaved(runs, _REPEATS), strict=True):
         stats, result, _ = run()
         if result != RESULTS.successful:
-            raise RuntimeError(f"{own.name}: {RESULTS[result]}")
+            raise RuntimeError(f"{single.name}: {RESULTS[result]}")
         steps, seconds = int(stats["num_steps"]), min(times)
-        bodies = str(len(own.system.body_names))
+        bodies = str(len(single.system.body_names))
         rows.append(
-            [own.name, bodies, f"{own.t1:g}", str(steps), f"{1e3 * seconds:.1f}", f"{1e6 * seconds / steps:.1f}"]
+            [single.name, bodies, f"{single.t1:g}", str(steps), f"{1e3 * seconds:.1f}", f"{1e6 * seconds / steps:.1f}"]
         )
     return rows
 

@@ -1,4 +1,4 @@
-"""The folder that a command writes to, with figures and the moving picture of `jaxmb run --show`."""
+"""The output folder of a command, with figures and the moving picture of `jaxmb run --show`."""
 
 import argparse
 import os
@@ -14,12 +14,12 @@ from ..viz.stage import viser
 
 
 def output_folder(arguments: argparse.Namespace) -> Path:
-    """The folder that was asked for, or the default."""
+    """The requested folder, or the default."""
     return Path("jaxmb-output") / arguments.mechanism.split(":")[-1] if arguments.out is None else arguments.out
 
 
 def check_folder(arguments: argparse.Namespace) -> None:
-    """Raise a `ValueError`, before anything is computed, for a folder that cannot be written to."""
+    """Raise a `ValueError` for a folder that is not writable, before anything is computed."""
     out = output_folder(arguments)
     existing = next(path for path in (out, *out.absolute().parents) if path.exists())
     if not existing.is_dir():
@@ -29,14 +29,14 @@ def check_folder(arguments: argparse.Namespace) -> None:
 
 
 def made_folder(arguments: argparse.Namespace) -> Path:
-    """The folder, which is there afterwards."""
+    """The folder, created if necessary."""
     out = output_folder(arguments)
     out.mkdir(parents=True, exist_ok=True)
     return out
 
 
 def write_figures(out: Path, precision: Table, trajectory: Trajectory) -> None:
-    """Write the figures of a report and of a motion; without Matplotlib, say so."""
+    """Write the figures of a report and of a motion; without Matplotlib print a message."""
     try:
         precision.figure(out / "work_precision.png")
         written = [out / "work_precision.png"]
@@ -53,7 +53,7 @@ def write_figures(out: Path, precision: Table, trajectory: Trajectory) -> None:
 
 
 def check_picture(system: AbstractSystem) -> None:
-    """Raise an error, before anything is computed, where no picture can be made."""
+    """Raise an error if no picture can be made, before anything is computed."""
     if not system.body_names:
         raise ValueError("--show draws bodies, and this mechanism has none; the figures show its coordinates.")
     try:
@@ -63,9 +63,9 @@ def check_picture(system: AbstractSystem) -> None:
 
 
 def show_motion(out: Path, trajectory: Trajectory) -> None:
-    """Write the picture to the folder, and open it where there is a screen."""
+    """Write the picture to the folder, and open it if there is a screen."""
     path = save_html(trajectory, out / "motion.html").resolve()
     print(f"Wrote {path}")
     screen = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if not (screen and webbrowser.open(path.as_uri())):
-        print("There is no screen or no browser here; open the file in any browser.")
+        print("There is no screen or browser here; open the file in any browser.")

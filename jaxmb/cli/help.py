@@ -1,4 +1,4 @@
-"""`jaxmb help NAME`: what docstrings and topics say, in the terminal."""
+"""`jaxmb help NAME`: docstrings and topics in the terminal."""
 
 import argparse
 import os
@@ -16,7 +16,7 @@ def add_to(commands: Any) -> None:
     """Add the command to a parser's commands."""
     command = commands.add_parser(
         "help",
-        help="print what public names are, a topic, or a list of all",
+        help="explain public names or a topic, or list all",
         description="Print the signatures and the docstrings of public names, topics, or a list of all by subject.",
     )
     command.add_argument(
@@ -25,7 +25,7 @@ def add_to(commands: Any) -> None:
         help="such as simulate, planar.Revolute, Trajectory.reactions, four_bar; a module: planar, solvers; or a "
         "topic: tolerances, derivatives, contacts",
     )
-    command.add_argument("--all", action="store_true", help="of parts also the methods, for parts of one's own")
+    command.add_argument("--all", action="store_true", help="also the methods of parts, for user-defined parts")
     command.set_defaults(command=_help)
 
 

@@ -24,11 +24,11 @@ from .folders import check_folder, check_picture, made_folder, show_motion, writ
 from .options import add_parameters
 from .subject import mechanism_of
 
-# What `run` does: saved times, and the fit of one parameter to every other saved time of the
-# first part of the motion, with noise, from a start that is off.
+# Settings of `run`: saved times, and the fit of a parameter to every other saved time of the first part of the motion,
+# with noise, from a wrong start.
 _TIMES = 401
 _FIT_SHARE, _NOISE, _START = 0.2, 1e-3, 1.1
-# The relative change of a parameter that tells how much it matters.
+# The relative change of a parameter for its sensitivity.
 _CHANGE = 1e-3
 
 
@@ -39,7 +39,7 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument("mechanism", help="a name from `jaxmb mechanisms`")
     command.add_argument("--rtol", type=float, default=1e-9, help="relative tolerance of a step (default %(default)g)")
-    command.add_argument("--t1", type=float, help="end of the motion [s] (default that of the mechanism)")
+    command.add_argument("--t1", type=float, help="end of the motion [s] (default from the mechanism)")
     tolerances = "tolerances at which error is measured against run time (default 1e-5 1e-7 1e-9)"
     command.add_argument(
         "--tolerances", type=float, nargs="+", metavar="RTOL", default=(1e-5, 1e-7, 1e-9), help=tolerances
@@ -102,24 +102,24 @@ def _residuals(trajectory: Trajectory) -> str:
 
 
 def _compare(mechanism: Mechanism, trajectory: Trajectory) -> None:
-    known = mechanism.references
-    if known is None:
+    references = mechanism.references
+    if references is None:
         print("There are no reference values for this motion.")
         return
-    print(f"Relative error at {known.times[-1]:g} s against reference values:")
-    print(f"  {known.source}; good to {known.tolerance:.0e}")
+    print(f"Relative error at {references.times[-1]:g} s against reference values:")
+    print(f"  {references.source}; good to {references.tolerance:.0e}")
     errors = mechanism.errors(trajectory)
     width = max(map(len, errors))
     for k, (label, error) in enumerate(errors.items()):
-        print(f"  {label:{width}}  {known.values[-1, k]:20.12g}  {error[-1]:.1e}")
+        print(f"  {label:{width}}  {references.values[-1, k]:20.12g}  {error[-1]:.1e}")
 
 
 def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
-    """Estimate the parameter to which the motion is most sensitive from a noisy sample of it."""
+    """Estimate the parameter to which the motion is most sensitive, from a noisy sample of the motion."""
     system = mechanism.system
     saved = np.asarray(trajectory.ts)
-    own = np.flatnonzero((saved > 0) & (saved <= _FIT_SHARE * mechanism.t1))[1::2]
-    ts = saved[own]
+    indices = np.flatnonzero((saved > 0) & (saved <= _FIT_SHARE * mechanism.t1))[1::2]
+    ts = saved[indices]
     name = _most_sensitive(mechanism, ts)
     if name is None:
         print("\nNo single number among the parameters has an effect on the motion; there is nothing to identify.")
@@ -127,7 +127,7 @@ def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
     random = np.random.default_rng(0)
     measured, sigma = {}, {}
     for place in system.catalogue.position_quantities():
-        exact = np.asarray(trajectory.quantity(place))[own]
+        exact = np.asarray(trajectory.quantity(place))[indices]
         noise = _NOISE * np.ptp(exact)
         if noise > 0:
             measured[place] = exact + noise * random.standard_normal(exact.shape)
@@ -153,23 +153,23 @@ def _fit(mechanism: Mechanism, trajectory: Trajectory) -> None:
 
 
 def _most_sensitive(mechanism: Mechanism, ts) -> str | None:
-    """The scalar parameter, in relative terms, that moves positions or coordinates most; None if none does."""
-    known = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}
-    if not known:
+    """The scalar parameter whose relative change moves positions or coordinates most; None without any effect."""
+    scalars = {name: v for name, v in parameters(mechanism.system).items() if v.ndim == 0 and float(v) != 0.0}
+    if not scalars:
         return None
 
     @eqx.filter_jit
     def positions(system, state, factors):
-        values = {name: value * factor for (name, value), factor in zip(known.items(), factors, strict=True)}
+        values = {name: value * factor for (name, value), factor in zip(scalars.items(), factors, strict=True)}
         changed = with_parameters(system, values)
         start = assemble(changed, state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
         motion = simulate(changed, start, t1=ts[-1], saveat=ts, rtol=1e-8, throw=False)
         return jnp.concatenate([motion.quantity(name).reshape(-1) for name in system.catalogue.position_quantities()])
 
-    # For a choice differences do, whose program compiles in a third of the time of one of derivatives.
-    factors = 1 + _CHANGE * np.eye(len(known) + 1, len(known), -1)
+    # Differences suffice for a choice, and compile in a third of the time of derivatives.
+    factors = 1 + _CHANGE * np.eye(len(scalars) + 1, len(scalars), -1)
     of_all = jax.vmap(positions, in_axes=(None, None, 0))
     first, *others = np.asarray(of_all(mechanism.system, mechanism.state, factors))
-    moved = np.linalg.norm(np.stack(others) - first, axis=1) / _CHANGE
+    changes = np.linalg.norm(np.stack(others) - first, axis=1) / _CHANGE
     size = float(mechanism.system.length)
-    return list(known)[int(np.nanargmax(moved))] if np.nanmax(moved, initial=0.0) > 1e-4 * size else None
+    return list(scalars)[int(np.nanargmax(changes))] if np.nanmax(changes, initial=0.0) > 1e-4 * size else None

@@ -1,4 +1,4 @@
-"""The machine that a command is about: of the library, or from a function of the user."""
+"""The machine of a command: from the library, or from a function of the user."""
 
 import argparse
 import dataclasses
@@ -18,13 +18,15 @@ from ..states.assembly import assemble
 
 
 def mechanism_of(arguments: argparse.Namespace) -> Mechanism:
-    """The mechanism, ending at `--t1` with the reference values up to there."""
+    """The mechanism, with end and reference values limited to `--t1`."""
     parameters = dict(arguments.set)
-    own = _function(arguments.mechanism) if ":" in arguments.mechanism else None
+    function = _function(arguments.mechanism) if ":" in arguments.mechanism else None
     try:
-        mechanism = mechanisms.get(arguments.mechanism, **parameters) if own is None else _made(own, arguments)
+        mechanism = (
+            mechanisms.get(arguments.mechanism, **parameters) if function is None else _made(function, arguments)
+        )
     except Exception as error:
-        if own is not None or not parameters:
+        if function is not None or not parameters:
             raise
         # A value of the wrong type may fail anywhere in the mechanism.
         given = ", ".join(f"{name}={value!r}" for name, value in parameters.items())
@@ -50,7 +52,7 @@ def _function(where: str) -> Callable[..., Any]:
         try:
             module = importlib.import_module(source)
         except ModuleNotFoundError as error:
-            # What the module itself imports may be missing as well.
+            # An import within the module may be missing instead.
             if error.name is None or not f"{source}.".startswith(f"{error.name}."):
                 raise
             raise ValueError(f"{where}: {error}; {cure}.") from error
@@ -80,10 +82,10 @@ def _made(function: Callable[..., Any], arguments: argparse.Namespace) -> Mechan
 
 
 def module_from(source: str) -> ModuleType:
-    """A user's file as a module, which cannot be imported by its name."""
+    """A user's file as a module, imported by its path."""
     spec = importlib.util.spec_from_file_location(Path(source).stem, source)
     if spec is None or spec.loader is None:
-        raise ValueError(f"{source} is no Python file.")
+        raise ValueError(f"{source} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -19,9 +19,9 @@ def add_to(commands: Any) -> None:
     """Add the command to a parser's commands."""
     command = commands.add_parser(
         "sweep",
-        help="compute a function of your own for many cases",
-        description="Compute a function of your own for many cases, and write what it returns to a zarr store. A sweep "
-        "that was interrupted goes on with the same command.",
+        help="compute your function for many cases",
+        description="Compute your function for many cases, and write the results to a zarr store. The same command "
+        "resumes an interrupted sweep.",
     )
     command.add_argument(
         "source",

@@ -25,14 +25,14 @@ from .notes import Notes
 
 # The time in which a compliant stop stops a joint [s], if the file gives none: MuJoCo's default.
 STOP_TIME = 0.02
-# The share of a joint's range over which a stop sets in.
+# The fraction of a joint's range over which a stop sets in.
 _ROUNDING = 1e-3
-# A loop is open as drawn if its ends are farther apart than this share of the machine's size, or than this angle [rad].
+# A loop is open as drawn if its ends are farther apart than this fraction of the machine's size, or this angle [rad].
 _OPEN = 1e-6
 
 
 class Scalar(NamedTuple):
-    """A scalar coordinate of the scene: the name of the file's joint or, if it is `of_tendon`, tendon; and whether it
+    """A scalar coordinate of the scene: the `name` of the file's joint, or tendon if it is `of_tendon`; and whether it
     `moves`, see `ScalarCoordinate` of `jaxmb.parts`.
     """
 
@@ -45,9 +45,9 @@ class Scalar(NamedTuple):
 class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
-    **Fields:** `coordinates`: for each joint the name of its coordinate, whose values are those of the file, or None;
-    `controls`: for each actuator the name of its control; `fused`: what links became; `scalars`: the scalar coordinates
-    of the scene in order; `shapes` and `collision_shapes` of bodies by name.
+    **Fields:** `coordinates`: for each joint the name of its coordinate, with the file's values, or None; `controls`:
+    for each actuator the name of its control; `fused`: the links as bodies; `scalars`: the scalar coordinates of the
+    scene in order; `shapes` and `collision_shapes` of bodies by name.
     """
 
     scene: Scene
@@ -60,7 +60,7 @@ class Built:
 
 
 def build_scene(machine: Machine, notes: Notes) -> Built:
-    """The scene of a machine; what cannot be expressed is refused in `notes`, which the caller finishes."""
+    """The scene of a machine; `notes`, which the caller finishes, refuse unsupported elements."""
     left_out = without_ends(machine, notes)
     with_rotors(machine, notes)
     return _Builder(machine, notes, left_out).build()
@@ -94,7 +94,7 @@ class _Builder:
             self._body(carrier)
             if carrier.moved:
                 self._moved(carrier)
-        # Names of joints come before those of other elements.
+        # Joints are named before other elements.
         for chain in self.fused.chains:
             self._chain(chain)
         for step in (self._loops, self._tendons, self._couplings, self._actuators, self._marks):
@@ -108,7 +108,7 @@ class _Builder:
                 text = "There is no moving link (base='free' sets the root link of URDF free)."
                 if self.left_out:
                     names = ", ".join(map(repr, self.left_out))
-                    text += f" These were left out, since they have no mass: {names}. Give them an <inertial>."
+                    text += f" Massless links were left out: {names}. Give them an <inertial>."
                 self.notes.refused.append(text)
             scene = none
         else:
@@ -118,9 +118,11 @@ class _Builder:
         return Built(scene, self.coordinates, self.controls, self.fused, self.scalars, shapes, collisions)
 
     def _named(self, name, kind=""):
-        """A name that nothing in the scene has yet: the one of the file, or one that no other of its kind has there."""
-        own = name.replace(".", "_") or kind
-        tries = itertools.chain([own, f"{own} {kind}".strip()], (f"{own} {k}" for k in itertools.count(2)))
+        """A name that is unused in the scene: the file's, or a name that no other element of this kind has in the
+        file.
+        """
+        plain = name.replace(".", "_") or kind
+        tries = itertools.chain([plain, f"{plain} {kind}".strip()], (f"{plain} {k}" for k in itertools.count(2)))
         is_free = lambda each: each not in self.names and (each == name or each not in self.given.get(kind, ()))
         out = next(each for each in tries if is_free(each))
         self.names.add(out)
@@ -146,7 +148,7 @@ class _Builder:
         a, b = self.fused.placed(chain.parent), self.fused.placed(chain.child)
         name = self._named(" ".join(joint.name for joint in joints), "joint")
         try:
-            found = chains.joint_of(joints, a, b, name)
+            result = chains.joint_of(joints, a, b, name)
         except ValueError as why:
             self.notes.refused.append(
                 f"{joints[0].where}Joints in succession to {b.name!r} are degenerate, {why}: put a link with mass "
@@ -155,25 +157,25 @@ class _Builder:
             return
         if len(joints) > 1:
             listed = ", ".join(f"{joint.name!r}" for joint in joints)
-            self.notes.say(f"Joints {listed} in succession are the {found.parts[0].kind} {name!r}.")
-        if found.half_turn:
+            self.notes.say(f"Joints {listed} in succession are the {result.parts[0].kind} {name!r}.")
+        if result.half_turn:
             self.notes.say(
-                "The second of three hinges in succession counts in half a turn, between the angles at which the three "
-                "axes lie in one plane: {}.",
-                found.half_turn,
+                "The second of three hinges in succession is limited to half a turn, between the angles at which the "
+                "three axes lie in one plane: {}.",
+                result.half_turn,
             )
-        self.joints += found.parts
-        self.coordinates |= found.coordinates
+        self.joints += result.parts
+        self.coordinates |= result.coordinates
         for joint in joints:
             self._passive(joint, a.name, b)
 
     def _moved(self, link):
-        """A body whose motion is prescribed: that of its joint."""
+        """A joint that prescribes the motion of a body."""
         place = {"point_a": link.position, "point_b": np.zeros(3), "orientation": from_matrix(link.rotation)}
         self.joints.append(Fixed(self._named(f"{link.name} motion"), GROUND, link.name, **place))
 
     def _passive(self, joint: Joint, a: str, b: chains.PlacedLink):
-        """What acts on a joint of itself."""
+        """Springs, dampers, armature, friction and limits of a joint."""
         coordinate = self.coordinates[joint.name]
         wanted = {kind for kind in joint.passive if not self.notes.leaves_out(kind, joint.name)}
         if coordinate is None or joint.kind == "ball":
@@ -199,8 +201,8 @@ class _Builder:
             self._stop(joint.name, coordinate, joint.limits, inertia, time, turns=joint.kind == "hinge")
 
     def _counted(self, name, coordinate):
-        """The coordinate of a joint for springs and servos: of a hinge that may turn as it likes, the length of a cord
-        that it winds up, which counts on through full turns.
+        """The coordinate of a joint for springs and servos: for a hinge without limits the length of a cord that it
+        winds up, which counts on through full turns.
         """
         joint = self.of_name[name]
         if joint.kind != "hinge" or _range(joint) is not None:
@@ -240,7 +242,7 @@ class _Builder:
         if turns and upper - lower >= 2 * np.pi:
             self.notes.say("Limits that allow more than a full turn are left out: {}.", name)
             return
-        own: dict[str, Any] = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
+        law: dict[str, Any] = {"stiffness": inertia / time**2, "damping": 2 * inertia / time}
         self.forces.append(
             JointStop(
                 self._named(f"{name} stop"),
@@ -248,7 +250,7 @@ class _Builder:
                 lower=lower,
                 upper=upper,
                 smoothing=_ROUNDING * (upper - lower),
-                **own,
+                **law,
             )
         )
         self.notes.say(
@@ -268,7 +270,7 @@ class _Builder:
                 for link, point in ((loop.link_a, loop.point_a), (loop.link_b, loop.point_b))
             )
             if a == b:
-                self.notes.say("Loops between links that are fixed to each other anyway are left out: {}.", loop.name)
+                self.notes.say("Loops between links that are already fixed to each other are left out: {}.", loop.name)
                 continue
             self._say_if_open(loop)
             name = self._named(loop.name, "loop")
@@ -280,12 +282,12 @@ class _Builder:
                 self.joints.append(Fixed(name, a, b, point_a=point_a, point_b=point_b, orientation=attitude))
 
     def _say_if_open(self, loop):
-        """Note a loop that does not close where the file has its links."""
+        """Note a loop that does not close in the file's pose."""
         a, b = self.fused.links[loop.link_a], self.fused.links[loop.link_b]
-        ends = [own.position + own.rotation @ at for own, at in ((a, loop.point_a), (b, loop.point_b))]
+        ends = [link.position + link.rotation @ at for link, at in ((a, loop.point_a), (b, loop.point_b))]
         off = np.zeros((3, 3)) if loop.rotation is None else a.rotation @ loop.rotation - b.rotation
         gap, angle = np.linalg.norm(ends[1] - ends[0]), 2 * np.arcsin(min(np.linalg.norm(off) / np.sqrt(8), 1.0))
-        size = max(float(np.linalg.norm(own.position)) for own in self.fused.links.values())
+        size = max(float(np.linalg.norm(link.position)) for link in self.fused.links.values())
         shown = [f"{gap:.3g} m"] * bool(gap > _OPEN * max(size, np.linalg.norm(ends))) + [f"{angle:.3g} rad"] * bool(
             angle > _OPEN
         )
@@ -299,10 +301,10 @@ class _Builder:
         for coupling in self.machine.couplings:
             if self.notes.leaves_out("couplings", coupling.name):
                 continue
-            known = self.tendons if coupling.of_tendons else self.coordinates
+            table = self.tendons if coupling.of_tendons else self.coordinates
             ends = coupling.joint, *(other for other, _, _ in coupling.others)
-            found = [self._coordinate(end, "couplings", coupling.name, known) for end in ends]
-            names = [name for name in found if name is not None]
+            resolved = [self._coordinate(end, "couplings", coupling.name, table) for end in ends]
+            names = [name for name in resolved if name is not None]
             if len(names) < len(ends):
                 continue
             name = self._named(coupling.name, "coupling")
@@ -315,11 +317,11 @@ class _Builder:
             for row, (_, powers, _) in zip(coefficients, coupling.others, strict=True):
                 row[1 : 1 + len(powers)] = powers[:size]
             zeros = [zero for _, _, zero in coupling.others]
-            own: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros}
+            numbers: dict[str, Any] = {"coefficients": coefficients, "other_zero": zeros}
             if len(ends) == 2:
-                own = {field: values[0] for field, values in own.items()}
+                numbers = {field: values[0] for field, values in numbers.items()}
             self.joints.append(
-                JointCoupling(name, coordinate=names[0], other=tuple(names[1:]), zero=coupling.zero, **own)
+                JointCoupling(name, coordinate=names[0], other=tuple(names[1:]), zero=coupling.zero, **numbers)
             )
             for other, powers, zero in coupling.others:
                 if not coupling.of_tendons and not self._turns_without_end(coupling.joint, powers):
@@ -329,11 +331,11 @@ class _Builder:
         """Whether full turns of another hinge are full turns of this one."""
         return self.of_name[joint].kind == "hinge" and not np.any(powers[1:]) and float(powers[0]).is_integer()
 
-    def _coordinate(self, what, kind, of, known=None):
-        """The coordinate of a joint, or of something else that is known."""
-        name = (self.coordinates if known is None else known).get(what)
+    def _coordinate(self, what, kind, of, table=None):
+        """The coordinate of a joint, or of another element in `table`."""
+        name = (self.coordinates if table is None else table).get(what)
         if name is None:
-            self.notes.refuse(kind, of, f"{of!r} acts on {what!r}, which has no coordinate of its own")
+            self.notes.refuse(kind, of, f"{of!r} acts on {what!r}, which has no coordinate")
         return name
 
     # Tendons and actuators
@@ -358,12 +360,12 @@ class _Builder:
 
     def _of_tendon(self, tendon, coordinate):
         if tendon.stiffness or tendon.damping:
-            own: dict[str, Any] = {
+            numbers: dict[str, Any] = {
                 "stiffness": tendon.stiffness,
                 "damping": tendon.damping,
                 "free": tendon.free,
             }
-            self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **own))
+            self.forces.append(JointSpring(self._named(f"{tendon.name} spring"), coordinate, **numbers))
         if tendon.armature and not self.notes.leaves_out("armature", tendon.name):
             self._inertia(tendon.name, coordinate, tendon.armature, of_tendon=True)
         if tendon.friction and not self.notes.leaves_out("friction", tendon.name):
@@ -376,8 +378,8 @@ class _Builder:
         for actuator in self.machine.actuators:
             if self.notes.leaves_out("actuators", actuator.name):
                 continue
-            known = self.tendons if actuator.on_tendon else self.coordinates
-            coordinate = self._coordinate(actuator.of, "actuators", actuator.name, known)
+            table = self.tendons if actuator.on_tendon else self.coordinates
+            coordinate = self._coordinate(actuator.of, "actuators", actuator.name, table)
             if coordinate is None:
                 continue
             if not actuator.on_tendon and (actuator.gain[1] or actuator.bias[1]):
@@ -400,34 +402,36 @@ class _Builder:
             )
             if any(given is not None for given in ranges.values()):
                 self.notes.say(
-                    "Controls or forces are clipped to their ranges; where that sets in, the motion has a kink and "
-                    "steps are short: {}.",
+                    "Controls or forces are clipped to their ranges; at the ends of the ranges the motion has kinks "
+                    "and steps are short: {}.",
                     actuator.name,
                 )
 
     def _middle(self, name):
-        """The middle of a hinge's range, about which its angle counts; zero where it may turn as it likes."""
+        """The middle of a hinge's range, about which its angle is wrapped; zero without limits."""
         joint = self.of_name[name]
         limits = _range(joint)
         return 0.0 if limits is None or joint.kind != "hinge" else 0.5 * (limits[0] + limits[1])
 
     def _seen_up_to_half_a_turn(self, name, of, zero=0.0):
-        """Note that something sees the angle of a joint up to half a turn from a zero, if it may leave this range."""
+        """Note that a coupling sees a joint's angle up to half a turn from its zero, if the angle may leave this
+        range.
+        """
         joint = self.of_name[name]
         if joint.kind == "hinge" and (_range(joint) is None or not _near(joint, zero)):
-            self.notes.say("Couplings see angles of hinges up to half a turn from their zeros: {}.", of)
+            self.notes.say("Couplings see angles of hinges only up to half a turn from their zeros: {}.", of)
 
     # Frames, weights and pictures
 
     def _marks(self):
         for name, (carrier, position, rotation) in self.fused.frames().items():
-            own = {"position": position, "orientation": from_matrix(rotation)}
-            self.frames.append(Frame(self._named(name, "link"), carrier, **own))
+            place = {"position": position, "orientation": from_matrix(rotation)}
+            self.frames.append(Frame(self._named(name, "link"), carrier, **place))
         for mark in self.machine.marks:
             carrier, position = self.fused.point(mark.link, mark.position)
             rotation = self.fused.rotation(mark.link) @ mark.rotation
-            own = {"position": position, "orientation": from_matrix(rotation)}
-            self.frames.append(Frame(self._named(mark.name, "frame"), carrier, **own))
+            place = {"position": position, "orientation": from_matrix(rotation)}
+            self.frames.append(Frame(self._named(mark.name, "frame"), carrier, **place))
 
     def _buoyancy(self, name, share):
         link = self.machine.links[name]
@@ -440,7 +444,7 @@ class _Builder:
             )
 
     def _of_bodies(self, shapes):
-        """Shapes of links by the name of the body that they are on."""
+        """Shapes of links by the name of their body."""
         out: dict[str, tuple[AbstractShape, ...]] = {}
         for link, shape in shapes:
             body, position = self.fused.point(link, np.zeros(3))
@@ -460,16 +464,16 @@ def _names(machine: Machine):
         "actuator": machine.actuators,
         "frame": machine.marks,
     }
-    return {kind: {own.name for own in of_kind} for kind, of_kind in elements.items()}
+    return {kind: {element.name for element in of_kind} for kind, of_kind in elements.items()}
 
 
 def _range(joint: Joint):
-    """The limits of a joint, of a hinge only if they allow less than a full turn: others are left out."""
+    """The limits of a joint; None for a hinge whose limits allow a full turn."""
     limits = joint.limits
     return None if limits is None or (joint.kind == "hinge" and limits[1] - limits[0] >= 2 * np.pi) else limits
 
 
 def _near(joint: Joint, zero: Any):
-    """Whether the limits of a hinge, if it has any, keep it within half a turn of a zero."""
+    """Whether the limits of a hinge, if any, keep it within half a turn of a zero."""
     limits = _range(joint)
     return joint.kind != "hinge" or limits is None or max(abs(limit - zero) for limit in limits) <= np.pi

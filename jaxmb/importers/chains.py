@@ -1,4 +1,4 @@
-"""Joints of the library that chains of elementary joints make, from one link with mass to the next."""
+"""Joints of the library from chains of elementary joints between links with mass."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from ..parts.spatial.composite import Composite, coordinate_names, degenerate, f
 from ..parts.spatial.joints import Prismatic, Revolute, Spherical
 from .description import Joint, turn_about
 
-# Axes that miss each other by less [m] meet.
+# Axes that pass each other within this distance [m] meet.
 _CLOSE = 1e-12
-# The sine of the angle from which on three axes do not lie in one plane.
+# Least sine of the angle of three axes that do not lie in one plane.
 _FLAT = 1e-6
 
 
@@ -34,9 +34,9 @@ class PlacedLink:
 
 @dataclasses.dataclass
 class Found:
-    """The part that some joints make, if any, and for each joint its coordinate, `"hip.angle"` or None if it has none.
+    """The part for some joints, if any, and for each joint its coordinate, `"hip.angle"`, or None.
 
-    `half_turn`: the joint whose angle counts in half a turn, though its range is larger.
+    `half_turn`: the joint whose angle is limited to half a turn, though its range is larger.
     """
 
     parts: list[Any]
@@ -45,7 +45,7 @@ class Found:
 
 
 def joint_of(joints: Sequence[Joint], a: PlacedLink, b: PlacedLink, name: str) -> Found:
-    """The part that joints in succession from body A to body B make.
+    """The part for joints in succession from body A to body B.
 
     **Arguments:** `name` of the part.
 
@@ -80,7 +80,7 @@ def _slide(joint, a, b, name):
 
 
 def _composite(joints, a, b, name):
-    # From where all coordinates are zero to the reference pose, a turn and a shift of what follows each joint.
+    # Turn and shift, from zero coordinates to the reference pose, of the joints and the body that follow.
     turn, shift = np.eye(3), np.zeros(3)
     axes, points = [], []
     for joint in joints:
@@ -88,8 +88,8 @@ def _composite(joints, a, b, name):
         axes.append(axis)
         points.append(point)
         if joint.kind == "hinge":
-            own = turn_about(axis, joint.reference)
-            turn, shift = turn @ own, turn @ (point - own @ point) + shift
+            rotation = turn_about(axis, joint.reference)
+            turn, shift = turn @ rotation, turn @ (point - rotation @ point) + shift
         elif joint.kind == "slide":
             shift = turn @ (joint.reference * axis) + shift
     sequence = [joint.kind for joint in joints]
@@ -119,18 +119,18 @@ def _composite(joints, a, b, name):
 
 
 def _meeting(points, axes):
-    """The point in which lines meet; None if they do not."""
+    """The common point of lines; None without one."""
     rows = np.concatenate([np.eye(3) - np.outer(axis, axis) for axis in axes])
     target = np.concatenate([rows[3 * k : 3 * k + 3] @ point for k, point in enumerate(points)])
-    # Near the first point, so that a common one is kept as it is.
+    # Near the first point, so that a common point stays unchanged.
     step = np.linalg.lstsq(rows, target - rows @ points[0], rcond=None)[0]
     point = points[0] + step
     return point if np.max(np.abs(rows @ point - target)) <= _CLOSE else None
 
 
 def _second_of_three(joints, axes):
-    """Of three hinges, options with about where the second angle stays, and the name of this hinge if its range
-    contains an angle at which the three axes lie in one plane.
+    """For three hinges: options with the middle of the second angle, and the name of the second hinge if the three axes
+    lie in one plane within its range.
     """
     hinges = [(joint, axis) for joint, axis in zip(joints, axes, strict=True) if joint.kind == "hinge"]
     if len(hinges) < 3:

@@ -1,6 +1,6 @@
-"""Description of a machine in a file, in one form for all formats: links, joints, loops, and what acts on them.
+"""Description of a machine in a file, in one form for all formats: links, joints, loops and forces.
 
-Places and axes are those of the reference pose, in the world; `[...]` gives shapes and units. Orientations are rotation
+Places and axes are in the world, at the reference pose; `[...]` gives shapes and units. Orientations are rotation
 matrices from the link to the world.
 """
 
@@ -19,7 +19,7 @@ class _Fixed(enum.Enum):
     WORLD = enum.auto()
 
 
-# The key of the fixed world among the links, which are known by their names in the file: no name is equal to it.
+# The key of the fixed world among the links, whose keys are their names in the file: no name equals it.
 WORLD = _Fixed.WORLD
 LinkKey = str | Literal[_Fixed.WORLD]
 Kind = Literal["hinge", "slide", "ball", "free", "fixed"]
@@ -49,12 +49,12 @@ class Link:
 
 @dataclasses.dataclass
 class Joint:
-    """A joint of one of the elementary kinds, of `child` on `parent`, with what acts on its coordinate. A weld that the
-    file does not call a joint has an empty name.
+    """An elementary joint of `child` on `parent`, with the forces on its coordinate. A weld that the file does not call
+    a joint has an empty name.
 
     `point` [m] and `axis`, unit; `reference` [rad, m]: the coordinate at the reference pose; `stiffness` and `free`,
-    `damping`, `armature`, `friction`, and `limits`, a pair or None. `stop`: the inertia [kg m², kg] and the time [s]
-    that a compliant stop is made from, None for a default.
+    `damping`, `armature`, `friction`, and `limits`, a pair or None. `stop`: the inertia [kg m², kg] and the time [s] of
+    a compliant stop, None for a default.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Joint:
 
     @property
     def passive(self) -> tuple[str, ...]:
-        """What acts on the joint of itself, by the words that leave it out."""
+        """The forces on the joint, by the words that leave them out."""
         values = {
             "springs": self.stiffness,
             "damping": self.damping,
@@ -88,7 +88,7 @@ class Joint:
 
 @dataclasses.dataclass
 class Loop:
-    """Two links whose points [m], in the links' axes, coincide; with `rotation`, that of B in A, they are welded."""
+    """Two links whose points [m], in the links' axes, coincide; with a `rotation`, B's in A, they are welded."""
 
     name: str
     link_a: LinkKey
@@ -100,8 +100,8 @@ class Loop:
 
 @dataclasses.dataclass
 class Coupling:
-    """A joint's coordinate as a constant and a sum of polynomials of other joints' coordinates, `x − zero = constant +
-    Σᵢ Σₖ powersᵢ[k − 1] (yᵢ − zeroᵢ)ᵏ`; without others it is held.
+    """A joint's coordinate as a constant plus polynomials of other joints' coordinates, `x − zero = constant + Σᵢ Σₖ
+    powersᵢ[k − 1] (yᵢ − zeroᵢ)ᵏ`; without others it is constant.
 
     `others`: names, powers and zeros; `of_tendons`: the coordinates are lengths of tendons.
     """
@@ -181,7 +181,7 @@ class Machine:
     def add(self, link: Link) -> str:
         """Add a link that the file does not have.
 
-        **Returns:** its name, that of `link` or a similar one that no other link has.
+        **Returns:** its name: the name of `link`, or a similar unused name.
         """
         link.name = unused(link.name, self.links.__contains__)
         self.links[link.name] = link
@@ -189,8 +189,12 @@ class Machine:
 
 
 def unused(name: str, is_used: Callable[[str], bool]) -> str:
-    """A name, with a number behind it if it is used already."""
-    return next(own for own in itertools.chain([name], (f"{name} {k}" for k in itertools.count(2))) if not is_used(own))
+    """A name, followed by a number if it is already used."""
+    return next(
+        candidate
+        for candidate in itertools.chain([name], (f"{name} {k}" for k in itertools.count(2)))
+        if not is_used(candidate)
+    )
 
 
 # Rotations

@@ -19,7 +19,7 @@ from .notes import Notes, checked_ignore
 
 @dataclasses.dataclass(frozen=True)
 class Exported:
-    """The `text` of an MJCF file, and `notes` on what is different in MuJoCo."""
+    """The `text` of an MJCF file, and `notes` on differences in MuJoCo."""
 
     text: str
     notes: tuple[str, ...]
@@ -35,13 +35,13 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     exported.text, exported.notes
     ```
 
-    Joints that make a tree become joints of MuJoCo, with the names and the values of the coordinates here; those that
+    Joints in a spanning tree become joints of MuJoCo, with the names and values of the coordinates here. Joints that
     close loops become equality constraints, which MuJoCo holds softly. Angles are in (−π, π] at the given pose, from
-    which MuJoCo counts them on; what a spring, stop or actuator counts from another turn is written for these angles.
-    Several springs, dampers, frictions or stops of one joint are one. Frames of bodies are at their mass centres.
+    which MuJoCo counts on; the numbers of springs, stops and actuators are shifted by full turns accordingly. Several
+    springs, dampers, frictions or stops of a joint are merged. Frames of bodies are at their mass centres.
 
-    **Arguments:** `system`: a compiled scene; `state`: where the machine stands, default the poses given with the
-    bodies, which must satisfy the constraints; `ignore`: names of parts to leave out.
+    **Arguments:** `system`: a compiled scene; `state` of the machine, default the poses given with the bodies, which
+    must satisfy the constraints; `ignore`: names of parts to leave out.
 
     **Returns:** an `Exported`.
 
@@ -75,19 +75,19 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
 
 def _body(parent, node: TreeBody, tree: Tree, mass, inertia):
     above: Any = tree.poses[node.parent]
-    own: Any = tree.poses[node.body]
+    pose: Any = tree.poses[node.body]
     back = rotation_of(above[3:]).T
     element = ElementTree.SubElement(
-        parent, "body", name=tree.bodies[node.body], pos=numbers(back @ (own[:3] - above[:3]))
+        parent, "body", name=tree.bodies[node.body], pos=numbers(back @ (pose[:3] - above[:3]))
     )
-    element.set("quat", numbers(multiply(conjugate(above[3:]), own[3:])))
+    element.set("quat", numbers(multiply(conjugate(above[3:]), pose[3:])))
     full = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] if np.any(inertia) else np.array([mass] * 3 + [0.0] * 3)
     ElementTree.SubElement(element, "inertial", pos="0 0 0", mass=numbers(mass), fullinertia=numbers(full))
     for joint in node.joints:
         written = ElementTree.SubElement(element, "joint", name=joint.name, type=joint.kind)
-        turn = rotation_of(own[3:]).T
+        turn = rotation_of(pose[3:]).T
         if joint.kind != "free":
-            written.set("pos", numbers(turn @ (joint.point - own[:3])))
+            written.set("pos", numbers(turn @ (joint.point - pose[:3])))
         if joint.kind in ("hinge", "slide"):
             written.set("axis", numbers(turn @ joint.axis))
             written.set("ref", numbers(joint.value))

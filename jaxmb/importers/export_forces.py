@@ -17,9 +17,9 @@ from .description import rotation_of
 from .export_tree import Tree, numbers, of_class, parts_of
 from .notes import Notes
 
-# MuJoCo reads this free length of a tendon's spring as the length in the pose of the file.
+# For this free length of a tendon's spring MuJoCo takes the length in the file's pose.
 _LENGTH_OF_POSE = -1.0
-_COUNTS = "These see an angle within half a turn of middle, or of free; MuJoCo counts it on from the given pose: {}."
+_COUNTS = "Here an angle is within half a turn of middle or free; MuJoCo counts it on from the given pose: {}."
 
 
 def write_forces(
@@ -50,10 +50,10 @@ class _Writer:
     def __init__(self, tree: Tree, elements: dict[str, Any], sections: dict[str, Any], notes: Notes):
         self.tree, self.elements, self.sections, self.notes = tree, elements, sections, notes
         self.tendons: dict[str, Any] = {}
-        # How far MuJoCo's lengths of tendons are ahead of those here, which may have wound up by full turns.
+        # MuJoCo's lengths of tendons minus the lengths here, which may have wound up by full turns.
         self.lengths: dict[str, float] = {}
         self.springs: dict[str, tuple[float, float]] = {}
-        # By names of joints: the range that stops leave; and for each part how far the joint is ahead of what it sees.
+        # By names of joints: the range between stops; and for each part MuJoCo's coordinate minus the part's.
         self.ranges: dict[str, tuple[float, float]] = {}
         self.turns: dict[str, dict[str, float]] = {}
 
@@ -61,13 +61,15 @@ class _Writer:
         """A site at a place and attitude in the world."""
         place = self.tree.poses[body]
         back = rotation_of(place[3:]).T
-        own = ElementTree.SubElement(self.elements[body], "site", name=name, pos=numbers(back @ (position - place[:3])))
+        element = ElementTree.SubElement(
+            self.elements[body], "site", name=name, pos=numbers(back @ (position - place[:3]))
+        )
         if rotation is not None:
-            own.set("quat", numbers(from_matrix(back @ rotation)))
+            element.set("quat", numbers(from_matrix(back @ rotation)))
 
     def ahead(self, part, about):
-        """How far MuJoCo's value of a part's coordinate is ahead of the one that the part sees, of an angle the one
-        within half a turn of another: full turns, or what a tendon winds up in these.
+        """MuJoCo's coordinate minus the part's. For an angle, which the part wraps to within half a turn of `about`, it
+        is a number of full turns [rad]; for a tendon, the length wound up by such turns.
         """
         (coordinate,) = part.acts_on
         joint = self.tree.coordinates.get(coordinate)
@@ -115,19 +117,19 @@ class _Writer:
         return None
 
     def spring(self, part):
-        own = part.part
+        law = part.part
         (coordinate,) = part.acts_on
         tendon, joint = self.tendons.get(coordinate), self.tree.coordinates.get(coordinate)
         if tendon is None and (joint is None or joint.kind == "ball"):
             return False
         element: Any = tendon if joint is None else self.tree.elements[joint.name]
-        _add(element, "damping", own.damping)
-        stiffness, free = float(own.stiffness), float(np.reshape(own.free, ()))
+        _add(element, "damping", law.damping)
+        stiffness, free = float(law.stiffness), float(np.reshape(law.free, ()))
         if stiffness == 0:
             return None
-        if joint is not None and own.is_periodic() and own.middle is None:
+        if joint is not None and law.is_periodic() and law.middle is None:
             self.notes.say(_COUNTS, part.name)
-        free += self.ahead(part, free if own.middle is None else own.middle)
+        free += self.ahead(part, free if law.middle is None else law.middle)
         before, its_free = self.springs.get(coordinate, (0.0, 0.0))
         total = before + stiffness
         free = (before * its_free + stiffness * free) / total
@@ -139,15 +141,15 @@ class _Writer:
         return None
 
     def spring_damper(self, part):
-        own = part.part
+        law = part.part
         element = ElementTree.SubElement(self.sections["tendon"], "spatial", name=part.name)
         for k, body in enumerate(part.bodies):
             site = part.named("ab"[k])
             self.site(site, body, part.point(k))
             ElementTree.SubElement(element, "site", site=site)
-        element.set("stiffness", numbers(own.stiffness))
-        element.set("damping", numbers(own.damping))
-        element.set("springlength", numbers(own.free_length))
+        element.set("stiffness", numbers(law.stiffness))
+        element.set("damping", numbers(law.damping))
+        element.set("springlength", numbers(law.free_length))
 
     def rotational_damper(self, part):
         balls = [
@@ -163,36 +165,36 @@ class _Writer:
         return None
 
     def actuator(self, part):
-        own = part.part
+        law = part.part
         (coordinate,) = part.acts_on
         joint = self.tree.coordinates.get(coordinate)
         if joint is None and coordinate not in self.tendons:
             return False
-        gain, bias = np.array(own.gain), np.array(own.bias)
+        gain, bias = np.array(law.gain), np.array(law.bias)
         if gain[1] or bias[1]:
-            ahead = float(own.gear) * self.ahead(part, own.middle)
+            ahead = float(law.gear) * self.ahead(part, law.middle)
             gain[0] -= ahead * gain[1]
             bias[0] -= ahead * bias[1]
         target = {"tendon": coordinate.split(".")[0]} if joint is None else {"joint": joint.name}
         element = ElementTree.SubElement(self.sections["actuator"], "general", attrib=target | {"name": part.name})
-        element.set("gear", numbers(own.gear))
+        element.set("gear", numbers(law.gear))
         element.set("gaintype", "affine")
         element.set("gainprm", numbers(gain))
         element.set("biastype", "affine")
         element.set("biasprm", numbers(bias))
-        if own.lag is not None:
+        if law.lag is not None:
             element.set("dyntype", "filterexact")
-            element.set("dynprm", numbers(own.lag))
-        for name, given in (("ctrlrange", own.control_range), ("forcerange", own.force_range)):
+            element.set("dynprm", numbers(law.lag))
+        for name, given in (("ctrlrange", law.control_range), ("forcerange", law.force_range)):
             if given is not None:
                 element.set(name, numbers(given))
         return None
 
     def stop(self, part):
-        own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
+        law, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
         if joint is None:
             return False
-        lower, upper = float(own.lower), float(own.upper)
+        lower, upper = float(law.lower), float(law.upper)
         ahead = self.ahead(part, 0.5 * (lower + upper))
         least, most = self.ranges.get(joint.name, (-np.inf, np.inf))
         lower, upper = max(least, lower + ahead), min(most, upper + ahead)
@@ -200,20 +202,20 @@ class _Writer:
             return False
         self.ranges[joint.name] = lower, upper
         self.tree.elements[joint.name].set("range", numbers((lower, upper)))
-        self.notes.say("Stops are MuJoCo's limits, of its own stiffness: {}.", part.name)
+        self.notes.say("Stops are MuJoCo's limits, with its stiffness: {}.", part.name)
         return None
 
     def friction(self, part):
-        own, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
+        law, joint = part.part, self.tree.coordinates.get(part.acts_on[0])
         if joint is None:
             return False
-        _add(self.tree.elements[joint.name], "frictionloss", own.force)
+        _add(self.tree.elements[joint.name], "frictionloss", law.force)
         self.notes.say("Dry friction is MuJoCo's frictionloss: {}.", part.name)
         return None
 
 
 def _add(element, name, value):
-    """Add to a number of an element, which several parts may give."""
+    """Add to a number of an element, to which several parts may contribute."""
     element.set(name, numbers(float(element.get(name, 0.0)) + float(value)))
 
 

@@ -20,9 +20,9 @@ from ..parts.spatial.kinematics import SPACE
 from .description import rotation_of, unused
 from .notes import Notes
 
-# What MuJoCo calls the fixed world.
+# MuJoCo's name of the fixed world.
 _WORLD = "world"
-# The methods by which a class says what its parts do.
+# The methods by which a class defines its laws.
 _LAWS = {"residual", "coordinates", "wrenches", "energy", "state_rates", "length", "force"}
 
 
@@ -32,7 +32,7 @@ def numbers(values: Any) -> str:
 
 
 def of_class(table: Mapping[type, Any], part: Any) -> Any:
-    """The entry of a table for the class of a part, or for the one that its laws are from; None without one."""
+    """The entry of a table for the class of a part, or for the class that defines its laws; None without one."""
     for cls in type(part).__mro__:
         if cls in table or _LAWS & vars(cls).keys():
             return table.get(cls)
@@ -41,8 +41,10 @@ def of_class(table: Mapping[type, Any], part: Any) -> Any:
 
 @dataclasses.dataclass
 class PlacedPart:
-    """A part of the scene with concrete numbers, the names of its bodies, the poses that it sees, the coordinates of
-    joints that it acts on, the values of its scalar coordinates, and the names in the scene and the file.
+    """A part of the scene with concrete numbers.
+
+    **Fields:** names of its `bodies`; the `poses` that it sees; the coordinates that it `acts_on`; values of its
+    `scalars`, the scalar coordinates; the `names` used in the scene and the file.
     """
 
     name: str
@@ -60,7 +62,7 @@ class PlacedPart:
 
     @functools.cached_property
     def joints(self) -> list[ElementaryJoint] | None:
-        """The hinges, slides and balls in succession that the part is; None if it is no such joint."""
+        """The part as hinges, slides and balls in succession; None if it is not such a joint."""
         is_known = isinstance(self.part, AbstractConstraint) and self.part.declares("elementary_joints", "coordinates")
         return jax.device_get(self.part.elementary_joints(SPACE, self.poses)) if is_known else None
 
@@ -74,15 +76,15 @@ class PlacedPart:
         return pose[:3] + rotation_of(pose[3:7]) @ point
 
     def turns(self, value: float, about: Any, k: int = 0) -> float:
-        """By how many full turns [rad] a value of its k-th coordinate is ahead of the one that the part sees, of an
-        angle the one within half a turn of another.
+        """The full turns [rad] by which a value exceeds the part's k-th coordinate, an angle wrapped to within half a
+        turn of `about`.
         """
         return float(turns(jnp.asarray(value - about).reshape(()))) if self.part.is_periodic(k) else 0.0
 
 
 @dataclasses.dataclass
 class TreeBody:
-    """A body of the tree, with its joints from the parent on, which have the names that MuJoCo knows them by."""
+    """A body of the tree, with its joints from the parent on, under their names in MuJoCo."""
 
     body: str
     parent: str
@@ -93,8 +95,8 @@ class TreeBody:
 class Tree:
     """The bodies in order, parents first; the constraints that close loops, each with the name of the part, a tag and
     attributes; and for each coordinate, `"hip.angle"`, MuJoCo's joint. `scalars`: the scalar coordinates of the scene;
-    `names`: those of the scene and of elements that have none there; `bodies`: what MuJoCo calls the bodies;
-    `elements`: the XML elements of joints.
+    `names` used in the scene and the file; `bodies`: MuJoCo's names of the bodies; `elements`: the XML elements of
+    joints.
     """
 
     poses: dict[str, np.ndarray]
@@ -108,30 +110,30 @@ class Tree:
 
 
 def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPart]:
-    """The parts of some groups, where the tree has the bodies and the scalar coordinates."""
-    # Scalar coordinates are no bodies; their numbers are those after the bodies'.
+    """The parts of some groups, at the tree's poses and scalar coordinates."""
+    # Scalar coordinates are not bodies; they are numbered after the bodies.
     names, out = dict(enumerate(system.body_names)) | {system.layout.ground: GROUND}, []
     for group in groups:
         for k, name in enumerate(group.group.names):
-            own = group.group.single(k, jnp.zeros(()))
+            single = group.group.single(k, jnp.zeros(()))
             bodies = tuple(names[body] for body in group.group.bodies[k] if body in names)
             values = tuple(
                 float(tree.scalars[n - len(system.body_names)]) for n in group.group.bodies[k] if n not in names
             )
             places = np.stack([tree.poses[body] for body in bodies])
-            places = np.asarray(own.seen_poses(SPACE, places))
-            out.append(PlacedPart(name, own, bodies, places, _acts_on(group.group, own, k), values, tree.names))
+            places = np.asarray(single.seen_poses(SPACE, places))
+            out.append(PlacedPart(name, single, bodies, places, _acts_on(group.group, single, k), values, tree.names))
     return out
 
 
 def _acts_on(group, part, k):
     """The coordinates that a part acts on: stacked parts know their joints by number only."""
-    names = [own[k] for keys, own in group.inner if len(keys) == 2 and keys[0] == "joints"]
-    return tuple(f"{name}.{own}" for name, own in zip(names, getattr(part, "within", ()), strict=False))
+    names = [joints[k] for keys, joints in group.inner if len(keys) == 2 and keys[0] == "joints"]
+    return tuple(f"{name}.{coordinate}" for name, coordinate in zip(names, getattr(part, "within", ()), strict=False))
 
 
 def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree:
-    """The tree of a system's bodies. Joints are taken in their order, those that cannot close a loop before others."""
+    """The tree of a system's bodies. Joints are taken in their order, but first all that cannot close a loop."""
     poses = np.asarray(system.poses(q))
     scalars = np.asarray(system.bodies.prepared_poses(q))[len(poses) : -1, 0]
     places = dict(zip(system.body_names, poses, strict=True)) | {GROUND: np.array([0.0, 0, 0, 1, 0, 0, 0])}
@@ -155,7 +157,7 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
             tree.nodes.append(TreeBody(body, GROUND, joints))
         else:
             waiting.remove(part)
-            parent, body = sorted(part.bodies, key=lambda own: own not in reached)
+            parent, body = sorted(part.bodies, key=lambda body_name: body_name not in reached)
             tree.nodes.append(TreeBody(body, parent, _oriented(part, tree, body)))
         reached.add(body)
         left.remove(body)
@@ -175,18 +177,18 @@ def spanning_tree(system: RigidBodySystem, q: Coordinates, notes: Notes) -> Tree
 
 
 def _new(name, names):
-    """A name that no element of the file has, to be one of them."""
+    """A new name, unused in the file, which is added to the names."""
     out = unused(name, names.__contains__)
     names.add(out)
     return out
 
 
 def _bodies(system, names, notes):
-    """What MuJoCo calls the bodies: it keeps one name for the fixed world."""
+    """MuJoCo's names of the bodies; a name is reserved for the fixed world."""
     out = {name: name for name in system.body_names}
     if _WORLD in out:
         out[_WORLD] = _new(f"{_WORLD} body", names)
-        notes.say("Bodies have other names, since MuJoCo has these: {}.", f"{_WORLD} → {out[_WORLD]}")
+        notes.say("Bodies have other names, since MuJoCo reserves these: {}.", f"{_WORLD} → {out[_WORLD]}")
     return out
 
 
@@ -199,12 +201,15 @@ def _free(body, tree, rotates):
 
 
 def _oriented(part, tree, child):
-    """The joints of MuJoCo that a joint is, from the parent to the child."""
+    """A joint as joints of MuJoCo, from the parent to the child."""
     back, single = child == part.bodies[0], len(part.joints) == 1
     joints = []
-    for own in part.joints:
-        joint = own._replace(name=part.name if single else part.named(own.name), axis=-own.axis if back else own.axis)
-        tree.coordinates[f"{part.name}.{own.name}"] = joint
+    for elementary in part.joints:
+        joint = elementary._replace(
+            name=part.name if single else part.named(elementary.name),
+            axis=-elementary.axis if back else elementary.axis,
+        )
+        tree.coordinates[f"{part.name}.{elementary.name}"] = joint
         joints.append(joint)
     return joints[::-1] if back else joints
 
@@ -213,7 +218,7 @@ def _oriented(part, tree, child):
 
 
 def _ends(part, tree):
-    """Attributes that name the bodies, a moving one first, and the number of that."""
+    """Attributes that name the bodies, a moving body first, and its number."""
     k = 0 if part.bodies[0] != GROUND else 1
     other = part.bodies[1 - k]
     return {"body1": tree.bodies[part.bodies[k]]} | ({} if other == GROUND else {"body2": tree.bodies[other]}), k
@@ -243,27 +248,27 @@ def _close_weld(part, tree):
 
 
 def _close_coupling(part, tree):
-    own = part.part
+    coupling = part.part
     joints = [tree.coordinates.get(name) for name in part.acts_on]
-    if None in joints or own.coefficients.ndim > 1 or own.coefficients.size > 5:
+    if None in joints or coupling.coefficients.ndim > 1 or coupling.coefficients.size > 5:
         return None
     x, y = joints
-    seen = y.value - float(own.other_zero)
+    seen = y.value - float(coupling.other_zero)
     shift = np.polynomial.Polynomial([seen - part.turns(seen, 0.0, 1), 1.0])
-    polynomial = np.polynomial.Polynomial(np.asarray(own.coefficients))(shift)
+    polynomial = np.polynomial.Polynomial(np.asarray(coupling.coefficients))(shift)
     powers = np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))
-    powers[0] += float(own.zero) - x.value
+    powers[0] += float(coupling.zero) - x.value
     # The row is taken up to full turns of x as well.
     powers[0] -= part.turns(powers[0], 0.0)
     return [("joint", {"name": part.name, "joint1": x.name, "joint2": y.name, "polycoef": numbers(powers)})]
 
 
 def _close_driver(part, tree):
-    own = part.part
+    driver = part.part
     joint = tree.coordinates.get(part.acts_on[0])
-    if joint is None or joint.kind == "ball" or np.any(np.asarray(own.rate)):
+    if joint is None or joint.kind == "ball" or np.any(np.asarray(driver.rate)):
         return None
-    off = float(np.reshape(own.value, -1)[0]) - joint.value
+    off = float(np.reshape(driver.value, -1)[0]) - joint.value
     constant = [off - part.turns(off, 0.0), *itertools.repeat(0.0, 4)]
     return [("joint", {"name": part.name, "joint1": joint.name, "polycoef": numbers(constant)})]
 
@@ -274,7 +279,7 @@ _CLOSING_PARTS = {JointCoupling: _close_coupling, JointDriver: _close_driver}
 
 
 def _closing(part):
-    """What writes a part as equality constraints; None if there is nothing."""
+    """The function that writes a part as equality constraints; None without one."""
     if part.joints is None:
         return of_class(_CLOSING_PARTS, part.part)
     return _CLOSING_JOINTS.get(tuple(joint.kind for joint in part.joints))

@@ -22,10 +22,10 @@ class Chain:
 
 @dataclasses.dataclass
 class Fused:
-    """What links became.
+    """The links as bodies and chains of joints.
 
-    **Fields:** `carriers`: the bodies, by the name of the link that they have the frame of, with the names that they
-    have in the scene; `of`: for each link the name of its carrier, or the world; `links` by their names; `chains`.
+    **Fields:** `carriers`: the bodies, with their names in the scene, by the name of the link whose frame they have;
+    `of`: for each link the name of its carrier, or the world; `links` by their names; `chains`.
     """
 
     carriers: dict[LinkKey, Link]
@@ -38,26 +38,26 @@ class Fused:
         carrier = self.of[link]
         if carrier is WORLD:
             return PlacedLink(GROUND, np.zeros(3), np.eye(3))
-        own = self.carriers[carrier]
-        return PlacedLink(own.name, own.position, own.rotation)
+        body = self.carriers[carrier]
+        return PlacedLink(body.name, body.position, body.rotation)
 
     def point(self, link: LinkKey, at: np.ndarray) -> tuple[str, np.ndarray]:
         """The body of a link, and a point of the link in that body's frame."""
         body = self.placed(link)
         if self.of[link] == link:
             return body.name, at
-        own = self.links[link]
-        return body.name, body.point(own.position + own.rotation @ at)
+        placement = self.links[link]
+        return body.name, body.point(placement.position + placement.rotation @ at)
 
     def rotation(self, link: LinkKey) -> np.ndarray:
-        """The rotation matrix from a link's axes to those of its body."""
+        """The rotation matrix from a link's axes to its body's."""
         body = self.placed(link)
         if self.of[link] == link:
             return np.eye(3)
         return body.rotation.T @ self.links[link].rotation
 
     def frames(self) -> dict[str, tuple[str, np.ndarray, np.ndarray]]:
-        """For each link that is fixed to another one its body, and position and rotation in it."""
+        """For each link that is fixed to another link its body, and position and rotation in it."""
         out = {}
         for name, carrier in self.of.items():
             if name is not WORLD and carrier != name and (carrier is WORLD or carrier in self.carriers):
@@ -65,8 +65,8 @@ class Fused:
         return out
 
     def moved_inertia(self, joint: Joint) -> float:
-        """The inertia [kg m²] or mass [kg] that moves with a joint, all other joints held; in a closed loop only that
-        of the next body.
+        """The inertia [kg m²] or mass [kg] that moves with a joint, with all other joints held; in a closed loop only
+        the next body's.
         """
         start, blocked = self.of[joint.child], self.of[joint.parent]
         seen, queue = {start}, [start]
@@ -83,10 +83,10 @@ class Fused:
                 if other not in seen:
                     seen.add(other)
                     queue.append(other)
-        own = [self.carriers[name] for name in seen if name in self.carriers]
+        links = [self.carriers[name] for name in seen if name in self.carriers]
         if joint.kind == "slide":
-            return sum(link.mass for link in own)
-        return sum(_about(link, joint) for link in own)
+            return sum(link.mass for link in links)
+        return sum(_about(link, joint) for link in links)
 
 
 def _about(link, joint):
@@ -96,13 +96,13 @@ def _about(link, joint):
 
 
 def fuse(machine: Machine, notes: Notes) -> Fused:
-    """Fuse links that are fixed to each other, the later ones of the file to the earlier ones."""
+    """Fuse links that are fixed to each other, later links of the file to earlier links."""
     links: dict[LinkKey, Link] = {WORLD: Link(GROUND), **machine.links}
     of = bodies_of(machine)
-    groups = {name: [links[own] for own in links if of[own] == name] for name in dict.fromkeys(of.values())}
+    groups = {name: [links[key] for key in links if of[key] == name] for name in dict.fromkeys(of.values())}
     moving = [joint for joint in machine.joints if joint.kind != "fixed"]
     weighs = lambda link: link.mass or np.any(link.inertia)
-    light = {name for name, own in groups.items() if name is not WORLD and not any(weighs(link) for link in own)}
+    light = {name for name, group in groups.items() if name is not WORLD and not any(weighs(link) for link in group)}
     chains = _chains(moving, of, light, links, notes)
     heavy = [name for name in groups if name is not WORLD and name not in light]
     carriers: dict[LinkKey, Link] = {name: _summed(links[name], groups[name]) for name in heavy}
@@ -128,7 +128,9 @@ def _chains(joints, of, light, links, notes):
             continue
         chain, end = [joint], joint.child
         while of[end] in light and len(chain) <= len(joints):
-            following = [own for own in at[of[end]] if own is not chain[-1] and of[own.parent] == of[end]]
+            following = [
+                candidate for candidate in at[of[end]] if candidate is not chain[-1] and of[candidate.parent] == of[end]
+            ]
             if not following:
                 break
             chain.append(following[0])
@@ -139,14 +141,14 @@ def _chains(joints, of, light, links, notes):
 
 
 def _summed(frame: Link, links: list[Link]) -> Link:
-    """Several links as one, in the frame of one of them."""
+    """Several links as one, in the frame of the link `frame`."""
     mass = sum(link.mass for link in links)
     if len(links) == 1 or not mass:
         return dataclasses.replace(frame)
     centres = [frame.rotation.T @ (link.position + link.rotation @ link.centre - frame.position) for link in links]
-    centre = sum(link.mass * own for link, own in zip(links, centres, strict=True)) / mass
+    centre = sum(link.mass * place for link, place in zip(links, centres, strict=True)) / mass
     inertia = np.zeros((3, 3))
-    for link, own in zip(links, centres, strict=True):
-        turn, arm = frame.rotation.T @ link.rotation, own - centre
+    for link, place in zip(links, centres, strict=True):
+        turn, arm = frame.rotation.T @ link.rotation, place - centre
         inertia += turn @ link.inertia @ turn.T + link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return dataclasses.replace(frame, mass=mass, centre=centre, inertia=inertia)

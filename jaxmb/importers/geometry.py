@@ -1,4 +1,4 @@
-"""Shapes of URDF and SDF, elements that have the same names and meanings in both."""
+"""Shapes of URDF and SDF, whose elements have the same names and meanings in both."""
 
 import importlib.util
 from collections.abc import Callable
@@ -12,12 +12,12 @@ from .notes import Notes
 from .source import Resources
 from .xml_tree import Element
 
-# What leaves out the elements of a tag.
+# The words that leave out the elements of a tag.
 _WORDS = {"visual": "pictures", "collision": "collisions"}
 
 
 def color_of(rgba: Any) -> Color | None:
-    """Red, green and blue from 0 to 255 of numbers in [0, 1]; None for what is not seen."""
+    """Red, green and blue from 0 to 255 of numbers in [0, 1]; None if invisible."""
     r, g, b = (round(255 * min(max(float(value), 0.0), 1.0)) for value in rgba[:3])
     return (r, g, b) if rgba[3] else None
 
@@ -32,8 +32,8 @@ def read_shapes(
 ) -> None:
     """Read the `<visual>`s and `<collision>`s of a link.
 
-    What has wrong numbers is refused, unless its kind is to be left out: then nothing acts by it. `place`: position,
-    orientation and color of such an element; a color of None is not seen.
+    Elements with wrong numbers are refused, unless their kind is left out and has no effect. `place`: position,
+    orientation and color of an element; a color of None is invisible.
     """
     for tag, word in _WORDS.items():
         for element in link.all(tag):
@@ -42,15 +42,15 @@ def read_shapes(
                 element.skip()
                 continue
             try:
-                own = place(element)
-                shapes = _read_geometry(element, notes, files, own)
+                placement = place(element)
+                shapes = _read_geometry(element, notes, files, placement)
             except ValueError as error:
                 element.skip()
                 notes.refuse(word, name, str(error))
                 continue
             if tag == "collision":
                 machine.collisions += [(name, shape) for shape in shapes]
-            elif own["color"] is not None:
+            elif placement["color"] is not None:
                 machine.shapes += [(name, shape) for shape in shapes]
 
 
@@ -63,8 +63,8 @@ def _read_geometry(element, notes, files, place):
     try:
         return _read(shape, notes, files, place)
     except ValueError as error:
-        said = str(error)
-        raise ValueError(said if said.startswith(shape.where) else f"{shape.where}{said}") from None
+        text = str(error)
+        raise ValueError(text if text.startswith(shape.where) else f"{shape.where}{text}") from None
 
 
 def _read(shape, notes, files, place) -> tuple[AbstractShape, ...]:
@@ -109,7 +109,7 @@ def _mesh(shape, notes, files, place):
     scale = _numbers(shape, "scale", default="1 1 1")
     file = files.find(name)
     if file is None:
-        notes.say("Mesh files are missing, so the picture lacks them; package_dirs= says where to look: {}.", name)
+        notes.say("Mesh files are missing, so the picture lacks them; give their folders as package_dirs=: {}.", name)
         return ()
     if importlib.util.find_spec("trimesh") is None:
         notes.say('Meshes need trimesh, so the picture lacks them: pip install "jaxmb[view]".')

@@ -1,4 +1,4 @@
-"""Links whose inertia is none, that of a joint, or not that of a rigid body."""
+"""Links without inertia, with the armature of a joint, or with an inertia that no rigid body has."""
 
 from collections import Counter
 
@@ -8,25 +8,25 @@ from ..linalg.graphs import connected
 from .description import WORLD, Joint, Link, LinkKey, Machine
 from .notes import Notes
 
-# The share of the largest moment of inertia that is taken for rounding.
+# The fraction of the largest moment of inertia that counts as rounding.
 _ROUNDED = 0.05
 
 
 def bodies_of(machine: Machine) -> dict[LinkKey, LinkKey]:
-    """For each link and the world the first one of the file that it is fixed to."""
+    """For each link and the world, the first link of the file that it is fixed to."""
     names: tuple[LinkKey, ...] = (WORLD, *machine.links)
     number = {name: k for k, name in enumerate(names)}
-    welds = [(number[own.parent], number[own.child]) for own in machine.joints if own.kind == "fixed"]
+    welds = [(number[joint.parent], number[joint.child]) for joint in machine.joints if joint.kind == "fixed"]
     return {name: names[k] for name, k in zip(names, connected(len(names), welds), strict=True)}
 
 
 def without_ends(machine: Machine, notes: Notes) -> list[str]:
-    """Take the links out of a machine that have no mass and hang at one joint, with all that they carry.
+    """Remove from a machine the massless links that hang at one joint, with all that they carry.
 
-    They take no force, so none passes their joint, whatever acts there. Those stay that something else holds as well:
-    a loop, a tendon, an actuator, or couplings that could pass a force on.
+    They take no force, so no force passes their joint. A link stays if it is also held by a loop, a tendon, an
+    actuator, or couplings that could transmit a force.
 
-    **Returns:** the names of the links that were taken out.
+    **Returns:** the names of the removed links.
     """
     before = list(machine.links)
     while True:
@@ -37,7 +37,7 @@ def without_ends(machine: Machine, notes: Notes) -> list[str]:
         held = Counter(of[link] for joint in moving for link in (joint.parent, joint.child))
         held.update(of[link] for loop in machine.loops for link in (loop.link_a, loop.link_b))
         held.update(of[link] for tendon in machine.tendons for link, _ in tendon.points)
-        # Bodies to leave out, and the joints that they hang at.
+        # Bodies to remove, and the joints at which they hang.
         ends: dict[LinkKey, str | None] = {body: None for body in of.values() if body not in heavy and held[body] == 0}
         for joint in moving:
             for link in (joint.parent, joint.child):
@@ -49,17 +49,17 @@ def without_ends(machine: Machine, notes: Notes) -> list[str]:
 
 
 def _alone(machine, notes, joint):
-    """Whether no force that acts on a joint can reach another one."""
+    """Whether no force on a joint can reach another joint."""
     acting = [actuator for actuator in machine.actuators if not actuator.on_tendon and actuator.of == joint.name]
     along = [tendon for tendon in machine.tendons if any(name == joint.name for name, _ in tendon.joints)]
-    coupled = [own for own in machine.couplings if joint.name in _coupled(own)]
+    coupled = [coupling for coupling in machine.couplings if joint.name in _coupled(coupling)]
     if acting or along or len(coupled) > 1:
         return False
     return not coupled or notes.ignore.issuperset(joint.passive)
 
 
 def _coupled(coupling):
-    """The joints that a coupling has."""
+    """The joints of a coupling."""
     return set() if coupling.of_tendons else {coupling.joint, *(name for name, _, _ in coupling.others)}
 
 
@@ -67,19 +67,19 @@ def _take_out(machine, links, joints, notes):
     notes.say("Links without mass at the ends of the machine take no force and are left out: {}.", *links)
     machine.links = {name: link for name, link in machine.links.items() if name not in links}
     hangs = lambda joint: joint.child in links or (joint.kind != "fixed" and joint.name in joints)
-    machine.joints = [own for own in machine.joints if not hangs(own)]
+    machine.joints = [element for element in machine.joints if not hangs(element)]
     machine.buoyancy = {name: share for name, share in machine.buoyancy.items() if name not in links}
-    machine.couplings = [own for own in machine.couplings if not _coupled(own) & joints]
-    machine.marks = [own for own in machine.marks if own.link not in links]
-    machine.shapes = [own for own in machine.shapes if own[0] not in links]
-    machine.collisions = [own for own in machine.collisions if own[0] not in links]
+    machine.couplings = [element for element in machine.couplings if not _coupled(element) & joints]
+    machine.marks = [element for element in machine.marks if element.link not in links]
+    machine.shapes = [element for element in machine.shapes if element[0] not in links]
+    machine.collisions = [element for element in machine.collisions if element[0] not in links]
 
 
 def with_rotors(machine: Machine, notes: Notes) -> None:
-    """Make the armature of free joints, and of ball joints on the ground, a link of its own, fixed to theirs.
+    """Make the armature of free joints, and of ball joints on the ground, a separate link, fixed to the joint's link.
 
-    The velocities of these joints are those of the link, so armature is the mass of a point in the origin of its frame,
-    without weight, and the inertia of a ball about it. No link moves like a ball joint between two moving ones.
+    The velocities of these joints are the link's. The armature is therefore a weightless point mass in the origin of
+    the link's frame, and the inertia of a ball about it. No link moves like a ball joint between two moving links.
     """
     of = bodies_of(machine)
     heavy = {of[name] for name, link in machine.links.items() if link.mass}
@@ -101,8 +101,8 @@ def with_rotors(machine: Machine, notes: Notes) -> None:
 
 
 def rigid(link: Link, notes: Notes) -> np.ndarray:
-    """The inertia of a link, shape (3, 3), symmetric, with its largest principal moment at most the sum of the others
-    where it is larger by rounding.
+    """The inertia of a link, shape (3, 3), symmetric; a largest principal moment that exceeds the sum of the others by
+    rounding is lowered to it.
     """
     inertia = 0.5 * (link.inertia + link.inertia.T)
     moments, axes = np.linalg.eigh(inertia)

@@ -30,14 +30,14 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     ```
 
     MuJoCo reads the file, with its includes, defaults, units and compiler options. Constraints are hard here:
-    `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`; of a `weld`
-    whose `torquescale` is zero the point only. Several joints of one body are one `spatial.Composite`, of which each is
-    a coordinate.
+    `connect`, `weld`, `joint` and `tendon` equalities hold exactly, whatever their `solref` and `solimp`; a `weld` with
+    zero `torquescale` holds the point only. Several joints of a body become one `spatial.Composite`, with a coordinate
+    for each.
 
-    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: what is to be left out, words
-    such as `"collisions"`, `"limits"` and `"friction"`, or names of elements.
+    **Arguments:** `source`: a path, the text of a file, or a `mujoco.MjSpec`; `ignore`: elements to leave out, by words
+    such as `"collisions"`, `"limits"` and `"friction"`, or by name.
 
-    **Returns:** an `ImportedModel`; its `notes` say what is approximated.
+    **Returns:** an `ImportedModel`; its `notes` list the approximations.
 
     **Raises:** `ValueError` that lists the elements that cannot be imported; `ImportError` without MuJoCo, `pip install
     "jaxmb[import]"`.
@@ -67,7 +67,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     _read_marks(model, names, machine)
     _read_shapes(mujoco, model, names, machine, notes)
     built = build_scene(machine, notes)
-    said = notes.finish(file)
+    sentences = notes.finish(file)
     locate = _Locate(mujoco, model, names, built)
     states = {
         mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or f"key {k}": locate(model.key_qpos[k], model.key_qvel[k])
@@ -76,7 +76,7 @@ def mjcf(source: Any, *, ignore: str | Collection[str] = ()) -> ImportedModel:
     coordinates = {joint: name for joint, name in built.coordinates.items() if name is not None}
     seen = built.shapes, built.collision_shapes
     return ImportedModel(
-        names.model, built.scene, tuple(said), coordinates, built.controls, states, *seen, said, locate
+        names.model, built.scene, tuple(sentences), coordinates, built.controls, states, *seen, sentences, locate
     )
 
 
@@ -95,14 +95,14 @@ class _Names:
         return self._find(kind, k) or self._unused(kind, f"{kind} {k}")
 
     def _unused(self, kind, name):
-        return unused(name, lambda own: self._is_there(kind, own))
+        return unused(name, lambda candidate: self._is_there(kind, candidate))
 
     def link(self, k: int) -> LinkKey:
         """A body, or the world."""
         return self("body", k) if k else WORLD
 
     def joint(self, k: int) -> str:
-        """A joint; one without a name is called after its body."""
+        """A joint; without a name it is called after its body."""
         return self._find("joint", k) or self._unused("joint", f"{self('body', self._model.jnt_bodyid[k])} joint {k}")
 
 
@@ -119,7 +119,7 @@ def _read_links(model, data, names, machine):
             rotation=np.array(data.xmat[k]).reshape(3, 3),
         )
         if model.body_mocapid[k] >= 0:
-            # What moves as prescribed may have any mass.
+            # Links with prescribed motion may have any mass.
             link = machine.links[name]
             link.moved, link.mass, link.inertia = True, max(link.mass, 1.0), link.inertia + np.eye(3)
         if model.body_gravcomp[k]:
@@ -139,7 +139,7 @@ def _read_joints(model, data, names, machine, off):
         parent = names.link(model.body_parentid[body]) if k == first else child
         child = names("body", body)
         if k < last:
-            # Between joints in succession there are links without mass.
+            # Massless links lie between joints in succession.
             place = {"position": machine.links[child].position, "rotation": machine.links[child].rotation}
             child = machine.add(Link(f"{child} after {names.joint(k)}", **place))
         scalar = kind in ("hinge", "slide")
@@ -190,8 +190,8 @@ def _read_equalities(mujoco, model, names, machine, notes):
 
 
 def _tendon_coupling(mujoco, model, names, name, one, two, data):
-    """A tendon's length as a polynomial of another's, both from their lengths at the reference pose; between the joints
-    along them where it is a sum of polynomials of their coordinates, which may then turn without end.
+    """A tendon's length as a polynomial of another's, both from their lengths at the reference pose. If it is a sum of
+    polynomials of joint coordinates, the coupling is between the joints, which may then turn without end.
     """
     on_joints = lambda k: model.wrap_type[model.tendon_adr[k]] == mujoco.mjtWrap.mjWRAP_JOINT
     tendons = [one] if two < 0 else [one, two]
@@ -216,7 +216,7 @@ def _tendon_coupling(mujoco, model, names, name, one, two, data):
 def _loop(mujoco, model, names, name, k, data):
     one, two = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
     weld = model.eq_type[k] == mujoco.mjtEq.mjEQ_WELD
-    # MuJoCo multiplies the residuals of a weld's rotation by this number: with zero it holds the point only.
+    # MuJoCo multiplies the residuals of a weld's rotation by this number: at zero the weld holds the point only.
     holds_rotation = weld and data[10] != 0
     if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
         a, b = (names.link(model.site_bodyid[site]) for site in (one, two))
@@ -233,7 +233,7 @@ def _read_tendons(mujoco, model, names, machine, off):
     for k in range(model.ntendon):
         start = model.tendon_adr[k]
         wraps = range(start, start + model.tendon_num[k])
-        own = TendonPath(
+        tendon = TendonPath(
             names("tendon", k),
             stiffness=0.0 if "SPRING" in off else float(model.tendon_stiffness[k]),
             free=float(model.tendon_lengthspring[k][0]),
@@ -244,14 +244,14 @@ def _read_tendons(mujoco, model, names, machine, off):
         )
         if model.tendon_solref_lim[k][0] > 0 and model.tendon_invweight0[k] > 0:
             time, ratio = model.tendon_solref_lim[k]
-            own.stop = (1 / model.tendon_invweight0[k], time * ratio)
+            tendon.stop = (1 / model.tendon_invweight0[k], time * ratio)
         for w in wraps:
             item = model.wrap_objid[w]
             if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT:
-                own.joints.append((names.joint(item), float(model.wrap_prm[w])))
+                tendon.joints.append((names.joint(item), float(model.wrap_prm[w])))
             elif model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_SITE:
-                own.points.append((names.link(model.site_bodyid[item]), np.array(model.site_pos[item])))
-        machine.tendons.append(own)
+                tendon.points.append((names.link(model.site_bodyid[item]), np.array(model.site_pos[item])))
+        machine.tendons.append(tendon)
 
 
 def _read_marks(model, names, machine):
@@ -264,15 +264,15 @@ def _read_shapes(mujoco, model, names, machine, notes):
     for k in range(model.ngeom):
         color, number = color_of(model.geom_rgba[k]), model.geom_bodyid[k]
         place = {"position": np.array(model.geom_pos[k]), "orientation": np.array(model.geom_quat[k]), "color": color}
-        own = [(names.link(number), shape) for shape in _shape(mujoco.mjtGeom, model, k, place)]
+        shapes = [(names.link(number), shape) for shape in _shape(mujoco.mjtGeom, model, k, place)]
         if model.geom_contype[k] or model.geom_conaffinity[k]:
-            machine.collisions += own
+            machine.collisions += shapes
         elif color is not None and not notes.leaves_out("pictures", names("body", number)):
-            machine.shapes += own
+            machine.shapes += shapes
 
 
 def _shape(kinds, model, k, place):
-    """The shapes of a geom; none of height fields and signed distances."""
+    """The shapes of a geom; none for height fields and signed distances."""
     size = np.array(model.geom_size[k])
     match kinds(int(model.geom_type[k])):
         case kinds.mjGEOM_PLANE:
@@ -302,12 +302,12 @@ class _Locate:
     def __init__(self, mujoco: Any, model: Any, names: _Names, built: Any):
         self._mujoco, self.model = mujoco, model
         links = {names.link(k): k for k in range(model.nbody)}
-        numbers = {own.name: links[link] for link, own in built.fused.carriers.items()}
+        numbers = {carrier.name: links[link] for link, carrier in built.fused.carriers.items()}
         bodies = () if built.scene is None else built.scene.bodies
         self._bodies = [(numbers[body.name], np.asarray(body.centre)) for body in bodies]
         joints = {names.joint(k): k for k in range(model.njnt)}
         tendons = {names("tendon", k): k for k in range(model.ntendon)}
-        self._scalars = [((tendons if own.of_tendon else joints)[own.name], own) for own in built.scalars]
+        self._scalars = [((tendons if scalar.of_tendon else joints)[scalar.name], scalar) for scalar in built.scalars]
 
     def __call__(self, qpos: np.ndarray, qvel: np.ndarray) -> State:
         mujoco, model = self._mujoco, self.model
@@ -326,9 +326,9 @@ class _Locate:
             arm = turn @ centre
             q += [*(data.xpos[k] + arm), *data.xquat[k]]
             u += [*(velocity[3:] + np.cross(velocity[:3], arm)), *(turn.T @ velocity[:3])]
-        for k, own in self._scalars:
-            value = data.ten_length[k] if own.of_tendon else data.qpos[model.jnt_qposadr[k]]
+        for k, scalar in self._scalars:
+            value = data.ten_length[k] if scalar.of_tendon else data.qpos[model.jnt_qposadr[k]]
             q.append(value)
-            if own.moves:
-                u.append(data.ten_velocity[k] if own.of_tendon else data.qvel[model.jnt_dofadr[k]])
+            if scalar.moves:
+                u.append(data.ten_velocity[k] if scalar.of_tendon else data.qvel[model.jnt_dofadr[k]])
         return State(jax.device_put(np.array(q)), jax.device_put(np.array(u)))

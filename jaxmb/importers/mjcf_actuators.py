@@ -10,7 +10,7 @@ from .notes import Notes
 
 
 def read_actuators(mujoco: Any, model: Any, names: Any, notes: Notes, off: Collection[str]) -> list[ActuatorElement]:
-    """The actuators of a model; the others are refused. `off`: names of MuJoCo's flags that are disabled."""
+    """The actuators of a model; unsupported actuators are refused. `off`: names of MuJoCo's flags that are disabled."""
     out = []
     for k in range(len(model.actuator_trntype)):
         name = names("actuator", k)
@@ -29,12 +29,12 @@ def _read(mujoco, model, names, notes, k, name):
     transmissions, kind = mujoco.mjtTrn, mujoco.mjtTrn(int(model.actuator_trntype[k]))
     target = int(model.actuator_trnid[k][0])
     # Before MuJoCo 4 every actuator has one control and one force.
-    control, out = (int(getattr(model, f"actuator_{own}adr", range(model.nu))[k]) for own in ("ctrl", "out"))
+    control, out = (int(getattr(model, f"actuator_{word}adr", range(model.nu))[k]) for word in ("ctrl", "out"))
     gear = float(model.actuator_gear[out][0])
     control_range = tuple(model.actuator_ctrlrange[control]) if model.actuator_ctrllimited[control] else None
     if kind == transmissions.mjTRN_BODY:
-        # Shapes that may touch are left out, or the model is refused.
-        notes.say("Adhesion acts in contacts only, of which there are none here: {}.", name)
+        # Shapes that may touch are ignored, or the model is refused.
+        notes.say("Adhesion acts in contacts only, and there are none here: {}.", name)
         return None
 
     def refuse(what):
@@ -46,9 +46,9 @@ def _read(mujoco, model, names, notes, k, name):
         if lag <= 0:
             return refuse("has a filter whose time constant is not positive")
         if model.actuator_actlimited[k] and not _within(control_range, model.actuator_actrange[k]):
-            return refuse("has a range of its activation that the control may leave")
+            return refuse("has a range of activation that the control may leave")
     elif dynamics != mujoco.mjtDyn.mjDYN_NONE:
-        return refuse("has dynamics of its own that are no filter, such as an integrator or a muscle")
+        return refuse("has dynamics other than a filter, such as an integrator or a muscle")
     if kind in (transmissions.mjTRN_JOINT, transmissions.mjTRN_JOINTINPARENT):
         if mujoco.mjtJoint(int(model.jnt_type[target])) not in (
             mujoco.mjtJoint.mjJNT_HINGE,
@@ -74,9 +74,9 @@ def _read(mujoco, model, names, notes, k, name):
     if kind != transmissions.mjTRN_TENDON and model.jnt_actfrclimited[target]:
         if len(_acting_on(mujoco, model, target)) > 1:
             return refuse(f"shares the limit of the actuator force of joint {of!r} with others")
-        own = np.sort(np.array(model.jnt_actfrcrange[target]) / gear)
-        given = own if force_range is None else np.array(force_range)
-        force_range = (max(own[0], given[0]), min(own[1], given[1]))
+        limits = np.sort(np.array(model.jnt_actfrcrange[target]) / gear)
+        given = limits if force_range is None else np.array(force_range)
+        force_range = (max(limits[0], given[0]), min(limits[1], given[1]))
     if kind == transmissions.mjTRN_TENDON:
         for joint in np.flatnonzero(model.jnt_actfrclimited):
             if k in _acting_on(mujoco, model, joint):
@@ -95,8 +95,8 @@ def _read(mujoco, model, names, notes, k, name):
 
 
 def _acting_on(mujoco, model, joint):
-    """Numbers of the actuators that may act on a joint, by themselves or by a tendon."""
-    kinds, found = mujoco.mjtTrn, []
+    """Numbers of the actuators that may act on a joint, directly or through a tendon."""
+    kinds, numbers = mujoco.mjtTrn, []
     for k, (number, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
         kind = kinds(int(number))
         if kind == kinds.mjTRN_BODY:
@@ -105,10 +105,10 @@ def _acting_on(mujoco, model, joint):
             wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
             is_other = lambda w: model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT and model.wrap_objid[w] != joint
             if not all(is_other(w) for w in wraps):
-                found.append(k)
+                numbers.append(k)
         elif kind not in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT) or target == joint:
-            found.append(k)
-    return found
+            numbers.append(k)
+    return numbers
 
 
 def _within(control_range, activation_range):

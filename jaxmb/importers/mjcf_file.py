@@ -1,4 +1,4 @@
-"""MuJoCo's compilation of an MJCF file, without what only pictures need."""
+"""MuJoCo's compilation of an MJCF file, without elements for pictures only."""
 
 import os
 import warnings
@@ -10,11 +10,11 @@ from .source import file_name, is_text
 
 
 def compiled(mujoco: Any, source: Any, notes: Notes) -> tuple[Any, str]:
-    """MuJoCo's model of a path, a text or an `MjSpec`, and what messages call it.
+    """MuJoCo's model of a path, a text or an `MjSpec`, and its name in messages.
 
-    Materials and textures, and meshes that are missing, are left out, and `notes` say so.
+    Materials, textures and missing meshes are left out, with a note.
 
-    **Raises:** `ValueError` for a file that MuJoCo does not accept, and for a missing mesh that an inertia comes from.
+    **Raises:** `ValueError` for a file that MuJoCo does not accept, and for a missing mesh that determines an inertia.
     """
     file = file_name(source)
     is_path = isinstance(source, os.PathLike | str) and not is_text(source)
@@ -29,8 +29,8 @@ def compiled(mujoco: Any, source: Any, notes: Notes) -> tuple[Any, str]:
             model.names.decode()
     except UnicodeDecodeError:
         raise ValueError(
-            f"{file}: names must be in UTF-8, whatever encoding a file declares: save it, and those that it includes, "
-            "as UTF-8."
+            f"{file}: names must be in UTF-8, whatever encoding a file declares: save it and its included files as "
+            "UTF-8."
         ) from None
     except ValueError as error:
         notes.finish(file)
@@ -47,11 +47,11 @@ def _specification(mujoco, source):
 
 
 def _compiled(spec, notes):
-    """The model; numbers of shapes do not matter where these are left out."""
+    """The model; wrong numbers of shapes do not matter if shapes are left out."""
     try:
         return spec.compile()
     except ValueError as error:
-        left_out = [own for own in spec.geoms if _is_weightless(own) and _word(own) in notes.ignore]
+        left_out = [shape for shape in spec.geoms if _is_weightless(shape) and _word(shape) in notes.ignore]
         for geom in left_out:
             notes.say("Shapes are not read, since some of them have wrong numbers: {}.", geom.parent.name)
             spec.delete(geom)
@@ -62,7 +62,7 @@ def _compiled(spec, notes):
 
 
 def _word(geom):
-    """What leaves a shape out."""
+    """The word that leaves a shape out."""
     return "collisions" if geom.contype or geom.conaffinity else "pictures"
 
 
@@ -96,15 +96,15 @@ def _without_pictures(spec: Any, notes: Notes) -> None:
         notes.say(f"Not read, since they are for pictures only: {', '.join(left_out)}.")
     if spec.sensors:
         notes.say(f"Not read, since they do not act on the motion: {len(spec.sensors)} sensors.")
-    # Sensors may name what is left out below.
+    # Sensors may name elements that are left out below.
     for kind in ("materials", "textures", "skins", "sensors"):
         for element in list(getattr(spec, kind)):
             spec.delete(element)
     folder = Path(spec.modelfiledir or ".") / (spec.meshdir or "")
-    is_missing = lambda own: own.file and not (folder / own.file).exists()
-    for field in [own for own in spec.hfields if is_missing(own)]:
+    is_missing = lambda item: item.file and not (folder / item.file).exists()
+    for field in [item for item in spec.hfields if is_missing(item)]:
         notes.refuse("collisions", field.name, f"The file {field.file!r} of the height field {field.name!r} is missing")
-        for geom in [own for own in spec.geoms if own.hfieldname == field.name]:
+        for geom in [item for item in spec.geoms if item.hfieldname == field.name]:
             spec.delete(geom)
         spec.delete(field)
     missing = {_named(mesh): mesh for mesh in spec.meshes if is_missing(mesh)}

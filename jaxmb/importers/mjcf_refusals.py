@@ -1,4 +1,4 @@
-"""Elements of MJCF that are refused, and those that have no effect on a motion."""
+"""Elements of MJCF that are refused, and elements without effect on a motion."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from .notes import Notes
 
-# Numbers that must vanish: the fields of the model, what they belong to, and the kind to leave out.
+# Numbers that must vanish: the fields of the model, a description, and the kind to leave out.
 _MUST_VANISH = {
     "jnt_stiffnesspoly": ("joint", "nonlinear stiffness", "springs"),
     "jnt_springyield": ("joint", "plastic springs", "springs"),
@@ -24,7 +24,7 @@ _MUST_VANISH = {
 
 
 def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
-    """Refuse what has no counterpart, and say what is not read because it has no effect on a motion."""
+    """Refuse elements without a counterpart, and note unread elements without effect on a motion."""
     named = lambda kind, k: (
         mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) or f"{kind} {k}"
     )
@@ -41,7 +41,7 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
     if model.nflex:
         notes.refused.append("Deformable bodies (flex) are not modelled; remove them from the file.")
     if model.nplugin:
-        notes.refused.append("Plugins are not known; remove them from the file.")
+        notes.refused.append("Plugins are not supported; remove them from the file.")
     if model.opt.density or model.opt.viscosity:
         notes.refuse("fluid", "", "A fluid is not modelled: set density and viscosity of <option> to zero")
     effectless = {
@@ -59,23 +59,23 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
         )
     if model.neq:
         notes.say("Equalities hold exactly: their solref and solimp have no effect.")
-    moved = np.flatnonzero(model.body_mocapid >= 0)
-    if moved.size:
+    mocap = np.flatnonzero(model.body_mocapid >= 0)
+    if mocap.size:
         notes.say(
             "Mocap bodies are held by a joint, whose point_a and orientation may be inputs: {}.",
-            *(named("body", k) for k in moved),
+            *(named("body", k) for k in mocap),
         )
 
 
 def _set(values):
-    """Numbers of the elements with an entry that is not zero."""
+    """Numbers of the elements with a nonzero entry."""
     values = np.asarray(values)
     return np.flatnonzero(np.any(values.reshape(len(values), -1) != 0, axis=1)) if values.size else ()
 
 
 def _check_tendon(mujoco, model, notes, k, name):
     start = model.tendon_adr[k]
-    wraps = {int(own) for own in model.wrap_type[start : start + model.tendon_num[k]]}
+    wraps = {int(wrap) for wrap in model.wrap_type[start : start + model.tendon_num[k]]}
     plain = {int(mujoco.mjtWrap.mjWRAP_JOINT), int(mujoco.mjtWrap.mjWRAP_SITE)}
     if wraps - plain:
         notes.refuse("tendons", name, f"Tendon {name!r} wraps around shapes or pulleys")
@@ -85,15 +85,15 @@ def _check_tendon(mujoco, model, notes, k, name):
 
 
 def _colliding(mujoco, model):
-    """Numbers of moving bodies with shapes that may collide with another."""
+    """Numbers of moving bodies whose shapes may collide with another body."""
     types: dict[tuple[int, int, int], set[int]] = {}
     for g in range(model.ngeom):
         mask = int(model.geom_contype[g]), int(model.geom_conaffinity[g])
         if any(mask):
             body = int(model.geom_bodyid[g])
             types.setdefault((int(model.body_weldid[body]), *mask), set()).add(body)
-    excluded = {int(own) for own in np.asarray(model.exclude_signature)}
-    found = set()
+    excluded = {int(pair) for pair in np.asarray(model.exclude_signature)}
+    colliding = set()
     for (i, type_i, affinity_i), bodies_i in types.items():
         for (j, type_j, affinity_j), bodies_j in types.items():
             if i == j or not (type_i & affinity_j or type_j & affinity_i):
@@ -101,7 +101,7 @@ def _colliding(mujoco, model):
             for a in bodies_i:
                 for b in bodies_j:
                     if (min(a, b) << 16) + max(a, b) not in excluded:
-                        found |= {k for k in (a, b) if model.body_weldid[k]}
+                        colliding |= {k for k in (a, b) if model.body_weldid[k]}
     for k in range(model.npair):
-        found |= {int(model.geom_bodyid[geom]) for geom in (model.pair_geom1[k], model.pair_geom2[k])} - {0}
-    return found
+        colliding |= {int(model.geom_bodyid[geom]) for geom in (model.pair_geom1[k], model.pair_geom2[k])} - {0}
+    return colliding

@@ -18,17 +18,17 @@ class ImportedModel:
     **Fields:**
 
     - `scene`: its bodies, joints, forces and frames, a `Scene`, to which `scene.extended(forces=[…])` adds parts.
-        Bodies and joints have the names of the file, and bodies their frames; links that are fixed to others, sites
-        and other marks are frames. An angle or displacement of a joint is that of the file. Joints in succession, with
-        no mass in between, are one `Composite`. The armature of a joint is a `JointInertia`.
-    - `notes`: sentences on what is approximated and what is left out, one for each kind; `named`: for each of them all
-        the names, or lines of the file, that it holds for: it lists the first ones.
-    - `coordinates`: for each joint of the file the coordinate of the scene that it is, `{"hip": "hip.angle"}`.
-    - `controls`: for each actuator of the file the parameter that is its control, `{"motor": "motor.control"}`, for
+        Bodies and joints have the names of the file, and bodies their frames; links fixed to other links, sites and
+        other marks are frames. Angles and displacements of joints are the file's. Joints in succession, with no mass in
+        between, are one `Composite`. The armature of a joint is a `JointInertia`.
+    - `notes`: sentences on approximations and omissions, one for each kind, with the first names or lines of the file
+        that it concerns; `named`: for each note all of these names or lines.
+    - `coordinates`: for each joint of the file its coordinate in the scene, `{"hip": "hip.angle"}`.
+    - `controls`: for each actuator of the file its control, a parameter, `{"motor": "motor.control"}`, for
         `simulate(..., inputs=)`.
     - `states`: the named states of the file, such as keyframes of MJCF, for `assemble`.
-    - `shapes`: what each body looks like, those for collisions where it has no others, for `viz.show(trajectory,
-        shapes=model.shapes)`; `collision_shapes`: those that the file has for collisions, for contacts of your own.
+    - `shapes` of each body, its collision shapes if it has no others, for `viz.show(trajectory, shapes=model.shapes)`;
+        `collision_shapes`: the file's shapes for collisions, for new contacts.
     """
 
     name: str

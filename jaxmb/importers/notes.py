@@ -1,11 +1,11 @@
-"""Notes of an import: approximations, elements that are left out, and those that are refused."""
+"""Notes of an import: approximations, omitted elements and refused elements."""
 
 import dataclasses
 from collections.abc import Collection
 
 from ..parts.names import unknown
 
-# What can be left out, by name.
+# The kinds of elements that can be left out.
 LEAVABLE = (
     "actuators",
     "armature",
@@ -22,7 +22,7 @@ LEAVABLE = (
     "springs",
     "tendons",
 )
-# A note lists so many names, and counts the others.
+# The number of names that a note lists; it counts the others.
 _LISTED = 8
 
 
@@ -30,8 +30,9 @@ _LISTED = 8
 class Notes:
     """Collects sentences while a file is read.
 
-    **Fields:** `ignore`: what is to be left out, a word of `LEAVABLE` or the name of an element of the file; `said`:
-    approximations, and what was left out, each with the names or lines that it holds for; `refused`.
+    **Fields:** `ignore`: elements to leave out, by words of `LEAVABLE` or by name; `said`: sentences on approximations
+    and omissions, each with the names or lines that it concerns; `refused`: sentences on refused elements; `used`: the
+    words of `ignore` that had an effect.
     """
 
     ignore: frozenset[str]
@@ -40,14 +41,12 @@ class Notes:
     used: set[str] = dataclasses.field(default_factory=set)
 
     def say(self, sentence: str, *names: str | int) -> None:
-        """Note a sentence once; if it holds for elements, with their names, or their lines in the file, in place of
-        `{}`.
-        """
-        own = self.said.setdefault(sentence, [])
-        own += [repr(name) for name in dict.fromkeys(names) if repr(name) not in own]
+        """Note a sentence once; names of elements, or their lines in the file, take the place of `{}`."""
+        listed = self.said.setdefault(sentence, [])
+        listed += [repr(name) for name in dict.fromkeys(names) if repr(name) not in listed]
 
     def leaves_out(self, kind: str, name: str = "") -> bool:
-        """Whether a kind of element, or the one of this name, is to be left out; if so, this is noted."""
+        """Whether a kind of element, or the element of this name, is to be left out; an omission is noted."""
         for word in (kind, name):
             if word and word in self.ignore:
                 self.used.add(word)
@@ -57,23 +56,23 @@ class Notes:
         return False
 
     def refuse(self, kind: str, name: str, sentence: str) -> None:
-        """Refuse an element, unless it is to be left out."""
+        """Refuse an element, unless `ignore` leaves it out."""
         if not self.leaves_out(kind, name):
             self.refused.append(f"{sentence} (ignore={kind!r} leaves it out)")
 
     def finish(self, file: str, what: str = "cannot be imported") -> dict[str, tuple[str, ...]]:
-        """The sentences, one for each kind, and for each the names or lines that it holds for, of which it has the
-        first ones.
+        """The sentences, one for each kind, with the first names or lines that it concerns; and for each all names or
+        lines.
 
-        **Raises:** `ValueError` that lists all that was refused, and for words of `ignore` that nothing answers to.
+        **Raises:** `ValueError` that lists all refused elements, and for words of `ignore` without effect.
         """
         for word in sorted(self.ignore - self.used - set(LEAVABLE)):
             raise unknown("element", word, LEAVABLE, "ignore")
         if self.refused:
             listed = "".join(f"\n- {sentence}" for sentence in self.refused)
             raise ValueError(f"{file} has elements that {what}:{listed}")
-        # Sentences may have braces from the names of a file.
-        return {said.replace("{}", _listed(names)): tuple(names) for said, names in self.said.items()}
+        # Names in a sentence may contain braces.
+        return {note.replace("{}", _listed(names)): tuple(names) for note, names in self.said.items()}
 
 
 def _listed(names):

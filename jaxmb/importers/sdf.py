@@ -26,14 +26,14 @@ _KINDS: dict[str, Kind] = {
     "fixed": "fixed",
     "universal": "hinge",
 }
-# What joints call the ground, and some files a link of theirs.
+# The ground's name in joints; some files have a link of this name.
 _WORLD = "world"
-# From this size on a limit of a joint is none.
+# A limit of a joint from this size on is ignored.
 _UNLIMITED = 1e15
-# Moments and products of inertia that are not given [kg m²].
+# Default moments and products of inertia [kg m²].
 _INERTIA = {"ixx": 1.0, "ixy": 0.0, "ixz": 0.0, "iyy": 1.0, "iyz": 0.0, "izz": 1.0}
 _GREY = (128, 128, 128)
-# Elements that do not act on the motion.
+# Elements without effect on the motion.
 _EFFECTLESS = {"sensor", "light", "material", "self_collide", "allow_auto_disable", "audio_source", "transparency"}
 
 
@@ -51,17 +51,17 @@ def sdf(
     system = model.scene.compile()
     ```
 
-    Links and joints of several models have the names of these before their own, `"arm::hand"`. A model is free unless
-    a joint binds it to `world`, or it is static. Before version 1.5 of the format, axes of joints are in the frame of
-    the model. Angles that are written with few digits, such as 1.5708, are the multiples of π/12 that they round: the
-    hinges of a loop are then as parallel as they are meant.
+    Links and joints of several models are prefixed by the model's name, `"arm::hand"`. A model is free unless a joint
+    binds it to `world`, or it is static. Before version 1.5 of the format, axes of joints are in the frame of the
+    model. Angles written with few digits, such as 1.5708, are taken as the multiples of π/12 that they round: hinges of
+    a loop are then exactly parallel.
 
-    **Arguments:** `source`: a path, or the text of a file; `gravity` [m/s²], shape (3,), unless a world
-    in the file has it; `ignore`: what is to be left out, words such as `"limits"`, `"collisions"` and `"pictures"`, or
-    names of joints; `package_dirs`: where `model://name/` is looked for first, folders of models or that hold models;
-    then in the folder of the file and those above it.
+    **Arguments:** `source`: a path, or the text of a file; `gravity` [m/s²], shape (3,), if no world in the file
+    defines it; `ignore`: elements to leave out, by words such as `"limits"`, `"collisions"` and `"pictures"`, or by
+    names of joints; `package_dirs`: folders of models, or with models, that are searched first for `model://name/`,
+    before the folder of the file and its parents.
 
-    **Returns:** an `ImportedModel`; its `notes` say what is approximated.
+    **Returns:** an `ImportedModel`; its `notes` list the approximations.
 
     **Raises:** `ValueError` with file and line for elements that cannot be imported.
     """
@@ -86,17 +86,17 @@ def sdf(
 
 
 def _scopes(models, notes):
-    """What stands before the names of each model's links and joints: nothing if there is one model only."""
+    """The prefix of the names of each model's links and joints: empty for a single model."""
     if len(models) == 1:
         return [""]
     out: list[str] = []
     for model in models:
         name = model.attributes.get("name", "model")
         tries = itertools.chain([name], (f"{name} {k}" for k in itertools.count(2)))
-        own = next(own for own in tries if f"{own}::" not in out)
-        if own != name:
-            notes.say("Models have other names, since those of the file are not unique: {}.", f"{name} → {own}")
-        out.append(f"{own}::")
+        unique = next(unique for unique in tries if f"{unique}::" not in out)
+        if unique != name:
+            notes.say("Models have other names, since the file's names are not unique: {}.", f"{name} → {unique}")
+        out.append(f"{unique}::")
     return out
 
 
@@ -105,7 +105,7 @@ def _read_model(model, scope, machine, version, notes, files):
     for nested in (*model.all("model"), *model.all("include"), *model.all("frame")):
         notes.refused.append(f"{nested.where}<{nested.tag}> within a model is not read; write the model out.")
     if "placement_frame" in model.attributes:
-        notes.refused.append(f"{model.where}placement_frame is not read: give the pose of the model's own frame.")
+        notes.refused.append(f"{model.where}placement_frame is not read: give the pose of the model's frame.")
     static = model.first("static")
     static = static is not None and _true(static.text)
     for element in model.all("link"):
@@ -132,29 +132,29 @@ def _true(word: str) -> bool:
 
 def _pose(element: Element, notes: Notes):
     """Position and rotation of a `<pose>`."""
-    own = element.first("pose")
-    if own is None:
+    pose = element.first("pose")
+    if pose is None:
         return np.zeros(3), np.eye(3)
-    relative = own.attributes.get("relative_to", own.attributes.get("frame", ""))
+    relative = pose.attributes.get("relative_to", pose.attributes.get("frame", ""))
     if relative not in ("", "__model__"):
-        raise ValueError(f"{own.where}a pose relative to {relative!r}: give it in the model's frame.")
-    words = own.text.split()
-    numbers = own.numbers(count=6)
-    angles = [_rounded(word, value, own, notes) for word, value in zip(words[3:], numbers[3:], strict=True)]
-    if _true(own.attributes.get("degrees", "")):
+        raise ValueError(f"{pose.where}a pose relative to {relative!r}: give it in the model's frame.")
+    words = pose.text.split()
+    numbers = pose.numbers(count=6)
+    angles = [_rounded(word, value, pose, notes) for word, value in zip(words[3:], numbers[3:], strict=True)]
+    if _true(pose.attributes.get("degrees", "")):
         angles = [np.deg2rad(value) for value in numbers[3:]]
     return numbers[:3], roll_pitch_yaw(angles)
 
 
 def _rounded(word, value, element, notes):
-    """An angle [rad]: the multiple of π/12 that the word is a rounding of, if it is one."""
+    """An angle [rad]; a word that is the rounding of a multiple of π/12 gives this multiple."""
     digits = re.fullmatch(r"[-+]?\d*\.(\d{2,})", word)
     if digits is None:
         return value
     step = np.pi / 12
     exact = step * round(value / step)
     if exact and exact != value and abs(value - exact) <= 0.51 * 10.0 ** -len(digits.group(1)):
-        notes.say("Angles such as 1.5708 are taken to be the multiples of π/12 that they round.")
+        notes.say("Angles such as 1.5708 are taken as the multiples of π/12 that they round.")
         return exact
     return value
 
@@ -162,7 +162,7 @@ def _rounded(word, value, element, notes):
 def _read_link(element, scope, machine, place, notes, files):
     name = f"{scope}{element.need('name')}"
     if name in machine.links:
-        raise ValueError(f"{element.where}link {name!r} is there twice.")
+        raise ValueError(f"{element.where}link {name!r} occurs twice.")
     position, rotation = _pose(element, notes)
     link = Link(name, where=element.where)
     link.position, link.rotation = place[0] + place[1] @ position, place[1] @ rotation
@@ -170,9 +170,9 @@ def _read_link(element, scope, machine, place, notes, files):
     if inertial is not None:
         link.centre, turn = _pose(inertial, notes)
         link.mass = inertial.number("mass", 1.0)
-        own = inertial.first("inertia")
+        moments = inertial.first("inertia")
         xx, xy, xz, yy, yz, zz = (
-            default if own is None else own.number(moment, default) for moment, default in _INERTIA.items()
+            default if moments is None else moments.number(moment, default) for moment, default in _INERTIA.items()
         )
         link.inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
         if _true(inertial.attributes.get("auto", "")):
@@ -186,7 +186,9 @@ def _read_link(element, scope, machine, place, notes, files):
     if weighs is not None and not _true(weighs.text):
         machine.buoyancy[name] = 1.0
     if inertial is not None and name == f"{scope}{_WORLD}":
-        notes.say("A link called world that has an <inertial> is no ground, and moves as its joints let it: {}.", name)
+        notes.say(
+            "A link called world that has an <inertial> is not the ground, and moves as its joints allow: {}.", name
+        )
     machine.links[name] = link
 
     def seen(element):
@@ -199,22 +201,22 @@ def _read_link(element, scope, machine, place, notes, files):
 def _read_joint(element, scope, machine, of_model, version, notes, names):
     name, kind = f"{scope}{element.need('name')}", element.need("type")
     if kind not in _KINDS:
-        known = ", ".join(_KINDS)
+        kinds = ", ".join(_KINDS)
         if kind in ("gearbox", "screw", "revolute2"):
             element.skip()
             notes.refuse("gearboxes", name, f"{element.where}joint {name!r} is of type {kind!r}")
             return
-        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
+        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {kinds}.")
     if names[name] > 1:
-        raise ValueError(f"{element.where}joint {name!r} is there twice.")
+        raise ValueError(f"{element.where}joint {name!r} occurs twice.")
     ends = []
     for tag in ("parent", "child"):
-        own = element.first(tag)
-        given = "" if own is None else own.text.strip()
+        reference = element.first(tag)
+        given = "" if reference is None else reference.text.strip()
         link = f"{scope}{given}"
         if link not in machine.links:
             if given != _WORLD:
-                raise ValueError(f"{element.where}joint {name!r} has the {tag} {given!r}, and there is no such link.")
+                raise ValueError(f"{element.where}joint {name!r} has the {tag} {given!r}, but there is no such link.")
             link = WORLD
         ends.append(link)
     if ends[0] == ends[1]:
@@ -223,7 +225,7 @@ def _read_joint(element, scope, machine, of_model, version, notes, names):
     position, rotation = _pose(element, notes)
     frame = child.rotation @ rotation
     point = child.position + child.rotation @ position
-    axes = [own for tag in ("axis", "axis2") if (own := element.first(tag)) is not None]
+    axes = [axis_element for tag in ("axis", "axis2") if (axis_element := element.first(tag)) is not None]
     if kind == "universal" and len(axes) == 2:
         between = machine.add(Link(f"{name} cross", position=point, rotation=frame, where=element.where))
         one, two = (unused(f"{name} {k}", names.__contains__) for k in (1, 2))
@@ -246,12 +248,14 @@ def _read_axis(joint, axis, frame, of_model, scope, machine, version, notes, kin
     direction = np.array([0.0, 0.0, 1.0]) if xyz is None else xyz.numbers()
     expressed = "" if xyz is None else xyz.attributes.get("expressed_in", "")
     in_model = axis.first("use_parent_model_frame")
-    # Before version 1.5 axes are in the frame of the model, which 1.5 and 1.6 have a word for.
+    # Before version 1.5 axes are in the frame of the model; 1.5 and 1.6 have an element for it.
     if (version < (1, 5) if in_model is None else _true(in_model.text)) or expressed == "__model__":
         frame = of_model
     elif expressed:
         if f"{scope}{expressed}" not in machine.links:
-            raise ValueError(f"{axis.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is no link.")
+            raise ValueError(
+                f"{axis.where}the axis of {joint.name!r} is expressed in {expressed!r}, which is not a link."
+            )
         frame = machine.links[f"{scope}{expressed}"].rotation
     length = np.linalg.norm(direction)
     if length == 0:

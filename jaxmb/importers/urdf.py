@@ -23,10 +23,10 @@ _KINDS: dict[str, Kind] = {
     "prismatic": "slide",
     "fixed": "fixed",
     "floating": "free",
-    # Of Bullet and MuJoCo, beside the format.
+    # Elements of Bullet and MuJoCo, not of the format.
     "spherical": "ball",
 }
-# Elements that do not act on the motion.
+# Elements without effect on the motion.
 _EFFECTLESS = {"material", "transmission", "verbose", "name"}
 
 
@@ -49,12 +49,13 @@ def urdf(
 
     - `source`: a path, or the text of a file.
     - `base`: whether the root link is fixed to the ground, or free. A root link called `world` is the ground.
-    - `gravity` [m/s²], shape (3,), which the format does not hold.
-    - `ignore`: what is to be left out, words such as `"limits"`, `"collisions"` and `"pictures"`, or names of joints.
-    - `package_dirs`: where `package://name/` is looked for first, folders of packages or that hold packages; then in
-        the folder of the file and those above it.
+    - `gravity` [m/s²], shape (3,), which the format does not define.
+    - `ignore`: elements to leave out, by words such as `"limits"`, `"collisions"` and `"pictures"`, or by names of
+        joints.
+    - `package_dirs`: folders of packages, or with packages, that are searched first for `package://name/`, before the
+        folder of the file and its parents.
 
-    **Returns:** an `ImportedModel`; its `notes` say what is approximated.
+    **Returns:** an `ImportedModel`; its `notes` list the approximations.
 
     **Raises:** `ValueError` with file and line for elements that cannot be imported.
     """
@@ -73,7 +74,7 @@ def urdf(
     _place(machine, joints, base, root, notes)
     for joint, element, _ in joints:
         machine.joints.append(joint)
-        _read_mimic(joint, element, machine, [own.name for own, _, _ in joints], notes)
+        _read_mimic(joint, element, machine, [other.name for other, _, _ in joints], notes)
     if any(element.first("limit") is not None for element in root.all("joint")):
         notes.say("Limits of efforts and speeds are not read: the joints have no actuators.")
     return model_of(root, machine, notes, file, _EFFECTLESS)
@@ -81,17 +82,17 @@ def urdf(
 
 def _origin(element: Element | None):
     """Position and rotation of an `<origin>`."""
-    own = None if element is None else element.first("origin")
-    if own is None:
+    origin = None if element is None else element.first("origin")
+    if origin is None:
         return np.zeros(3), np.eye(3)
-    position = own.numbers(own.attributes.get("xyz", "0 0 0"))
-    return position, roll_pitch_yaw(own.numbers(own.attributes.get("rpy", "0 0 0")))
+    position = origin.numbers(origin.attributes.get("xyz", "0 0 0"))
+    return position, roll_pitch_yaw(origin.numbers(origin.attributes.get("rpy", "0 0 0")))
 
 
 def _read_link(element, machine, notes, files):
     name = element.need("name")
     if name in machine.links:
-        raise ValueError(f"{element.where}link {name!r} is there twice.")
+        raise ValueError(f"{element.where}link {name!r} occurs twice.")
     link = Link(name, where=element.where)
     inertial = element.first("inertial")
     if inertial is not None:
@@ -119,14 +120,14 @@ def _read_joint(element, machine, notes):
     """A joint, its element, and place and rotation of its frame in the parent link."""
     name, kind = element.need("name"), element.need("type")
     if kind not in (*_KINDS, "planar"):
-        known = ", ".join((*_KINDS, "planar"))
-        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {known}.")
+        kinds = ", ".join((*_KINDS, "planar"))
+        raise ValueError(f"{element.where}joint {name!r} has the unknown type {kind!r}; there are {kinds}.")
     ends = []
     for tag in ("parent", "child"):
-        own = element.first(tag)
-        link = None if own is None else own.need("link")
+        end = element.first(tag)
+        link = None if end is None else end.need("link")
         if link not in machine.links:
-            raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, and there is no such link.")
+            raise ValueError(f"{element.where}joint {name!r} has the {tag} {link!r}, but there is no such link.")
         ends.append(link)
     axis = element.first("axis")
     direction = np.array([1.0, 0.0, 0.0]) if axis is None else axis.numbers(axis.attributes.get("xyz", "1 0 0"))
@@ -155,33 +156,35 @@ def _limits(limit, name, notes):
         notes.refuse("limits", name, f"{where} must increase, got {lower} and {upper}")
         return None
     if lower == upper:
-        notes.say("Limits that leave no range are taken for none: {}.", name)
+        notes.say("Limits without a range are ignored: {}.", name)
         return None
     return lower, upper
 
 
 def _place(machine, joints, base, root, notes):
-    """Place the links where all coordinates are zero."""
+    """Place the links at zero coordinates."""
     names = Counter(joint.name for joint, _, _ in joints)
     for joint, _, _ in joints:
         if names[joint.name] > 1:
-            raise ValueError(f"{joint.where}joint {joint.name!r} is there twice.")
+            raise ValueError(f"{joint.where}joint {joint.name!r} occurs twice.")
     children = [joint.child for joint, _, _ in joints]
     twice = [name for name, number in Counter(children).items() if number > 1]
     if twice:
         raise ValueError(f"{root.where}link {twice[0]!r} is the child of several joints; URDF holds trees only.")
     roots = [name for name in machine.links if name not in children]
     if len(roots) != 1:
-        raise ValueError(f"{root.where}the links make no tree: roots are {', '.join(map(repr, roots)) or 'none'}.")
+        raise ValueError(
+            f"{root.where}the links do not form a tree: roots are {', '.join(map(repr, roots)) or 'none'}."
+        )
     if base == "free" and roots[0] == "world" and machine.links["world"].mass:
-        notes.say("The root link 'world' is the ground, whatever its mass, though base='free': give it another name.")
+        notes.say("The root link 'world' is the ground, whatever its mass, despite base='free': give it another name.")
     if base == "fixed" or roots[0] == "world":
         machine.joints.append(Joint("", "fixed", WORLD, roots[0]))
     else:
         machine.joints.append(Joint(unused("base", names.__contains__), "free", WORLD, roots[0]))
     of_parent: dict[str, list[Any]] = {}
-    for own in joints:
-        of_parent.setdefault(own[0].parent, []).append(own)
+    for each in joints:
+        of_parent.setdefault(each[0].parent, []).append(each)
     queue, unreached = [roots[0]], set(machine.links)
     while queue:
         parent = machine.links[queue.pop()]
@@ -196,11 +199,11 @@ def _place(machine, joints, base, root, notes):
                 _spread(machine, joint, names)
     if unreached:
         listed = ", ".join(map(repr, sorted(unreached)))
-        raise ValueError(f"{root.where}the links make no tree: no joints lead from {roots[0]!r} to {listed}.")
+        raise ValueError(f"{root.where}the links do not form a tree: no joints lead from {roots[0]!r} to {listed}.")
 
 
 def _spread(machine, joint, names):
-    """A planar joint as two slides and a hinge, with links without mass between them."""
+    """A planar joint as two slides and a hinge, with massless links between them."""
     child = machine.links[joint.child]
     u = child.rotation[:, int(np.argmin(np.abs(child.rotation.T @ joint.axis)))]
     u = np.cross(np.cross(joint.axis, u), joint.axis)
@@ -220,7 +223,7 @@ def _read_mimic(joint, element, machine, names, notes):
     factor, offset = mimic.attribute_number("multiplier", 1.0), mimic.attribute_number("offset")
     other, name = mimic.need("joint"), f"{joint.name} mimic"
     if joint.kind == "fixed":
-        notes.say("Fixed joints follow no other: their <mimic> has no effect: {}.", joint.name)
+        notes.say("Fixed joints do not move, so their <mimic> has no effect: {}.", joint.name)
     elif other not in names:
         notes.refuse("couplings", name, f"{mimic.where}<mimic> of {joint.name!r}: {unknown('joint', other, names)}")
     else:

@@ -1,4 +1,4 @@
-"""The model of a machine that URDF or SDF describes, when all of the file has been read."""
+"""The model of a machine, after all of its URDF or SDF has been read."""
 
 from collections.abc import Collection
 
@@ -10,10 +10,9 @@ from .xml_tree import Element
 
 
 def model_of(root: Element, machine: Machine, notes: Notes, file: str, effectless: Collection[str]) -> ImportedModel:
-    """The model; its notes also name the elements that nothing has read. `effectless`: tags that do not act on the
-    motion.
+    """The model; its notes also name unread elements. `effectless`: tags without effect on the motion.
 
-    **Raises:** `ValueError` that lists all that was refused.
+    **Raises:** `ValueError` that lists all refused elements.
     """
     if machine.collisions:
         notes.refuse("collisions", "", "Links have shapes for collisions")
@@ -26,14 +25,14 @@ def model_of(root: Element, machine: Machine, notes: Notes, file: str, effectles
         notes.say(f"Not read, since they do not act on the motion: {', '.join(f'<{tag}>' for tag in listed)}.")
     built = build_scene(machine, notes)
     coordinates = {joint: name for joint, name in built.coordinates.items() if name is not None}
-    said = notes.finish(file)
+    sentences = notes.finish(file)
     return ImportedModel(
         machine.name,
         built.scene,
-        tuple(said),
+        tuple(sentences),
         coordinates,
         built.controls,
         shapes=built.shapes,
         collision_shapes=built.collision_shapes,
-        named=said,
+        named=sentences,
     )

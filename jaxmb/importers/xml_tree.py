@@ -1,4 +1,4 @@
-"""XML elements that know their line in the file, for messages."""
+"""XML elements with their line in the file, for messages."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclasses.dataclass
 class Element:
-    """An element: its tag, attributes, text and children, and `where` it stands, `"file:line: "`, with the line."""
+    """An element: its tag, attributes, text and children, its place `where`, `"file:line: "`, and the line."""
 
     tag: str
     attributes: dict[str, str]
@@ -31,13 +31,13 @@ class Element:
         return next(self.all(tag), None)
 
     def need(self, name: str) -> str:
-        """An attribute that must be there."""
+        """A required attribute."""
         if name not in self.attributes:
             raise ValueError(f"{self.where}<{self.tag}> needs the attribute {name!r}.")
         return self.attributes[name]
 
     def numbers(self, text: str | None = None, count: int = 3) -> np.ndarray:
-        """Numbers from an attribute's text, by default from that of the element."""
+        """Numbers from an attribute's text, by default from the element's."""
         given = self.text if text is None else text
         try:
             out = np.array([float(word) for word in given.split()])
@@ -59,7 +59,7 @@ class Element:
         return float(self.numbers(self.attributes[name], 1)[0])
 
     def skip(self) -> None:
-        """Take all that is in the element as read."""
+        """Mark the element and all its contents as read."""
         below = list(self.children)
         while below:
             child = below.pop()
@@ -67,7 +67,7 @@ class Element:
             below += child.children
 
     def unread(self) -> Iterator["Element"]:
-        """Elements that nothing has asked for, the outermost of them."""
+        """The outermost unread elements."""
         below = self.children[::-1]
         while below:
             child = below.pop()
@@ -80,15 +80,15 @@ class Element:
 def parse(text: str, file: str) -> Element:
     """The root element of a text.
 
-    **Raises:** `ValueError` with the line for a text that is not XML, and for one that declares a document type: its
-    entities may stand for more text than any memory holds.
+    **Raises:** `ValueError` with the line for a text that is not XML, and for a declared document type: its entities
+    may expand to more text than any memory holds.
     """
     root = Element("", {}, "", 0)
     stack = [root]
-    # A text is decoded already, whatever its first line declares.
+    # The text is already decoded, whatever its first line declares.
     parser = expat.ParserCreate("utf-8")
     parser.buffer_text = True
-    # Before the declaration of XML nothing may stand, not even an empty line, and no zero of C behind the text.
+    # The declaration of XML must be first, even before an empty line; a C string's zero must not follow the text.
     text = text.rstrip("\0")
     blank = len(text) - len(text.lstrip())
     above = text.count("\n", 0, blank)
@@ -104,8 +104,8 @@ def parse(text: str, file: str) -> Element:
 
     def document_type(*_):
         raise ValueError(
-            f"{file}:{parser.CurrentLineNumber + above}: a document type or an entity is declared, which is not read: "
-            "remove <!DOCTYPE …> and write out what its entities stand for."
+            f"{file}:{parser.CurrentLineNumber + above}: a document type or an entity is declared, which is not "
+            "supported: remove <!DOCTYPE …> and write out its entities."
         )
 
     parser.StartElementHandler = start

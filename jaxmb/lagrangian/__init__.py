@@ -12,9 +12,8 @@ Assembly, simulation, identification and derivatives work as with scenes of bodi
   of base and fibre, nonlinear quasi-velocities.
 - `Hamel`, `Voronets`: equations of motion with structure functions or curvature, for any transpositional relation.
 
-Accelerations are computed by any of `jaxmb.formulations`: `Partitioned`, `Multipliers`, `NullSpace`, `Poincare`, or
-`UdwadiaKalaba` in three forms. They agree to 1e-10 on every mechanism of the library, with and without redundant
-joints.
+Any of `jaxmb.formulations` computes the accelerations: `Partitioned`, `Multipliers`, `NullSpace`, `Poincare`, or
+`UdwadiaKalaba` in three forms. They agree to 1e-10 on every mechanism of the library, also with redundant joints.
 """
 
 from .._moved import tell_of_moved as _tell_of_moved

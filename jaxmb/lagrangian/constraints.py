@@ -22,7 +22,7 @@ else:
 class AbstractCoordinateConstraint(eqx.Module):
     """Some rows of constraint equations in generalized coordinates, with a name.
 
-    `level` says what the rows bind: 0 for positions, 1 for velocities, 2 for accelerations.
+    The rows bind positions (`level` 0), velocities (1) or accelerations (2).
     """
 
     name: AbstractVar[str]
@@ -35,14 +35,12 @@ class AbstractCoordinateConstraint(eqx.Module):
         """The residual, with `v = q̇` and `a = q̈`; derivatives above the constraint's level are not used."""
 
     def is_linear(self, q: Coordinates, parameters: Parameters) -> bool:
-        """Hook: whether the rows are linear in velocities up to a term without them; of a constraint between
-        accelerations always true.
-        """
+        """Hook: whether the rows are affine in velocities; always true for a constraint between accelerations."""
         del q, parameters
         return True
 
     def is_drift_free(self, q: Coordinates, parameters: Parameters) -> bool:
-        """Hook: whether rows between velocities vanish at rest; of a constraint between accelerations always true."""
+        """Hook: whether rows between velocities vanish at rest; always true for a constraint between accelerations."""
         del q, parameters
         return True
 
@@ -93,7 +91,7 @@ class Nonholonomic(AbstractCoordinateConstraint):
         return not depends(slope, (jnp.zeros((), q.dtype), q, q, parameters), 2)
 
     def is_drift_free(self, q, parameters):
-        # A function does not say so.
+        # Unknown for a function.
         return False
 
 
@@ -133,7 +131,8 @@ class AccelerationConstraint(AbstractCoordinateConstraint):
     system = jaxmb.lagrangian.LagrangianSystem(kinetic=free, constraints=[pull], q=[0.0, 0.0])
     ```
 
-    Nothing keeps the motion on a relation that such a constraint is a derivative of: it is what its rows say.
+    If the rows are the derivative of a relation between positions or velocities, the motion may drift off this
+    relation.
 
     **Arguments:** `matrix`: shape (rows, nq); `right`: shape (rows,).
     """
@@ -157,10 +156,11 @@ class ServoConstraint(AbstractCoordinateConstraint):
     lift = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, potential=potential, constraints=[rise], q=[0.2])
     ```
 
-    The constraint acts on accelerations, `φ̈ + damping φ̇ + stiffness φ = 0`, so the motion may start off it. What it
-    takes to do that, its constraint force, is the exact generalized control force, the least one in the metric of M⁻¹.
+    The constraint acts on accelerations, `φ̈ + damping φ̇ + stiffness φ = 0`, so the motion may start off it. Its
+    constraint force is the exact generalized control force, the smallest in the metric of M⁻¹.
 
-    **Arguments:** `deviation`: φ, shape (rows,); `damping` [1/s] and `stiffness` [1/s²], default zero: kept only.
+    **Arguments:** `deviation`: φ, shape (rows,); `damping` [1/s] and `stiffness` [1/s²], default zero: a deviation of
+    zero is kept.
 
     **Reference:**
 
@@ -195,7 +195,7 @@ def _of_rows(constraint: str, what: str, rows: Float[Array, "rows"], value: Any)
 
 
 def check_names(constraints: tuple[Any, ...], coordinates: tuple[str, ...]) -> None:
-    """Raise a `ValueError` unless every entry is a constraint, with a name of its own."""
+    """Raise a `ValueError` unless every entry is a constraint with a unique name."""
     for constraint in constraints:
         if not isinstance(constraint, AbstractCoordinateConstraint):
             raise ValueError(
@@ -205,7 +205,9 @@ def check_names(constraints: tuple[Any, ...], coordinates: tuple[str, ...]) -> N
     names = [constraint.name for constraint in constraints]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise ValueError(f"The name {', '.join(map(repr, repeated))} is used twice; every constraint needs its own.")
+        raise ValueError(
+            f"The name {', '.join(map(repr, repeated))} is used twice; every constraint needs a different name."
+        )
     for name in names:
         if name in coordinates:
             raise ValueError(f"{name!r} is a constraint as well as a coordinate; rename one of them.")

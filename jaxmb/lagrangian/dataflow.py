@@ -11,7 +11,7 @@ from .._compat import Literal
 def depends(function: Callable[..., Any], arguments: tuple[Any, ...], *which: int) -> bool:
     """Whether the data flow of a function leads from one of these arguments to its values.
 
-    An argument that drops out only numerically, by a factor of zero, counts as one that the function depends on.
+    A dependence with a factor of zero counts as well.
     """
     closed = jax.make_jaxpr(function)(*arguments)
     owner = [k for k, argument in enumerate(arguments) for _ in jax.tree.leaves(argument)]

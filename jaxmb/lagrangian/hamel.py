@@ -30,11 +30,11 @@ class Hamel(AbstractEquations):
     ```
 
     with `ℓ(t, q, ξ) = L(t, q, N ξ + ν)`, its momenta `p_a` along all of the frame, and the transitivity coefficients
-    `γ^a_c = c^a_bc ξ^b + Ψ^a W_c`, `Ψ = N⁻¹`. The drift ν counts as one more field with
-    velocity one. With a frame of a base, moved along by a connection, these are the Hamel-Voronets equations.
+    `γ^a_c = c^a_bc ξ^b + Ψ^a W_c`, `Ψ = N⁻¹`. The drift ν counts as a further field with velocity one. With the frame
+    of a base, lifted by a connection, these are the Hamel-Voronets equations.
 
-    **Arguments:** `transposition`: what is meant by the variation of a velocity: `"holder"` (W = 0), `"suslov"` (varied
-    velocities stay in the frame's columns), a number between zero and one for a mixture of both, or a function
+    **Arguments:** `transposition`: the definition of the variation of a velocity: `"holder"` (W = 0), `"suslov"`
+    (varied velocities stay in the frame's columns), a number between zero and one for a mixture of both, or a function
     `W(t, q, v, dq, parameters)`, shape (nq,). The equations are the same for all.
 
     **Reference:**
@@ -53,7 +53,7 @@ class Hamel(AbstractEquations):
         share_of_suslov(self.transposition)
 
     def check(self, system):
-        # A concrete class: only it has the columns that the equations are written in.
+        # A concrete class: only it has the columns of these equations.
         if not isinstance(system.kinematics, QuasiVelocityFrame):
             raise ValueError(
                 f"Hamel's equations need kinematics=QuasiVelocityFrame(...), got {type(system.kinematics).__name__}."
@@ -72,10 +72,10 @@ class Hamel(AbstractEquations):
         X, v = columns(t, q), system.rates(t, q, u)
         sigma = u.size
         # [X_b, X_c] for all columns c, summed over the velocities of b with the drift: d X_c / dt − ∂v/∂q X_c.
-        _, moved = jax.jvp(columns, (t, q), (one, v))
+        _, column_rates = jax.jvp(columns, (t, q), (one, v))
         turned = jax.vmap(lambda x: jax.jvp(lambda q: system.rates(t, q, u), (q,), (x,))[1], in_axes=1, out_axes=1)(X)
         inverse = inverse_of(complete(X))
-        structure = inverse @ (moved - turned)
+        structure = inverse @ (column_rates - turned)
 
         ell = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), system.parameters_at(t))
         momenta = system.momentum(t, q, v) @ complete(X)
@@ -87,7 +87,7 @@ class Hamel(AbstractEquations):
         return along - rate + right + system.applied_force(t, q, v) @ X
 
     def _transposed(self, system, t, q, v, X, structure, sigma):
-        """W for displacements along each of the columns, shape (nq, columns)."""
+        """W for displacements along each column, shape (nq, columns)."""
         share = share_of_suslov(self.transposition)
         if share is None:
             transposition: Any = self.transposition

@@ -31,7 +31,7 @@ def _rows(system: AbstractLagrangian, t: Any, q: Any, u: Any) -> tuple[Array, Ar
 
 
 class HostLagrangian(AbstractHost):
-    """The constraints of a Lagrangian system, also of one whose structure is not known yet."""
+    """The constraints of a Lagrangian system, whose structure may be unknown."""
 
     def __init__(self, system: AbstractLagrangian, t: Any):
         self._system, self._given = Unanalysed.of(system), np.asarray(system.guess.u)

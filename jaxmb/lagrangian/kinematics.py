@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-# Functions of the user take `t`, `q`, then velocities if they depend on them, and the parameters: a dictionary of
-# numbers, and of modules, by name.
+# Functions of the user take `t`, `q`, velocities if they depend on them, and the parameters: numbers and modules by
+# name.
 Parameters = dict[str, Any]
 
 
@@ -24,7 +24,7 @@ class AbstractKinematics(eqx.Module):
     """The map from velocities u to rates q̇.
 
     - `identity`: whether u is q̇.
-    - `linear`: whether q̇ is linear in u up to a term without it; `drift_free`: whether that term is zero.
+    - `linear`: whether q̇ is affine in u; `drift_free`: whether its constant term is zero.
     """
 
     identity: AbstractVar[bool]
@@ -64,12 +64,12 @@ class QuasiVelocityFrame(AbstractKinematics):
     sled = jaxmb.lagrangian.LagrangianSystem(kinetic=kinetic, kinematics=frame, q=[0.0, 0.0, 0.0], u=[1.0, 0.5])
     ```
 
-    With fewer columns than coordinates the frame eliminates constraints: `u` are then free velocities of a system whose
-    constraints `A N = 0` are satisfied by whatever u is, and the equations are projected on the frame's columns.
+    With fewer columns than coordinates the frame eliminates constraints: since `A N = 0`, any `u` satisfies them, and
+    the equations are projected on the frame's columns.
 
     **Arguments:**
 
-    - `matrix(t, q, parameters)`: N, shape (nq, nu); its columns are independent wherever the system is.
+    - `matrix(t, q, parameters)`: N, shape (nq, nu), with independent columns everywhere.
     - `columns`: nu, the number of columns.
     - `drift(t, q, parameters)`: ν, shape (nq,); default zero.
     """
@@ -87,7 +87,7 @@ class QuasiVelocityFrame(AbstractKinematics):
     def count(self, nq):
         if not 0 < self.columns <= nq:
             raise ValueError(
-                f"A frame has at least one column and at most as many as coordinates, {nq}; got {self.columns}."
+                f"A frame must have at least one column and at most one per coordinate, {nq}; got {self.columns}."
             )
         return self.columns
 
@@ -103,7 +103,7 @@ class QuasiVelocityFrame(AbstractKinematics):
 
 
 class Connection(AbstractKinematics):
-    """Velocities are the rates of some coordinates r, the base; a connection gives those of the others, the fibre.
+    """Velocities are the rates of some coordinates r, the base; a connection gives the rates of the others, the fibre.
 
     ```python
     slope = lambda t, q, p: jnp.array([[-jnp.tan(q[2]), 0.0]])  # ẏ = tan(angle) ẋ, of (x, y, angle).
@@ -116,7 +116,7 @@ class Connection(AbstractKinematics):
 
     **Arguments:**
 
-    - `base`, `fibre`: indices of the coordinates r and s, all of them together.
+    - `base`, `fibre`: indices of the coordinates r and s, together all coordinates.
     - `matrix(t, q, parameters)`: A, shape (fibre, base).
     - `drift(t, q, parameters)`: a, shape (fibre,); default zero.
     """

@@ -1,4 +1,4 @@
-"""The equations of a Lagrangian system in any velocities, and the ways to write them, before its structure is known."""
+"""The equations of a Lagrangian system in any velocities, and their forms, before its structure is known."""
 
 import abc
 import dataclasses
@@ -31,11 +31,11 @@ else:
 
 
 class AbstractEquations(eqx.Module):
-    """A way to write `M u̇ = F + Aᵀ λ`; all ways give the same F."""
+    """A form of `M u̇ = F + Aᵀ λ`; all forms give the same F."""
 
     @abc.abstractmethod
     def check(self, system: "AbstractLagrangian") -> None:
-        """Raise a `ValueError` for a system that the equations cannot be written for."""
+        """Raise a `ValueError` for a system that does not admit this form."""
 
     @abc.abstractmethod
     def force(self, system: "AbstractLagrangian", t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nu"]:
@@ -43,13 +43,13 @@ class AbstractEquations(eqx.Module):
 
 
 class AbstractLagrangian(AbstractSystem):
-    """The functions of a Lagrangian system, and every kernel that follows from them by automatic differentiation.
+    """The functions of a Lagrangian system, and the kernels that follow by automatic differentiation.
 
-    **Fields:** those that `LagrangianSystem` takes; `lagrangian(t, q, v, parameters)`; `applied`, the forces without
+    **Fields:** the arguments of `LagrangianSystem`; `lagrangian(t, q, v, parameters)`; `applied`, the forces without
     potential, or None; `constraints`, ordered by level; `sizes`, the number of rows of each.
 
-    `inputs` are the parameters that are functions of time; `known`: of classes of the user's what they compute, as
-    it was when the system was made. `diagonal` says whether the mass matrix is diagonal and constant.
+    `inputs`: the parameters that are functions of time; `known`: the traces of users' classes from when the system was
+    made; `diagonal`: whether the mass matrix is diagonal and constant.
     """
 
     lagrangian: Callable[..., Array] = eqx.field(static=True)
@@ -130,13 +130,13 @@ class AbstractLagrangian(AbstractSystem):
 
     def parameters_at(self, t: Scalar) -> Parameters:
         """The parameters at a time, the last argument of every function."""
-        driven = ((name, x) for own in self.inputs for name, x in zip(own.names, own.at(t), strict=True))
+        driven = ((name, x) for group in self.inputs for name, x in zip(group.names, group.at(t), strict=True))
         return self.parameters | {name: jnp.asarray(x, self.parameters[name].dtype) for name, x in driven}
 
-    def kernel(self, own: Any, name: str) -> Callable[..., Array]:
+    def kernel(self, item: Any, name: str) -> Callable[..., Array]:
         """A method of a constraint, of a non-ideal force or of the kinematics."""
-        known = dict(self.known).get(type(own))
-        return getattr(own, name) if known is None else functools.partial(known, own)
+        trace = dict(self.known).get(type(item))
+        return getattr(item, name) if trace is None else functools.partial(trace, item)
 
     def value(self, constraint: AbstractCoordinateConstraint, t: Scalar, *motion: Array) -> Array:
         """The residual of a constraint, from coordinates, rates and accelerations."""
@@ -180,8 +180,8 @@ class AbstractLagrangian(AbstractSystem):
             mine = jnp.array([name == law.constraint for name, _ in self.rows])
             reaction = self._on_coordinates(t, q, v, jnp.where(mine, multipliers, 0.0))
             first = [name for name, _ in self.rows].index(law.constraint)
-            own = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
-            total = total + self.kernel(law, "force")(t, q, v, reaction, own, self.parameters_at(t))
+            law_multipliers = multipliers[first : first + sum(name == law.constraint for name, _ in self.rows)]
+            total = total + self.kernel(law, "force")(t, q, v, reaction, law_multipliers, self.parameters_at(t))
         return pull(total)[0]
 
     def _on_coordinates(self, t, q, v, multipliers):
@@ -221,7 +221,7 @@ class AbstractLagrangian(AbstractSystem):
         return self.equations.force(self, jnp.asarray(t, q.dtype), q, u)
 
     def applied_force(self, t: Scalar, q: Coordinates, v: Float[Array, "nq"]) -> Float[Array, "nq"]:
-        """Q, the generalized forces on the coordinates that have no potential."""
+        """Q, the generalized forces without potential on the coordinates."""
         return jnp.zeros_like(v) if self.applied is None else jnp.asarray(self.applied(t, q, v, self.parameters_at(t)))
 
     # Energy
@@ -272,12 +272,12 @@ class AbstractLagrangian(AbstractSystem):
         if self.diagonal:
             left_out.append("factorisation of the mass matrix: it is diagonal")
         if self.applied is None:
-            left_out.append("forces besides those of the Lagrangian: there are none")
+            left_out.append("forces besides the Lagrangian's: there are none")
         return Description(tuple(facts), tables, remarks(self, left_out))
 
 
 class Unanalysed(AbstractLagrangian):
-    """A Lagrangian system without its structure, whose programs serve before that is known and afterwards."""
+    """A Lagrangian system without its structure; its programs serve before and after the structure is known."""
 
     diagonal: ClassVar[bool] = False
     positive_definite_mass: ClassVar[bool] = False
@@ -292,9 +292,9 @@ class Unanalysed(AbstractLagrangian):
 
 
 class Projected(AbstractEquations):
-    """Lagrange's equations in the coordinates, projected on the directions that velocities move them in: the default.
+    """Lagrange's equations in the coordinates, projected on the directions of the velocities: the default.
 
-    For any kinematics, also nonlinear ones. The cheapest way: two derivatives of L, and one of the kinematics.
+    For any kinematics, also nonlinear. The cheapest form: two derivatives of L, and one of the kinematics.
     """
 
     def check(self, system):

@@ -1,8 +1,8 @@
 """Non-ideal constraint forces, which do virtual work.
 
-A constraint that is not ideal exerts the force `Aᵀ λ + C`: its reaction, which does no work in displacements that the
-constraints allow, and a force C, which does. C may depend on the reaction, and is then solved for with it. What C has
-along the gradients of the constraint the reaction balances, and has that much less itself.
+A non-ideal constraint exerts the force `Aᵀ λ + C`. Its reaction `Aᵀ λ` does no work in admissible displacements; C
+does. C may depend on the reaction; both are then solved for together. Components of C along the constraint's gradients
+only reduce the reaction.
 """
 
 import abc
@@ -28,8 +28,8 @@ else:
 class AbstractNonIdealForce(eqx.Module):
     """The force C of one constraint.
 
-    `constraint` is the name of the constraint, `coefficients` are the names of the system's parameters that the law
-    uses, and `of_multipliers` says whether C depends on the constraint's multipliers.
+    `constraint`: the name of the constraint; `coefficients`: the names of the system's parameters that the law uses;
+    `of_multipliers`: whether C depends on the constraint's multipliers.
     """
 
     constraint: AbstractVar[str]
@@ -88,10 +88,10 @@ class CoulombFriction(AbstractNonIdealForce):
     **Arguments:**
 
     - `coefficient`: name of μ among the parameters.
-    - `slip(t, q, v, parameters)`: velocity of slip [m/s], linear in v, shape (k,); default v, that of a particle in
+    - `slip(t, q, v, parameters)`: velocity of slip [m/s], linear in v, shape (k,); default v, for a particle in
         Cartesian coordinates.
     - `normal(t, q, multipliers, parameters)`: the normal force N [N]; default the length of the constraint's
-        generalized force, that of a particle in Cartesian coordinates.
+        generalized force, for a particle in Cartesian coordinates.
     - `transition_speed` [m/s], the slip at which 76 % of the friction acts.
     """
 

@@ -1,4 +1,4 @@
-"""The parameters of a Lagrangian system by name, and which are functions of time."""
+"""The parameters of a Lagrangian system by name, constant or functions of time."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,8 @@ from .dataflow import depends
 
 
 class DrivenParameters(eqx.Module):
-    """Parameters that are functions of time, several of one kind together, and whether constraints or the meaning of
-    velocities depend on them.
+    """Parameters that are functions of time, grouped by kind, and whether constraints or the kinematics depend on
+    them.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -54,7 +54,7 @@ class LagrangianParameters(ParameterTable):
 
 
 def _together(inputs: Mapping[str, tuple[AbstractSignal, bool]]) -> tuple[DrivenParameters, ...]:
-    """Inputs by name with inputs of one kind together."""
+    """Inputs by name, grouped by kind."""
     out = []
     for binds in (True, False):
         names = [name for name, signal in inputs.items() if signal[1] == binds]
@@ -66,7 +66,7 @@ def _together(inputs: Mapping[str, tuple[AbstractSignal, bool]]) -> tuple[Driven
 def _inputs_of(system: Any, signals: Mapping[str, AbstractSignal]) -> dict[str, tuple[AbstractSignal, bool]]:
     """Signals as inputs of a system, by name, and whether constraints depend on them.
 
-    **Raises:** `ValueError` for a value that jumps and that position constraints or rates of the coordinates depend on.
+    **Raises:** `ValueError` for a jumping value on which position constraints or rates of the coordinates depend.
     """
     q, u = system.guess.q, system.guess.u
     t = jnp.zeros((), q.dtype)

@@ -1,4 +1,4 @@
-"""Nonlinear quasi-velocities, and the forces that hold the dependent ones at zero."""
+"""Nonlinear quasi-velocities, and the forces that hold the dependent velocities at zero."""
 
 from collections.abc import Callable
 from typing import ClassVar
@@ -19,7 +19,7 @@ _ITERATIONS = 50
 
 
 class QuasiVelocities(AbstractKinematics):
-    r"""Velocities that are any functions of the rates, `ω = ω(t, q, q̇)`; those of them that are `dependent` are zero.
+    r"""Velocities that are any functions of the rates, `ω = ω(t, q, q̇)`; the `dependent` velocities are zero.
 
     ```python
     speed_and_heading = lambda t, q, v, p: jnp.array([jnp.hypot(v[0], v[1]) - p["speed"], jnp.arctan2(v[1], v[0])])
@@ -29,16 +29,16 @@ class QuasiVelocities(AbstractKinematics):
     particle = jaxmb.lagrangian.LagrangianSystem(**common, kinematics=held, u=[0.3], parameters={"speed": 1.0})
     ```
 
-    As many functions as coordinates, invertible for the rates. `ω_D = 0` are nonholonomic constraints, also nonlinear
-    ones; virtual displacements are those of Chetaev, along `∂q̇/∂ω_I`. The system's velocities u are the independent
-    ω_I, in their order. The inverse is found by Newton's method from the rates `near`, on whose side of a fold the
-    branch is taken, and differentiated as an implicit function.
+    There are as many functions as coordinates, invertible for the rates. `ω_D = 0` are nonholonomic constraints, also
+    nonlinear; virtual displacements are Chetaev's, along `∂q̇/∂ω_I`. The system's velocities u are the independent ω_I,
+    in their order. Newton's method finds the inverse from the rates `near`, which select the branch at a fold; the
+    inverse is differentiated as an implicit function.
 
     **Arguments:**
 
     - `omega(t, q, v, parameters)`: shape (nq,).
     - `dependent`: indices of the components that are zero.
-    - `near`: rates to begin Newton's method with, shape (nq,), or a function `near(t, q, omega, parameters)`, for
+    - `near`: start of Newton's method, rates of shape (nq,), or a function `near(t, q, omega, parameters)`, for
         branches that turn.
 
     **Reference:**
@@ -77,7 +77,7 @@ class QuasiVelocities(AbstractKinematics):
         return nq - len(self.dependent)
 
     def all_of(self, nq: int, u: Velocities) -> Float[Array, "nq"]:
-        """ω, from the independent ones."""
+        """ω, from the independent components."""
         return jnp.zeros(nq, u.dtype).at[np.delete(np.arange(nq), self.dependent)].set(u)
 
     def rates(self, t, q, u, parameters):
@@ -102,9 +102,9 @@ def _inverse(omega, t, q, target, parameters, near):
 
     far = lambda v, size: size > 8 * jnp.finfo(v.dtype).eps * (1.0 + jnp.max(jnp.abs(v)))
     v, size = newton(correct, far, near, most=_ITERATIONS, dtype=q.dtype)
-    # Where rounding keeps corrections a little larger the inverse is found as well.
-    found = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
-    return jnp.where(found, v, jnp.nan)
+    # The inverse is accepted also if rounding keeps corrections slightly larger.
+    converged = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
+    return jnp.where(converged, v, jnp.nan)
 
 
 @_inverse.def_jvp
@@ -112,9 +112,9 @@ def _inverse_jvp(primals, tangents):
     omega, t, q, target, parameters, near = primals
     _, dt, dq, dtarget, dparameters, _ = tangents
     v = _inverse(omega, t, q, target, parameters, near)
-    _, moved = eqx.filter_jvp(lambda t, q, p: omega(t, q, v, p), (t, q, parameters), (dt, dq, dparameters))
-    moved = jnp.zeros_like(v) if moved is None else moved
-    change = -moved if dtarget is None else dtarget - moved
+    _, drift = eqx.filter_jvp(lambda t, q, p: omega(t, q, v, p), (t, q, parameters), (dt, dq, dparameters))
+    drift = jnp.zeros_like(v) if drift is None else drift
+    change = -drift if dtarget is None else dtarget - drift
     return v, _solve(jax.jacfwd(omega, 2)(t, q, v, parameters), change)
 
 

@@ -29,7 +29,7 @@ from .model import AbstractLagrangian, Unanalysed
 
 # Number of sets of parameters at which the entries of the mass matrix are compared with zero.
 _LOOKS = 3
-# An equilibrated pivot below this power of eps is zero.
+# Equilibrated pivots below this power of eps count as zero.
 _ZERO = 0.5
 
 
@@ -43,7 +43,7 @@ def constraint_sizes(
 ) -> tuple[int, ...]:
     """The number of rows of each constraint, from shapes alone.
 
-    **Arguments:** `energies`: those that are given of `lagrangian`, `kinetic` and `potential`, by these names.
+    **Arguments:** `energies`: the given functions among `lagrangian`, `kinetic` and `potential`, by name.
 
     **Raises:** `ValueError` for functions of the wrong shape.
     """
@@ -53,9 +53,9 @@ def constraint_sizes(
     for name, energy in energies.items():
         if energy is None:
             continue
-        found = _shape(name, None, energy, t, q, *(() if name == "potential" else (q,)), p)
-        if math.prod(found) != 1:
-            raise ValueError(f"{name} must be a scalar, got shape {found}.")
+        shape = _shape(name, None, energy, t, q, *(() if name == "potential" else (q,)), p)
+        if math.prod(shape) != 1:
+            raise ValueError(f"{name} must be a scalar, got shape {shape}.")
     if applied is not None:
         _shape("force", (q.size,), applied, t, q, q, p)
     return tuple(math.prod(_shape(c.name, None, c.value, t, q, q, q, p)) for c in constraints)
@@ -75,7 +75,7 @@ def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[..., 
 
 
 def with_programs(system: Unanalysed) -> Unanalysed:
-    """A system whose functions have been checked, with these as JAX traces them now."""
+    """A system with its functions checked, and kept as JAX traces them now."""
     # Modules among the parameters are called by functions.
     parameters = system.parameters
     system, functions = with_captured(changed(system, parameters={}))
@@ -84,7 +84,7 @@ def with_programs(system: Unanalysed) -> Unanalysed:
     def evaluated(system: Unanalysed, t: Any, q: Any, u: Any) -> Any:
         v, p = system.rates(t, q, u), system.parameters
         sizes = {c.name: jnp.zeros(n, q.dtype) for c, n in zip(system.constraints, system.sizes, strict=True)}
-        # The law of a constraint or a coefficient that is not there is refused later.
+        # Laws of missing constraints or coefficients are refused later.
         laws = [law for law in system.nonideal if law.constraint in sizes and p.keys() >= set(law.coefficients)]
         return (
             system.lagrangian(t, q, v, p),
@@ -97,15 +97,15 @@ def with_programs(system: Unanalysed) -> Unanalysed:
     eqx.filter_eval_shape(evaluated, system, *given)
     for function in functions:
         function.keep()
-    parts = [(own, "value") for own in system.constraints] + [(own, "force") for own in system.nonideal]
-    own = {
+    parts = [(item, "value") for item in system.constraints] + [(item, "force") for item in system.nonideal]
+    programs = {
         type(part): Captured(getattr(type(part), name))
         for part, name in [*parts, (system.kinematics, "rates")]
         if is_of_user(part)
     }
-    system = changed(system, known=tuple(own.items()))
+    system = changed(system, known=tuple(programs.items()))
     eqx.filter_eval_shape(evaluated, system, *given)
-    for function in own.values():
+    for function in programs.values():
         function.keep()
     return system
 
@@ -129,12 +129,12 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     """Evaluate a system's functions at its guess, and eliminate.
 
     **Raises:** `ValueError` for an L without second derivatives in the rates, constraints that cannot be satisfied near
-    the guess, and laws of constraints that are not there, or whose own force is not determined.
+    the guess, and laws of missing constraints, or of constraints whose force is not determined.
     """
     q: Any = np.asarray(system.guess.q)
     u, p = np.asarray(system.guess.u), system.parameters
     t, host = np.zeros((), q.dtype), HostLagrangian(system, 0.0)
-    # A matrix that depends on where the system is might have other entries elsewhere.
+    # A matrix that depends on the coordinates may have other entries elsewhere.
     constant = system.kinematics.identity and not depends(jax.hessian(system.lagrangian, 2), (t, q, q, p), 0, 1, 2)
     rates, columns, masses = _evaluate(system, constant)
     _check_finite(system, rates, masses[0])
@@ -156,7 +156,7 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     if linear and system.velocity_rows:
         rows = slice(0, system.velocity_rows)
         _check_consistent(system, "velocities", jacobian[rows], -host.velocity_rows_at(q, u)[0], rows)
-    # Only rows that bind accelerations: the guess need not satisfy those that bind velocities.
+    # Only rows that bind accelerations: the guess need not satisfy rows that bind velocities.
     if system.acceleration_rows > system.velocity_rows:
         rows = slice(system.velocity_rows, system.acceleration_rows)
         _check_consistent(system, "accelerations", jacobian, np.asarray(_asked(system, q)), rows)
@@ -177,18 +177,18 @@ def find_structure(system: AbstractLagrangian) -> Structure:
 def _check_finite(system, rates, mass):
     if not np.all(np.isfinite(rates)):
         raise ValueError(
-            f"The velocities u = {system.guess.u.tolist()} are not invertible for the rates at "
-            f"q = {system.guess.q.tolist()}: no rates were found that belong to them."
+            f"The velocities u = {system.guess.u.tolist()} are not invertible for the rates at q = "
+            f"{system.guess.q.tolist()}: no rates were found for them."
         )
     if not np.all(np.isfinite(mass)) or not np.any(mass):
         raise ValueError(
-            f"The Lagrangian needs finite second derivatives with respect to the rates, and not all of them zero; at "
-            f"the guess they are {mass.tolist()}."
+            "The Lagrangian needs finite second derivatives with respect to the rates, not all zero; at the guess they "
+            f"are {mass.tolist()}."
         )
 
 
 def _met(system, host, start):
-    """The configuration where the constraints are met, without any program if NumPy finds it."""
+    """The configuration on the constraints; NumPy finds it without compilation if possible."""
     if not system.position_rows:
         return start
     q = host.met(start)
@@ -231,13 +231,13 @@ def _evaluate(system, constant):
 
 @eqx.filter_jit
 def _asked(system, q):
-    """What rows ask of accelerations at the given velocities."""
+    """The right-hand side of the rows for accelerations, at the given velocities."""
     u = system.guess.u
     return -system.acceleration_residual(jnp.zeros((), q.dtype), q, u, jnp.zeros_like(u))
 
 
 def _shaken(x: Array, share: Array, k: Array) -> Array:
-    """A parameter with each of its numbers changed by a different factor, about this share of it."""
+    """A parameter with each of its numbers changed by a different factor, by about this fraction."""
     return x * (1 + share * jnp.cos(k + jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape))
 
 
@@ -246,7 +246,7 @@ def _row_counts(system):
 
 
 def _rows_of(system, name):
-    return np.array([own == name for own, _ in system.rows], bool)
+    return np.array([row_name == name for row_name, _ in system.rows], bool)
 
 
 def _independent(jacobian):
@@ -267,7 +267,7 @@ def _check_consistent(
         return
     left_over = np.abs(right - jacobian @ np.linalg.lstsq(jacobian, right, rcond=None)[0])
     bound = left_over[rows] > 1e-8 * (1.0 + np.max(np.abs(right)))
-    wrong = dict.fromkeys(name for (name, _), own in zip(system.rows[rows], bound, strict=True) if own)
+    wrong = dict.fromkeys(name for (name, _), is_wrong in zip(system.rows[rows], bound, strict=True) if is_wrong)
     if wrong:
         raise ValueError(
             f"The constraints {', '.join(wrong)} contradict each other: no {what} satisfy them together at the guess."
@@ -275,9 +275,9 @@ def _check_consistent(
 
 
 def _check_nonideal(system: AbstractLagrangian, jacobian: np.ndarray, rank: int) -> None:
-    """Raise a `ValueError` unless every law is of a constraint whose force is determined.
+    """Raise a `ValueError` unless the force of every law's constraint is determined.
 
-    `rank` of all rows of A.
+    **Arguments:** `rank` of all rows of A.
     """
     names = [name for name, _ in system.rows]
     for law in system.nonideal:
@@ -292,5 +292,5 @@ def _check_nonideal(system: AbstractLagrangian, jacobian: np.ndarray, rank: int)
         if _independent(others).size + names.count(law.constraint) > rank:
             raise ValueError(
                 f"{type(law).__name__} of {law.constraint!r}: the force of this constraint is not determined, because "
-                "other constraints imply some of its rows. Leave the redundant ones out."
+                "other constraints imply some of its rows. Leave out the redundant rows."
             )

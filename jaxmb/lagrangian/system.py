@@ -22,7 +22,7 @@ from .model import AbstractEquations, AbstractLagrangian, Projected, Unanalysed
 from .nonideal import AbstractNonIdealForce
 from .structure import constraint_sizes, find_structure, with_programs
 
-# Names that a saved motion holds besides the coordinates, and the argument of `numpy.savez` that no array can have.
+# Further names in a saved motion, and the argument of `numpy.savez` that cannot name an array.
 _TAKEN = ("t", "q", "u", "energy", "file")
 _NOT_IN_FILES = "/\\:\0"
 
@@ -46,35 +46,35 @@ class LagrangianSystem(AbstractLagrangian):
     Bᵀ (d/dt ∂L/∂q̇ − ∂L/∂q − Q) = Aᵀ λ
     ```
 
-    Every term is found by automatic differentiation; structure functions of quasi-velocities appear only in equations
-    that are written with them.
+    Automatic differentiation gives every term; structure functions of quasi-velocities appear only in `Hamel()` and
+    `Voronets()`.
 
     All functions are JAX functions. Their last argument is the dictionary of the system's parameters by name.
 
     **Arguments:**
 
     - `lagrangian(t, q, v, parameters)`: L, with `v = q̇`; or instead
-    - `kinetic(t, q, v, parameters)` and `potential(t, q, parameters)`: energies [J], `L = T − V`; no potential if that
-        is not given.
+    - `kinetic(t, q, v, parameters)` and `potential(t, q, parameters)`: energies [J], `L = T − V`; the potential may be
+        left out.
     - `force(t, q, v, parameters)`: generalized forces Q without potential, shape (nq,).
     - `constraints`: `Holonomic`, `Nonholonomic`, `Pfaffian`, `AccelerationConstraint`, `ServoConstraint`; rows may
         imply others.
-    - `nonideal`: forces of constraints that do virtual work: `CoulombFriction`, `Viscous`, `NonIdealForce`.
+    - `nonideal`: constraint forces that do virtual work: `CoulombFriction`, `Viscous`, `NonIdealForce`.
     - `kinematics`: the meaning of u; default `Rates()`, u = q̇.
-    - `equations`: how they are written; default `Projected()`, as above, or `Hamel()`, `Voronets()`.
+    - `equations`: their form; default `Projected()`, as above, or `Hamel()`, `Voronets()`.
     - `q`, `u`: a state near the constraints, the guess for `assemble`; ranks are found there. Default u is zero.
     - `parameters`: numbers by name. An equinox module, such as a network, is called in the functions,
         `parameters["net"](v)`; its weights are one parameter, a vector, as in `Force`.
-    - `coordinates`: names of the coordinates, which a saved motion keeps them under, so no `t`, `q`, `u`, `energy`,
-        `file`, and no slashes; default `q0`, `q1`, ….
+    - `coordinates`: their names, default `q0`, `q1`, …. A saved motion uses them: not `t`, `q`, `u`, `energy` or
+        `file`, and without slashes.
     - `length`: the size that residuals of positions are relative to.
 
-    Functions count with the values that they read now: after a change of a global variable, make the system anew.
+    Functions keep the values that they read now: after a change of a global variable, make a new system.
 
-    **Raises:** `ValueError` for functions of the wrong shape, an L that is not twice differentiable in q̇, constraints
-    that no positions satisfy near the guess, constraints on velocities or accelerations that contradict others, a guess
-    at a singular position, where a row has no gradient or is implied by others, but not near it, friction of a
-    constraint that others imply, and names that are not unique.
+    **Raises:** `ValueError` for functions of the wrong shape; an L that is not twice differentiable in q̇; constraints
+    that no positions satisfy near the guess; contradictory constraints on velocities or accelerations; names that are
+    not unique; friction of a constraint that others imply; and a guess at a singular position, where a row has no
+    gradient or is implied by others, unlike nearby.
     """
 
     diagonal: bool = eqx.field(static=True)
@@ -132,9 +132,9 @@ class LagrangianSystem(AbstractLagrangian):
         self.equations.check(self)
 
     def on_host(self, t):
-        known = not is_traced((self, t)) and self.guess.q.dtype == np.float64
+        is_concrete = not is_traced((self, t)) and self.guess.q.dtype == np.float64
         small = 0 < self.acceleration_rows <= MOST and self.nq <= MOST
-        return HostLagrangian(self, t) if known and small else None
+        return HostLagrangian(self, t) if is_concrete and small else None
 
 
 def _number(name: str, value: Any) -> Array | ModuleWeights:
@@ -156,20 +156,20 @@ def _guess(q: VectorLike, u: VectorLike | None, kinematics: AbstractKinematics) 
 
 
 def _names(coordinates: Sequence[str] | None, count: int) -> tuple[str, ...]:
-    """The coordinates' names. They become names of files within the archive that `Trajectory.save` writes."""
+    """The coordinates' names, which become names of files in the archive of `Trajectory.save`."""
     names = tuple(f"q{k}" for k in range(count)) if coordinates is None else tuple(coordinates)
     for name in names:
         if not isinstance(name, str) or not name:
-            raise ValueError(f"A coordinate's name is a string that is not empty, got {name!r} in coordinates={names}.")
+            raise ValueError(f"A coordinate's name must be a non-empty string, got {name!r} in coordinates={names}.")
     if len(names) != count or len(set(names)) != count:
         raise ValueError(f"{count} coordinates need as many names, all different; got {names}.")
     for name in names:
         if f"{name}_rate" in names:
             raise ValueError(
-                f"'{name}_rate' is the name of the rate of {name!r}; choose another one for the coordinate."
+                f"'{name}_rate' is the name of the rate of {name!r}; choose another name for the coordinate."
             )
         if name in _TAKEN:
-            raise ValueError(f"In a saved motion {name!r} is something else; choose another name for the coordinate.")
+            raise ValueError(f"In a saved motion {name!r} has another meaning; choose another name for the coordinate.")
         if any(character in name for character in _NOT_IN_FILES) or name.startswith("."):
             raise ValueError(
                 f"The coordinate {name!r} cannot be saved under its name: leave out slashes, colons and leading dots."
@@ -181,13 +181,13 @@ def _lagrangian(lagrangian, kinetic, potential):
     if (lagrangian is None) == (kinetic is None):
         raise ValueError("A LagrangianSystem takes either `lagrangian` or `kinetic`, and `potential` with the latter.")
     if lagrangian is not None and potential is not None:
-        raise ValueError("`lagrangian` holds the potential energy already; pass `kinetic` to give it apart.")
+        raise ValueError("`lagrangian` already contains the potential energy; pass `kinetic` to give it separately.")
     return _Difference(kinetic if lagrangian is None else lagrangian, potential)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Difference:
-    """L = T − V, or L alone; equal for equal functions, so that another system of them is not compiled anew."""
+    """L = T − V, or L alone; equal for equal functions, so that a second system of them is not compiled again."""
 
     kinetic: Callable[..., Array]
     potential: Callable[..., Array] | None

@@ -1,13 +1,13 @@
-"""Transpositional relations: what is meant by the variation of a velocity.
+"""Transpositional relations: the definition of the variation of a velocity.
 
-Virtual displacements δq always satisfy the constraints. The variation of velocities may be defined as one likes,
+Virtual displacements δq always satisfy the constraints. The variation of velocities may be defined freely,
 
     δ(q̇) − d(δq)/dt = W(t, q; q̇, δq),
 
-bilinear in the last two, as long as the principle makes up for it: `∫ (δ_W L − p · W + Q · δq) dt = 0`. Hölder's
-choice is W = 0: varied motions violate the constraints. With Suslov's they satisfy them. All give the same equations of
-motion, those of Lagrange and d'Alembert; without the term p · W they would be those of a variational problem with
-constraints (vakonomic), which are others.
+bilinear in the last two, if the principle compensates for it: `∫ (δ_W L − p · W + Q · δq) dt = 0`. With Hölder's
+choice, W = 0, varied motions violate the constraints; with Suslov's they satisfy them. All choices give the equations
+of Lagrange and d'Alembert. Without the term p · W, the different equations of a variational problem with constraints
+(vakonomic) would result.
 
 Source: J. Papastavridis, Analytical Mechanics, World Scientific, 2014, §3.8; A. M. Bloch, Nonholonomic Mechanics and
 Control, Springer, 2015.
@@ -33,7 +33,7 @@ def check_shape(transposition: Callable[..., Array], q: Array, parameters: Param
 
 
 def share_of_suslov(transposition: Transposition) -> float | None:
-    """The number that stands for a transposition, None for a function.
+    """The number of a transposition, None for a function.
 
     **Raises:** `ValueError` for other words.
     """

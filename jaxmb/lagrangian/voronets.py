@@ -26,8 +26,8 @@ class Voronets(AbstractEquations):
     d/dt ∂L_c/∂ṙ^α − ∂L_c/∂r^α + A^a_α ∂L_c/∂s^a = p_b (W^b_α − B^b_α) − p_b W^b_α + Q_α − A^a_α Q_a
     ```
 
-    `B_α = B_αβ ṙ^β + B_α0` is the curvature of the connection, time being one more coordinate of the base. Constraining
-    L first and forgetting B is the classical mistake.
+    `B_α = B_αβ ṙ^β + B_α0` is the curvature of the connection, with time as a further base coordinate. Constraining L
+    first and forgetting B is the classical mistake.
 
     **Arguments:** `transposition`: as in `Hamel`; with `"suslov"`, W = B, varied velocities satisfy the constraints.
 
@@ -47,7 +47,7 @@ class Voronets(AbstractEquations):
         share_of_suslov(self.transposition)
 
     def check(self, system):
-        # A concrete class: only it has a base, a fibre and the curvature that the equations are written with.
+        # A concrete class: only it has a base, a fibre and the curvature of these equations.
         if not isinstance(system.kinematics, Connection):
             raise ValueError(
                 f"Voronets' equations need kinematics=Connection(...), got {type(system.kinematics).__name__}."
@@ -64,8 +64,8 @@ class Voronets(AbstractEquations):
         columns = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
         along = lambda fn: jax.vmap(lambda x: jax.jvp(fn, (q,), (x,))[1], in_axes=1, out_axes=1)(columns)
         # B_αβ ṙ^β + B_α0 = d A_α / dt along the motion less the change of ṡ, as a function of q alone, along column α.
-        _, moved = jax.jvp(A, (t, q), (one, v))
-        curvature = moved + along(lambda q: system.rates(t, q, u)[fibre])
+        _, matrix_rate = jax.jvp(A, (t, q), (one, v))
+        curvature = matrix_rate + along(lambda q: system.rates(t, q, u)[fibre])
 
         at = system.parameters_at
         constrained = lambda t, q, u: system.lagrangian(t, q, system.rates(t, q, u), at(t))

@@ -63,7 +63,7 @@ from .rough_ring import rough_ring as rough_ring
 from .tracking_chain import tracking_chain as tracking_chain
 from .spherical_four_bar import spherical_four_bar as spherical_four_bar
 
-# Those that are decorated as mechanisms.
+# The functions decorated as mechanisms.
 _LIBRARY: dict[str, Callable[..., Mechanism]] = {
     name: function for name, function in globals().items() if hasattr(function, "__wrapped__")
 }
@@ -80,7 +80,7 @@ def get(name: str, **parameters: Any) -> Mechanism:
 
     **Arguments:** `name`, one of `names()`; `parameters` of that mechanism, by keyword.
 
-    **Raises:** `ValueError` for an unknown name, with the nearest one, and for an unknown parameter.
+    **Raises:** `ValueError` for an unknown name, with the nearest name, and for an unknown parameter.
     """
     if name not in _LIBRARY:
         raise unknown("mechanism", name, names())

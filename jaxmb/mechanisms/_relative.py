@@ -46,7 +46,7 @@ class RelativeInertia(AbstractInertia):
 
 
 def velocities(u: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """Velocities of the vehicles, from the first one's and the rates of extension."""
+    """Velocities of the vehicles, from the first vehicle's and the rates of extension."""
     return jnp.cumsum(jnp.concatenate([u[:1], -u[1:]]), axis=0)
 
 
@@ -66,11 +66,11 @@ class _TrainParameters(ParameterTable):
 
 
 class RelativeTrain(AbstractSystem):
-    """A train on a straight track; every number a leaf.
+    """A train on a straight track; every number is a leaf.
 
     **Fields:** `mass` [kg], shape (n,); `couplers`, a draft gear whose numbers have shape (n − 1,); `law(t, v,
-    numbers)`, the forces [N] on vehicles at absolute velocities v [m/s], and its `numbers`, by part and field, of shape
-    (n,), or () for those of all vehicles; `slope` [m/s²], the acceleration of gravity along the track, backwards;
+    numbers)`, the forces [N] on vehicles at absolute velocities v [m/s]; its `numbers` by part and field, shape (n,),
+    or () if all vehicles share a number; `slope` [m/s²], the acceleration of gravity along the track, backwards;
     `guess`; `length` [m].
     """
 
@@ -138,7 +138,7 @@ class RelativeTrain(AbstractSystem):
         return 0.5 * jnp.sum(self.mass * velocities(u) ** 2)
 
     def potential_energy(self, t, q):
-        # Positions along the track up to a constant, that of couplers without extension.
+        # Positions along the track up to the constant part, of couplers without extension.
         return jnp.sum(self.couplers.stored(q[1:])) + self.slope * jnp.sum(self.mass * velocities(q))
 
     def coordinate_scale(self):

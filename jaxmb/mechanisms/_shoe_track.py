@@ -17,15 +17,15 @@ from .ride import PREFIXES
 
 # Distance [m] of the tensioner's fixed end before the idler in its design position.
 _TENSIONER = 0.5
-# How far [m] the idler may stand from its design position to fit a number of shoes.
+# Largest distance [m] of the idler from its design position to fit a number of shoes.
 _REACH = 0.2
-# How long [s] a vehicle comes to rest before it starts, and the number of steps that this may take.
+# Time [s] in which a vehicle comes to rest before it starts, and the largest number of steps.
 _SETTLING, _STEPS = 1.0, 100_000
 
 
 @dataclasses.dataclass(frozen=True)
 class Shoes:
-    """A track of rigid shoes on pins, for `tracked_vehicle(track=Shoes(...))`. One body stands for a left and right
+    """A track of rigid shoes on pins, for `tracked_vehicle(track=Shoes(...))`. One body represents a left and right
     pair.
 
     ```python
@@ -34,14 +34,13 @@ class Shoes:
     ```
 
     Shoes touch sprocket, idler and wheels on their inner side and at the corners between them, and the ground at two
-    points, a quarter of their pitch from their middle. Stiffness and damping are those of one shoe, not of a length of
-    track.
+    points, a quarter of their pitch from their middle. Stiffness and damping are per shoe, not per length of track.
 
-    **Fields:** `number` of shoes, default the one for which the idler stands closest to its design position; `pitch`
-    [m], the distance of their pins, and `height` [m]; `mass` [kg] of a shoe; radii [m] and masses [kg] of `sprocket`
-    and `idler`, which are discs; `rim_stiffness` [N/m] of the contact of shoes with these and with wheels;
-    `sprocket_friction`, the coefficient there, which stands for the sprocket's teeth; `ground_damping` [N s/m] under a
-    shoe; `pin_damping` [N m s/rad]; `tensioner_damping` [N s/m].
+    **Fields:** `number` of shoes, default with the idler closest to its design position; `pitch` [m], the distance of
+    their pins, and `height` [m]; `mass` [kg] of a shoe; radii [m] and masses [kg] of `sprocket` and `idler`, which are
+    discs; `rim_stiffness` [N/m] of the contact of shoes with these and with wheels; `sprocket_friction`, the
+    coefficient on the sprocket, which models its teeth; `ground_damping` [N s/m] under a shoe; `pin_damping` [N m
+    s/rad]; `tensioner_damping` [N s/m].
     """
 
     number: int | None = None
@@ -61,7 +60,7 @@ class Shoes:
     def __post_init__(self):
         if self.number is not None and not isinstance(self.number, int | np.integer):
             raise ValueError(f"Shoes: number must be an integer, got {self.number!r}.")
-        # With other numbers no track can be laid; those of bodies and forces are checked there.
+        # Without these numbers no track can be laid; bodies and forces check theirs.
         for name in ("pitch", "height", "sprocket_radius", "idler_radius"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"Shoes: {name} must be positive and finite, got {getattr(self, name)!r}.")
@@ -72,9 +71,9 @@ def shoe_track(
 ):
     """Bodies, joints and forces of a track around discs of a hull, taut and without sag.
 
-    **Arguments:** `place`, of the hull; `sprocket`, `idler` [m] in the hull; `wheels` [m], centres in the world, of
-    `radius` [m], front one first; `stiffness` [N/m] and `pretension` [N] along the loop, both of which the tensioner
-    has; `friction` with its transition `speed`, and `damping`, of wheels and idler on shoes.
+    **Arguments:** `place`, of the hull; `sprocket`, `idler` [m] in the hull; `wheels` [m], centres in the world, front
+    wheel first, of `radius` [m]; `stiffness` [N/m] and `pretension` [N] along the loop, both by the tensioner;
+    `friction` with its transition `speed`, and `damping`, of wheels and idler on shoes.
     """
     p, hull = prefix, f"{prefix}hull"
     offset, pins = laid(shoes, place + sprocket, place + idler, wheels, radius)
@@ -89,8 +88,8 @@ def shoe_track(
     inertia = planar.box(shoes.mass, shoes.pitch, shoes.height)
     for name, start, end in zip(names, pins, ends, strict=True):
         way = end - start
-        own = {"position": (start + end) / 2, "angle": np.arctan2(way[1], way[0])}
-        bodies.append(planar.Body(name, mass=shoes.mass, inertia=inertia, **own))
+        pose = {"position": (start + end) / 2, "angle": np.arctan2(way[1], way[0])}
+        bodies.append(planar.Body(name, mass=shoes.mass, inertia=inertia, **pose))
 
     half = (shoes.pitch / 2, 0.0)
     spring = 4 * stiffness
@@ -99,7 +98,7 @@ def shoe_track(
         planar.PointOnLine(f"{p}slide", hull, f"{p}idler", point_a=idler, point_b=(0.0, 0.0), axis_a=(1.0, 0.0)),
     ]
     forces: list[Any] = [
-        # The idler moves by half of what it gives to the loop, against the tension of both strands.
+        # The idler moves by half of the length that it gives to the loop, against the tension of both strands.
         planar.SpringDamper(
             f"{p}tensioner",
             hull,
@@ -119,12 +118,12 @@ def shoe_track(
         (f"{p}idler", shoes.idler_radius, friction),
         *((f"{p}wheel{k}", radius, friction) for k in range(1, len(wheels) + 1)),
     ]
-    for body, own, coefficient in rims:
+    for body, rim_radius, coefficient in rims:
         forces.append(
             planar.PlateContact(
                 f"{body}_rim",
                 (body, *names),
-                radius=own,
+                radius=rim_radius,
                 start=(-half[0], shoes.height / 2),
                 end=(half[0], shoes.height / 2),
                 edge=shoes.pitch / 4,
@@ -138,33 +137,33 @@ def shoe_track(
 
 
 def running(system, guess, speed):
-    """The state in which a vehicle on tracks of shoes has come to rest, nearly, and then moves forward, with wheels
-    that roll and shoes that lie on the ground.
+    """The state of a vehicle on tracks of shoes, from near rest, that moves forward with rolling wheels and shoes that
+    lie on the ground.
 
-    Without drive, shoes hang down and vehicle and tracks lose their motion in a second. Dry friction is regularised,
-    so that they go on to creep: of equilibria in which friction holds the shoes there are many.
+    Without drive, shoes hang down, and vehicle and tracks lose their motion in a second. They go on to creep, since dry
+    friction is regularised: there are many equilibria in which friction holds the shoes.
     """
-    names, known = system.body_names, parameters(system)
-    still = undriven(system)
-    start = assemble(still, State(guess.q, jnp.zeros_like(guess.u)))
-    q = simulate(still, start, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
-    discs = {name: _rolling_radius(name, known) for name in names if f"{name}_rim.radius" in known}
+    names, values = system.body_names, parameters(system)
+    undriven_system = undriven(system)
+    start = assemble(undriven_system, State(guess.q, jnp.zeros_like(guess.u)))
+    q = simulate(undriven_system, start, t1=_SETTLING, rtol=1e-4, max_steps=_STEPS).ys.q[-1]
+    discs = {name: _rolling_radius(name, values) for name in names if f"{name}_rim.radius" in values}
     radii = jnp.stack([discs.get(name, jnp.ones(())) for name in names])
     turn = jnp.where(np.array([name in discs for name in names]), -speed / radii, 0.0)
     u = jnp.stack([jnp.full_like(turn, speed), jnp.zeros_like(turn), turn], axis=1)
     for p in PREFIXES:
-        own = np.array([k for k, name in enumerate(names) if name.startswith(f"{p}shoe")])
-        if own.size:
-            pitch = -2 * known[f"{p}idler_rim.start"][0]
-            u = u.at[own].add(_circulation(q.reshape(-1, 3)[own], speed, pitch))
+        places = np.array([k for k, name in enumerate(names) if name.startswith(f"{p}shoe")])
+        if places.size:
+            pitch = -2 * values[f"{p}idler_rim.start"][0]
+            u = u.at[places].add(_circulation(q.reshape(-1, 3)[places], speed, pitch))
     return assemble(system, State(q, u.reshape(-1)))
 
 
-def _rolling_radius(name, known):
-    """Distance per angle [m/rad] that a disc's track runs: straight under wheels, and around sprocket and idler as a
-    polygon whose sides touch the disc with their middle.
+def _rolling_radius(name, values):
+    """Length of track per angle [m/rad] of a disc: straight under wheels, and around sprocket and idler a polygon whose
+    sides touch the disc in their middle.
     """
-    radius, (start, height) = known[f"{name}_rim.radius"], known[f"{name}_rim.start"]
+    radius, (start, height) = values[f"{name}_rim.radius"], values[f"{name}_rim.start"]
     return radius if "wheel" in name else -start / jnp.arctan2(-start, radius + height)
 
 
@@ -175,7 +174,7 @@ def undriven(system):
 
 
 def _circulation(poses, speed, pitch):
-    """Velocities of a track's shoes that run through its own shape at a speed [m/s], backwards along the ground, from
+    """Velocities of shoes that run through the shape of their track at a speed [m/s], backwards along the ground; from
     their poses, both of shape (shoes, 3), and their pitch [m].
     """
     turn = lambda v: jnp.stack([-v[:, 1], v[:, 0]], axis=1)
@@ -188,9 +187,9 @@ def _circulation(poses, speed, pitch):
 
 
 def laid(shoes, sprocket, idler, wheels, radius):
-    """How far the idler stands behind its design position, and the pins of the taut loop, counter-clockwise."""
+    """The distance of the idler behind its design position, and the pins of the taut loop, counter-clockwise."""
     radii = np.array([shoes.sprocket_radius, shoes.idler_radius, *[radius] * len(wheels)]) + shoes.height / 2
-    # Around sprocket and idler shoes touch with their middle, and pins stand farther out.
+    # Around sprocket and idler, shoes touch in their middle, and pins lie farther out.
     radii[:2] = np.hypot(radii[:2], shoes.pitch / 2)
 
     def loop(offset):
@@ -234,7 +233,7 @@ class _Loop:
         return ahead
 
     def number(self, pitch):
-        """How many chords fit around, with the fraction of the last one."""
+        """The number of chords that fit around, including the fraction of the last chord."""
         s, n = 0.0, 0
         while (ahead := self.next(s, pitch)) <= self.lengths[-1]:
             s, n = ahead, n + 1

@@ -3,8 +3,8 @@ Lagrangian, or as rigid bodies.
 
 Coordinates: x, y of the middle of the rear axle, its heading θ, and the angle φ of the front platform against it.
 Parameters: `mass`, `inertia` and `ahead` of the rear platform, its mass centre ahead of its axle; `front_mass`,
-`front_inertia` and `front_ahead` of the front one; `pivot`, of the pin ahead of the rear axle, and `handle`, of the
-front axle ahead of the pin.
+`front_inertia` and `front_ahead` of the front platform; `pivot`, of the pin ahead of the rear axle, and `handle`, of
+the front axle ahead of the pin.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def build_wheeled(
     model: Model,
     as_bodies: Callable[[dict[str, Any]], dict[str, Any]] = lambda parameters: parameters,
 ) -> Mechanism:
-    """Such a mechanism, in one of its models.
+    """A mechanism of two wheeled platforms, in one of its models.
 
     **Arguments:** `start`: the angle φ [rad], speed [m/s] and turning rate [rad/s]; `form`, `equations` and `model` as
     in `roller_racer`; `as_bodies`: the parameters of its rigid bodies, from those of its Lagrangian.
@@ -157,7 +157,7 @@ def wheels(t, q, p):
 
 
 def connection(t, q, p):
-    """Of x, y over θ, φ; singular where the platforms are in line."""
+    """Rates of x, y over rates of θ, φ; singular where the platforms are in line."""
     along = jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
     return -along[:, None] * jnp.stack([_lever(q[3], p), p["handle"]])[None, :] / jnp.sin(q[3])
 

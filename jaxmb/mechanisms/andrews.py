@@ -20,7 +20,7 @@ _ANGLES = (
     -0.222668390165885884674473185609,
     1.23054744454982119249735015568,
 )
-# Mass [kg], moment of inertia [kg m²], mass centre [m] in a frame with its origin in the first of the body's points.
+# Mass [kg], moment of inertia [kg m²], and mass centre [m] in a frame with its origin in the body's first point.
 _BODIES = {
     "K1": (0.04325, 2.194e-6, (0.00092, 0.0)),
     "K2": (0.00365, 4.410e-7, (-0.0115, 0.0)),
@@ -69,12 +69,12 @@ def andrews(
     Source: G. C. Andrews and M. K. Ormrod, "Advent: a simulation program for constrained planar kinematic and dynamic
     systems", ASME 86-DET-97, 1986; data of W. Schiehlen (ed.), "Multibody Systems Handbook", Springer 1990, as in F.
     Mazzia and C. Magherini, "Test Set for Initial Value Problem Solvers", 2008. The reference values were recomputed in
-    extended precision in two formulations: the end values printed in the test set are right to ten digits in the angles
-    and to seven in their rates.
+    extended precision in two formulations: the end values printed in the test set are correct to ten digits in the
+    angles and to seven in their rates.
 
     **Arguments:** `problem`: `"ivp"`, the test set's start and 0.03 s, or `"iftomm"`, problem A03 of the IFToMM library
     with 0.05 s; `torque` [N m] on K1; `stiffness` [N/m] and `free_length` [m] of the spring; `angle` [rad] of K1 at the
-    start, default that of the problem (−0.0617… or −0.0620).
+    start, default from the problem (−0.0617… or −0.0620).
 
     **Labels:** the test set's angles [rad] `beta`, `Theta`, `gamma`, `Phi`, `delta`, `Omega`, `epsilon` and their rates
     [rad/s] `d_beta`, …; `F_x`, `F_y` [m], the crank's pin.

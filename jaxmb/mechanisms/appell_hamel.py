@@ -26,7 +26,7 @@ def appell_hamel(
     """A particle whose vertical velocity is held in proportion to its horizontal speed: ż = a √(ẋ² + ẏ²).
 
     Coordinates: x, y, z [m], z up, the start in the origin. It moves on a straight line, slower and slower; at rest the
-    constraint has no gradient, and the motion cannot be continued.
+    constraint has no gradient, and the motion cannot continue.
 
     Source: P. Appell, Exemple de mouvement d'un point assujetti à une liaison exprimée par une relation non linéaire
     entre les composantes de la vitesse, Rend. Circ. Mat. Palermo 32, 1911. Reference values in closed form.

@@ -24,12 +24,12 @@ def bennett(
 ) -> Mechanism:
     """Four hinges on skew axes, a loop with one degree of freedom although the count of rows leaves −2; y up.
 
-    Links of length a and twist α alternate with links of length b and twist β, `b sin α = a sin β`; the ground is one
-    of the latter, with the input axis z in the origin and the output axis at (−b, 0, 0). Input θ and output φ, measured
-    from x, obey `tan(θ/2) tan(φ/2) = sin((α + β)/2) / sin((β − α)/2)`.
+    Links of length a and twist α alternate with links of length b and twist β, `b sin α = a sin β`. The ground is a
+    link of length b, with the input axis z in the origin and the output axis at (−b, 0, 0). Input θ and output φ,
+    measured from x, obey `tan(θ/2) tan(φ/2) = sin((α + β)/2) / sin((β − α)/2)`.
 
     Source: G. T. Bennett, A new mechanism, Engineering 76, 1903; data of this package. The reference values come from
-    the energy of a model with one coordinate, and from that relation.
+    the energy of a model with one coordinate, and from this relation.
 
     **Arguments:** `lengths` a and b [m]; `twist` β [degree], α is acute; `masses` [kg] of the moving links, uniform
     round rods of radius `section` [m]; `angle` θ [rad] and `speed` [rad/s] of the input at the start; `gravity` [m/s²].

@@ -17,8 +17,8 @@ def bricard(*, length: float = 1.0, mass: float = 1.0, section: float = 0.1, gra
     although the count of rows leaves none; y up, released from rest.
 
     Source: problem A04 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics. The reference
-    values were computed in two joint angles with the loop closed in closed form, in extended precision, and with all
-    five.
+    values were computed in two joint angles with the loop closed in closed form, in extended precision, and in all five
+    joint angles.
 
     **Arguments:** `length` [m] and `mass` [kg] of a bar, `section` [m], edge of its square cross-section; `gravity`
     [m/s²].

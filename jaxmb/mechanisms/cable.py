@@ -27,11 +27,11 @@ def cable(
 
     It hangs from the origin and from `(span, 0, 0)`. At the start it is at rest on a circular arc, a polygon of equal
     sides and equal angles, in a plane at 0.5 rad from the vertical: swung to the side of positive y. Every rod is free
-    to turn about its own axis, which nothing sets in motion. Of the `6 n` velocities `3 n - 3` are free.
+    to turn about its axis, but nothing turns it. Of the `6 n` velocities `3 n - 3` are free.
 
     With the turn α from one rod to the next, a polygon of n sides l spans `l Σ cos((k - (n + 1) / 2) α)`, k = 1 … n,
-    which falls from `n l` to zero while α grows from zero to `2 π / n`; α is found by bisection. The tests
-    check the motion by equations of its own, in the directions of the rods.
+    which falls from `n l` to zero while α grows from zero to `2 π / n`; α is found by bisection. The tests check the
+    motion by independent equations in the directions of the rods.
 
     **Arguments:** `n` ≥ 2, the number of rods; `length` [m] and `mass` [kg] of the whole cable; `span` [m], the
     distance of its ends, less than its length; `radius` [m] of the rods; `gravity` [m/s²].
@@ -39,7 +39,7 @@ def cable(
     **Labels:** `x`, `y`, `z` [m] and `vx`, `vy`, `vz` [m/s] of the middle of the cable: a joint if n is even, the
     centre of a rod if it is odd.
 
-    **Raises:** `ValueError` for less than two rods, and for ends that are not apart or that the cable cannot reach.
+    **Raises:** `ValueError` for less than two rods, and for ends that coincide or are out of reach.
     """
     if n < 2:
         raise ValueError(f"cable needs n ≥ 2 rods, got {n}.")
@@ -77,7 +77,7 @@ def cable(
 
 
 def _turn(n, sides):
-    """The turn [rad] from side to side of a polygon of n equal sides whose ends are so many sides apart."""
+    """The turn [rad] from side to side of a polygon of n equal sides whose ends are `sides` sides apart."""
     apart = lambda turn: np.sum(np.cos((np.arange(n) - (n - 1) / 2) * turn))
     low, high = 0.0, 2 * np.pi / n
     for _ in range(60):

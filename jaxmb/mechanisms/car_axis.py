@@ -25,9 +25,8 @@ def car_axis(
     """A chassis on two stiff springs, one wheel on a flat road and the other on a bumpy one.
 
     Two point masses `left` and `right` of `mass epsilon² / 2`, joined by a massless bar, on springs of unit stiffness
-    over the wheels (0, 0) and (x_b, y_b), `y_b = amplitude sin(frequency t)`, `x_b = √(length² − y_b²)`; the left
-    spring stays perpendicular to the line between the wheels: `x_l x_b + y_l y_b = 0`, a constraint that depends on
-    time.
+    over the wheels (0, 0) and (x_b, y_b), `y_b = amplitude sin(frequency t)`, `x_b = √(length² − y_b²)`. The left
+    spring stays perpendicular to the line between the wheels, a rheonomic constraint: `x_l x_b + y_l y_b = 0`.
 
     Source: S. Schneider, "Intégration de systèmes d'équations différentielles raides et différentielles-algébriques par
     des méthodes de collocations et méthodes générales linéaires", thesis, Genève 1994, as in F. Mazzia and C.
@@ -90,6 +89,6 @@ def _observe(trajectory, length):
         observed |= columns((f"x{letter}", f"y{letter}"), motion.position)
         observed |= columns((f"x{letter}1", f"y{letter}1"), motion.velocity)
     observed["lam1"] = trajectory.reactions["upright"].multipliers[:, 0]
-    # The row of a rod is its constraint over twice the length, so that its multiplier is a force.
+    # A rod's row is its constraint over twice the length, so that its multiplier is a force.
     observed["lam2"] = trajectory.reactions["axle"].multipliers[:, 0] / (2 * length)
     return observed

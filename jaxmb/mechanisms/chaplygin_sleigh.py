@@ -12,8 +12,7 @@ from .observe import columns, point_motion
 def chaplygin_sleigh(
     *, mass: float = 2.0, inertia: float = 0.5, distance: float = 0.3, speed: float = 1.0, spin: float = 2.0
 ) -> Mechanism:
-    """A sleigh on a horizontal plane with one blade behind its mass centre: it straightens out although nothing
-    dissipates.
+    """A sleigh on a horizontal plane with one blade behind its mass centre: it straightens out without dissipation.
 
     Source: S. A. Chaplygin, "On the theory of motion of nonholonomic systems. The reducing-multiplier theorem", Mat.
     Sb. 28(2), 1911. The reference values are the closed form `v = V tanh(kt + c)`, `ω = V/√J sech(kt + c)`, `k = aV/J`,

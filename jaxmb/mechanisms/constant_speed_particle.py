@@ -34,9 +34,8 @@ def constant_speed_particle(
     values in closed form, with Gudermann's function: φ = gd(C − g t / c).
 
     **Arguments:** `speed` c [m/s]; `steepness` C, with φ = gd(C) at the start; `gravity` [m/s²]; `mass` [kg]; `form`:
-    `"constraint"`, with the coordinates' rates as velocities, or `"quasi"`, with the heading φ as the only one, from
-    the nonlinear quasi-velocities |q̇| − c and φ;
-    `model`: from its Lagrangian, or as a point mass `particle`.
+    `"constraint"`, with the coordinates' rates as velocities, or `"quasi"`, with the heading φ as the only velocity,
+    from the nonlinear quasi-velocities |q̇| − c and φ; `model`: from its Lagrangian, or as a point mass `particle`.
 
     **Labels:** `x`, `y` [m], and the velocities `u0`, …: [m/s], or the heading [rad].
     """

@@ -56,13 +56,12 @@ def double_wishbone(
 
     Source: data of this package. The reference values, for hinges, come from a model in the lower arm's angle.
 
-    **Arguments:** `points`: positions [m] by name that replace the default ones: `lower_front`, `lower_rear`,
-    `lower_ball`, `upper_front`, `upper_rear`, `upper_ball`, `rack`, `steering_arm`, `wheel`, `spring_top`,
-    `spring_bottom`, the latter on the lower arm; `masses` [kg] of lower arm, upper arm, and upright with wheel;
-    `stiffness` [N/m] and `damping` [N s/m] of the spring; `tyre` [N/m], vertical stiffness; `speed` [m/s] of the
-    wheel's centre at the start, upward; `gravity` [m/s²]; `joints` of arms and car; `bushing` [N/m, N m/rad], against
-    shifts and turns in all directions, default 5·10⁶ and 20, and `bushing_damping` [N s/m, N m s/rad], default 2·10³
-    and 0.1.
+    **Arguments:** `points`: positions [m] by name that replace defaults: `lower_front`, `lower_rear`, `lower_ball`,
+    `upper_front`, `upper_rear`, `upper_ball`, `rack`, `steering_arm`, `wheel`, `spring_top`, `spring_bottom`, the
+    latter on the lower arm; `masses` [kg] of lower arm, upper arm, and upright with wheel; `stiffness` [N/m] and
+    `damping` [N s/m] of the spring; `tyre` [N/m], vertical stiffness; `speed` [m/s] of the wheel's centre at the start,
+    upward; `gravity` [m/s²]; `joints` of arms and car; `bushing` [N/m, N m/rad], against shifts and turns in all
+    directions, default 5·10⁶ and 20, and `bushing_damping` [N s/m, N m s/rad], default 2·10³ and 0.1.
 
     **Labels:** `z`, `y` [m], travel of the wheel's centre, up and outward; `camber` [rad], top outward; `toe` [rad],
     front inward; `rate` [m/s], ż.
@@ -117,7 +116,7 @@ def double_wishbone(
 
 
 def _arm(name, mass, P):
-    """A triangular plate, with the inertia of a square one."""
+    """A triangular plate, with the inertia of a square plate."""
     place = (P[f"{name}_front"] + P[f"{name}_rear"] + P[f"{name}_ball"]) / 3
     return spatial.Body(name, mass=mass, inertia=spatial.box(mass, 0.3, 0.3, 0.03), position=place)
 

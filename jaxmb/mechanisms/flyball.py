@@ -30,8 +30,8 @@ def flyball(
 
     The shaft, 1 m high, stands in the origin on its axis z. The arms, 1 m long, hang on hinges along the shaft's y axis
     at (±0.05, 0, 1) m in its frame, and point away from the axis, α below the horizontal. A spring and a damper act
-    between the middle of each arm and the point (±0.05, 0, s) m of the cube, s the height of its centre; they are 0.5 m
-    long and free of force at the start, where all parts turn together. Shaft and arms are bars of 0.01 m × 0.01 m, the
+    between the middle of each arm and the point (±0.05, 0, s) m of the cube, s the height of its centre. They are 0.5 m
+    long and free of force at the start, and all parts turn together. Shaft and arms are bars of 0.01 m × 0.01 m, the
     cube has 0.1 m, their density is 3000 kg/m³; the balls are points at the arms' ends. The fastest motion of the
     springs decays at 8100 / s, the slowest at 20 / s.
 
@@ -41,8 +41,8 @@ def flyball(
     **Arguments:** `stiffness` [N/m] and `damping` [N s/m] of each spring; `ball` [kg], mass of a ball; `angle` α [rad],
     between 0 and π/2, and `speed` [rad/s] of the shaft, at the start; `gravity` [m/s²].
 
-    **Labels:** `cos`, `sin` of the shaft's angle, zero at the start; `alpha` [rad] of `arm1`, the one at +x; `s` [m];
-    `omega` [rad/s] of the shaft; `alpha_dot` [rad/s]; `s_dot` [m/s].
+    **Labels:** `cos`, `sin` of the shaft's angle, zero at the start; `alpha` [rad] of `arm1`, at +x; `s` [m]; `omega`
+    [rad/s] of the shaft; `alpha_dot` [rad/s]; `s_dot` [m/s].
     """
     z = np.array([0.0, 0.0, 1.0])
     rod, cube = _DENSITY * _ARM * _SECTION**2, _DENSITY * _CUBE**3

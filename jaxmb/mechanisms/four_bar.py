@@ -63,7 +63,7 @@ def four_bar(
 
 
 def circles_meet(B, D, coupler, rocker):
-    """The intersection of circles about B and D to the left of the way from B to D, or the point nearest to both."""
+    """The intersection of circles about B and D to the left of the line from B to D, or the point nearest to both."""
     d = D - B
     distance = np.hypot(*d)
     along = (coupler**2 - rocker**2 + distance**2) / (2 * distance)

@@ -23,9 +23,8 @@ def hanging_chain(
     """n equal masses on massless rods hang from the origin, released in the shape of a mode; y up.
 
     Small oscillations of the k-th mode have the frequency `√(g x_k / l)`, with l the length of a rod and x_k the k-th
-    zero of Laguerre's polynomial L_n, and in it the masses are displaced in proportion to `L_j(x_k)`, j counted from
-    the lowest. For many masses the frequencies are those of a chain, `j_k √(g / length) / 2`, j_k the zeros of
-    Bessel's J_0.
+    zero of Laguerre's polynomial L_n. The masses are displaced in proportion to `L_j(x_k)`, j counted from the lowest.
+    For many masses the frequencies tend to a chain's, `j_k √(g / length) / 2`, with the zeros j_k of Bessel's J_0.
 
     Source: D. Bernoulli, Theoremata de oscillationibus corporum filo flexili connexorum et catenae verticaliter
     suspensae, Comm. Acad. Sci. Petropol. 6, 1738. The reference values, of large oscillations, come from a model in the

@@ -28,10 +28,10 @@ def heavy_top(
 
     **Arguments:** `mass` [kg]; `distance` [m] from the tip to the mass centre; `inertia` [kg m²] about the mass centre,
     across and along the axis, shape (2,); `tilt` θ [rad], `precession` dψ/dt [rad/s] and `spin` ω₃ [rad/s] about its
-    own axis at the start, with dθ/dt = 0; `gravity` [m/s²].
+    axis at the start, with dθ/dt = 0; `gravity` [m/s²].
 
     **Labels:** `xc`, `yc`, `zc` [m], the mass centre; `e0` … `e3`, Euler parameters from the body frame, whose third
-    axis is that of the top; `w1`, `w2`, `w3` [rad/s], angular velocity in the body frame.
+    axis is the top's; `w1`, `w2`, `w3` [rad/s], angular velocity in the body frame.
     """
     across, along = inertia
     p = np.asarray(rotations.from_axis_angle((1.0, 0.0, 0.0), tilt))

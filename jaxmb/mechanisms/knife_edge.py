@@ -19,8 +19,8 @@ def knife_edge(
     spin: float = 2.0,
     gravity: float = 9.81,
 ) -> Mechanism:
-    """A blade on an inclined plane, turning steadily about the plane's normal: it does not slide down but to the side,
-    on a cycloid. x points down the incline, y along the contour.
+    """A blade on an inclined plane, turning steadily about the plane's normal: it slides not down but sideways, on a
+    cycloid. x points down the incline, y along the contour.
 
     Source: Ju. I. Neimark and N. A. Fufaev, "Dynamics of Nonholonomic Systems", AMS 1972, ch. II. The reference values
     are the closed form `x = a sin² ωt`, `y = a (ωt − ½ sin 2ωt)`, `a = g sin α / 2ω²`.

@@ -36,12 +36,12 @@ def longitudinal_train(
     gravity: float = 9.81,
     t1: float = 3.0,
 ) -> Mechanism:
-    """An emergency stop of a train of n vehicles that move along a straight track only, in relative coordinates.
+    """An emergency stop of a train of n vehicles on a straight track, in relative coordinates.
 
-    Coordinates are the position `x1` of the leading vehicle and the extensions `y1`, `y2`, … of the couplers. So slack
-    loses no digits in a long train, and tolerances are relative to it. (To stop 300 vehicles with a mean error of 500 N
-    in the coupler forces takes rtol 1e-4 and 14000 steps; in positions along the track, 4 km long, it takes rtol 1e-7
-    and about as many steps, and rtol 1e-6 leaves 5000 N.) Otherwise as `train`, without pitch.
+    Coordinates are the position `x1` of the leading vehicle and the extensions `y1`, `y2`, … of the couplers. Slack
+    thus loses no digits in a long train, and tolerances are relative to it. A stop of 300 vehicles with a mean error of
+    500 N in the coupler forces takes rtol 1e-4 and 14000 steps. In positions along the track, 4 km long, it takes rtol
+    1e-7 and about as many steps; rtol 1e-6 leaves 5000 N. Otherwise as `train`, without pitch.
 
     Source: V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974.
 
@@ -49,8 +49,8 @@ def longitudinal_train(
 
     - `n` ≥ 1, the number of vehicles; `coupler(name, front, rear, free_length=)`: makes a draft gear.
     - `mass` [kg], `speed` [m/s] and `brake` [N], of all vehicles or of each, shape (n,).
-    - `extension` [m] of all couplers or of each at the start, shape (n − 1,); `spacing` [m] of the vehicles without it,
-        for the delay of the brakes.
+    - `extension` [m] of all couplers or of each at the start, shape (n − 1,); `spacing` [m] of the vehicles without
+        extension, for the delay of the brakes.
     - the others as in `train`.
 
     **Labels:** `x1` [m]; `y1`, … [m]; `v1`, `v2`, … [m/s] of the vehicles; `F1`, … [N], the tensions of the couplers.

@@ -35,9 +35,9 @@ class References:
     - `times` [s]: ascending, shape (times,).
     - `labels`: names of the quantities, as in `Mechanism.observe`.
     - `values`: shape (times, labels), in SI units.
-    - `source`: where they come from.
-    - `tolerance`: the relative error up to which the values can be trusted.
-    - `sizes` of the labels that errors are relative to, shape (labels,); default the largest value of each.
+    - `source` of the values.
+    - `tolerance`: relative accuracy of the values.
+    - `sizes` of the labels, the scales of relative errors, shape (labels,); default the largest value of each.
     """
 
     times: np.ndarray
@@ -99,25 +99,25 @@ class Mechanism:
     start: Callable[[Any, State], State] | None = None
 
     def errors(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
-        """Relative errors against the references, by label, at every reference time that the trajectory was saved at.
+        """Relative errors against the references, by label, at every saved reference time.
 
-        Errors are relative to the largest reference value of their label.
+        Errors are relative to `references.scales`: the sizes of the labels, by default their largest reference values.
 
-        **Raises:** `ValueError` if there are no references, or none of their times was saved.
+        **Raises:** `ValueError` if there are no references, or the trajectory saved none of their times.
         """
         if self.references is None:
             raise ValueError(f"There are no reference values for {self.name!r} with these parameters.")
         times, saved = self.references.times, np.asarray(trajectory.ts)
         near = np.isclose(saved[None, :], times[:, None], rtol=0.0, atol=1e-12 * max(1.0, float(times[-1])))
-        own, where = np.nonzero(near)
-        if own.size == 0:
+        rows, where = np.nonzero(near)
+        if rows.size == 0:
             raise ValueError(
                 f"The trajectory of {self.name!r} was saved at none of the reference times {times.tolist()}; "
                 "use simulate(..., saveat=mechanism.references.times)."
             )
         observed = self.observe(trajectory)
         return {
-            label: np.abs(np.asarray(observed[label])[where] - self.references.values[own, k]) / scale
+            label: np.abs(np.asarray(observed[label])[where] - self.references.values[rows, k]) / scale
             for k, (label, scale) in enumerate(zip(self.references.labels, self.references.scales, strict=True))
         }
 
@@ -125,16 +125,16 @@ class Mechanism:
         """The same motion with another end `t1` [s], and the reference values up to there."""
         if not 0 < t1 < float("inf"):
             raise ValueError(f"t1 must be positive and finite, got {t1:g}.")
-        known = self.references
-        if known is not None:
-            keep = known.times <= t1
-            own = dataclasses.replace(known, times=known.times[keep], values=known.values[keep])
-            known = own if keep.any() else None
-        return dataclasses.replace(self, t1=float(t1), references=known)
+        references = self.references
+        if references is not None:
+            keep = references.times <= t1
+            kept = dataclasses.replace(references, times=references.times[keep], values=references.values[keep])
+            references = kept if keep.any() else None
+        return dataclasses.replace(self, t1=float(t1), references=references)
 
     def with_parameters(self, values: Mapping[str, VectorLike]) -> "Mechanism":
-        """The same mechanism with some parameters replaced and the state computed anew near the present one; also
-        under `jit`.
+        """The same mechanism with some parameters replaced and the state recomputed near the present state; also under
+        `jit`.
 
         **Arguments:** `values`: new numbers by name, as in `jaxmb.with_parameters`.
         """
@@ -190,7 +190,7 @@ def build(
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
-    # A concrete class: only a scene has parts to build on, and is still to be compiled.
+    # A concrete class: only a scene has parts to extend, and must be compiled.
     parts = scene if isinstance(scene, Scene) else None
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
@@ -201,8 +201,8 @@ def build(
 def is_rigid(model: Model, **defaults: bool) -> bool:
     """Whether to build a scene of rigid bodies instead of a system from a Lagrangian.
 
-    **Arguments:** `defaults`: for every parameter that chooses the form of the Lagrangian's equations, whether it has
-    its default value.
+    **Arguments:** `defaults`: whether each parameter that selects the form of the Lagrangian's equations has its
+    default value.
 
     **Raises:** `ValueError` for an unknown model, and for rigid bodies with a form of the Lagrangian's equations.
     """
@@ -210,5 +210,5 @@ def is_rigid(model: Model, **defaults: bool) -> bool:
         raise ValueError(f"The models are {', '.join(get_args(Model))}; got {model!r}.")
     chosen = [name for name, default in defaults.items() if not default]
     if model == "rigid_bodies" and chosen:
-        raise ValueError(f"model='rigid_bodies' has no Lagrangian to write: leave out {', '.join(chosen)}.")
+        raise ValueError(f"model='rigid_bodies' has no Lagrangian: leave out {', '.join(chosen)}.")
     return model == "rigid_bodies"

@@ -17,9 +17,10 @@ def n_four_bar(
 
     One degree of freedom, θ from upright: `I θ̈ = P g sin θ / l` with `I = (n + 1)/3 + n`, `P = (n + 1)/2 + n`. Where
     all bars lie in one line, at odd multiples of π/2, the rows lose rank and other motions branch off. Steps pass over
-    these positions and stay on their branch, because the prediction is much closer to it than to any other. Steps end
-    at a distance from them, since round-off is divided by its cube. At rtol 1e-11 and below no distance that a step can
-    cross is far enough: steps become tiny, and the motion ends there with a result that reports it.
+    these positions and stay on their branch, because the prediction is much closer to it than to any other branch.
+    Steps keep a distance from these positions, since round-off is divided by the cube of the distance. At rtol 1e-11
+    and below, no step can cross the necessary distance: steps become tiny, and the motion ends with a result that
+    reports this.
 
     Source: problem A02 of the IFToMM Library of Computational Benchmark Problems for multibody dynamics (1 m, 1 kg,
     1 m/s, 10 s). The reference values, for n = 2, come from the equation above.

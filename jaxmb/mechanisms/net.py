@@ -14,13 +14,13 @@ def net(*, n: int = 4, m: int = 4, spacing: float = 1.0, mass: float = 1.0, grav
 
     Knot (i, j), i = 1 … n and j = 1 … m, starts at `((i - 1) spacing, (j - 1) spacing, 0)`, and a rod connects it with
     each of its neighbours in the grid. Knots (1, 1) and (n, 1) hang from ground points at the height `spacing` above
-    them, on rods of that length. Rods carry tension and compression alike, and may pass through each other.
+    them, on rods of this length. Rods carry tension and compression alike, and may pass through each other.
 
-    Meshes are squares without diagonals, so that no rod follows from the others, also while all are in one plane: the
-    `2 n m - n - m + 2` rows are independent there, and leave `n m + n + m - 2` of the `3 n m` velocities free. The
-    motion is symmetric about the plane `x = (n - 1) spacing / 2`.
+    Meshes are squares without diagonals. Thus the `2 n m - n - m + 2` rows are independent, also while all rods are in
+    one plane, and leave `n m + n + m - 2` of the `3 n m` velocities free. The motion is symmetric about the plane `x =
+    (n - 1) spacing / 2`.
 
-    The tests check it by equations of its own for the forces in the rods.
+    The tests check it by independent equations for the forces in the rods.
 
     **Arguments:** `n`, `m` ≥ 2, the numbers of knots along x and y; `spacing` [m] of the knots; `mass` [kg] of one
     knot; `gravity` [m/s²].

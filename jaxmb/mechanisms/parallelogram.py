@@ -23,7 +23,7 @@ def parallelogram(
 ) -> Mechanism:
     """Parallel rockers of equal length that carry a coupler: every rocker after the second is redundant; y up.
 
-    It can move only because the rockers are exactly equal. An `offset` moves the last rocker's ground pin, and three
+    It can move only because the rockers are exactly equal. With an `offset` of the last rocker's ground pin, three
     rockers lock.
 
     **Arguments:** `rockers` ≥ 2; `offset` [m] of the last ground pin along x; length of a `rocker` and `spacing` of the

@@ -42,16 +42,16 @@ def vertical_rms(trajectory: Trajectory, seat: VectorLike = (0.5, 0.4), *, unit:
 
 def arm_travel(trajectory: Trajectory, *, unit: int = 1) -> Float[Array, "times wheels"]:
     """Angles [rad] of the road arms in the hull from the middle between their stops; wheels upwards are negative."""
-    p, known = PREFIXES[unit - 1], parameters(trajectory.system)
+    p, values = PREFIXES[unit - 1], parameters(trajectory.system)
     hull = trajectory[f"{p}hull"].angle
     arms = [name for name in trajectory.system.body_names if name.startswith(f"{p}arm")]
-    middle = [0.5 * (known[f"{p}stop{k}.lower"] + known[f"{p}stop{k}.upper"]) for k in range(1, len(arms) + 1)]
+    middle = [0.5 * (values[f"{p}stop{k}.lower"] + values[f"{p}stop{k}.upper"]) for k in range(1, len(arms) + 1)]
     return jnp.stack([trajectory[arm].angle - hull - angle for arm, angle in zip(arms, middle, strict=True)], axis=1)
 
 
 def wheel_loads(trajectory: Trajectory) -> Float[Array, "times wheels"]:
-    """Vertical forces [N] of the ground, or of the shoes of a track, on the wheels, those of the leading carrier first,
-    damping included.
+    """Vertical forces [N] of the ground, or of a track's shoes, on the wheels, including damping; the leading carrier
+    first.
     """
     rims = [name for name in trajectory.system.catalogue.force_names() if name.endswith("_rim") and "wheel" in name]
     if rims:
@@ -64,8 +64,8 @@ def track_tension(trajectory: Trajectory, *, unit: int = 1) -> Float[Array, "tim
 
     **Raises:** `ValueError` if the track has no shoes.
     """
-    own = f"{PREFIXES[unit - 1]}pin"
-    rows = [k for k, (name, _) in enumerate(trajectory.system.rows) if name.startswith(own)]
+    prefix = f"{PREFIXES[unit - 1]}pin"
+    rows = [k for k, (name, _) in enumerate(trajectory.system.rows) if name.startswith(prefix)]
     if not rows:
         raise ValueError('track_tension needs the pins of shoes: tracked_vehicle(track="shoes").')
     forces = trajectory.multipliers[..., jnp.array(rows)]

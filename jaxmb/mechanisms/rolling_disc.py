@@ -30,11 +30,11 @@ def rolling_disc(
     cos θ, sin θ)` the axle and `e₃ = e₁ × e₂` points from the contact to the centre; ω₁, ω₂, ω₃ are the components of
     the angular velocity along them. Steady motion needs `m g r sin θ + (C + m r²) ω₂ ω₃ = A ω₃² tan θ`.
 
-    Source: E. J. Routh, "Advanced Dynamics of a System of Rigid Bodies", 1905, §244. The reference values are those of
-    the steady circle, in closed form.
+    Source: E. J. Routh, "Advanced Dynamics of a System of Rigid Bodies", 1905, §244. The reference values are the
+    steady circle, in closed form.
 
-    **Arguments:** `mass` [kg]; `radius` [m]; `lean` θ [rad] at the start, with ψ = 0; `roll` ω₂ [rad/s], default that
-    of steady motion; `turn` ω₃ [rad/s]; `pitch` ω₁ [rad/s], the rate of the lean; `gravity` [m/s²].
+    **Arguments:** `mass` [kg]; `radius` [m]; `lean` θ [rad] at the start, with ψ = 0; `roll` ω₂ [rad/s], default steady
+    motion; `turn` ω₃ [rad/s]; `pitch` ω₁ [rad/s], the rate of the lean; `gravity` [m/s²].
 
     **Labels:** `xc`, `yc` [m], the centre, from (0, 0); `theta` [rad]; `cos_psi`, `sin_psi`; `w1`, `w2`, `w3` [rad/s].
     """

@@ -21,7 +21,7 @@ def rough_ring(
     gravity: float = 0.0,
     model: Model = "lagrangian",
 ) -> Mechanism:
-    """A bead slides on a ring with Coulomb friction in proportion to the ring's own force on it.
+    """A bead slides on a ring with Coulomb friction in proportion to the ring's force on it.
 
     Coordinates: x, y [m], the ring's centre in the origin; the bead starts at (radius, 0), upward. Without gravity the
     speed falls as v0 / (1 + μ v0 t / R).
@@ -80,6 +80,6 @@ def _references():
         labels=("x", "y", "u0", "u1"),
         values=np.concatenate([place, speed[:, None] * along], axis=1),
         source="closed form",
-        # The library's friction is smooth near rest, and the whole at these speeds.
+        # The library's friction is smooth near rest, and complete at these speeds.
         tolerance=1e-12,
     )

@@ -24,8 +24,8 @@ def spatial_loop(
 ) -> Mechanism:
     """The linkage of `four_bar` in space, with four parallel hinges and a base that is a body welded to the ground.
 
-    Spatial hinges hold the bars in their plane redundantly: of the 30 rows between 28 coordinates (26 of
-    joints, 4 of Euler parameters) three follow from the others, and one degree of freedom is left.
+    Spatial hinges hold the bars in their plane redundantly: of the 30 rows (26 of joints, 4 of Euler parameters) on 28
+    coordinates, three follow from the others, which leaves one degree of freedom.
 
     Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989, example 10.1.1 (the
     count).

@@ -27,7 +27,7 @@ def spatial_slider_crank(
 
     Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989, §10.2, with the masses of
     the test `sliderCrank3Dbenchmark` of EXUDYN. The reference values come from a model with one coordinate, checked by
-    one with four coordinates and three multipliers, in extended precision.
+    a model with four coordinates and three multipliers, in extended precision.
 
     **Arguments:** lengths of `crank` and `rod` [m]; `centre` [m], y and z of A, shape (2,); `masses` [kg] of crank, rod
     and slider, shape (3,); `speed` [rad/s] of the crank at the start; `gravity` [m/s²].

@@ -42,12 +42,11 @@ def spherical_four_bar(
     Source: J. R. Dooley and J. M. McCarthy, on the dynamics of spherical four-bar linkages with the Euler parameters of
     the coupler; data of this package. Reference values from DOP853 on the equation of motion in θ alone.
 
-    **Arguments:** `arcs` [degree] of input, coupler, output and ground; `inertias` [kg m²] of input and output
-    about their axes; `coupler_inertia` [kg m²] about the sphere's centre, in its frame; `masses` [kg] and mass
-    `centres` [m] of input, coupler and output in their frames; `torque` [N m] on the input; `angle` θ [rad] and
-    `speed` θ̇ [rad/s] at the start; `branch` of the assembly, 1 or −1; `gravity` [m/s²] along −y;
-    `model`: from its Lagrangian, or as rigid bodies `input`, `coupler` and `output` on four hinges through the centre,
-    three of whose twenty rows others imply.
+    **Arguments:** `arcs` [degree] of input, coupler, output and ground; `inertias` [kg m²] of input and output about
+    their axes; `coupler_inertia` [kg m²] about the sphere's centre, in its frame; `masses` [kg] and mass `centres` [m]
+    of input, coupler and output in their frames; `torque` [N m] on the input; `angle` θ [rad] and `speed` θ̇ [rad/s] at
+    the start; `branch` of the assembly, 1 or −1; `gravity` [m/s²] along −y; `model`: from its Lagrangian, or as rigid
+    bodies `input`, `coupler` and `output` on four hinges through the centre, with three redundant rows among twenty.
 
     **Labels:** `theta`, `psi` [rad], of rigid bodies in (−π, π] and [0, 2π); `e0` … `e3`, and the rates `u0`, `u1`
     [rad/s], ….
@@ -88,8 +87,8 @@ def _lagrangian(parameters, q) -> LagrangianSystem:
 
 
 def _bodies(p, q) -> Scene:
-    """The links with their frames, and their inertia, at the sphere's centre, where hinges hold them; so weights have
-    points of their own.
+    """The links with their frames and inertia at the sphere's centre, where hinges hold them; their weights act at
+    separate points.
     """
     alpha, eta, beta, gamma = p["arcs"]
     z = np.array([0.0, 0.0, 1.0])
@@ -137,7 +136,7 @@ def _weight(poses, velocities, t, p):
 
 def _observe_bodies(trajectory):
     first, coupler, last = (trajectory[name] for name in ("input", "coupler", "output"))
-    # The output's axle is tilted by the ground arc: its Euler parameters are those of a turn about z after that.
+    # The output's axle is tilted by the ground arc, and then turned about z.
     axle = parameters_of(trajectory.system)["output_axle.axis_a"]
     tilt = rotations.from_axis_angle((1.0, 0.0, 0.0), jnp.arctan2(-axle[1], axle[2]))
     turned = jax.vmap(lambda p: rotations.multiply(rotations.conjugate(tilt), p))(last.orientation)
@@ -195,7 +194,7 @@ def _output(t, q, p):
 
 
 def _dyad(axis, angle, arc):
-    """A joint axis lies on a cone about z, and in the plane that turns with the angle."""
+    """The residual of a joint axis on a cone about z, in the plane that turns with the angle."""
     return jnp.stack([axis[2] - jnp.cos(arc), jnp.cos(angle) * axis[0] + jnp.sin(angle) * axis[1]])
 
 

@@ -24,13 +24,13 @@ def stiff_four_bar(
 
     It starts in the state of the rigid linkage, so the bushing bears no force at first and oscillates about the force
     of the rigid pivot. With the default values the displacement stays below 10⁻⁶ m; the frequencies at the start are
-    5.2·10³ and 1.13·10⁴ rad/s, with decay rates of 15 and 64 / s. As the stiffness grows the motion tends to that of
-    `four_bar`. The reference values come from an independent model, an open chain of three bars.
+    5.2·10³ and 1.13·10⁴ rad/s, with decay rates of 15 and 64 / s. As the stiffness grows the motion tends to the motion
+    of `four_bar`. The reference values come from an independent model, an open chain of three bars.
 
-    **Arguments:** `stiffness` [N/m] and `damping` [N s/m] of the bushing, the same in all directions of the plane, and
-    none against turning; the others as in `four_bar`.
+    **Arguments:** `stiffness` [N/m] and `damping` [N s/m] of the bushing, the same in all directions of the plane, none
+    in rotation; the others as in `four_bar`.
 
-    **Labels:** those of `four_bar`, and `pivot_x`, `pivot_y` [m], displacement of the rocker's end from D, which has no
+    **Labels:** as in `four_bar`, and `pivot_x`, `pivot_y` [m], displacement of the rocker's end from D, without
     reference values.
     """
     rigid = four_bar(lengths=lengths, base=base, masses=masses, angle=angle, speed=speed, gravity=gravity)

@@ -25,17 +25,17 @@ def swash_plate(
 ) -> Mechanism:
     """A plate on an inclined journal of a shaft drives pistons parallel to the shaft by rods; x along the shaft, z up.
 
-    A pin in a slot keeps a point of the plate in the plane of x and y, so that the plate wobbles and does not turn with
-    the shaft. Rods have ball joints at the plate and Cardan joints at the pistons. With three pistons, and the ground
+    A pin in a slot keeps a point of the plate in the plane of x and y: the plate wobbles and does not turn with the
+    shaft. Rods have ball joints at the plate and Cardan joints at the pistons. With three pistons, and the ground
     counted as a body, there are nine bodies with 63 coordinates and 62 rows: one degree of freedom.
 
     Source: the air compressor of E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", 1989,
     §10.4, with masses of this package. The reference values come from the energy of a model with one coordinate.
 
-    **Arguments:** `pistons` ≥ 1; `radius` [m] of their circle and that of the plate's joints; length of a `rod` [m];
-    `tilt` [rad] of the journal; `masses` [kg] of shaft, plate, a rod and a piston, shape (4,): the plate a thin disc,
-    rods slender; `shaft_inertia` [kg m²]; `speed` [rad/s] of the shaft at the start, `torque` [N m] on it; `gravity`
-    [m/s²].
+    **Arguments:** `pistons` ≥ 1; `radius` [m] of the circles of pistons and of the plate's joints; length of a `rod`
+    [m]; `tilt` [rad] of the journal; `masses` [kg] of shaft, plate, a rod and a piston, shape (4,): the plate a thin
+    disc, rods slender; `shaft_inertia` [kg m²]; `speed` [rad/s] of the shaft at the start, `torque` [N m] on it;
+    `gravity` [m/s²].
 
     **Labels:** `cos`, `sin` of the shaft's angle θ, zero at the start; `omega` [rad/s], its rate; `x1`, `x2`, … [m] and
     `v1`, `v2`, … [m/s] of the pistons.

@@ -34,19 +34,19 @@ def three_platform_snake(
 ) -> Mechanism:
     """Three platforms in a row, joined by pins, each with one axle in its middle whose wheels do not slip sideways.
 
-    Coordinates: x, y [m] of the middle platform, its heading θ, and φ1, φ2 [rad]: the rear platform's heading is θ
-    − φ1, the front one's θ + φ2. Three axles leave only the two velocities of the shape: a change of shape moves the
-    snake by a connection, and a closed path of shapes by a geometric phase. The connection is singular where the lines
-    of the axles meet in one point or are parallel, as where φ1 = φ2.
+    Coordinates: x, y [m] of the middle platform, its heading θ, and φ1, φ2 [rad]: the rear platform's heading is θ −
+    φ1, the front platform's θ + φ2. Three axles leave only the two velocities of the shape: a change of shape moves the
+    snake by a connection, and a closed path of shapes by a geometric phase. The connection is singular if the lines of
+    the axles meet in one point or are parallel, for example if φ1 = φ2.
 
     Source: P. S. Krishnaprasad and D. P. Tsakiris, G-Snakes: nonholonomic kinematic chains on Lie groups, Proc. 33rd
     IEEE CDC, 1994. Reference values from DOP853 on Voronets' equations, with a gait on the connection.
 
     **Arguments:** `mass` [kg], `inertia` [kg m²] and `half` length [m] of a platform; `angles` φ [rad] and `rates`
-    [rad/s] at the start, of a free motion; `gait(t)`: prescribes the angles, shape (2,), as a function of time;
-    `form`: the velocities are those of the shape, with the connection, or the coordinates' rates, with constraints (as
-    always with a gait); `equations`: how they are written, default `Projected()`; `model`: from its Lagrangian, or as
-    rigid bodies `rear`, `middle` and `front`.
+    [rad/s] at the start, of a free motion; `gait(t)`: prescribes the angles, shape (2,), as a function of time; `form`:
+    the velocities are the shape's, with the connection, or the coordinates' rates, with constraints (always with a
+    gait); `equations`: their form, default `Projected()`; `model`: from its Lagrangian, or as rigid bodies `rear`,
+    `middle` and `front`.
 
     **Labels:** `x`, `y` [m], `theta`, `phi1`, `phi2` [rad], and the velocities `u0`, `u1`, ….
     """

@@ -21,7 +21,7 @@ from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
 
-# Arm pivots of five wheels, in the hull [m]; of other numbers they lie evenly between the outer ones.
+# Arm pivots of five wheels, in the hull [m]; other numbers of pivots lie evenly between the outer two.
 _PIVOTS = np.array([(1.639, -0.487), (0.972, -0.487), (0.305, -0.487), (-0.362, -0.487), (-1.028, -0.487)])
 
 
@@ -62,34 +62,34 @@ def tracked_vehicle(
     hitch_damping: float = 2e4,
     gravity: float = 9.81,
 ) -> Mechanism:
-    """A tracked carrier that drives over a bump: a hull on trailing road arms with torsion bars and bump stops, road
-    wheels on compliant ground, and the track as an elastic loop around wheels, sprocket and idler, all of one radius;
-    3 + 2 n_wheels degrees of freedom. With `units=2` it tows another carrier by a hitch, which takes away two degrees
-    of freedom.
+    """A tracked carrier that drives over a bump, with 3 + 2 n_wheels degrees of freedom. The hull rests on trailing
+    road arms with torsion bars and bump stops, and road wheels on compliant ground. The track is an elastic loop around
+    wheels, sprocket and idler, all of one radius. With `units=2` it tows another carrier by a hitch, which removes two
+    degrees of freedom.
 
-    It starts in static equilibrium without drive, moving forward with wheels that roll. One body stands for a left and
+    It starts in static equilibrium without drive, moving forward with rolling wheels. One body represents a left and
     right pair; x is forward, y up.
 
-    With `track="shoes"` every shoe is a body. Shoes on pins run in a closed loop around a sprocket, which is driven,
-    an idler on a tensioner and the wheels, and touch these and the ground by compliant contact with friction; with n
-    shoes there are n + 6 + 2 n_wheels degrees of freedom. The shoes are laid around the discs without sag, hang down
-    and come nearly to rest by a simulation without drive, and start to run at the vehicle's speed.
+    With `track="shoes"` every shoe is a body. Shoes on pins run in a closed loop around a driven sprocket, an idler on
+    a tensioner and the wheels. Contact on these and on the ground is compliant, with friction. With n shoes there are n
+    + 6 + 2 n_wheels degrees of freedom. The shoes are laid around the discs without sag. A simulation without drive
+    brings them nearly to rest, hanging down, and then they run at the vehicle's speed.
 
     Source: the kind of vehicle of R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Dimension
     Reduction in Analysis of Constrained Dynamic Systems", J. Mech. Design 104(1), 1982, with 13 and 24 degrees of
-    freedom; dimensions and masses close to those of the M113 model of Project Chrono. The reference values were
-    computed in minimal coordinates by a Runge–Kutta method of order 8.
+    freedom; dimensions and masses close to the M113 model of Project Chrono. The reference values were computed in
+    minimal coordinates by a Runge–Kutta method of order 8.
 
-    **Arguments:** `n_wheels` ≥ 1; `track`: `"loop"`, `"shoes"`, or `Shoes(...)` with the numbers of such a track;
-    `speed` [m/s]; `torque` [N m], of the drive of each unit, shared by its wheels, or on its sprocket, with its
-    reaction on the hull; `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²], of
-    the arms default 1.54 and that of a rod; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and
-    below its pivot in the design position; `pivots` [m], shape (n_wheels, 2), `sprocket` and `idler` [m] in the hull;
-    torsion bars [N m/rad, N m s/rad], that carry the design load in the design position; stops at ± `stop_angle` [rad]
-    from there [N m/rad³]; track, of the length of the design position [N, N/m], of shoes by their tensioner; ground
-    under each wheel or shoe [N/m], with its damping [N s/m] under wheels, which with shoes acts between these and the
-    discs in them; `friction` with its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and
-    damping [N m/rad, N m s/rad]; `gravity` [m/s²].
+    **Arguments:** `n_wheels` ≥ 1; `track`: `"loop"`, `"shoes"`, or `Shoes(...)` with numbers; `speed` [m/s]; `torque`
+    [N m], of the drive of each unit, shared by its wheels, or on its sprocket, with its reaction on the hull;
+    `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²], of the arms default 1.54
+    and a rod's; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and below its pivot in the design
+    position; `pivots` [m], shape (n_wheels, 2), `sprocket` and `idler` [m] in the hull; torsion bars [N m/rad, N m
+    s/rad], that carry the design load in the design position; stops at ± `stop_angle` [rad] from there [N m/rad³];
+    track, of the length of the design position [N, N/m], of shoes by their tensioner; ground under each wheel or shoe
+    [N/m], with its damping [N s/m] under wheels, which with shoes acts between these and the discs in them; `friction`
+    with its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and damping [N m/rad, N m
+    s/rad]; `gravity` [m/s²].
 
     **Labels:** `x`, `y` [m], `phi` [rad] of the hull, `a1`, … [rad] of the arms from their design position, upwards
     negative; of the towed unit `rear_x`, ….
@@ -145,7 +145,7 @@ def tracked_vehicle(
             forces.append(planar.Track(f"{p}track", path, **loop))
             driven = (hull, *(f"{p}wheel{k}" for k in wheels))
         else:
-            own, pins, laws = shoe_track(
+            shoe_bodies, pins, laws = shoe_track(
                 shoes,
                 p,
                 place=place,
@@ -159,7 +159,7 @@ def tracked_vehicle(
                 speed=transition_speed,
                 damping=ground_damping,
             )
-            bodies, joints, forces = [*bodies, *own], [*joints, *pins], [*forces, *laws]
+            bodies, joints, forces = [*bodies, *shoe_bodies], [*joints, *pins], [*forces, *laws]
             driven = (hull, f"{p}sprocket")
         forces.append(Force(f"{p}drive", driven, _drive, parameters={"torque": torque}))
         place = place + np.asarray(hitch_rear) - np.asarray(hitch_front)
@@ -201,7 +201,7 @@ def _drive(poses, velocities, t, p):
 
 
 def _rolling(system, guess, speed):
-    """In static equilibrium without drive, moving forward with wheels that roll."""
+    """The state in static equilibrium without drive, moving forward with rolling wheels."""
     rest = equilibrium(undriven(system), guess, fix={"hull.x": 0.0})
     wheels = np.array(["wheel" in name for name in system.body_names])
     turn = jnp.where(wheels, -speed / parameters(system)["road.radius"], 0.0)

@@ -26,8 +26,8 @@ def tracking_chain(
     gains: tuple[float, float] = (0.0, 0.0),
     model: Model = "lagrangian",
 ) -> Mechanism:
-    """Three masses in a row on nonlinear springs, driven at the end, with a control force that makes two of them
-    follow a desired motion.
+    """Three masses in a row on nonlinear springs, driven at the end; a control force makes two of them follow a desired
+    motion.
 
     Coordinates: displacements q1, q2, q3 [m]; springs to the ground and between neighbours have the force k d + κ
     d³. The desired motion, q1 = 0.5 sin t and q3 − q1 = 0.2 cos 2t, is a servo constraint on accelerations; its force
@@ -114,6 +114,6 @@ def _observe(trajectory):
 def _observe_points(trajectory):
     places = {f"q{k + 1}": trajectory[name].position[:, 0] for k, name in enumerate(_MASSES)}
     rates = {f"u{k}": trajectory[name].velocity[:, 0] for k, name in enumerate(_MASSES)}
-    # The program's rows are of q1 and of q3 − q1.
+    # The program's rows are for q1 and q3 − q1.
     first, second = trajectory.reactions["track"].multipliers.T
     return places | rates | {"force1": first - second, "force3": second}

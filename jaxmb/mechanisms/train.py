@@ -51,10 +51,10 @@ def train(
     `brake_rise`.
 
     Tolerances are relative to positions along the track: at 10 km an rtol of 1e-6 is a centimetre, half the slack of a
-    coupler. Use smaller ones for long trains, or `longitudinal_train`.
+    coupler. Use smaller tolerances for long trains, or `longitudinal_train`.
 
     Source: after V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974; the numbers
-    are those of a loaded four-axle wagon, with a generic friction draft gear.
+    describe a loaded four-axle wagon with a generic friction draft gear.
 
     **Arguments:**
 
@@ -164,7 +164,7 @@ def davis(resistance: VectorLike) -> dict[str, float]:
 
 
 def check_train(n: int, **positive: float) -> None:
-    """Raise a `ValueError` for trains without vehicles, and for numbers that must be positive and are not."""
+    """Raise a `ValueError` for trains without vehicles, and for numbers that are not positive as required."""
     if n < 1:
         raise ValueError(f"A train needs n ≥ 1 vehicles, got {n}.")
     for name, value in positive.items():

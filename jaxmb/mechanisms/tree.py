@@ -26,13 +26,14 @@ def tree(
 
     Rod 1 hangs from the ground, and every further rod k from the free end of rod `1 + (k - 2) // branching`. At the
     start rod 1 is at 0.5 rad from the downward vertical, and the rods that hang from one rod are at evenly spaced
-    angles from `-spread` to `spread` about its direction, a single one straight on. Rods may pass through each other.
+    angles from `-spread` to `spread` about its direction; a single rod is straight on. Rods may pass through each
+    other.
 
-    The equations of motion in the rods' angles have a closed form, by which the tests check this mechanism. Its mass
-    matrix couples a rod only with those above and below it.
+    The equations of motion in the rods' angles have a closed form; the tests compare with it. Its mass matrix couples a
+    rod only with rods above and below it.
 
-    **Arguments:** `n` ≥ 1, the number of rods; `branching` ≥ 1, how many rods hang from one; `spread` [rad]; `length`
-    [m] and `mass` [kg] of one rod; `gravity` [m/s²].
+    **Arguments:** `n` ≥ 1, the number of rods; `branching` ≥ 1, the number of rods that hang from one; `spread` [rad];
+    `length` [m] and `mass` [kg] of one rod; `gravity` [m/s²].
 
     **Labels:** `tip_x`, `tip_y` [m], of the free end of the last rod; `th1`, `th2`, … [rad], angles of the rods from
     the downward vertical, counter-clockwise; `w1`, `w2`, … [rad/s], their rates.

@@ -1,7 +1,7 @@
 """Motors and actuators on the coordinates of joints, with lag and limits.
 
-A `Motor` is given by what it regulates, a force, a speed or a position, and its force lags behind the demand. An
-`Actuator` is given by a control and a force that is affine in the coordinate and its rate, and its control may lag.
+A `Motor` regulates a force, a speed or a position, and its force lags behind the demand. An `Actuator` has a control,
+which may lag, and a force that is affine in the coordinate and its rate.
 """
 
 from typing import Literal
@@ -26,17 +26,17 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
 
     - `mode="force"`: `command`;
     - `mode="speed"`: `gain (command − ẋ)`;
-    - `mode="position"`: `gain (command − x) − damping ẋ`; of an angle the shortest way to the command, up to half a
+    - `mode="position"`: `gain (command − x) − damping ẋ`; an angle takes the shortest way to the command, up to half a
         turn, in the plane as in space;
 
     with a limit F it becomes `F tanh(demand / F)`. The force of the motor, an internal state, follows it as
     `lag · d(force)/dt = demand − force`.
 
     **Arguments:** `command` of the coordinate's shape, [N m, N], [rad/s, m/s] or [rad, m]; as an input of `simulate`,
-    `"motor.command"` is a function of time; `gain` and `damping` ≥ 0, of a force over the command's unit and over a
-    speed; the modes `"speed"` and `"position"` need a gain; `lag` [s] > 0; `limit` [N m, N] > 0 of the demand, default
-    none; `force` [N m, N], its initial value. Positive forces increase the coordinate, with the reaction on the joint's
-    other body.
+    `"motor.command"` is a function of time; `gain` ≥ 0, force per unit of the command, needed by the modes `"speed"`
+    and `"position"`; `damping` ≥ 0, force per speed; `lag` [s] > 0; `limit` [N m, N] > 0 of the demand, default none;
+    `force` [N m, N], its initial value. A positive force increases the coordinate; the joint's other body bears the
+    reaction.
     """
 
     mode: Literal["force", "speed", "position"] = fields.choice("force", "speed", "position", default="force")
@@ -96,13 +96,13 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     `f = (gain · (1, l, l̇)) control + bias · (1, l, l̇)`: a motor has gain (1, 0, 0) and no bias; a position servo has
     gain (k, 0, 0) and bias (0, −k, −d); a velocity servo gain (d, 0, 0) and bias (0, 0, −d).
 
-    With a `lag` an internal state, the `activation`, takes the place of the control and follows it,
-    `lag · d(activation)/dt = control − activation`. Of a `Motor` it is the force that follows.
+    With a `lag` an internal state, the `activation`, takes the place of the control and follows it, `lag ·
+    d(activation)/dt = control − activation`. In a `Motor` the force follows instead.
 
     **Arguments:** `control`, default zero, as an input of `simulate`, `"motor.control"`, a function of time; `gain` and
-    `bias`, shape (3,); `gear`; `middle` [rad], default zero, about which an angle in space counts in (−π, π], and which
-    other coordinates have not; `control_range` and `force_range`, shape (2,): the control and f are clipped to them, by
-    default they are not; `lag` [s] > 0, default none; `activation`, its initial value, default zero.
+    `bias`, shape (3,); `gear`; `middle` [rad], default zero, for angles in space only: the angle is taken within (−π,
+    π] of it; `control_range` and `force_range`, shape (2,), to which the control and f are clipped, default none; `lag`
+    [s] > 0, default none; `activation`, its initial value, default zero.
     """
 
     control: fields.Number = fields.parameter(default=0.0)

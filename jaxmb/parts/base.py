@@ -1,9 +1,8 @@
 """Base classes of the parts of a scene: a name, the bodies that the part acts on, and a pure residual or force law.
 
-A user-defined part derives from one of these classes and declares its fields with the helpers of `fields`. It is then
-treated like the parts of the library: parts of one type are stacked and `vmap`ped, the Jacobian and γ follow from the
-residual, numbers become named, differentiable parameters, and redundant rows, reactions and pictures need no further
-code.
+A user-defined part derives from a class here and declares its fields with the helpers of `fields`. It is then treated
+like the parts of the library. Parts of a type are stacked and `vmap`ped; the Jacobian and γ follow from the residual;
+numbers become named, differentiable parameters. Redundant rows, reactions and pictures need no further code.
 
 A kernel (`residual`, `wrenches`, `energy`) is written for one part. It takes the poses of that part's bodies, shape
 `(len(bodies), pose size)`; `space` converts them to points, directions and wrenches.
@@ -44,14 +43,15 @@ GROUND = "ground"
 
 # How a picture draws the line of a part.
 PathKind = Literal["rod", "coil", "belt"]
-# What coordinates are, by their names: an angle [rad], a rotation vector [rad] or a length [m].
+# The quantity of each coordinate by name: an angle [rad], a rotation vector [rad] or a length [m].
 Quantities = Mapping[str, Literal["angle", "rotation", "length"]]
 
 
 class ScalarCoordinate(NamedTuple):
-    """A coordinate that a part adds to the scene, a number: its `name`, `"rotor.angle"`; whether it is a length [m],
-    otherwise an angle [rad]; and whether it has a velocity, and with it an inertia. One without only counts the turns
-    of an angle that is known up to full turns.
+    """A scalar coordinate that a part adds to the scene, `"rotor.angle"`.
+
+    **Fields:** `is_length`: a length [m], otherwise an angle [rad]; `moves`: whether it has a velocity, and so an
+    inertia. Without a velocity it only counts the turns of an angle that is known up to full turns.
     """
 
     name: str
@@ -60,11 +60,11 @@ class ScalarCoordinate(NamedTuple):
 
 
 class KnownParts(NamedTuple):
-    """The parts of a scene that are settled so far, from which others are.
+    """Parts already resolved; the remaining parts are resolved from these.
 
-    **Fields:** the `space`; the `numbers` of bodies by the names of these and of frames; `scalars`: those of the scalar
-    coordinates of parts, by their names; `frames` by name, and of these the `observed`, those that the scene names;
-    `poses` of all bodies and scalar coordinates, as given; the `joints` by name, each with the numbers of its bodies.
+    **Fields:** the `space`; the `numbers` of bodies, by the name of a body or frame; `scalars`: the numbers of scalar
+    coordinates, by the name of their part; `frames` by name; `observed`: the frames that the scene names; the given
+    `poses` of all bodies and scalar coordinates; the `joints` by name, each with the numbers of its bodies.
     """
 
     space: AbstractSpace
@@ -112,28 +112,28 @@ class AbstractPart(eqx.Module):
     def check(self, dimension: int | None = None) -> None:
         """Raise a `ValueError` that names the part and the field if a number is invalid.
 
-        **Arguments:** `dimension`: that of the scene, default that of the part.
+        **Arguments:** `dimension` of the scene, default the part's.
         """
         fields.check_numbers(self, self.label, self.dimensions[0] if dimension is None else dimension)
         type(self).validate(self)
 
     def validate(self) -> None:
-        """Hook: raise a `ValueError` for inconsistent numbers; each by itself has already been checked."""
+        """Hook: raise a `ValueError` for inconsistent numbers; each number has already been checked by itself."""
 
     def numbers_agree(self) -> Any:
-        """Hook: whether the numbers are as `validate` asks, which it cannot tell of those that are traced."""
+        """Hook: whether the numbers satisfy `validate`, also for traced numbers, which `validate` cannot check."""
         return True
 
     def is_of_length(self, field: str) -> Any:
-        """Hook: of a number with a unit for an angle and one for a length, whether it has the second one, or which of
-        its components have; None if it is not known.
+        """Hook: whether a number with a unit for angles and a unit for lengths has the second one, for each component
+        if they differ; None if unknown.
         """
         del field
 
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
-        own = fields.values_of(self)
-        missing = {name: fields.as_parameter(value) for name, value in values.items() if own[name] is None}
+        current = fields.values_of(self)
+        missing = {name: fields.as_parameter(value) for name, value in values.items() if current[name] is None}
         return type(self).with_fields(self, **missing) if missing else self
 
     def named(self, name: str) -> Self:
@@ -166,8 +166,8 @@ class AbstractBody(AbstractPart):
     """A body with mass. The origin of its frame is the mass centre, unless it has a field `centre` that is not None:
     the mass centre [m] in the frame.
 
-    Points that parts have on a body, and poses, velocities and wrenches in the kernels of parts, are those of its
-    frame. The coordinates of the body and its motion are those of the mass centre.
+    The points of parts on a body, and the poses, velocities and wrenches in kernels, refer to the frame. The body's
+    coordinates and its motion refer to the mass centre.
 
     Fields declared with `fields.guess` hold its initial guess; all other numbers are parameters. `mass` and `inertia`
     are fields, or properties computed from other fields, such as a radius and a density.
@@ -209,7 +209,9 @@ class _Bodies:
         if part is None:
             return self
         values = fields.values_of(part)
-        return tuple(values[name] for name, own in fields.declarations(type(part)).items() if own.kind == "body")
+        return tuple(
+            values[name] for name, declaration in fields.declarations(type(part)).items() if declaration.kind == "body"
+        )
 
 
 class AbstractLaw(eqx.Module):
@@ -220,20 +222,20 @@ class AbstractLaw(eqx.Module):
 
 
 class AbstractActor(AbstractPart):
-    """A part that acts on bodies, or on frames that are fixed in them.
+    """A part that acts on bodies, or on frames fixed in them.
 
-    Its kernels see the poses and velocities of the frames, and the wrenches that they return act on these. A scene
-    fills in the `body_frames`, by the number of the body, `"0"` the first; none where the part names the body itself.
+    Its kernels see the poses and velocities of the frames and return wrenches on them. A scene fills in the
+    `body_frames` by the number of the body, `"0"` for the first; there is none where the part names a body itself.
     """
 
     body_frames: Any = eqx.field(init=False, repr=False, metadata={"declaration": fields.Declaration("parts", of=dict)})
-    # The rates of its numbers that are functions of time and move what it measures, in a part of None otherwise; None
-    # without any. See `with_drift`.
+    # A copy of the part that holds the rates of its time-dependent numbers, and None in all other fields; None without
+    # any. See `with_drift`.
     drift: Any = eqx.field(init=False, repr=False)
-    # When a scene settles the part: 0 from its bodies, 1 after the joints between them, 2 after tendons as well.
+    # When a scene resolves the part: 0 from its bodies, 1 after the joints between them, 2 after tendons as well.
     stage: ClassVar[int] = 0
-    # Whether its kernels are given the `drift`; and its numbers, beside points, axes and those of joints, of which that
-    # has the rates.
+    # `takes_drift`: whether kernels receive `drift`. `moving`: further numbers whose rates `drift` contains, besides
+    # points, axes and the numbers of joints.
     takes_drift: ClassVar[bool] = True
     moving: ClassVar[tuple[str, ...]] = ()
     # Whether the part may act on bodies and frames among its `sources`, other than joints and tendons.
@@ -241,19 +243,19 @@ class AbstractActor(AbstractPart):
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         out = super().__new__(cls, *args, **kwargs)
-        # Here, so that parts with an `__init__` of their own have it as well.
+        # Set here, so that parts with a custom `__init__` have it as well.
         object.__setattr__(out, "body_frames", {})
         object.__setattr__(out, "drift", None)
         return out
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Hook: the names of the parts that it acts on or measures, where these are not bodies that it names itself."""
+        """Hook: the names of the parts that it acts on or measures, except bodies that its fields name."""
         return ()
 
     def may_vary(self, keys: tuple[str, ...]) -> bool:
-        """Hook: whether the number at the end of these keys may be an input. Where the velocity of a point counts that
-        such a number moves in its body, it may not, unless the kernels know (`with_drift`).
+        """Hook: whether the number at the end of these keys may be an input. It may not if it moves a point in its body
+        whose velocity matters, unless the kernels use `with_drift`.
         """
         del keys
         return True
@@ -263,29 +265,29 @@ class AbstractActor(AbstractPart):
         """The part in a scene, with every number filled in, and the numbers of its bodies."""
 
     def seen_poses(self, space: AbstractSpace, poses: Poses) -> Poses:
-        """The poses that the kernels see, from those of the bodies."""
+        """The poses that the kernels see, from poses of the bodies."""
         return type(self)._on_frames(self, lambda frame, x: frame.pose(space, x), poses)
 
     def seen(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> tuple[Poses, Velocities]:
-        """The poses and velocities that the kernels see, from those of the bodies."""
+        """The poses and velocities that the kernels see, from poses and velocities of the bodies."""
         seen = self._on_frames(lambda frame, x, v: frame.velocity(space, x, v), poses, velocities)
         return self.seen_poses(space, poses), seen
 
     def seen_wrenches(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
-        """The wrenches that the kernels see, from those on the bodies."""
+        """The wrenches that the kernels see, from wrenches on the bodies."""
         return self._on_frames(lambda frame, x, w: frame.wrench_on_frame(space, x, w), poses, wrenches)
 
     def wrenches_on_bodies(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
-        """The wrenches on the bodies that are equivalent to those that the kernels return."""
+        """The wrenches on the bodies that are equivalent to the kernels' wrenches."""
         return self._on_frames(lambda frame, x, w: frame.wrench(space, x, w), poses, wrenches)
 
     def _on_frames(self, of_frame: Callable[..., Any], *rows: Any) -> Any:
-        """The last of some rows of bodies, with `of_frame(frame, …)` in its place where there is a frame."""
+        """The last of the arrays of rows, with `of_frame(frame, …)` of all rows in place of a row that has a frame."""
         frames = self.body_frames
         if not frames:
             return rows[-1]
-        own = enumerate(zip(*rows, strict=True))
-        out = [of_frame(frames[str(k)], *row) if str(k) in frames else row[-1] for k, row in own]
+        numbered = enumerate(zip(*rows, strict=True))
+        out = [of_frame(frames[str(k)], *row) if str(k) in frames else row[-1] for k, row in numbered]
         return namespace(*out).stack(out)
 
 
@@ -296,11 +298,11 @@ class AbstractLink(AbstractActor):
     # How a picture draws the line between its points A and B; none by default.
     path_kind: ClassVar[PathKind | None] = None
 
-    # From which of its bodies on several may be one, on which the part has several places; None where all must differ.
+    # Index from which bodies may repeat, as several places on one body; None if all must differ.
     several_from: ClassVar[int | None] = None
-    # Whether it has a function of time, in which steps look for pulses, by `given_in_time`.
+    # Whether it has a function of time, `given_in_time`, in which steps look for pulses.
     of_time: ClassVar[bool] = False
-    # What its coordinates are; not known without an entry.
+    # The quantities of its coordinates; unknown without an entry.
     quantities: ClassVar[Quantities] = {}
     # Names of the coordinates that measure how the bodies slide over each other, where they do in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
@@ -320,12 +322,12 @@ class AbstractLink(AbstractActor):
         return frozenset() if 2 in self.dimensions else self.angles
 
     def coordinates(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
-        """Hook: the part's own coordinates by name, numbers or vectors, such as the `angle` of a joint."""
+        """Hook: the coordinates of the part by name, numbers or vectors, such as the `angle` of a joint."""
         del space, poses
         return {}
 
     def given_in_time(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Array:
-        """Hook: what the function of time gives while nothing moves, of a part that is `of_time`."""
+        """Hook: the values of the function of time of a part that is `of_time`, while nothing moves."""
         raise NotImplementedError(f"{self.kind} says of_time = True, and needs a method given_in_time.")
 
     def coordinates_at(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
@@ -344,7 +346,7 @@ class AbstractLink(AbstractActor):
 
     @classmethod
     def distinct(cls, bodies: Sequence[Any]) -> list[Any]:
-        """The bodies that must be different ones: one that the part may have several places on counts once."""
+        """The bodies that must differ: a body on which the part may have several places counts once."""
         first = len(bodies) if cls.several_from is None else cls.several_from
         return [*bodies[:first], *dict.fromkeys(bodies[first:])]
 
@@ -355,17 +357,17 @@ class AbstractLink(AbstractActor):
 
     def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
         cls, names = type(self), self.bodies
-        own = tuple(known.numbers[name] for name in names)
-        moving = [k for k in cls.distinct(own) if k != known.numbers[GROUND]]
+        numbers = tuple(known.numbers[name] for name in names)
+        moving = [k for k in cls.distinct(numbers) if k != known.numbers[GROUND]]
         if len({*moving}) < len(moving):
             raise ValueError(f"{self.label} connects two frames of one body: {', '.join(names)}.")
         frames = {str(k): known.frames[name] for k, name in enumerate(names) if name in known.frames}
         part = cls.with_fields(self, body_frames=frames)
-        part = cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(own)]))
-        return part, (*own, *known.scalars.get(self.name, ()))
+        part = cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(numbers)]))
+        return part, (*numbers, *known.scalars.get(self.name, ()))
 
     def components(self) -> tuple["AbstractLink", ...]:
-        """Hook: the parts that it consists of, by default itself; called after the numbers have been filled in."""
+        """Hook: the component parts, by default itself; called after the numbers have been filled in."""
         return (self,)
 
     def scalar_coordinates(
@@ -373,16 +375,15 @@ class AbstractLink(AbstractActor):
     ) -> tuple[ScalarCoordinate, ...]:
         """Hook: the scalar coordinates that the part adds, from all joints of the scene by name.
 
-        Its kernel sees each as one body more than `bodies`, after these, of which the first entry of the pose is the
-        coordinate.
+        Its kernel sees each as a further body after `bodies`; the first entry of its pose is the coordinate.
         """
         del space, parts
         return ()
 
     def anchor(self, k: int) -> Array | None:
         """The part's point [m] on its k-th body, in that body's frame; None if it has none."""
-        for name, own in fields.declarations(type(self)).items():
-            point = getattr(self, name) if own.is_point and own.body == k else None
+        for name, declaration in fields.declarations(type(self)).items():
+            point = getattr(self, name) if declaration.is_point and declaration.body == k else None
             if point is not None:
                 frame = self.body_frames.get(str(k))
                 return point if frame is None else frame.point(point)
@@ -391,14 +392,14 @@ class AbstractLink(AbstractActor):
     def pictured(self, space: AbstractSpace) -> Self:
         """Hook: the part as a picture shows it: a copy that acts in the same way, with points where they are seen.
 
-        A slide acts along a whole line, of which a picture shows the point next to the middle of the body that slides.
+        A slide acts along a whole line: a picture shows the point of the line nearest to the middle of the sliding
+        body.
         """
         del space
         return self
 
     def shapes(self, space: AbstractSpace, size: float) -> tuple[tuple[int | None, AbstractShape], ...]:
-        """Hook: the shapes by which a picture shows the part, each with the number of the body that it is fixed in,
-        None for the world.
+        """Hook: the shapes by which a picture shows the part, each with the number of its body, None for the world.
 
         **Arguments:** `size` [m]: the radius of a bar, to which symbols such as pins are drawn.
         """
@@ -406,8 +407,10 @@ class AbstractLink(AbstractActor):
         return ()
 
     def path(self, space: AbstractSpace, poses: Poses) -> Float[Array, "points d"] | None:
-        """Hook: the world points [m] through which a picture draws the part, as `path_kind` says: `"rod"`, the default,
-        and `"coil"` between two points, `"belt"` a closed line through any number; None if it shows no line.
+        """Hook: the world points [m] of the line by which a picture shows the part; None without a line.
+
+        By `path_kind`, `"rod"` (the default) and `"coil"` have two points, `"belt"` is a closed line through any
+        number.
         """
         return None if self.path_kind is None else both_points(space, self, poses)
 
@@ -427,7 +430,7 @@ class AbstractPair(AbstractLink):
 
 
 class AbstractPointPair(AbstractPair):
-    """A part that acts between a point of one body and a point of another one.
+    """A part that acts between points of two bodies.
 
     **Arguments:**
 
@@ -455,29 +458,30 @@ class AbstractConstraint(AbstractLink):
 
     @property
     def elements(self) -> Any:
-        """Hook: the elementary constraints that a joint consists of, in the order of its rows, of `parts.coincident`,
-        `perpendicular`, `in_planes` and `apart`. They vanish with the residual and have its derivatives there, which
-        `jaxmb.report.check_elements` tells. None where the joint is known by its residual alone.
+        """Hook: the elementary constraints of a joint in the order of its rows, from `parts.coincident`,
+        `perpendicular`, `in_planes` and `apart`; None if the joint has its residual alone.
+
+        They vanish with the residual and have the same derivatives there; `jaxmb.report.check_elements` compares them.
         """
         return None
 
     def elementary_joints(self, space: AbstractSpace, poses: Any) -> Any:
-        """Hook: the hinges, slides and balls in succession, from `body_a` to `body_b`, that a spatial joint is: an
-        `ElementaryJoint` for each of its coordinates at these poses. None for a joint that is no such succession.
+        """Hook: a spatial joint as a succession of hinges, slides and balls from `body_a` to `body_b`: an
+        `ElementaryJoint` for each of its coordinates at these poses. None if the joint is not such a succession.
         """
         del space, poses
         return None
 
     @classmethod
     def declares(cls, hook: str, *laws: str) -> bool:
-        """Whether the class defines a hook, and neither its `residual` nor other laws of the hook are newer."""
+        """Whether the class defines a hook, and no subclass of that class has redefined `residual` or the `laws`."""
         where = lambda name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind))
         return all(where(hook) <= where(law) for law in ("residual", *laws))
 
 
 class AbstractInertialConstraint(AbstractConstraint):
-    """A position constraint that binds a scalar coordinate of its own, which has an `inertia` [kg m² of an angle, kg of
-    a length] and nothing else.
+    """A position constraint on a scalar coordinate that it adds, which has an `inertia` [kg m² of an angle, kg of a
+    length] and nothing else.
     """
 
     inertia: AbstractVar[Float[Array, ""]]
@@ -512,7 +516,7 @@ class AbstractAxisJoint(AbstractJoint):
 
 
 class AbstractTendon(AbstractLink):
-    """A length along joints or bodies, for parts of coordinates to act on; by itself it exerts no force.
+    """A length along joints or bodies, on which other parts act; by itself it exerts no force.
 
     Its coordinate is `length`. It may have scalar coordinates that count turns of angles; `rows` is their number.
     """
@@ -529,7 +533,7 @@ class AbstractTendon(AbstractLink):
         """The length at these poses of its bodies."""
 
     def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
-        """Hook: what its scalar coordinates differ from their angles by, less full turns; zero along a motion."""
+        """Hook: its scalar coordinates minus their angles, less full turns; zero along a motion."""
         del space, t
         return jnp.zeros(0, poses.dtype)
 
@@ -585,7 +589,7 @@ class AbstractForce(AbstractLink):
 
     def gap_pace(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Float[Array, ""]:
         """Hook: a rate [1/s]; in an interval of 1/pace no gap closes and opens unless its rates at both ends say so. By
-        default that at which two bodies turn by a radian relative to each other.
+        default the rate at which two bodies turn by a radian relative to each other.
         """
         del poses, t
         return 2 * jnp.max(norm(velocities[:, space.dimension :]))
@@ -604,9 +608,9 @@ class AbstractPotentialForce(AbstractForce):
 class AbstractDynamicForce(AbstractForce):
     """A force law with internal states of first order: a motor with lag, a tyre with relaxation, a filter.
 
-    Each state is a field declared with `fields.internal_state`, in which the kernels `wrenches`, `state_rates` and, of
-    a part with a potential, `energy` find its current value. A `State` holds those of all parts in `z`; by name they
-    are `"motor.torque"`.
+    Each state is a field declared with `fields.internal_state`. It holds the current value in the kernels `wrenches`,
+    `state_rates` and `energy` (for a part with a potential). `State.z` holds the internal states of all parts; their
+    names are `"motor.torque"`.
     """
 
     @abc.abstractmethod
@@ -614,8 +618,8 @@ class AbstractDynamicForce(AbstractForce):
         """The rate of every internal state [its unit/s], by the name of the field."""
 
     def state_sizes(self) -> dict[str, Any]:
-        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. For error
-        control states that have stayed smaller than 1e-4 of it count as this much.
+        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. Error control
+        counts a state that has stayed smaller than 1e-4 of its size as that much.
         """
         return {}
 
@@ -623,9 +627,9 @@ class AbstractDynamicForce(AbstractForce):
 class AbstractNonIdeal(AbstractActor):
     """A non-ideal constraint force: it does virtual work.
 
-    `joint` is the joint's name. The joint exerts its reactions and this force. The force may depend on the reactions,
-    and is solved for with them. Components of the force in directions that the joint blocks do not change the motion:
-    the reactions are smaller by them.
+    `joint` is the joint's name. The joint exerts its reactions and this force. The force may depend on the reactions;
+    both are solved for together. Its components in directions that the joint blocks do not change the motion: they only
+    reduce the reactions.
     """
 
     joint: AbstractVar[str]
@@ -636,16 +640,16 @@ class AbstractNonIdeal(AbstractActor):
         return (self.joint,)
 
     def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
-        joint, own = known.joints[self.joint]
+        joint, bodies = known.joints[self.joint]
         # The law sees what its joint sees.
         law = self.with_fields(body_frames=joint.body_frames)
-        poses = law.seen_poses(known.space, known.poses[list(own)])
-        return law.resolve(known.space, joint.with_fields(body_frames={}), poses), own
+        poses = law.seen_poses(known.space, known.poses[list(bodies)])
+        return law.resolve(known.space, joint.with_fields(body_frames={}), poses), bodies
 
     def resolve(self, space: AbstractSpace, joint: AbstractLink, poses: Poses) -> Self:
         """A checked copy with every number filled in, from its joint and the poses of the joint's bodies.
 
-        **Raises:** `ValueError` also if the joint has no rows, and so no reaction.
+        **Raises:** `ValueError` also if the joint has no rows, and therefore no reaction.
         """
         if isinstance(joint, AbstractConstraint) and not joint.rows:
             raise ValueError(f"{self.label} acts in {joint.label}, which leaves all motions free and has no reaction.")
@@ -663,30 +667,30 @@ class AbstractNonIdeal(AbstractActor):
     def wrenches(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: Scalar
     ) -> Wrenches:
-        """The wrench on each of the joint's bodies; `reactions`: those that the joint exerts besides."""
+        """The wrench on each of the joint's bodies; `reactions`: the joint's reaction wrenches on them."""
 
 
 def _body_fixed(part: Any, space: AbstractSpace, poses: Poses) -> Any:
     """A copy with world points and directions made body-fixed, and directions normalised."""
     declared, given, values = fields.declarations(type(part)), fields.values_of(part), {}
-    for name, own in declared.items():
+    for name, declaration in declared.items():
         value = given[name]
-        if own.at_origin and value is None:
+        if declaration.at_origin and value is None:
             values[name] = fields.as_parameter(np.zeros(space.dimension))
-        elif own.gives:
-            _check_given(part, name, own)
+        elif declaration.gives:
+            _check_given(part, name, declaration)
             if value is None:
                 continue
             values[name] = None
-            for fixed in own.gives:
+            for fixed in declaration.gives:
                 pose = poses[declared[fixed].body]
-                convert = space.body_point if own.is_point else space.body_direction
-                in_body = lambda row, own=own, pose=pose, convert=convert: convert(
-                    pose, row if own.is_point else _unit(row)
+                convert = space.body_point if declaration.is_point else space.body_direction
+                in_body = lambda row, declaration=declaration, pose=pose, convert=convert: convert(
+                    pose, row if declaration.is_point else _unit(row)
                 )
                 several = value.ndim > 1
                 values[fixed] = namespace(pose, value).stack([*map(in_body, value)]) if several else in_body(value)
-        elif (own.is_direction or own.is_attitude) and value is not None:
+        elif (declaration.is_direction or declaration.is_attitude) and value is not None:
             values[name] = _unit(value)
     return type(part).with_fields(part, **values) if values else part
 
@@ -695,23 +699,23 @@ def _unit(value: Any) -> Any:
     return value / np.linalg.norm(value, axis=-1, keepdims=True)
 
 
-def _check_given(part: Any, world: str, own: fields.Declaration) -> None:
+def _check_given(part: Any, world: str, declaration: fields.Declaration) -> None:
     """Check that a point or direction is given either in the world or in the body frames."""
     values = fields.values_of(part)
-    given = [name for name in own.gives if values[name] is not None]
+    given = [name for name in declaration.gives if values[name] is not None]
     in_world = values[world] is not None
-    if len(own.gives) == 1:
-        if in_world == bool(given) and (in_world or own.needed):
-            (fixed,) = own.gives
+    if len(declaration.gives) == 1:
+        if in_world == bool(given) and (in_world or declaration.needed):
+            (fixed,) = declaration.gives
             body = part.bodies[fields.declarations(type(part))[fixed].body]
             raise ValueError(
                 f"{part.label}: give {fixed} (fixed in {body!r}) or {world} (world), and only one of them."
             )
         return
-    listed = " and ".join(own.gives)
+    listed = " and ".join(declaration.gives)
     if in_world and given:
         raise ValueError(f"{part.label}: give either {world} (world) or {listed} (body-fixed), not both.")
-    if not in_world and len(given) < len(own.gives):
+    if not in_world and len(given) < len(declaration.gives):
         raise ValueError(f"{part.label}: give {listed} (body-fixed), or {world} (world).")
 
 

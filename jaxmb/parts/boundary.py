@@ -1,5 +1,5 @@
-"""Where the functions of a part enter a scene: checks of what its kernels return, by abstract evaluation, and its
-functions as JAX traces them then. Nothing is computed or compiled.
+"""The entry of a part's functions into a scene: its kernels are checked by abstract evaluation, and its functions are
+kept as JAX traces them then. Nothing is computed or compiled.
 """
 
 import dataclasses
@@ -41,10 +41,10 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
     """
     if internal_states(part) and not isinstance(part, AbstractDynamicForce):
         raise ValueError(
-            f"{part.label} has internal states; derive it from AbstractDynamicForce, which has their rates."
+            f"{part.label} has internal states; derive it from AbstractDynamicForce, which declares their rates."
         )
     for name, shape, given in _kernels(part, space, bodies):
-        kernel = lambda *own, name=name: getattr(part, name)(space, *own)
+        kernel = lambda *arguments, name=name: getattr(part, name)(space, *arguments)
         if name == "gaps":
             _check_gaps(part, kernel, given)
         elif shape is None:
@@ -62,8 +62,8 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
 def captured(part: T, space: AbstractSpace, bodies: int) -> tuple[T, dict[str, Captured]]:
     """A part whose kernels have been checked, with its functions as JAX traces them now.
 
-    **Returns:** the part, and by their names kernels that a class of the user's may have a share in: functions of the
-    part and of what the kernel takes after `space`.
+    **Returns:** the part, and by name the kernels that a class of the user's may define: functions of the part and the
+    kernel's arguments after `space`.
     """
     part, functions = with_captured(part)
     kernels = dict(_traced_kernels(part, space, bodies)) if functions or is_of_user(part) else {}
@@ -85,19 +85,19 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         yield "mass", (lambda part: part.mass, [])
         yield "inertia", (lambda part: part.inertia, [])
     for name, _, given in _kernels(part, space, bodies):
-        yield name, (lambda part, *own, name=name: getattr(part, name)(space, *own), given)
+        yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):
         yield "elements", (lambda part: part.elements, [])
     if isinstance(part, AbstractLink):
         poses, velocities, t = _arguments(space, bodies)
         yield "coordinates", (lambda part, poses: part.coordinates(space, poses), [poses])
         if part.of_time:
-            moving = lambda part, *own: part.given_in_time(space, *own)
+            moving = lambda part, *arguments: part.given_in_time(space, *arguments)
             yield "given_in_time", (moving, [poses, velocities, t])
 
 
 def is_of_user(value: Any) -> bool:
-    """Whether there is a module in a part, or in a collection of modules, of a class that no installed package defines.
+    """Whether a part, or a collection of modules, contains a module of a class that no installed package defines.
 
     Modules whose weights are a number do not count: functions call them.
     """
@@ -113,37 +113,39 @@ def is_of_user(value: Any) -> bool:
 
 
 def with_captured(module: T) -> tuple[T, list[Captured]]:
-    """A module with all functions in its fields captured, also in modules that it holds, and these functions.
+    """A module with all functions in its fields captured, also in inner modules; and these functions.
 
     Modules whose weights are a number stay: other functions call them.
     """
-    found: list[Captured] = []
+    functions: list[Captured] = []
 
-    def own(value: Any, is_static: bool) -> Any:
+    def convert(value: Any, is_static: bool) -> Any:
         if isinstance(value, eqx.Module) and not is_static:
-            return with_values(type(value), vars(value) | {name: own(*held) for name, held in _held(value).items()})
+            return with_values(type(value), vars(value) | {name: convert(*held) for name, held in _held(value).items()})
         if isinstance(value, dict):
-            return {name: own(x, is_static) for name, x in value.items()}
+            return {name: convert(x, is_static) for name, x in value.items()}
         if type(value) is tuple:
-            return tuple(own(x, is_static) for x in value)
+            return tuple(convert(x, is_static) for x in value)
         if callable(value) and not isinstance(value, type):
-            found.append(Captured(value))
-            return found[-1]
+            functions.append(Captured(value))
+            return functions[-1]
         return value
 
-    new = own(module, False)
-    return (new if found else module), found
+    new = convert(module, False)
+    return (new if functions else module), functions
 
 
 def _held(module: eqx.Module) -> dict[str, tuple[Any, bool]]:
-    """The values of the fields of a module that are no numbers of its own, by name, and whether they are static."""
+    """The values of a module's fields that are not its parameters, by name, and whether they are static."""
     static = {field.name: field.metadata.get("static", False) for field in dataclasses.fields(module)}
-    numbers = {name for name, own in declarations(type(module)).items() if own.kind in ("numbers", "module")}
+    numbers = {
+        name for name, declaration in declarations(type(module)).items() if declaration.kind in ("numbers", "module")
+    }
     return {name: (value, static.get(name, False)) for name, value in vars(module).items() if name not in numbers}
 
 
 def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[int, ...] | None, list[Any]]]:
-    """The name of each kernel of a part, the shape that it must return, None where there is none, and its arguments."""
+    """The name of each kernel of a part, the shape that it must return (None for any), and its arguments."""
     poses, velocities, t = _arguments(space, bodies)
     if isinstance(part, AbstractVelocityConstraint):
         yield "residual", (part.rows,), [poses, velocities, t]
@@ -163,7 +165,7 @@ def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str
 
 
 def _check_gaps(part: AbstractForce, kernel: Callable[..., Any], given: list[Any]) -> None:
-    """The same for gaps, of which there may be any number."""
+    """The same for any number of gaps."""
     shape = getattr(_evaluated(part.label, "gaps", kernel, tuple(given)), "shape", ())
     if len(shape) != 1:
         raise ValueError(f"{part.label}: gaps must return a vector, got shape {shape}.")
@@ -179,23 +181,25 @@ def _arguments(space: AbstractSpace, bodies: int) -> tuple[Any, Any, Any]:
 
 
 def _check_state_rates(part: AbstractDynamicForce, kernel: Callable[..., Any], given: list[Any]) -> None:
-    """The same for the rates of internal states, each of which must have a rate of its shape."""
+    """The same for the rates of internal states: each must have the shape of its state."""
     states = internal_states(part)
-    found = _evaluated(part.label, "state_rates", kernel, tuple(given))
-    if not isinstance(found, dict) or set(found) != set(states):
+    rates = _evaluated(part.label, "state_rates", kernel, tuple(given))
+    if not isinstance(rates, dict) or set(rates) != set(states):
         names = ", ".join(states) or "none"
         raise ValueError(f"{part.label}: state_rates must return a dictionary of the internal states, {names}.")
     for name, keys in states.items():
         shape = np.shape(entry(part, keys))
-        check_returns(part.label, f"state_rates[{name!r}]", shape, lambda *own, name=name: kernel(*own)[name], *given)
+        check_returns(
+            part.label, f"state_rates[{name!r}]", shape, lambda *arguments, name=name: kernel(*arguments)[name], *given
+        )
 
 
 def check_returns(label: str, name: str, shape: tuple[int, ...], kernel: Callable[..., Any], *given: Any) -> None:
-    """Raise a `ValueError` unless a kernel of NumPy arrays returns this shape, and the dtype of the first of them."""
-    out = _evaluated(label, name, lambda *own: _as_array(kernel(*own)), given)
+    """Raise a `ValueError` unless a kernel of NumPy arrays returns this shape, and the dtype of its first argument."""
+    out = _evaluated(label, name, lambda *arguments: _as_array(kernel(*arguments)), given)
     if not hasattr(out, "shape") or out.shape != shape:
-        found = getattr(out, "shape", type(out).__name__)
-        raise ValueError(f"{label}: {name} must return shape {shape}, got {found}.")
+        got = getattr(out, "shape", type(out).__name__)
+        raise ValueError(f"{label}: {name} must return shape {shape}, got {got}.")
     if out.dtype != given[0].dtype:
         raise ValueError(f"{label}: {name} must return {given[0].dtype} numbers, got {out.dtype}.")
 

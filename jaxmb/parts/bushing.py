@@ -11,8 +11,8 @@ from .spatial.axes import offset_in_a, rotation_error, with_given_orientation
 
 
 class Bushing(AbstractPair, AbstractPotentialForce):
-    """A compliant joint: springs and dampers on the relative motions of a frame in B with respect to one in A, three in
-    the plane and six in space.
+    """A compliant joint: springs and dampers on the motions of a frame in B relative to a frame in A, three in the
+    plane and six in space.
 
     ```python
     stiffness, damping = (1e5, 1e5, 10.0), (100.0, 100.0, 0.1)
@@ -21,9 +21,9 @@ class Bushing(AbstractPair, AbstractPotentialForce):
     ```
 
     The motions are first the position of B's point relative to A's point in the axes of `body_a` [m]. In the plane the
-    relative angle less that of the given poses follows [rad]; in space twice the vector part of the Euler parameters
-    from `orientation` to the relative attitude, in the axes of `body_b`: the rotation vector [rad] when small,
-    `2 sin(angle/2)` along the axis of rotation in general, so the moment of an isotropic spring is `stiffness
+    relative angle minus `free_angle` follows [rad]. In space twice the vector part of the Euler parameters from
+    `orientation` to the relative attitude follows, in the axes of `body_b`. It is the rotation vector [rad] if small,
+    and `2 sin(angle/2)` along the axis of rotation in general: the moment of an isotropic spring is `stiffness
     sin(angle)`. Both signs of the bodies' Euler parameters give the same wrench and energy.
 
     **Arguments:**
@@ -32,7 +32,7 @@ class Bushing(AbstractPair, AbstractPotentialForce):
     - `point_a`, `point_b` [m]: A fixed in `body_a`, B fixed in `body_b`; or `point` [m]: both, at this place of the
         world at the given poses.
     - `free_angle` [rad], in the plane, and `orientation`, in space, shape (4,), unit Euler parameters: the angle or
-        attitude of `body_b` relative to `body_a` without a moment, default that of the given poses.
+        attitude of `body_b` relative to `body_a` without a moment, default from the given poses.
     """
 
     stiffness: fields.Number = fields.parameter(shape=("v",), unit=("N m/rad", "N/m"), sign="non-negative")

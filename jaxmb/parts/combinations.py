@@ -15,7 +15,7 @@ from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
 from .coordinate_parts import AbstractOfCoordinates, shortest, turns
 
-# Points of a tendon coincide if they are no farther apart than this share of its length.
+# Largest distance of coinciding points of a tendon, relative to its length.
 _APART = 1e-9
 
 
@@ -38,12 +38,12 @@ class AbstractCombination(AbstractOfCoordinates):
 
     def values(self, space, poses) -> list[Float[Array, ""]]:
         """The coordinates."""
-        return [self.coordinates_of(k, space, poses)[own].reshape(()) for k, own in enumerate(self.within)]
+        return [self.coordinates_of(k, space, poses)[name].reshape(()) for k, name in enumerate(self.within)]
 
 
 class JointCoupling(AbstractCombination, AbstractConstraint):
-    """A coordinate that is a polynomial of another one, or a sum of polynomials of several others. Rows 1:
-    `(x − zero) − Σᵢ Σₖ coefficients[i, k] (yᵢ − other_zero[i])ᵏ`.
+    """A coordinate that is a polynomial of another coordinate, or a sum of polynomials of several. Rows 1: `(x − zero)
+    − Σᵢ Σₖ coefficients[i, k] (yᵢ − other_zero[i])ᵏ`.
 
     ```python
     link = planar.Body("link", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(1.5, 0.0))
@@ -52,12 +52,12 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
     system = jaxmb.Scene([bar, link], joints=[pin, elbow, bend]).compile()
     ```
 
-    Of angles known up to full turns, the row and `yᵢ − other_zero[i]` are taken in [−π, π]. A gear whose ratios are
-    whole numbers so turns without end, one with other ratios by half a turn to either side.
+    For angles known up to full turns, the row and `yᵢ − other_zero[i]` are wrapped to [−π, π]. Gears with integer
+    ratios then turn without end, other gears by half a turn to either side.
 
-    **Arguments:** `coordinate` and `other`, the names of x and of y, such as `"finger.angle"`, or of several others;
-    `coefficients`, of the polynomial, the constant first, or for several others one row each: of the carrier of a
-    differential `((0, 0.5), (0, 0.5))`; `zero` and `other_zero` [rad, m], for several others one each, default the
+    **Arguments:** `coordinate`, the name of x, such as `"finger.angle"`; `other`, the name or names of y;
+    `coefficients` of the polynomial, the constant first, with one row for each of several others: `((0, 0.5), (0,
+    0.5))` for the carrier of a differential; `zero` and `other_zero` [rad, m], for several others one each, default the
     coordinates at the given poses.
     """
 
@@ -114,13 +114,13 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
     ```
 
     The rotor of a motor with inertia J behind a gear of ratio n adds `n² J` to its joint: the reflected inertia, the
-    armature of MuJoCo. It has no mass, no weight and no momentum of its own. The gyroscopic moment of the rotor and the
-    reaction of its acceleration on the housing are neglected, as is usual for gears of high ratio; where they count,
-    model the rotor as a body and the gear by a `JointCoupling`.
+    armature of MuJoCo. It adds no mass, weight or momentum. The gyroscopic moment of the rotor and the reaction of its
+    acceleration on the housing are neglected, as is usual for gears of high ratio. Where they matter, model the rotor
+    as a body and the gear as a `JointCoupling`.
 
-    The scene has one coordinate, one velocity and one row more for each: the coordinate x itself, `"rotor.angle"` of an
-    angle, `"rotor.displacement"` of a displacement or length, which counts on through full turns. The reaction of the
-    part is the generalized force `−inertia ẍ`, on the last body of the joint.
+    It adds one coordinate, one velocity and one row to the scene. The coordinate is x itself, which counts on through
+    full turns: `"rotor.angle"`, or `"rotor.displacement"` for a displacement or length. The reaction of the part is the
+    generalized force `−inertia ẍ`, on the last body of the joint.
 
     **Arguments:** `coordinate`, a number, such as `"hip.angle"`; `inertia` > 0 [kg m² of an angle, kg of a
     displacement].
@@ -166,8 +166,8 @@ class FixedTendon(AbstractCombination, AbstractTendon):
 
     Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`.
 
-    Angles of hinges in space are in (−π, π] at the given poses, and counted from there on through full turns, like a
-    cord that winds up: for each the scene has a coordinate more, which no force acts on.
+    Angles of hinges in space are in (−π, π] at the given poses. From there on they count through full turns, like a
+    cord that winds up; for each, the scene has a further coordinate, on which no force acts.
 
     **Arguments:** `along`: the names of the coordinates, such as `("left.angle", "right.angle")`; `coefficients` [m/rad
     of an angle], one for each.
@@ -199,8 +199,10 @@ class FixedTendon(AbstractCombination, AbstractTendon):
     def scalar_coordinates(self, space, parts):
         del space
         split = [name.partition(".") for name in self.along]
-        periodic = (own in parts[joint].periodic if joint in parts else False for joint, _, own in split)
-        return tuple(ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k, own in enumerate(periodic) if own)
+        periodic = (within in parts[joint].periodic if joint in parts else False for joint, _, within in split)
+        return tuple(
+            ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k, is_periodic in enumerate(periodic) if is_periodic
+        )
 
     def residual(self, space, poses, t):
         values = self.values(space, poses)

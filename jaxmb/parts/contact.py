@@ -117,7 +117,7 @@ class AbstractFrictionLaw(AbstractLaw):
         """Force [N] on the body.
 
         **Arguments:** `load`: normal force [N]; `engaged`: from 0 off the ground to 1 in full contact; `slip`: velocity
-        along the ground [m/s] of the body's lowest point; `travel`: that of its centre.
+        along the ground [m/s] of the body's lowest point; `travel`: the velocity of its centre.
         """
 
 
@@ -173,7 +173,7 @@ class Janosi(AbstractFrictionLaw):
 
 class AbstractContact(AbstractPotentialForce):
     """Base class of contacts with one terrain. Subclasses define the distance from the ground (`distance`, `outward`)
-    and the onset of damping (`onset`); the fields are those of `Contact`.
+    and the onset of damping (`onset`); fields as in `Contact`.
     """
 
     name: str = fields.name()
@@ -217,7 +217,7 @@ class AbstractContact(AbstractPotentialForce):
         return keys[0] not in ("radius", "centres")
 
     def wrenches(self, space, poses, velocities, t):
-        return self._each(space, lambda *own: self._wrench(space, *own), poses, velocities)
+        return self._each(space, lambda *arguments: self._wrench(space, *arguments), poses, velocities)
 
     def energy(self, space, poses, t):
         single = lambda pose, point, radius: self.normal.energy(self._depth(space.point(pose, point), radius))
@@ -241,8 +241,8 @@ class AbstractContact(AbstractPotentialForce):
     def shapes(self, space, size):
         n = len(self.bodies)
         radii, centres = np.broadcast_to(self.radius, n), np.broadcast_to(self.centres, (n, space.dimension))
-        own = (round_shapes(space, k, radii[k], centres[k]) for k in range(n))
-        return (None, Ground(height=self.terrain.height)), *itertools.chain(*own)
+        solids = (round_shapes(space, k, radii[k], centres[k]) for k in range(n))
+        return (None, Ground(height=self.terrain.height)), *itertools.chain(*solids)
 
     def _each(self, space, single, *of_bodies):
         """`single(…, point, radius)` of every body."""
@@ -292,12 +292,12 @@ class Contact(AbstractContact):
     **Arguments:**
 
     - `bodies`: one name or several; all share one terrain, one law and one set of parameters.
-    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but that it rises and sinks where its
-        numbers are inputs.
+    - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but it rises and sinks if its numbers
+        are inputs.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
     - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the origins of the frames.
-    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, from which on it acts fully.
     - `smoothing` [m] > 0. Far above the ground a depth of `smoothing² / (4 |d|)` remains.
     """
 

@@ -16,7 +16,7 @@ from .frames import AbstractFrame
 from .names import unknown
 from .space import rate_of
 
-# What is seen of a body or a frame, and in which space if not in both.
+# The quantities of a body or a frame; the dimension of the space, None for both.
 _OF_BODIES = {"position": None, "velocity": None, "angular_velocity": None, "angle": 2, "orientation": 3}
 
 
@@ -29,7 +29,7 @@ def _names(names: Any) -> Any:
 
 
 class Controller(AbstractOfJoints, AbstractDynamicForce):
-    """Forces on coordinates of joints as a function of measurements, with a memory: `function(t, measured, states,
+    """Forces on coordinates of joints as a function of measurements and internal states: `function(t, measured, states,
     parameters) -> forces, rates`.
 
     ```python
@@ -46,13 +46,13 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     **Arguments:**
 
     - `function`: of the time [s] and dictionaries of the measurements, the internal states and the parameters. It
-        returns the force [N m, N] on the coordinate that the controller `acts_on`, or by their names those on several;
-        and the rates of the internal states by name, `{}` if there are none. Controllers with the same function are
-        computed together.
-    - `measures`: measured quantities by the name that the function knows them by: a joint's coordinate
-        `"hinge.angle"` or its rate `"hinge.angle_rate"`; of a body or frame `"cart.position"` and `velocity` [m,
-        m/s] (world axes; of a body those of the mass centre, as in its motion), `angular_velocity` [rad/s] (in space in
-        the axes of the body or frame), in the plane `angle`, in space `orientation`.
+        returns the force [N m, N] on the coordinate that the controller `acts_on`, or a dictionary of forces by
+        coordinate; and the rates of the internal states by name, `{}` without states. Controllers with the same
+        function are computed together.
+    - `measures`: measured quantities by their names in the function: a joint's coordinate `"hinge.angle"` or its rate
+        `"hinge.angle_rate"`; of a body or frame `"cart.position"` and `velocity` [m, m/s] (world axes; a body's at the
+        mass centre, as in its motion), `angular_velocity` [rad/s] (in space in the axes of the body or frame), in the
+        plane `angle`, in space `orientation`.
     - `acts_on`: a coordinate, `"slide.displacement"`, or several.
     - `states`: the internal states, such as an integral, with their initial values; their names are `"pid.integral"`.
     - `parameters`: numbers, or modules as in `Force`, by name; they become parameters of the system, `"pid.gain"`.
@@ -65,8 +65,9 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     acts_on: Any = eqx.field(static=True, converter=_names)  # pyright: ignore[reportGeneralTypeIssues]
     states: fields.Numbers = fields.internal_states_by_name()
     parameters: fields.Numbers = fields.numbers()
-    # A scene fills in the names of the sources, and those by which the function returns several forces. In `measures`
-    # and `acts_on` the number of a source then stands for its name, so that controllers of other joints are stacked.
+    # A scene fills in the names of the sources, and the names by which the function returns several forces. In
+    # `measures` and `acts_on` the number of a source then replaces its name, so that controllers of different joints
+    # are stacked.
     source_names: tuple[str, ...] = fields.names(optional=True)
     force_names: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
     takes_bodies: ClassVar[bool] = True
@@ -75,8 +76,8 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         names = [name for pair in self.measures for name in pair] if isinstance(self.measures, tuple) else [None]
         if not all(isinstance(name, str) for name in names):
             raise ValueError(
-                f"{self.label}: measures must be names by the function's own, {{'angle': 'hinge.angle'}}, got "
-                f"{self.measures!r}."
+                f"{self.label}: measures must be a dictionary of quantities by the function's names, "
+                f"{{'angle': 'hinge.angle'}}, got {self.measures!r}."
             )
         for name in (*dict(self.measures).values(), *self.acts_on):
             if not isinstance(name, str) or name.count(".") != 1:
@@ -85,9 +86,9 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
             raise ValueError(f"{self.label}: acts_on names at least one coordinate of a joint.")
         if len(set(self.acts_on)) < len(self.acts_on):
             raise ValueError(f"{self.label}: acts_on names a coordinate twice, got {self.acts_on}.")
-        taken = set(self.states) & set(self.parameters)
-        if taken:
-            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a state and of a parameter; rename one.")
+        repeated = set(self.states) & set(self.parameters)
+        if repeated:
+            raise ValueError(f"{self.label}: {repeated.pop()!r} is the name of a state and of a parameter; rename one.")
 
     @property
     def sources(self):
@@ -125,19 +126,24 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     def _check_names(self, space):
         for name in (*dict(self.measures).values(), *self.acts_on):
             source, quantity = name.split(".")
-            known = self._known(source, space)
+            available = self._known(source, space)
             acted = name in self.acts_on
-            allowed = known if acted or not self._is_joint(source) else [*known, *(f"{own}_rate" for own in known)]
+            allowed = (
+                available
+                if acted or not self._is_joint(source)
+                else [*available, *(f"{entry}_rate" for entry in available)]
+            )
             if acted and not self._is_joint(source):
                 raise ValueError(
-                    f"{self.label}: it acts on coordinates of joints, and {self.source_names[int(source)]!r} is none."
+                    f"{self.label}: it acts on coordinates of joints, and {self.source_names[int(source)]!r} is not a "
+                    "joint."
                 )
             if quantity not in allowed:
-                listed = [self._called(f"{source}.{own}") for own in allowed]
+                listed = [self._called(f"{source}.{entry}") for entry in allowed]
                 raise unknown("quantity", self._called(name), listed, self.label)
 
     def _called(self, name):
-        """The name of a quantity, with that of its source in place of the number."""
+        """The name of a quantity, with its source's name in place of the number."""
         source, quantity = name.split(".")
         return f"{self.source_names[int(source)]}.{quantity}"
 
@@ -182,8 +188,8 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         if not isinstance(forces, dict) or set(forces) != set(names) or isinstance(forces[names[0]], dict):
             raise ValueError(f"the function of {self.label} must return the force on {' and '.join(names)}.")
         rows = []
-        for name, own in zip(names, self.acts_on, strict=True):
-            shape, force = self._coordinate(space, poses, own).shape, jnp.asarray(forces[name], poses.dtype)
+        for name, coordinate in zip(names, self.acts_on, strict=True):
+            shape, force = self._coordinate(space, poses, coordinate).shape, jnp.asarray(forces[name], poses.dtype)
             if force.shape != shape:
                 raise ValueError(
                     f"the function of {self.label} must return a force of shape {shape} on {name!r}, got {force.shape}."

@@ -30,10 +30,10 @@ from .space import rate_of, with_drift
 
 
 class AbstractOfJoints(AbstractLink):
-    """A part that acts on joints and tendons, or measures them, and if it `takes_bodies` bodies and frames as well.
+    """A part that acts on joints and tendons, or measures them; also bodies and frames if it `takes_bodies`.
 
-    **Fields:** a scene fills in the `joints`, by the number of the source (a joint, a tendon or a frame, none for a
-    body), and `places`: for each source the numbers of its bodies among those of the part.
+    **Fields:** a scene fills in the `joints` by the number of the source (a joint, a tendon or a frame, none for a
+    body), and `places`: for each source the indices of its bodies in the part's bodies.
     """
 
     name: str = fields.name()
@@ -49,16 +49,16 @@ class AbstractOfJoints(AbstractLink):
 
     def settled(self, known: KnownParts):
         held = [known.source(name) for name in self.sources]
-        own = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
-        places = [tuple(own.index(k) for k in bodies) for _, bodies in held]
+        numbers = tuple(dict.fromkeys(k for _, bodies in held for k in bodies))
+        places = [tuple(numbers.index(k) for k in bodies) for _, bodies in held]
         part = self.of_sources([source for source, _ in held], places)
-        return part.resolve(known.space, known.poses[list(own)]), (*own, *known.scalars.get(self.name, ()))
+        return part.resolve(known.space, known.poses[list(numbers)]), (*numbers, *known.scalars.get(self.name, ()))
 
     def of_sources(self, parts: Sequence[AbstractPart | None], places: Sequence[tuple[int, ...]]) -> Any:
         """A copy that holds its sources.
 
         **Arguments:** `parts`: a joint, tendon or frame for each of `sources`, None for a body; `places`: for each the
-        numbers of its bodies among those of this part.
+        indices of its bodies in this part's bodies.
         """
         held = {str(k): part for k, part in enumerate(parts) if part is not None}
         return self.with_fields(joints=held, places=tuple(places))
@@ -69,12 +69,12 @@ class AbstractOfJoints(AbstractLink):
         **Raises:** `ValueError` if its class does not say so.
         """
         joint = self.joints[str(k)]
-        if (known := joint.is_length(within)) is None:
+        if (is_length := joint.is_length(within)) is None:
             raise ValueError(
                 f"{self.label}: {joint.label} does not say whether its coordinate {within!r} is an angle or a length; "
                 f"declare quantities = {{{within!r}: 'angle'}} or 'length' in the class {joint.kind}."
             )
-        return known
+        return is_length
 
     def coordinates_of(self, k: int, space, poses) -> dict[str, Array]:
         """The coordinates of a source, by their names within it."""
@@ -86,16 +86,16 @@ class AbstractOfJoints(AbstractLink):
     def given_coordinate(self, k: int, coordinate: str, space: Any, poses: Any) -> np.ndarray:
         """A coordinate of a source at the given poses.
 
-        **Raises:** `ValueError` if the joint has no such coordinate; see its class for those that it has.
+        **Raises:** `ValueError` if the joint has no such coordinate; its class lists them.
         """
-        known = self.coordinates_of(k, space, poses)
+        values = self.coordinates_of(k, space, poses)
         name, _, within = coordinate.partition(".")
-        if within not in known:
-            names = [f"{name}.{own}" for own in known]
+        if within not in values:
+            names = [f"{name}.{key}" for key in values]
             if not names:
-                raise ValueError(f"{self.label}: {self.joints[str(k)].label} has no coordinate of its own.")
+                raise ValueError(f"{self.label}: {self.joints[str(k)].label} has no coordinate.")
             raise unknown("coordinate", coordinate, names, self.label)
-        return np.asarray(known[within])
+        return np.asarray(values[within])
 
 
 class AbstractOfCoordinates(AbstractOfJoints):
@@ -123,9 +123,9 @@ class AbstractOfCoordinates(AbstractOfJoints):
         return self.are_lengths(range(len(self.within)))
 
     def are_lengths(self, numbers: Iterable[int]) -> Any:
-        """Which of the coordinates with these numbers are lengths; None if it is not known."""
-        known = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
-        return None if None in known else np.array(known if len(known) > 1 else known[0])
+        """Whether each of the coordinates with these numbers is a length; None if unknown."""
+        lengths = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
+        return None if None in lengths else np.array(lengths if len(lengths) > 1 else lengths[0])
 
     def is_periodic(self, k: int = 0) -> bool:
         """Whether a coordinate is an angle known up to full turns."""
@@ -172,17 +172,17 @@ class AbstractCoordinatePart(AbstractOfCoordinates):
         return generalized_force(space, self, lambda part, x: part.measured(space, x), poses, velocities, law)
 
     def difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
-        """`value − target`; of angles that are known up to full turns the smallest such difference."""
+        """`value − target`, wrapped to [−π, π] for angles known up to full turns."""
         out = value - target.reshape(-1)
         return shortest(out) if self.is_periodic() else out
 
     def shortest_difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
-        """`value − target`; of an angle less full turns, in [−π, π]."""
+        """`value − target`, wrapped to [−π, π] for any angle."""
         out = value - target.reshape(-1)
         return shortest(out) if self.within[0] in self.joint.angles else out
 
     def near(self, value: Float[Array, "n"], middle: Float[Array, "*shape"]) -> Float[Array, "n"]:
-        """The value; of angles that are known up to full turns the one within half a turn of `middle`."""
+        """The value; an angle known up to full turns is wrapped to within half a turn of `middle`."""
         return middle.reshape(-1) + self.difference(value, middle) if self.is_periodic() else value
 
     def _check_shape(self, field: str, given: np.ndarray) -> None:
@@ -195,12 +195,12 @@ class AbstractCoordinatePart(AbstractOfCoordinates):
     def _check_middle(self) -> None:
         if not self.is_periodic():
             raise ValueError(
-                f"{self.label}: middle is that of an angle in space, which {self.coordinate!r} is not; leave it out."
+                f"{self.label}: middle belongs to an angle in space, which {self.coordinate!r} is not; leave it out."
             )
 
 
 def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The angle [rad] less full turns, in [−π, π]."""
+    """The angle [rad] wrapped to [−π, π]."""
     return angle - turns(angle)
 
 
@@ -219,8 +219,8 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
 
     **Arguments:** `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m] ≥ 0; `free` [rad, m], where the spring
     exerts no force, default the coordinate at the given poses. In space the spring of an angle takes the shortest way
-    to it, up to half a turn; with `middle` [rad], of the range in which the angle stays, it takes the way within half a
-    turn of that.
+    to `free`, up to half a turn. With `middle` [rad] of its range, the angle counts within half a turn of `middle`
+    instead.
     """
 
     stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
@@ -280,7 +280,7 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
     system = jaxmb.Scene([bar], joints=[pin, turn]).compile()
     ```
 
-    **Arguments:** `value` [rad, m], default that at the given poses; `rate` [rad/s, m/s], default zero; both of the
+    **Arguments:** `value` [rad, m], default from the given poses; `rate` [rad/s, m/s], default zero; both of the
     coordinate's shape. As an input of `simulate`, `"drive.value"` is any function of time.
     """
 
@@ -316,14 +316,14 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[stop]).compile()
     ```
 
-    The depth δ beyond a stop is that of a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or
-    value − upper. The stop has the potential `½ stiffness δ²`, so that its force is `stiffness δ`, and the dissipation
-    `damping δ̇²`. With an `exponent` the stop is progressive: its potential is `stiffness δ^(exponent + 1) /
-    (exponent + 1)`, and its force nearly `stiffness d^exponent`.
+    The depth δ beyond a stop is a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or value −
+    upper. The stop has the potential `½ stiffness δ²`, so that its force is `stiffness δ`, and the dissipation `damping
+    δ̇²`. With an `exponent` the stop is progressive: its potential is `stiffness δ^(exponent + 1) / (exponent + 1)`,
+    and its force nearly `stiffness d^exponent`.
 
-    **Arguments:** `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0, or over this power of an angle or length;
-    `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, where the ramp bends.
-    In space the range of an angle must be less than a full turn.
+    **Arguments:** `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0, per power `exponent` of the angle or
+    length; `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, the width of
+    the ramp's bend. In space the range of an angle must be less than a full turn.
     """
 
     lower: fields.Number = fields.parameter(unit=("rad", "m"))

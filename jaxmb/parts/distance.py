@@ -19,9 +19,9 @@ class Distance(AbstractPointPair, AbstractConstraint):
     system = jaxmb.Scene([bob], joints=[rod]).compile()
     ```
 
-    It has no coordinates of its own.
+    It has no coordinates.
 
-    **Arguments:** `length` [m] > 0, default that of the given poses.
+    **Arguments:** `length` [m] > 0, default from the given poses.
     """
 
     length: fields.Number = fields.length(sign="positive", optional=True)

@@ -29,9 +29,9 @@ class Driver(AbstractPair, AbstractConstraint):
     system = jaxmb.Scene([crank], joints=[pin, turn]).compile()
     ```
 
-    In space an angle is prescribed as `2 sin(ψ/2) = 0` with ψ = angle − motion in (−π, π], written with products of
-    direction components, which holds for any number of turns. The joint should let B turn about the axis only;
-    otherwise the angle is that of the projections perpendicular to the axis. The driver has no coordinates of its own.
+    In space an angle is prescribed as `2 sin(ψ/2) = 0` with ψ = angle − motion in (−π, π], for any number of turns. The
+    joint should let B turn about the axis only; otherwise the angle is measured between projections perpendicular to
+    the axis. The driver has no coordinates.
 
     **Arguments:**
 

@@ -31,17 +31,17 @@ from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
 class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     """Coulomb friction in a joint or a rigid contact, along one direction of slip, or two in a contact in space.
 
-    Subclasses define the velocity of `slip`. The scene has one coordinate, one velocity and one row more for each: its
-    mode, `"rub.mode"`, which is 2 where it sticks, 1 or -1 where it slips forwards or backwards, and 0 before the
-    start of a motion and in contacts that are open. Where it sticks, `slip = 0` is a constraint, whose force is at most
-    `static_coefficient` times the normal force; where it slips, the force is `coefficient` times the normal force,
-    against the slip. `simulate` finds the times at which one turns into the other.
+    Subclasses define the velocity of `slip`. It adds one coordinate, one velocity and one row to the scene. The
+    coordinate is its mode, `"rub.mode"`: 2 for stick, 1 or -1 for slip forwards or backwards, and 0 before the start of
+    a motion and in open contacts. In stick, `slip = 0` is a constraint whose force is at most `static_coefficient`
+    times the normal force. In slip, the force is `coefficient` times the normal force, against the slip. `simulate`
+    finds the times of transitions.
 
-    In a contact in space, and in a joint whose bodies slide over each other in two directions, all of these are two.
-    The modes `"rub.mode_1"` and `"rub.mode_2"` are both 2 where it sticks, and where it slips the components of a unit
-    vector near the direction of slip, or of half of one where slip has begun from rest and is not to be seen yet.
+    Contacts in space, and joints whose bodies slide over each other in two directions, add two of each. The modes
+    `"rub.mode_1"` and `"rub.mode_2"` are both 2 in stick. In slip they are the components of a vector near the
+    direction of slip: of length one, or one half if slip has just begun from rest and is not visible yet.
 
-    **Fields:** `joint`, its name, or `"joint.coordinate"`; `coefficient` μ ≥ 0 of slip; `static_coefficient` ≥ μ of
+    **Fields:** `joint`, its name, or `"joint.coordinate"`; `coefficient` μ ≥ 0 in slip; `static_coefficient` ≥ μ in
     stick, default μ.
     """
 
@@ -107,8 +107,8 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
         """The velocities of slip [m/s], from poses and velocities of the bodies of the joint."""
 
     def normal_force(self, space: AbstractSpace, poses: Poses, reactions: Wrenches) -> Float[Array, ""]:
-        """The normal force [N], from the reactions of the joint on its bodies: the size of the force of a joint, and
-        the force along the normal of a contact, which is positive where it pushes.
+        """The normal force [N], from the reactions on the bodies: the size of a joint's force, or a contact's force
+        along its normal, positive if it pushes.
         """
         held = self.joints["0"]
         force = reactions[self.last, : space.dimension]
@@ -124,10 +124,10 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     def wrenches(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: float
     ) -> Wrenches:
-        """The wrench of slip on each of the joint's bodies; `reactions`: those that the joint exerts besides."""
+        """The wrench of slip on each of the joint's bodies; `reactions`: the joint's reaction wrenches on them."""
         del t
         slip, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
-        # Its direction does not depend on reactions, which are solved for by iteration.
+        # The direction does not depend on reactions; an iteration solves for these.
         (against,) = pull(-slip_direction(self._modes(poses), slip))
         return self.coefficient * self.normal_force(space, poses, reactions) * against
 
@@ -149,30 +149,29 @@ class DryFriction(AbstractDryFriction):
     scene = jaxmb.Scene([block], joints=[slide], forces=[rub, jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    The slip of a joint is the rate of its displacement, or `radius` times that of its angle. In a `spatial.Cylindrical`
-    it has both as components, and in a `spatial.Planar` both components of the displacement: friction then acts against
-    the direction of slip, so that a pin which turns slides along its axis under the smallest force. In other joints
-    with several coordinates one of them is named, as in `"cardan.angle_a"`; friction in another one is a part of its
-    own. The normal force is the size of the joint's reaction force, in which moments do not count.
+    The slip of a joint is the rate of its displacement, or `radius` times the rate of its angle. In a
+    `spatial.Cylindrical` it has both as components, and in a `spatial.Planar` both rates of displacement. Friction then
+    acts against the direction of slip: a turning pin slides along its axis under the smallest force. Other joints with
+    several coordinates need a name such as `"cardan.angle_a"`, and a separate part for each. The normal force is the
+    size of the joint's reaction force, without moments.
 
     The slip of a contact (`RigidContact`, `RigidBallContact`, `RigidPlaneContact`, `RigidBoxContact`) is the velocity
-    of the last body against the other one where they touch: in the plane along the tangent that is the outward normal
-    turned clockwise, so that on level ground it points along x; in space in the tangent plane, where the force has the
-    direction of the slip (there is no moment against a spin about the normal), with components along two tangents that
-    on level ground are x and y. The normal force is that of the contact. In an impact the friction of the contacts has
-    an impulse of at most `coefficient` times theirs, and just that where slip does not end; friction of joints has
-    none.
+    of the last body relative to the other body at the point of contact. In the plane it is taken along the outward
+    normal turned clockwise, which on level ground points along x. In space it lies in the tangent plane, with
+    components along two tangents, x and y on level ground; the force is opposite to it, without a moment against spin
+    about the normal. The normal force is the contact's. In an impact, friction in contacts has an impulse of at most
+    `coefficient` times the contact's, and exactly this if slip does not end; friction in joints has none.
 
-    With a `speed` the first body carries a belt, or the terrain is one: its surface moves at this speed along the
-    directions of slip, and slip is measured against it.
+    With a `speed` the first body, or the terrain, is a belt: its surface moves at this speed along the directions of
+    slip, and slip is measured against it.
 
-    Several contacts in space that stick, as the feet of a table do, share forces that are not determined: they are as
-    small as they can be, and where one reaches its limit others take more. Where the normal forces are not determined
-    either, as those of four feet, the motion that slips may not be, and the run may end with a failure. In the plane
-    one of the ways to share is found, in which a foot of a body at rest may be at its limit: its mode is that of slip,
-    at the velocity zero, and another foot bears the rest. The motion and the sum of their forces are determined.
+    Several contacts in space that stick, such as the feet of a table, share undetermined forces. These are as small as
+    possible, and where a contact reaches its limit others take more. If the normal forces are undetermined too, as with
+    four feet, the motion in slip may be as well, and the run may end with a failure. In the plane the run finds a
+    possible distribution, in which a foot of a body at rest may be at its limit: its mode is slip, at velocity zero,
+    and another foot bears the rest. The motion and the sum of the forces are determined.
 
-    `Trajectory.reactions["rub"]` is its force on the last body, of stick and of slip.
+    `Trajectory.reactions["rub"]` is its force on the last body, in stick and in slip.
 
     If the normal force does not exist, or more than one does (Painlevé's paradox), the run ends with a failure that
     names the friction. `Friction` lists the ways in which a joint rubs.
@@ -181,16 +180,16 @@ class DryFriction(AbstractDryFriction):
 
     - `joint`: the name of the joint or contact, or `"joint.coordinate"`. The reaction must be determinate: no other
       joint may imply any of its rows.
-    - `coefficient` μ ≥ 0, of slip; `static_coefficient` ≥ μ, of stick, default μ.
+    - `coefficient` μ ≥ 0 in slip; `static_coefficient` ≥ μ in stick, default μ.
     - `radius` [m] > 0 of the pin, for a coordinate that is an angle.
-    - `speed` [m/s] of a belt, one number, or two where slip has two directions; default none.
+    - `speed` [m/s] of a belt, a number, or two numbers for two directions of slip; default none.
     """
 
     radius: fields.Number = fields.length(sign="positive", optional=True)
     speed: fields.Number = fields.parameter(shape=None, unit="m/s", optional=True, constant=True)
-    # The coordinates of a joint whose rates are those of slip.
+    # The coordinates of a joint whose rates are the slip.
     within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
-    # In a contact in space the axis from which its tangents turn, see `AbstractRigidContact.tangents`; otherwise zero.
+    # The axis from which the tangents of a contact in space turn, see `AbstractRigidContact.tangents`; otherwise zero.
     pole: int = eqx.field(static=True, default_factory=int, init=False)
 
     @property
@@ -207,14 +206,14 @@ class DryFriction(AbstractDryFriction):
             )
         if isinstance(held, AbstractUnilateralConstraint):
             return part._of_contact(space, held, poses)
-        within = part._own_coordinates(space, held, poses)
+        within = part._slip_coordinates(space, held, poses)
         if all(self.source_is_length(0, name) for name in within) != (self.radius is None):
             needs = "slides and has no radius" if self.radius is not None else "turns: give the radius of its pin"
             raise ValueError(f"{self.label}: {held.label} {needs}.")
         return part.with_fields(within=within)
 
-    def _own_coordinates(self, space, held, poses) -> tuple[str, ...]:
-        """The coordinates of the joint whose rates are those of slip."""
+    def _slip_coordinates(self, space, held, poses) -> tuple[str, ...]:
+        """The coordinates of the joint whose rates are the slip."""
         coordinates = self.coordinates_of(0, space, poses)
         numbers = [name for name, value in coordinates.items() if value.size == 1]
         named = self.joint.partition(".")[2]
@@ -252,7 +251,7 @@ class DryFriction(AbstractDryFriction):
         return self.with_fields(pole=(k + 1) * int(np.sign(normal[k])))
 
     def may_vary(self, keys):
-        # Where bodies touch, points of theirs are fixed in them; a terrain rises and sinks.
+        # Points of contact are fixed in the bodies, but a terrain rises and sinks.
         in_contact = keys[0] == "joints" and isinstance(self.joints["0"], AbstractRigidContact)
         return not in_contact or "terrain" in keys
 
@@ -270,8 +269,8 @@ class DryFriction(AbstractDryFriction):
         return rate_of(space, self, lambda part, x: part._lengths(space, x), poses, velocities)[1]
 
     def _lengths(self, space, poses):
-        own = self.joints["0"].coordinates_at(space, poses)
-        return jnp.concatenate([self._length(name, own[name].reshape(-1)) for name in self.within])
+        coordinates = self.joints["0"].coordinates_at(space, poses)
+        return jnp.concatenate([self._length(name, coordinates[name].reshape(-1)) for name in self.within])
 
     def _length(self, name, value):
         return value if self.radius is None or self.joints["0"].is_length(name) else self.radius * value

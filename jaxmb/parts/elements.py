@@ -1,8 +1,8 @@
 """The elementary constraints that joints consist of: points that coincide, and products of two vectors.
 
-A joint that declares them as its property `elements` has its rows computed together with those of all other such
-joints, whatever their types, in a few small kernels. The declared rows and the `residual` of the joint vanish together,
-and have the same derivatives where they do; `jaxmb.report.check_elements` compares them.
+The rows of all joints that declare them as their property `elements` are computed together in a few small kernels,
+whatever the joints' types. The declared rows and the joint's `residual` vanish together, and have the same derivatives
+there; `jaxmb.report.check_elements` compares them.
 
 Source: E. J. Haug, "Computer Aided Kinematics and Dynamics of Mechanical Systems", Allyn and Bacon 1989, chapter 9;
 P. E. Nikravesh, "Computer-Aided Analysis of Mechanical Systems", Prentice-Hall 1988, chapter 7.
@@ -25,7 +25,7 @@ class Coincident(NamedTuple):
         return dimension
 
     def moved(self, point: Callable[[int, Any], Any], direction: Callable[[int, Any], Any]) -> Self:
-        """The same for other axes of bodies 0 and 1: `point(k, s)` and `direction(k, v)` give those of the body k."""
+        """The same for other axes of bodies 0 and 1: `point(k, s)` and `direction(k, v)` convert to body k."""
         del direction
         return type(self)(point(0, self.point_a), point(1, self.point_b))
 
@@ -35,8 +35,8 @@ class Product(NamedTuple):
 
     **Fields:** `x_a`: X, fixed in A; None for X = Y / length. `y_b`: Y, fixed in B; or, with `y_a`, the vector from the
     point `y_a` of A to the point `y_b` of B [m]. `length` [m]: the row is `(Y · Y / length − length) / 2`. `along_a`
-    and `along_b`, fixed in A and in B: directions with a positive product, where the row alone does not tell a joint
-    from the same one half a turn away.
+    and `along_b`, fixed in A and in B: directions with a positive product, if the row alone also holds half a turn
+    away.
     """
 
     x_a: Any
@@ -89,17 +89,16 @@ def coincident(part: Any) -> Coincident:
 
 
 def perpendicular(x_a: Any, y_b: Any, along: tuple[Any, Any] = (None, None)) -> Product:
-    """A direction fixed in A and one fixed in B are perpendicular, and those of `along` have a positive product.
+    """A direction fixed in A and a direction fixed in B are perpendicular; the two directions `along` have a positive
+    product.
 
-    **Arguments:** `along`: give it where the residual of the joint does not vanish half a turn away, as this row does.
+    **Arguments:** `along`: needed if the joint's residual, unlike this row, does not vanish half a turn away.
     """
     return Product(x_a, y_b, along_a=along[0], along_b=along[1])
 
 
 def in_planes(part: Any, normals: Iterable[Any]) -> tuple[Product, ...]:
-    """Point B of a part stays in planes, or on lines in the plane, that are fixed in A, go through point A and have
-    these normals.
-    """
+    """Point B of a part stays in planes (lines in planar scenes) with these normals, fixed in A and through point A."""
     return tuple(Product(x, part.point_b, part.point_a) for x in normals)
 
 
@@ -109,7 +108,7 @@ def apart(part: Any) -> Product:
 
 
 def on_bodies(part: Any, space: Any, elements: Iterable[Element]) -> tuple[Element, ...]:
-    """Elements in the axes of the bodies, from those in the frames that the part names in their place."""
+    """Elements in the axes of the bodies, from elements in the frames that the part names in their place."""
     frames = part.body_frames
     if not frames:
         return tuple(elements)

@@ -1,4 +1,4 @@
-"""Declarations of the fields of a part, checks of its numbers against them, and what it holds by them.
+"""Declarations of the fields of a part, checks of its numbers against them, and its contents by them.
 
 A part declares its fields with the helpers of this file, in place of `equinox.field`:
 
@@ -41,7 +41,7 @@ else:
 Sign = Literal["positive", "non-negative", "nonzero", "positive definite"]
 Size = int | Literal["d", "v"] | None
 
-# A direction counts as a unit vector if its length differs from one by no more than this.
+# Largest error of the length of a unit vector.
 _UNIT = 1e-6
 
 
@@ -52,15 +52,15 @@ class Declaration:
     **Fields:**
 
     - `kind`: `"identity"` for a name that distinguishes stacked parts (`"identities"` for several), `"body"` for the
-        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of them and of modules,
-        `"module"` for a module whose weights are one number, `"law"` for one with parameters of its own, `"part"` for
-        another part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
-        `"internal"` for an internal state (`"internals"` for a dictionary of them); these are not parameters.
-    - `shape`: of a number, None for any, and None in it for any size; `sign`; `unit`, `"1"` for a number without one,
-        None where it is not known, and `("N m", "N")` where it is the first for an angle, the second for a length.
+        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of numbers and modules,
+        `"module"` for a module whose weights are one number, `"law"` for a module with parameters, `"part"` for another
+        part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
+        `"internal"` for an internal state (`"internals"` for a dictionary of them); states are not parameters.
+    - `shape` of a number, None for any, with None for any size; `sign`; `unit`, `"1"` for a number without unit, None
+        if unknown, and `("N m", "N")` for the units with an angle and with a length.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
-    - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters; of
-        several points or unit vectors each row is one.
+    - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
+        Several points or unit vectors are rows.
     - `sizes`: whether the scene's size is computed from this length.
     - `optional`: whether the field may be None, and is computed from the given poses; `at_origin`: whether a point that
         is left out is the origin of its frame.
@@ -106,8 +106,8 @@ def declarations(cls: type) -> dict[str, Declaration]:
 
 
 def values_of(part: Any) -> dict[str, Any]:
-    """The values of all fields of a part by name, at once: each attribute of a module that is asked for takes a
-    microsecond, too long for those of thousands of parts.
+    """The values of all fields of a part by name, at once: access to each attribute of a module takes a microsecond,
+    too long for thousands of parts.
     """
     return vars(part)
 
@@ -126,7 +126,7 @@ def as_parameter(value: Any) -> Any:
 
     It is a JAX array if any entry is traced, otherwise a read-only NumPy array: building a scene compiles nothing.
 
-    **Raises:** `ValueError` for anything but a real number or an array of real numbers.
+    **Raises:** `ValueError` unless it is a real number or an array of real numbers.
     """
     dtype = default_float()
     if is_traced(value):
@@ -275,13 +275,13 @@ def parameter(
 
     - `shape`, in which `"d"` is the dimension of the space, `"v"` the size of a velocity and None any size; None for
         any shape.
-    - `unit`: a product of powers of SI units, `"1"` of a number without one; of a number that belongs to a coordinate
-        the unit for an angle and for a length, `("N m/rad", "N/m")`; None, the default, where it is not known, so that
-        `report.stress_test` cannot scale lengths.
+    - `unit`: a product of powers of SI units, `"1"` for a number without unit; two units for a number of a coordinate,
+        with an angle and with a length, `("N m/rad", "N/m")`; None, the default, if unknown: `report.stress_test` then
+        cannot scale lengths.
     - `sign` of every component: `"positive"`, `"non-negative"`, `"nonzero"`, or `"positive definite"` of a matrix.
     - `default`; `optional`: default None, which the part's `complete` replaces.
     - `sizes`: whether the scene's size is computed from this length; `constant`: whether it cannot be a function of
-        time; `dimension`, 2 or 3, of the scenes that it is for, default both; `converter`, applied before the checks.
+        time; `dimension` of the scenes that have it, 2 or 3, default both; `converter`, applied before the checks.
 
     **Raises:** `ValueError` for a unit that cannot be read.
     """
@@ -318,13 +318,13 @@ def point(
     point_b: jaxmb.parts.Number = jaxmb.parts.point(body=1, default="origin")
     ```
 
-    A point of a body is given in the frame of the body, or in that of the frame that the part names in its place. The
-    origin of a body's frame is its mass centre, unless the body was given `centre=`.
+    A point of a body is given in the body's frame, or in the frame that the part names in its place. The origin of a
+    body's frame is its mass centre, unless the body was given `centre=`.
 
     **Arguments:** `body`: index among the part's bodies; `shape`: `(None, "d")` for any number of points, a row each;
     `default`: `"origin"`, of that frame, or coordinates; `optional`: default None; `sizes`: whether it contributes to
     the scene's size; `gives`: the body-fixed points that a world point determines at the given poses; `needed=False`:
-    both the world point and the one body-fixed point that it gives may be omitted.
+    both the world point and the body-fixed point that it gives may be omitted.
     """
     at_origin = isinstance(default, str)
     if at_origin and default != "origin":
@@ -410,8 +410,8 @@ def internal_state(
     torque: jaxmb.parts.Number = jaxmb.parts.internal_state(unit="N m")
     ```
 
-    The kernels of the part see the current value in this field; the value that is given here is that of the initial
-    guess. It is not a parameter. `optional`: default None, with which the part has no such state.
+    The kernels of the part see the current value in this field; its given value is the initial guess. It is not a
+    parameter. `optional`: default None, without such a state.
     """
     declaration = Declaration("internal", shape=shape, unit=unit, optional=optional)
     return _field(declaration, converter=_optional(_NUMBER), default=None if optional else default, kw_only=True)
@@ -440,8 +440,8 @@ def module() -> Any:
     net: Any = jaxmb.parts.module()
     ```
 
-    The weights are all arrays of floating-point numbers in it; everything else, such as sizes and functions, is static.
-    The kernels of the part call it as the module, `self.net(x)`; `self.net.module` is the module itself.
+    The weights are all arrays of floating-point numbers in it; the rest, such as sizes and functions, is static. The
+    kernels of the part call it as the module, `self.net(x)`; `self.net.module` is the module itself.
     """
     return _field(_MODULE_FIELD, converter=_MODULE, kw_only=True)
 
@@ -450,7 +450,7 @@ _MODULE_FIELD = Declaration("module", shape=(None,))
 
 
 def part(of: Any) -> Any:
-    """Another part, which the scene fills in; its numbers are parameters under that part's own name."""
+    """Another part, which the scene fills in; its numbers are parameters under that part's name."""
     return _field(Declaration("part", of=of | None), default_factory=lambda: None, init=False)
 
 
@@ -523,7 +523,7 @@ def _is_number(value: Any) -> bool:
 
 
 def in_range(declared: Declaration, values: Float[Array, "..."]) -> Bool[Array, ""]:
-    """Whether numbers that are traced, perhaps of several parts, are finite, of the declared sign, and unit vectors."""
+    """Whether traced numbers, perhaps of several parts, are finite, of the declared sign, and unit vectors."""
     values, sign = lax.stop_gradient(values), declared.sign
     ok = jnp.all(jnp.isfinite(values))
     if sign == "nonzero":
@@ -541,7 +541,7 @@ def in_range(declared: Declaration, values: Float[Array, "..."]) -> Bool[Array, 
 
 
 def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> None:
-    """Raise a `ValueError` for numbers of wrong shape or sign, non-finite ones, and directions that are not unit
+    """Raise a `ValueError` for numbers of wrong shape or sign, non-finite numbers, and directions that are not unit
     vectors, in the part and its laws.
     """
     values = values_of(part)
@@ -560,7 +560,7 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
 
 
 def _check_finite(value: Any, label: str, shown: str) -> None:
-    # Of a module these are its weights.
+    # The values of a module are its weights.
     for number in jax.tree.leaves(value):
         if not is_traced(number) and not np.all(np.isfinite(number)):
             raise ValueError(f"{label}: {shown} must be finite, got {np.asarray(number)}.")
@@ -617,13 +617,13 @@ def anonymous(part: Any) -> Any:
         elif kind in ("part", "law"):
             value = None if value is None else anonymous(value)
         elif kind == "parts":
-            value = {key: anonymous(own) for key, own in value.items()}
+            value = {key: anonymous(inner) for key, inner in value.items()}
         out[field] = value
     return with_values(type(part), out)
 
 
 def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """The other parts that a part holds, and those that these hold, each after the path of keys that leads to it."""
+    """All other parts inside a part, at any depth, each after its path of keys."""
     for name in _fields_of_parts(type(part)):
         value: Any = getattr(part, name)
         held = value if isinstance(value, dict) else {} if value is None else {None: value}
@@ -635,31 +635,31 @@ def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple
 
 @functools.cache
 def _fields_of_parts(cls: type) -> tuple[str, ...]:
-    return tuple(name for name, own in declarations(cls).items() if own.kind in ("part", "parts"))
+    return tuple(name for name, declaration in declarations(cls).items() if declaration.kind in ("part", "parts"))
 
 
 def internal_states(part: Any) -> dict[str, tuple[str, ...]]:
     """The paths of keys to the internal states of a part, by their names."""
-    found = {}
+    states = {}
     for name, declared in declarations(type(part)).items():
         if declared.kind == "internal" and getattr(part, name) is not None:
-            found[name] = (name,)
+            states[name] = (name,)
         elif declared.kind == "internals":
-            found |= {key: (name, key) for key in getattr(part, name)}
-    return found
+            states |= {key: (name, key) for key in getattr(part, name)}
+    return states
 
 
 def paths(part: Any) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Declaration]]:
-    """The parameters of a part itself, not of parts that it holds.
+    """The parameters of a part itself, without the parts in it.
 
-    For each: the path of keys to it; the path in its name, which leaves out the keys of dictionaries' fields; and its
-    declaration, an empty one for an entry of a dictionary. The weights of a module have the name of the module.
+    For each: its path of keys; the path in its name, without the keys of fields that are dictionaries; and its
+    declaration, empty for an entry of a dictionary. The weights of a module have the name of the module.
     """
     declared = declarations(type(part))
     for field in field_names(type(part)):
-        own = declared.get(field, _ANY_NUMBER)
-        if own.kind not in ("state", "internal", "internals", "part", "parts"):
-            yield from _paths(getattr(part, field), (field,), (field,), own)
+        declaration = declared.get(field, _ANY_NUMBER)
+        if declaration.kind not in ("state", "internal", "internals", "part", "parts"):
+            yield from _paths(getattr(part, field), (field,), (field,), declaration)
 
 
 _ANY_NUMBER = Declaration("number")
@@ -675,8 +675,8 @@ def _paths(value: Any, keys: tuple[str, ...], shown: tuple[str, ...], declared: 
             is_module = declared.kind == "numbers" and isinstance(entry, eqx.Module)
             yield from _paths(entry, (*keys, key), (*shown[:-1], key), _MODULE_FIELD if is_module else _ANY_NUMBER)
     elif isinstance(value, eqx.Module):
-        for inner, name, own in paths(value):
-            yield (*keys, *inner), (*shown, *name), own
+        for inner, name, declaration in paths(value):
+            yield (*keys, *inner), (*shown, *name), declaration
 
 
 def entry(value: Any, keys: tuple[str, ...]) -> Any:

@@ -28,8 +28,8 @@ class Gravity(AbstractPart):
 
 
 def over_ground(part: Any, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"]:
-    """A velocity [m/s] in the world, less that of the ground below a point, which rises and sinks where numbers of the
-    part's `terrain` are inputs.
+    """A velocity [m/s] relative to the ground below a point, which rises and sinks if numbers of the part's `terrain`
+    are inputs.
     """
     upwards = jnp.zeros_like(point).at[-1].set(1.0)
     return with_drift(part, velocity, lambda part: -part.terrain.height(point[:-1]) * upwards)
@@ -57,9 +57,8 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[spring]).compile()
     ```
 
-    At zero length the direction of a pretension is undefined and the pretension is taken as zero; a spring of zero
-    free length is linear there. The damping is against the velocity there, as it is in the limit along every motion
-    that comes to zero length.
+    At zero length a pretension is taken as zero, since its direction is undefined; a spring of zero free length is
+    linear there. Damping acts against the velocity there, the limit along every motion that reaches zero length.
 
     **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
     given poses.
@@ -132,7 +131,7 @@ class PointForce(AbstractForce):
 
 
 class Torque(AbstractForce):
-    """A constant moment on `body`, with its reaction on another one.
+    """A constant moment on `body`, with its reaction on another body.
 
     ```python
     motor = planar.Torque("motor", "bar", torque=2.0)

@@ -14,10 +14,10 @@ from .space import AbstractSpace, Point, Pose, Velocity, Wrench
 
 
 class AbstractFrame(AbstractPart):
-    """A frame fixed in a body, or in another frame, which is then its `base`; a scene fills that in.
+    """A frame fixed in a body, or in another frame, its `base`, which a scene fills in.
 
-    A part that names a frame in place of a body sees the pose and the velocity of the frame: points and axes that are
-    given with the part are in the frame's axes, from its origin.
+    A part that names a frame in place of a body sees the pose and the velocity of the frame. Points and axes given with
+    the part are in the frame's axes, from its origin.
     """
 
     name: str = fields.name()
@@ -26,7 +26,7 @@ class AbstractFrame(AbstractPart):
 
     @abc.abstractmethod
     def own_pose(self, space: AbstractSpace, pose: Pose) -> Pose:
-        """The frame's pose from that of its base, with or without prepared quantities."""
+        """The frame's pose from its base's, with or without prepared quantities."""
 
     @abc.abstractmethod
     def own_velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
@@ -34,7 +34,7 @@ class AbstractFrame(AbstractPart):
 
     @abc.abstractmethod
     def own_wrench(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
-        """The wrench on the base that is equivalent to one on the frame."""
+        """The wrench on the base that is equivalent to a wrench on the frame."""
 
     @abc.abstractmethod
     def own_point(self, point: Point) -> Point:
@@ -48,9 +48,9 @@ class AbstractFrame(AbstractPart):
     # From the body itself.
 
     def pose(self, space: AbstractSpace, pose: Pose) -> Pose:
-        """The frame's pose from that of the body; with prepared quantities if the body's has them."""
-        found = self.own_pose(space, pose if self.base is None else self.base.pose(space, pose))
-        return space.prepare(found) if pose.shape[0] > found.shape[0] else found
+        """The frame's pose from the body's; with prepared quantities if the body's has them."""
+        placed = self.own_pose(space, pose if self.base is None else self.base.pose(space, pose))
+        return space.prepare(placed) if pose.shape[0] > placed.shape[0] else placed
 
     def velocity(self, space: AbstractSpace, pose: Pose, velocity: Velocity) -> Velocity:
         """The frame's velocity from pose and velocity of the body."""
@@ -59,37 +59,37 @@ class AbstractFrame(AbstractPart):
         return self.own_velocity(space, pose, velocity)
 
     def wrench(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
-        """The wrench on the body that is equivalent to one on the frame."""
+        """The wrench on the body that is equivalent to a wrench on the frame."""
         if self.base is None:
             return self.own_wrench(space, pose, wrench)
         return self.base.wrench(space, pose, self.own_wrench(space, self.base.pose(space, pose), wrench))
 
     def wrench_on_frame(self, space: AbstractSpace, pose: Pose, wrench: Wrench) -> Wrench:
-        """The wrench on the frame that is equivalent to one on the body."""
+        """The wrench on the frame that is equivalent to a wrench on the body."""
         if self.base is not None:
             pose, wrench = self.base.pose(space, pose), self.base.wrench_on_frame(space, pose, wrench)
         d = space.dimension
         at_origin = space.point_force(pose, self.own_point(jnp.zeros(d, wrench.dtype)), wrench[:d])
-        # Components of moments change as those of angular velocities do.
+        # Moments transform like angular velocities.
         moment = jnp.concatenate([jnp.zeros_like(wrench[:d]), wrench[d:] - at_origin[d:]])
         return jnp.concatenate([wrench[:d], self.own_velocity(space, pose, moment)[d:]])
 
     def point(self, point: Point) -> Point:
         """The point of the body [m] at a point of the frame."""
-        own = self.own_point(point)
-        return own if self.base is None else self.base.point(own)
+        in_base = self.own_point(point)
+        return in_base if self.base is None else self.base.point(in_base)
 
 
 class LinkFrame(AbstractFrame):
     """The frame of a body whose mass centre is not its origin.
 
-    **Arguments:** `centre` [m]: the mass centre in the frame, whose axes are those of the body.
+    **Arguments:** `centre` [m]: the mass centre in the frame, whose axes are the body's.
     """
 
     centre: fields.Number = fields.parameter(shape=("d",), unit="m")
 
     def own_pose(self, space, pose):
-        # What is prepared belongs to the attitude, which is the body's.
+        # Prepared quantities belong to the attitude, which is the body's.
         xp = namespace(pose, self.centre)
         return xp.concatenate([space.point(pose, -self.centre), pose[space.dimension :]])
 
@@ -107,15 +107,15 @@ class LinkFrame(AbstractFrame):
 
 
 def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBody]) -> dict[str, AbstractFrame]:
-    """Checked frames with their bases, by name; also those of the bodies whose mass centre is not their origin, by the
-    names of these.
+    """Checked frames with their bases, by name; bodies whose mass centre is not their origin have a frame under their
+    name.
 
-    **Raises:** `ValueError` for frames on unknown bodies, and those that are fixed in themselves.
+    **Raises:** `ValueError` for frames on unknown bodies, and frames that are fixed in themselves.
     """
-    given, known = {frame.name: frame for frame in frames}, {body.name: body for body in bodies}
+    given, bodies_by_name = {frame.name: frame for frame in frames}, {body.name: body for body in bodies}
     out: dict[str, Any] = {
         name: LinkFrame(name=name, body=name, centre=centre)
-        for name, body in known.items()
+        for name, body in bodies_by_name.items()
         if (centre := body.mass_centre) is not None
     }
 
@@ -125,8 +125,8 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
         frame = given[name]
         if name in path:
             raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
-        if frame.body not in (*given, *known, GROUND):
-            raise unknown("body", frame.body, [*known, GROUND, *given], frame.label)
+        if frame.body not in (*given, *bodies_by_name, GROUND):
+            raise unknown("body", frame.body, [*bodies_by_name, GROUND, *given], frame.label)
         based(frame.body, (*path, name))
         frame.check(bodies[0].dimension)
         out[name] = frame.with_fields(base=out.get(frame.body))

@@ -27,11 +27,11 @@ class Friction(AbstractNonIdeal):
     system = jaxmb.Scene([bar], joints=[pin], forces=[rub, jaxmb.Gravity((0.0, -9.81))]).compile()
     ```
 
-    The slip s combines the relative velocity of the bodies at the joint's point (of a single body: relative to the
-    ground) with `radius` times their relative angular velocity, so that one law serves pins, slides and cylinders. The
-    force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest. N is the magnitude of
-    the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If no
-    such N exists, or more than one (Painlevé's paradox), the simulation ends with `friction_undetermined`.
+    The slip s combines the relative velocity of the bodies at the joint's point (a single body's: relative to the
+    ground) with `radius` times their relative angular velocity. The same law thus serves pins, slides and cylinders.
+    The force conjugate to s is `−μ N s/|s| tanh(|s| / transition_speed)`, which is smooth at rest. N is the magnitude
+    of the reaction force that the joint exerts in the presence of all friction; reaction moments do not contribute. If
+    no such N exists, or more than one (Painlevé's paradox), the simulation ends with `friction_undetermined`.
 
     **Arguments:**
 
@@ -52,7 +52,7 @@ class Friction(AbstractNonIdeal):
 
     def complete(self, space, joint, poses):
         if isinstance(joint, AbstractInertialConstraint):
-            raise ValueError(f"{self.label}: {joint.label} is no joint with a smooth force; use jaxmb.DryFriction.")
+            raise ValueError(f"{self.label}: {joint.label} is not a joint with a smooth force; use jaxmb.DryFriction.")
         k = poses.shape[0] - 1
         if k > 1:
             raise ValueError(f"{self.label}: {joint.name!r} connects more than two bodies; use NonIdeal.")
@@ -63,7 +63,7 @@ class Friction(AbstractNonIdeal):
 
     def _check_slip(self, space, joint, poses):
         columns = poses.shape[0] * space.velocity_size
-        rows = [np.asarray(rows_of(own, space, poses)).reshape(-1, columns) for own in joint.components()]
+        rows = [np.asarray(rows_of(component, space, poses)).reshape(-1, columns) for component in joint.components()]
         _, sizes, directions = np.linalg.svd(np.concatenate(rows))
         allowed = directions[np.sum(sizes > 1e-9 * sizes[0]) :].reshape(-1, poses.shape[0], space.velocity_size)
         slips = jax.vmap(lambda v: self.slip(space, poses, v))(jnp.asarray(allowed))

@@ -16,8 +16,8 @@ from .base import AbstractConstraint, AbstractNonIdeal, AbstractPotentialForce, 
 
 
 def _shaped(part: Any, value: Any, shape: tuple[int, ...]) -> Array:
-    """The return value of a user function in the required shape. It may lack the axis of a single row or body, and a
-    number may be an array of one.
+    """The return value of a user function in the required shape. It may lack the axis of a single row or body; a number
+    may be an array of one element.
     """
     value = jnp.asarray(value)
     equivalent = shape[1:] if shape[:1] == (1,) else shape or (1,)
@@ -115,17 +115,17 @@ class Force(AbstractPotentialForce):
 
     - `bodies`: one name or several; `"ground"` may be among them (its wrench is dropped).
     - `function`: returns shape `(len(bodies), 3)` in the plane (force [N], moment [N m]) or `(len(bodies), 6)` in space
-        (force in the world frame, moment in the body frame); of one body also shape `(3,)` or `(6,)`. The
-        force acts at the origin of the body's frame, whose pose and velocity the function sees, and the moment is about
-        it: the mass centre, unless the body was given `centre=`.
+        (force in the world frame, moment in the body frame); of one body also shape `(3,)` or `(6,)`. Force and moment
+        refer to the origin of the body's frame, whose pose and velocity the function sees: the mass centre, unless the
+        body was given `centre=`.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`. An equinox module, such as a
         neural network, may be among them: the function calls it as `parameters["net"](x)`, and all its weights are one
         parameter, a vector. `with_parameters` takes a vector or a module of new weights, and `jaxmb.modules` gives it.
     - `potential(poses, t, parameters)`: optional potential energy [J] of which these forces are the gradient, for the
         energy balance.
-    - `gap(poses, t, parameters)`: optional gap [m, rad], a number or a vector, of a force that acts only where it is
-        negative, such as a contact. No step of `simulate` then passes over the force, however short it acts. The gap is
-        a distance from a convex shape, or varies with a joint; other shapes need one for each of their convex parts.
+    - `gap(poses, t, parameters)`: optional gap [m, rad], a number or a vector, for a force such as a contact that acts
+        only where it is negative. No step of `simulate` then passes over the force, however short it acts. The gap is a
+        distance from a convex shape, or varies with a joint; other shapes need a gap for each convex part.
     """
 
     name: str = fields.name()
@@ -162,8 +162,8 @@ class Force(AbstractPotentialForce):
 
 
 class NonIdeal(AbstractNonIdeal):
-    """A non-ideal constraint force (it does virtual work) from a function, `function(poses, velocities, reactions, t,
-    parameters) -> wrenches`.
+    """A non-ideal constraint force, which does virtual work, from a function, `function(poses, velocities, reactions,
+    t, parameters) -> wrenches`.
 
     ```python
     def rub(poses, velocities, reactions, t, p):
@@ -177,10 +177,10 @@ class NonIdeal(AbstractNonIdeal):
     **Arguments:**
 
     - `joint`: the name of a joint with a determinate reaction: no other joint may imply any of its rows.
-    - `function`: as in `Force`, with a row for each of the joint's bodies. `reactions` are the wrenches that the joint
-        exerts on them besides, in the same axes, in the presence of all these forces. Components that the function
-        returns in directions that the joint blocks do not change the motion: the reactions are smaller by them. Moments
-        of both are about the origins of the frames.
+    - `function`: as in `Force`, with a row for each of the joint's bodies. `reactions` are the joint's reaction
+        wrenches on them, in the same axes, in the presence of all these forces. Returned components in directions that
+        the joint blocks do not change the motion: they only reduce the reactions. Both moments are about the origins of
+        the frames.
     - `parameters`: as in `Force`.
     """
 

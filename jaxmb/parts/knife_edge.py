@@ -12,8 +12,9 @@ from .space import with_drift
 
 
 class KnifeEdge(AbstractVelocityConstraint):
-    """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, v the velocity of the contact point, n
-    the normal of the blade in its plane, in space `n = e × h` of the direction h of the blade and the plane's normal e.
+    """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, with the velocity v of the contact point
+    and the normal n of the blade in its plane. In space `n = e × h`, with the direction h of the blade and the plane's
+    normal e.
 
     ```python
     sled = planar.Body("sled", mass=1.0, inertia=0.1, velocity=(1.0, 0.0))
@@ -21,15 +22,15 @@ class KnifeEdge(AbstractVelocityConstraint):
     system = jaxmb.Scene([sled], joints=[blade]).compile()
     ```
 
-    It has no coordinates of its own. In space it does not hold the body on the plane; add a `spatial.Planar` or
-    `PointOnPlane` joint.
+    It has no coordinates. In space it does not hold the body on the plane; add a `spatial.Planar` or `PointOnPlane`
+    joint.
 
     **Arguments:**
 
     - `name`, of the blade; `body`: the body that it is fixed in, or a frame in it, by name.
     - `point` [m]: the contact point fixed in the body, default the origin of its frame.
     - `axis`, unit: the direction of the blade fixed in the body, default its x axis.
-    - `normal`, unit, shape (3,), in space: that of the plane in the world, default z.
+    - `normal`, unit, shape (3,), in space: the normal of the plane in the world, default z.
     """
 
     name: str = fields.name()

@@ -1,10 +1,10 @@
-"""Modes of contacts and of dry friction: numbers among the coordinates that say which of their laws hold.
+"""Modes of contacts and of dry friction: coordinates that select their laws.
 
-A contact is open (0) or closed (1), or closed while others that are closed as well imply it and take the force (2). Dry
-friction in one direction does nothing (0), slips forwards or backwards (1, -1), or sticks (2), in which others that
-stick as well may imply it and take the force (3). Friction in two directions has two modes. Both are that number where
-it does nothing or sticks; where it slips they are the components of a vector, near the direction of slip, of length
-one, or of half of that where slip has begun from rest and is not to be seen yet.
+A contact is open (0), closed (1), or closed while other closed contacts imply it and take the force (2). Dry friction
+in one direction is inactive (0), slips forwards or backwards (1, -1), sticks (2), or sticks while other friction
+implies it and takes the force (3). Friction in two directions has two modes. Both have the same number if it is
+inactive or sticks. In slip they are the components of a vector near the direction of slip: of length one, or one half
+if slip has just begun from rest and is not visible yet.
 """
 
 from typing import NamedTuple
@@ -21,20 +21,20 @@ from ..linalg.sums import with_entries
 
 OPEN, CLOSED, IMPLIED = 0, 1, 2
 FREE, FORWARD, STICK, IMPLIED_STICK = 0, 1, 2, 3
-# The length of the modes of slip in two directions that has just begun, and the lengths between which it is seen.
+# The length of the modes when slip in two directions has just begun, and the lengths between which slip is visible.
 BEGUN, _SEEN, _HELD = 0.5, 0.75, 1.5
 
 
 def kind_of(mode: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The whole number that a mode is, without derivative."""
+    """The whole number of a mode, without derivative."""
     return lax.stop_gradient(jnp.round(mode))
 
 
 def slip_direction(modes: Float[Array, "rows"], slip: Float[Array, "rows"]) -> Float[Array, "rows"]:
     """The unit vector against which dry friction acts, by its modes; zero where it sticks or is free.
 
-    In two directions it is that of the slip, on the side of the modes, so that the force has no jump where slip passes
-    through zero; where slip has just begun, or there is none, it is that of the modes.
+    In two directions it is the direction of the slip, on the side of the modes: the force does not jump where slip
+    passes through zero. It is the direction of the modes if slip has just begun, or is zero.
     """
     if modes.size == 1:
         return jnp.where(jnp.abs(jnp.round(modes)) == FORWARD, jnp.round(modes), 0.0)
@@ -58,20 +58,20 @@ class SlipInPlane(NamedTuple):
 
     @property
     def begun(self) -> Bool[Array, "pairs"]:
-        """Friction whose slip has begun and is not to be seen yet."""
+        """Friction whose slip has begun and is not visible yet."""
         return (self.size > 0) & (self.size < _SEEN)
 
     @property
     def slides(self) -> Bool[Array, "pairs"]:
-        """Friction whose slip is to be seen."""
+        """Friction whose slip is visible."""
         return (self.size > _SEEN) & (self.size < _HELD)
 
 
 class Modes(NamedTuple):
-    """The modes of a system's contacts, and behind them those of its dry friction.
+    """The modes of a system's contacts, followed by the modes of its dry friction.
 
-    **Fields:** the `numbers`, whole ones but for slip in two directions; how many are of contacts, `n`; `pairs`: the
-    places of the first directions of friction that has two, among all friction.
+    **Fields:** the `numbers`, whole except for slip in two directions; `n`, the number of contacts; `pairs`: among all
+    friction, the indices of the first directions of friction in two directions.
     """
 
     numbers: Float[Array, "laws"]
@@ -80,7 +80,7 @@ class Modes(NamedTuple):
 
     @classmethod
     def of(cls, numbers: Float[Array, "laws"], n: int, pairs: tuple[int, ...]) -> "Modes":
-        """The modes that some coordinates are."""
+        """Modes from coordinates."""
         out = cls(jnp.round(numbers), n, pairs)
         return out._replace(numbers=jnp.where(out._paired, numbers, out.numbers)) if pairs else out
 
@@ -118,7 +118,7 @@ class Modes(NamedTuple):
 
     @property
     def implied_stick(self) -> Bool[Array, "frictions"]:
-        """Friction that sticks while others imply it."""
+        """Friction that sticks while other friction implies it."""
         return self.of_friction == IMPLIED_STICK
 
     @property
@@ -138,7 +138,7 @@ class Modes(NamedTuple):
         return SlipInPlane(modes, norm(modes))
 
     def slips(self, slip: Float[Array, "frictions"]) -> Float[Array, "frictions"]:
-        """The directions of slip, from its velocities; zero where nothing slips."""
+        """The directions of slip, from its velocities; zero without slip."""
         slips = jnp.where(self.slides, self.of_friction, FREE)
         if not self.pairs:
             return slips
@@ -147,7 +147,7 @@ class Modes(NamedTuple):
 
     @property
     def kinds(self) -> Float[Array, "laws"]:
-        """The modes as whole numbers: of friction that slips in two directions 1."""
+        """The modes as whole numbers: 1 for slip in two directions."""
         if not self.pairs:
             return self.numbers
         sizes = self.in_plane.size
@@ -156,7 +156,7 @@ class Modes(NamedTuple):
 
 
 def modes_of_contacts(closed: Bool[Array, "contacts"], implied: Bool[Array, "contacts"]) -> Array:
-    """The modes of contacts that are `closed`, or `implied` by those, and of others, which are open."""
+    """The modes of contacts that are `closed`, `implied` by these, or else open."""
     return jnp.where(closed, CLOSED, jnp.where(implied, IMPLIED, OPEN))
 
 
@@ -166,7 +166,7 @@ def modes_of_friction(
     slips: Float[Array, "frictions"],
     begun: Bool[Array, "frictions"],
 ) -> Array:
-    """The modes of friction that `sticks`, with a force or `implied`, or `slips` in a direction; in two directions slip
-    may have `begun`.
+    """The modes of friction that `sticks`, is `implied` to stick, or `slips` in a direction; in two directions slip may
+    have just `begun`.
     """
     return jnp.where(sticks, STICK, jnp.where(implied, IMPLIED_STICK, jnp.where(begun, BEGUN, 1.0) * slips))

@@ -14,7 +14,7 @@ from ..linalg.arrays import ARRAYS, is_traced
 
 
 class ModuleWeights(eqx.Module):
-    """A module as the vector of its weights, and the rest, which is static. A call is one of the module.
+    """A module as the vector of its weights, and the rest, which is static. A call calls the module.
 
     The weights are all arrays of floating-point numbers, raveled one after the other in the order of `jax.tree.leaves`.
 
@@ -36,10 +36,10 @@ class ModuleWeights(eqx.Module):
 
 @functools.singledispatch
 def as_weights(module: Any) -> ModuleWeights:
-    """A module as its weights and the rest; what is that already stays as it is.
+    """A module as its weights and the rest; `ModuleWeights` are returned unchanged.
 
-    **Raises:** `ValueError` for a module without weights, and for arrays of other numbers, which are neither weights
-    nor static.
+    **Raises:** `ValueError` for a module without weights, and for arrays that are not of floating-point numbers, which
+    are neither weights nor static.
     """
     if not isinstance(module, eqx.Module):
         raise ValueError(f"expected an equinox module, such as an eqx.nn.MLP, got {module!r}")
@@ -50,8 +50,8 @@ def as_weights(module: Any) -> ModuleWeights:
             return leaf
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(
-                f"{_place(path)} is an array of {leaf.dtype} numbers; weights are floating-point numbers, and what is "
-                "fixed is no array"
+                f"{_place(path)} is an array of {leaf.dtype} numbers; weights are floating-point arrays, and fixed "
+                "values must not be arrays"
             )
         weights.append(leaf)
         return jax.ShapeDtypeStruct(leaf.shape, dtype)
@@ -77,24 +77,24 @@ def with_weights(like: eqx.Module, values: Float[Array, "n"]) -> eqx.Module:
     """
     leaves, structure = jax.tree.flatten(like)
     sizes = [leaf.size if _is_shape(leaf) else 0 for leaf in leaves]
-    own = jnp.split(values, np.cumsum(sizes)[:-1])
-    filled = [part.reshape(leaf.shape) if _is_shape(leaf) else leaf for leaf, part in zip(leaves, own, strict=True)]
+    pieces = jnp.split(values, np.cumsum(sizes)[:-1])
+    filled = [part.reshape(leaf.shape) if _is_shape(leaf) else leaf for leaf, part in zip(leaves, pieces, strict=True)]
     return jax.tree.unflatten(structure, filled)
 
 
 def weights_of(module: eqx.Module, like: eqx.Module) -> Float[Array, "n"]:
-    """The weights of a module that must differ from another one in nothing else.
+    """The weights of a module that may differ from `like` in its weights only.
 
-    **Raises:** `ValueError` that names what differs.
+    **Raises:** `ValueError` that names the difference.
     """
-    found = as_weights(module)
-    if found.like == like:
-        return found.values
+    weights = as_weights(module)
+    if weights.like == like:
+        return weights.values
     kinds = type(like).__name__, type(module).__name__
     if kinds[0] != kinds[1]:
         raise ValueError(f"expected a module {kinds[0]}, got {kinds[1]}")
     flat = lambda module: jax.tree_util.tree_flatten_with_path(module)[0]
-    wanted, given = ({_place(path): leaf for path, leaf in flat(x)} for x in (like, found.like))
+    wanted, given = ({_place(path): leaf for path, leaf in flat(x)} for x in (like, weights.like))
     for place in wanted | given:
         old, new = (leaves.get(place) for leaves in (wanted, given))
         if old != new:

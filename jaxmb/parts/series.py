@@ -17,12 +17,12 @@ from ..linalg.arrays import is_traced
 from .fields import as_jax, as_parameter
 
 Interpolation = Literal["linear", "cubic", "held"]
-# At how many times a function is looked at.
+# The number of times at which a function is sampled.
 _SAMPLES = 513
 
 
 def sample_times(t0: Scalar, t1: Scalar) -> Float[Array, "n"]:
-    """The times [s] between two others at which functions of time are looked at, ascending."""
+    """The times [s] between two times at which functions of time are sampled, ascending."""
     return jnp.linspace(jnp.minimum(t0, t1), jnp.maximum(t0, t1), _SAMPLES)
 
 
@@ -36,20 +36,20 @@ class AbstractSignal(eqx.Module):
         """The value at a time [s]."""
 
     def shape(self, t: Scalar) -> Any:
-        """The shape of the value at a time [s], or the value itself where it is no array."""
-        found = eqx.filter_eval_shape(self, t)
-        return getattr(found, "shape", found)
+        """The shape of the value at a time [s], or the value itself if it is not an array."""
+        result = eqx.filter_eval_shape(self, t)
+        return getattr(result, "shape", result)
 
     def keep(self) -> None:
-        """Hook: stay as it is now, after a call; see `Captured`."""
+        """Hook: keep the trace of a call; see `Captured`."""
 
     @abc.abstractmethod
     def break_times(self, *, of_rates: bool) -> np.ndarray:
-        """Times [s] at which the value jumps; with `of_rates` also those at which its rate does."""
+        """Times [s] at which the value jumps; with `of_rates` also times at which its rate jumps."""
 
     @abc.abstractmethod
     def samples(self, t0: Scalar, t1: Scalar) -> Array:
-        """Times [s], ascending, between which the value is taken to rise or to fall."""
+        """Times [s], ascending, between which the value is assumed monotonic."""
 
     @abc.abstractmethod
     def check_interval(self, label: str, t0: Scalar, t1: Scalar) -> None:
@@ -79,7 +79,7 @@ class Series(AbstractSignal):
         `"held"`, each value until the next time.
 
     A call before the first or after the last time returns the value there; as an input of a motion a series must last
-    as long as that. `ts` and `values` may be traced: motions can be differentiated with respect to values.
+    as long as the motion. `ts` and `values` may be traced: motions can be differentiated with respect to values.
 
     **Raises:** `ValueError` for times that do not ascend, and for numbers that are not finite or of the wrong shape.
 
@@ -96,14 +96,14 @@ class Series(AbstractSignal):
         if interpolation not in ("linear", "cubic", "held"):
             raise ValueError(f"Series: interpolation must be 'linear', 'cubic' or 'held', got {interpolation!r}.")
         try:
-            # Times stay numbers in a function that JAX traces: where a value jumps, a motion is restarted.
+            # Times stay numbers in a function that JAX traces: a motion is restarted at each jump.
             self.ts, self.values = as_parameter(ts), as_jax(values)
         except (ValueError, TypeError) as error:
             raise ValueError(f"Series: {error}.") from error
         if self.ts.ndim != 1 or self.ts.shape[0] < 2 or self.values.shape[:1] != self.ts.shape:
             raise ValueError(
-                f"Series: ts must be a vector of at least two times and values have one entry for each along axis 0, "
-                f"got shapes {self.ts.shape} and {self.values.shape}."
+                "Series: ts must be a vector of at least two times, and values must have one entry for each along axis "
+                f"0, got shapes {self.ts.shape} and {self.values.shape}."
             )
         if not is_traced(self.ts):
             times = np.asarray(self.ts)
@@ -118,7 +118,7 @@ class Series(AbstractSignal):
         if not is_traced(self.values) and not np.all(np.isfinite(np.asarray(self.values))):
             missing = np.asarray(self.ts)[~np.isfinite(np.asarray(self.values).reshape(len(self.ts), -1)).all(axis=1)]
             raise ValueError(
-                f"Series: values must be finite, got another at t = {missing[0]:g}; leave such samples out."
+                f"Series: values must be finite, got a non-finite value at t = {missing[0]:g}; leave such samples out."
             )
         self.interpolation = interpolation
         self.slopes = _spline_slopes(jnp.asarray(self.ts), self.values) if interpolation == "cubic" else None
@@ -127,7 +127,7 @@ class Series(AbstractSignal):
         ts, values = jnp.asarray(self.ts), self.values
         k = jnp.clip(jnp.searchsorted(ts, t, side="right") - 1, 0, ts.shape[0] - 2)
         if self.interpolation == "held":
-            # At a time of the series the value is the new one.
+            # At a time of the series the new value holds.
             return jnp.where(t >= ts[-1], values[-1], values[k])
         h = ts[k + 1] - ts[k]
         s = (t - ts[k]) / h
@@ -136,7 +136,7 @@ class Series(AbstractSignal):
             chord = (values[k + 1] - values[k]) / h
             before, after = self.slopes[k] - chord, chord - self.slopes[k + 1]
             inside = inside + h * s * (1 - s) * (before * (1 - s) + after * s)
-        # Not a clipped time, whose derivative would be halved at the first and the last one.
+        # Not a clipped time, whose derivative would be halved at the first and the last time.
         return jnp.where(t < ts[0], values[0], jnp.where(t > ts[-1], values[-1], inside))
 
     def shape(self, t):
@@ -191,7 +191,7 @@ class Signal(AbstractSignal):
         self.function.known.keep()
 
     def break_times(self, *, of_rates):
-        # What a function does is not known; `simulate(..., jumps=)` says it.
+        # The jumps of a function are unknown here; `simulate(..., jumps=)` gives them.
         return np.zeros(0)
 
     def samples(self, t0, t1):
@@ -218,7 +218,7 @@ def as_signal(label: str, value: Any) -> AbstractSignal:
 
 
 def of_one_kind(signals: Sequence[AbstractSignal]) -> list[tuple[tuple[int, ...], AbstractSignal]]:
-    """Signals with those of one kind together: their numbers, and one signal with an axis of them before all others.
+    """Signals grouped by kind: their numbers, and one signal whose first axis runs over the group.
 
     Series with the same interpolation and shapes are of one kind; a series or function alone has no such axis.
     """
@@ -235,8 +235,8 @@ def of_one_kind(signals: Sequence[AbstractSignal]) -> list[tuple[tuple[int, ...]
 
 def of_each(signals: AbstractSignal, count: int) -> list[AbstractSignal]:
     """The signals that `of_one_kind` has put together."""
-    taken = lambda x, k: x[k] if is_traced(x) else np.asarray(x)[k]
-    return [signals] if count == 1 else [jax.tree.map(lambda x, k=k: taken(x, k), signals) for k in range(count)]
+    take = lambda x, k: x[k] if is_traced(x) else np.asarray(x)[k]
+    return [signals] if count == 1 else [jax.tree.map(lambda x, k=k: take(x, k), signals) for k in range(count)]
 
 
 def _spline_slopes(ts, values):

@@ -21,7 +21,7 @@ class Servo(AbstractLink):
     The reaction of the servo is the exact control force, the smallest one in the metric of M⁻¹. The servo has the name
     of its program; the numbers of the program and the gains are parameters under that name.
 
-    **Arguments:** `program`: a position constraint between bodies, such as a `Driver` or a `Constraint`, not one on the
+    **Arguments:** `program`: a position constraint between bodies, such as a `Driver` or a `Constraint`, not on the
     coordinate of a joint; `damping` [1/s] and `stiffness` [1/s²] ≥ 0, default zero: the motion stays on the program but
     is not brought to it.
 
@@ -42,9 +42,9 @@ class Servo(AbstractLink):
                 f"{self.program.kind} acts on coordinates of joints. Prescribe a coordinate of a body with a Driver, "
                 "or write the coordinate's residual as a Constraint."
             )
-        taken = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))
-        if taken:
-            raise ValueError(f"{self.label}: {taken.pop()!r} is the name of a gain; rename that parameter.")
+        repeated = {"damping", "stiffness"} & set(getattr(self.program, "parameters", {}))
+        if repeated:
+            raise ValueError(f"{self.label}: {repeated.pop()!r} is the name of a gain; rename that parameter.")
 
     @property
     def name(self):

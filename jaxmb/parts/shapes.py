@@ -11,8 +11,8 @@ flag = shapes.Mesh([(0.0, 0.0, 0.0), (0.3, 0.1, 0.0), (0.0, 0.2, 0.0)], [(0, 1, 
 jaxmb.viz.show(motion, shapes={"bar": [*beam, strut], "ground": shapes.Ground()})
 ```
 
-A shape is placed in the frame of a body: `position` [m] of its origin, and `orientation`, Euler parameters from its own
-axes to those of the body. In the plane, z points to the viewer. A shape has no mass and no effect on the motion.
+A shape is placed in the frame of a body: `position` [m] of its origin, and `orientation`, Euler parameters from its
+axes to the body's. In the plane, z points to the viewer. A shape has no mass and no effect on the motion.
 """
 
 import abc
@@ -45,13 +45,13 @@ STEEL, DARK, GROUND = (150, 155, 162), (64, 68, 76), (176, 170, 158)
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class AbstractShape(abc.ABC):
-    """A shape with its place in a body; `color`: red, green and blue from 0 to 255, default that of the body."""
+    """A shape with its place in a body; `color`: red, green and blue from 0 to 255, default the body's."""
 
     position: Any = (0.0, 0.0, 0.0)
     orientation: Any = (1.0, 0.0, 0.0, 0.0)
     color: Color | None = None
 
-    # Which mesh of unit size the shape is a scaled copy of; "own" for one with vertices of its own.
+    # The mesh of unit size that the shape scales; "own" for its own vertices.
     primitive: ClassVar[Literal["box", "sphere", "cylinder", "own", "ground"]]
     # The fields that are lengths.
     lengths: ClassVar[tuple[str, ...]] = ()
@@ -78,9 +78,9 @@ class AbstractShape(abc.ABC):
         """Lengths [m] by which the mesh of unit size is stretched along its axes, shape (3,)."""
 
     def moved(self, position: Any, orientation: Any) -> Self:
-        """The shape in another frame, in which its present one is at a position with an orientation."""
-        moved = position + rot.rotate(orientation, self.position)
-        return dataclasses.replace(self, position=moved, orientation=rot.multiply(orientation, self.orientation))
+        """The shape in another frame, given the position and orientation of the present frame in it."""
+        shifted = position + rot.rotate(orientation, self.position)
+        return dataclasses.replace(self, position=shifted, orientation=rot.multiply(orientation, self.orientation))
 
     def colored(self, color: Color) -> Self:
         """The shape in this colour, if it has none."""
@@ -123,7 +123,7 @@ class Sphere(AbstractShape):
 class Ellipsoid(AbstractShape):
     """An ellipsoid with its centre at the position.
 
-    **Arguments:** `radii` [m], shape (3,), along its own axes.
+    **Arguments:** `radii` [m], shape (3,), along its axes.
     """
 
     radii: VectorLike
@@ -137,7 +137,7 @@ class Ellipsoid(AbstractShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cylinder(AbstractShape):
-    """A cylinder along its own z axis, with its centre at the position; see also `cylinder_between` and `wheel`.
+    """A cylinder along its z axis, with its centre at the position; see also `cylinder_between` and `wheel`.
 
     **Arguments:** `radius` [m]; `length` [m].
     """
@@ -156,7 +156,7 @@ class Cylinder(AbstractShape):
 class Mesh(AbstractShape):
     """A surface of triangles; `Mesh.read` reads one from a file.
 
-    **Arguments:** `vertices` [m], shape (n, 3), in the shape's own axes; `faces`, shape (m, 3): the vertices of each
+    **Arguments:** `vertices` [m], shape (n, 3), in the shape's axes; `faces`, shape (m, 3): the vertices of each
     triangle, counter-clockwise seen from outside.
     """
 
@@ -184,11 +184,11 @@ class Mesh(AbstractShape):
     def read(cls, path: str | Path, *, scale: VectorLike = 1.0, **place: Any) -> "Mesh":
         """From a file that trimesh reads, such as STL, OBJ, PLY or GLB.
 
-        **Arguments:** `scale` [m per unit of the file], one number or one along each axis, where a negative one
-        mirrors; `position`, `orientation` and `color` as of all shapes.
+        **Arguments:** `scale` [m per unit of the file], one number or one along each axis, negative for a mirror image;
+        `position`, `orientation` and `color` as for all shapes.
 
         **Raises:** `ImportError` without trimesh, which `jaxmb[view]` installs; `ValueError` for a file that trimesh
-        cannot read, such as one without an extension, which tells its format.
+        cannot read, such as without an extension, which specifies its format.
         """
         try:
             import trimesh
@@ -197,7 +197,7 @@ class Mesh(AbstractShape):
         scales = np.broadcast_to(np.asarray(scale, float), (3,))
         try:
             mesh = trimesh.load_mesh(path)
-        except Exception as error:  # Its readers of many formats raise whatever they meet.
+        except Exception as error:  # Its readers of many formats raise any type of error.
             format_of = Path(path).suffix or "without an extension, which tells the format"
             raise ValueError(
                 f"Mesh.read: trimesh cannot read {str(path)!r} ({format_of}): {type(error).__name__}: {error}"
@@ -211,7 +211,7 @@ class Mesh(AbstractShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ground(AbstractShape):
-    """Ground that reaches as far as the motion; a picture draws the part of it that it shows.
+    """Ground without limits; a picture draws the visible part.
 
     **Arguments:** `height(place)`: height [m] above the shape's plane z = 0 at the place, shape (2,), in its axes; in
     the plane above y = 0, shape (1,). None for level ground.
@@ -242,7 +242,7 @@ def cylinder_between(start: VectorLike, end: VectorLike, radius: float, **place:
 
 
 def capsule(radius: float, length: float, **place: Any) -> tuple[AbstractShape, ...]:
-    """A cylinder along its own z axis with a half ball at either end; `length` [m]: without these."""
+    """A cylinder along its z axis with a half ball at either end; `length` [m] without the half balls."""
     middle = Cylinder(radius, length, **place)
     top: Any = np.array([0.0, 0.0, 0.5 * length])
     half = rot.rotate(middle.orientation, top)
@@ -271,7 +271,7 @@ def marked_ball(radius: float, position: VectorLike = (0.0, 0.0, 0.0)) -> tuple[
     return Sphere(radius, position=position), band((0.0, 0.0, 1.0)), band((1.0, 0.0, 0.0))
 
 
-# Symbols of joints, to the radius of a bar.
+# Symbols of joints, scaled by the radius of a bar.
 
 
 def pin(point: VectorLike, size: float, axis: VectorLike = (0.0, 0.0, 1.0)) -> Cylinder:

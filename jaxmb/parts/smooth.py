@@ -7,8 +7,8 @@ from .._types import Scalar
 
 
 def sign(speed: Float[Array, "*n"], transition_speed: Scalar) -> Float[Array, "*n"]:
-    """`tanh(v / transition_speed)`, the sign of a speed v, regularised at rest. It is 76 % of it at `transition_speed`
-    and all of it but a part in 1e8 at ten times as much.
+    """`tanh(v / transition_speed)`, the sign of a speed v, regularised at rest. It is 0.76 at `transition_speed`, and 1
+    to within 1e-8 at ten times that speed.
     """
     return jnp.tanh(speed / transition_speed)
 

@@ -91,7 +91,7 @@ class AbstractSpace(abc.ABC):
 
     @abc.abstractmethod
     def normalize(self, pose: Pose) -> Pose:
-        """The nearest pose that satisfies the pose's own invariant (unit Euler parameters)."""
+        """The nearest pose with unit Euler parameters."""
 
     @abc.abstractmethod
     def placement(self, pose: Pose) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
@@ -117,15 +117,15 @@ def separation(space: AbstractSpace, part: Any, poses: Float[Array, "k p"]) -> P
     return points[1] - points[0]
 
 
-def _of_both(function, part, *own):
-    """`function(…, point)` of both bodies, by one kernel: rows of some arrays, and points A and B."""
-    xp = namespace(*own, part.point_a, part.point_b)
-    own = *own, xp.stack([part.point_a, part.point_b])
-    return xp.stack([function(*x) for x in zip(*own, strict=True)]) if xp is np else jax.vmap(function)(*own)
+def _of_both(function, part, *rows):
+    """`function(…, point)` of both bodies in one kernel, from rows of some arrays and points A and B."""
+    xp = namespace(*rows, part.point_a, part.point_b)
+    rows = *rows, xp.stack([part.point_a, part.point_b])
+    return xp.stack([function(*x) for x in zip(*rows, strict=True)]) if xp is np else jax.vmap(function)(*rows)
 
 
 def nearest_to_origin(point: Point, axis: Point) -> Point:
-    """The point nearest to the origin of the line through a point along a unit vector."""
+    """The point, nearest to the origin, of the line through a point along a unit vector."""
     return point - jnp.dot(point, axis) * axis
 
 
@@ -145,7 +145,8 @@ def rate_of(
     poses: Float[Array, "k p"],
     velocities: Float[Array, "k v"],
 ) -> tuple[Array, Array]:
-    """The value and the rate of `function(part, poses)`, which contains those of numbers of the part that are inputs.
+    """The value and the rate of `function(part, poses)`; the rate includes the rates of the part's numbers that are
+    inputs.
 
     ```python
     class Rope(jaxmb.parts.AbstractPointPair, jaxmb.parts.AbstractForce):
@@ -169,13 +170,13 @@ def rate_of(
 
 
 def with_drift(part: Any, rate: Array, function: Callable[[Any], Array]) -> Array:
-    """The rate of `function(part)`, from that which it has by the motion of the bodies, with that by numbers of the
-    part that are inputs, such as a point that moves in its body.
+    """The `rate` of `function(part)` by the motion of the bodies, plus its rate by inputs, such as a point that moves
+    in its body.
     """
     if part.drift is None:
         return rate
-    still = part.with_fields(drift=None)
-    moving = eqx.filter_jvp(function, (still,), (part.drift,))[1]
+    plain = part.with_fields(drift=None)
+    moving = eqx.filter_jvp(function, (plain,), (part.drift,))[1]
     return rate if moving is None else rate + moving
 
 
@@ -191,6 +192,6 @@ def moment_pair(space: AbstractSpace, poses: Float[Array, "2 p"], moment_W: Floa
 
 
 def round_shapes(space: AbstractSpace, body: int, radius: Any, centre: Any) -> tuple[tuple[int, AbstractShape], ...]:
-    """The shapes of a disc, in space of a ball, each with the number of its body; none of a point."""
+    """The shapes of a disc (in space of a ball), each with the number of its body; none for a point."""
     solid = wheel if space.dimension == 2 else marked_ball
     return tuple((body, shape) for shape in solid(radius, position=space.in_space(centre))) if radius > 0 else ()

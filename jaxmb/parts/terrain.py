@@ -31,7 +31,7 @@ from .smooth import step
 __all__ = ["AbstractTerrain", "Bump", "Flat", "Ramp", "Sinusoid", "Slope", "Spline", "Surface"]
 
 Place = Float[Array, "h"]
-# The share of a bump or wave within which the ground rises or falls once.
+# The fraction of a bump or wave within which the ground rises or falls once.
 _SHARE = 0.25
 
 
@@ -47,8 +47,8 @@ class AbstractTerrain(AbstractLaw):
         """Height [m] above the world's origin at a place [m], continuously differentiable."""
 
     def detail(self, place: Place) -> Float[Array, ""]:
-        """Hook: a length [m] within which the ground around a place rises or falls once at most; by default infinite.
-        Between two places that are so far apart no step looks at a contact.
+        """Hook: a length [m] within which the ground around a place rises or falls at most once; by default infinite.
+        Steps evaluate contacts at least once over this length.
         """
         return jnp.asarray(jnp.inf, place.dtype)
 
@@ -158,7 +158,7 @@ class Ramp(AbstractTerrain):
 class Spline(AbstractTerrain):
     """A profile through measured points; C² and local: a height depends on the four nearest points only.
 
-    Between two points the profile is a polynomial of degree five, whose slope and curvature at each point are those of
+    Between two points the profile is a polynomial of degree five. Its slope and curvature at each point are taken from
     the parabola through the point and its two neighbours. Beyond the first and the last point it continues as a
     straight line.
 
@@ -200,7 +200,7 @@ class Spline(AbstractTerrain):
         return _beyond(place, self.x[0], self.x[-1]) + jnp.min(jnp.diff(self.x))
 
     def _at_point(self, k):
-        """Height, slope and curvature at a point; at the ends those of the straight continuation."""
+        """Height, slope and curvature at a point; at the ends of the straight continuation."""
         n = self.x.shape[0]
         i = jnp.clip(k, 1, n - 2)
         left, right = self.x[i] - self.x[i - 1], self.x[i + 1] - self.x[i]

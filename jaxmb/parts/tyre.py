@@ -32,10 +32,10 @@ class Tyre(AbstractDynamicForce, AbstractPotentialForce):
     ```
 
     The tread deflects in each direction as `ḋ = −v_s − (V/σ) d`, with the slip velocity v_s of the wheel's lowest point
-    and the rolling speed `V = √(v² + transition_speed²)` of its centre, so that in steady rolling the slips `d/σ` are
-    `−v_s/V`, the lateral one the tangent of the slip angle. With `s = c d/(σ μ)`, the force on the wheel at its lowest
-    point is `μ N tanh(|s|) s/|s|`, with the load N: `c N d/σ` for small slips, and friction for large ones. The wheel's
-    inclination only moves the contact; there are no aligning torque and no rolling resistance.
+    and the rolling speed `V = √(v² + transition_speed²)` of its centre. In steady rolling the slips `d/σ` are thus
+    `−v_s/V`; the lateral slip is the tangent of the slip angle. With `s = c d/(σ μ)`, the force on the wheel at its
+    lowest point is `μ N tanh(|s|) s/|s|`, with the load N: `c N d/σ` for small slips, and friction for large ones. The
+    wheel's inclination only moves the contact; there is no aligning torque or rolling resistance.
 
     **Arguments:**
 
@@ -44,14 +44,14 @@ class Tyre(AbstractDynamicForce, AbstractPotentialForce):
     - `axis`, unit, shape (3,), in space: the axle fixed in the body, pointing to the left of a wheel that rolls
         forwards, default the y axis. The wheel must not lie flat.
     - `terrain`, from `jaxmb.terrain`; `normal`: the load [N] as a function of the depth, from `jaxmb.contact`;
-        `damping` [N s/m] ≥ 0 against the rate of the depth, fully from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
+        `damping` [N s/m] ≥ 0 against the rate of the depth, full from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
         of the depth, `½ (δ + √(δ² + smoothing²))`.
     - `slip_stiffness` c > 0, of one direction or of all, (d − 1,): force over load and slip, for small slips;
         `coefficient` μ > 0 of friction.
     - `relaxation_length` σ [m] > 0, of one direction or of all; `transition_speed` [m/s] > 0: rolling speeds below it
         are regularised.
     - `deflection` [m], (d − 1,), an internal state: of the tread in the contact relative to the rim, forwards and, in
-        space, to the left; initially zero. Off the ground, where there is no force, it follows the slip all the same.
+        space, to the left; initially zero. Off the ground it follows the slip as well, without a force.
     """
 
     name: str = fields.name()
@@ -157,8 +157,8 @@ class Tyre(AbstractDynamicForce, AbstractPotentialForce):
         return over_ground(self, space.point(pose, self.centre), space.point_velocity(pose, velocity, point))
 
     def _contact(self, space, pose, velocity):
-        """The ground's normal, the wheel's lowest point fixed in the body, the directions along the ground, the slip
-        velocities along them, and the rolling speed, regularised.
+        """The ground's normal, the wheel's lowest point in the body's frame, the directions along the ground, the slip
+        velocities along them, and the regularised rolling speed.
         """
         centre = space.point(pose, self.centre)
         normal = outward(self.terrain, centre)

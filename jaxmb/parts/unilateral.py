@@ -1,8 +1,8 @@
 """Unilateral constraints: gaps that close at an instant, with an impact, and open again.
 
-A gap is a function of the poses of bodies that stays non-negative. Where it is open the part does nothing; where it is
-closed, `gap = 0` is a constraint like that of a joint, whose force pushes and never pulls. `simulate` finds the times
-of impacts and of loss of contact within its steps. Every pair that may touch is named: nothing looks for others.
+A gap is a function of the poses of bodies that stays non-negative. An open gap has no effect; a closed gap is a
+constraint `gap = 0`, as in a joint, whose force pushes and never pulls. `simulate` finds the times of impacts and of
+loss of contact within its steps. Every pair that may touch must be named; no others are searched for.
 """
 
 import abc
@@ -35,20 +35,20 @@ from .terrain import AbstractTerrain, distance
 class AbstractUnilateralConstraint(AbstractInertialConstraint):
     """A gap between bodies, which stays non-negative.
 
-    Subclasses define the `gap` and list the bodies. The scene has one coordinate, one velocity and one row more for
-    each: its mode, which is 0 where it is open, 1 where it is closed, and 2 where it is closed but other contacts imply
-    it. By name the mode is `"stop.mode"`: `assemble(system, fix={"stop.mode": 1})` closes the gap.
+    Subclasses define the `gap` and list the bodies. It adds one coordinate, one velocity and one row to the scene. The
+    coordinate is its mode: 0 open, 1 closed, 2 closed but implied by other contacts. Its name is `"stop.mode"`:
+    `assemble(system, fix={"stop.mode": 1})` closes the gap.
 
     By Newton's law of impact the gap opens at `restitution` times the rate at which it closed. By Poisson's law the
-    impulse of the contact while the bodies part is `restitution` times that until they no longer approach, or more
-    where the gap would close. The two differ where friction acts, or several contacts at once. Contacts that are closed
-    at the same time share the impulse. With friction, or with several coefficients at once, Newton's law may give
-    energy back (T. R. Kane and D. A. Levinson, "Dynamics", McGraw-Hill, 1985, §5.9): the rebounds of such an impact are
-    all less, by the share at which no energy is gained.
+    impulse of restitution is `restitution` times the impulse of compression, or more where the gap would close. The two
+    laws differ if friction or several contacts act at once. Contacts that are closed at the same time share the
+    impulse. With friction, or with several coefficients at once, Newton's law may give energy back (T. R. Kane and D.
+    A. Levinson, "Dynamics", McGraw-Hill, 1985, §5.9): all rebounds of such an impact are reduced by the same fraction,
+    so that no energy is gained.
 
     **Arguments:**
 
-    - `restitution` from 0 to 1, default 0: the rate after an impact over that before; `impact_law`, `"newton"`
+    - `restitution` from 0 to 1, default 0: the rate after an impact over the rate before; `impact_law`, `"newton"`
         (default) or `"poisson"`.
     """
 
@@ -59,7 +59,7 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
 
     @property
     def inertia(self) -> Float[Array, ""]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        # That of the mode, which no force acts on.
+        # The inertia of the mode, on which no force acts.
         return jnp.ones_like(self.restitution)
 
     def validate(self):
@@ -81,8 +81,8 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
 
     @property
     def peak(self) -> Float[Array, "..."]:
-        """The largest value of a gap that rises to a kink and falls again, as between two stops; infinite, the default,
-        for one without.
+        """The largest value of a gap that rises to a kink and falls again, as between two stops; by default infinite,
+        without a kink.
         """
         return jnp.full_like(self.restitution, jnp.inf)
 
@@ -101,10 +101,10 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
     scene = jaxmb.Scene([bar], joints=[pin, buffer], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    `JointStop` is a compliant one.
+    `JointStop` is compliant.
 
-    **Arguments:** `lower` < `upper` [rad, m], of which one may be left out. In space the range of an angle must be less
-    than a full turn, and has both ends.
+    **Arguments:** `lower` < `upper` [rad, m]; either may be left out. In space the range of an angle must be less than
+    a full turn and have both ends.
     """
 
     lower: fields.Number = fields.parameter(unit=("rad", "m"), optional=True)
@@ -145,7 +145,7 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
         if self.lower is None or self.upper is None:
             return value - self.lower if self.upper is None else self.upper - value
         middle = 0.5 * (self.lower + self.upper)
-        # Of the two stops that which is nearer.
+        # The nearer of the two stops.
         return self.peak - jnp.abs(self.near(value[None], middle)[0] - middle)
 
 
@@ -159,10 +159,10 @@ class AbstractGeometricContact(AbstractUnilateralConstraint):
 
 
 class AbstractRigidContact(AbstractGeometricContact):
-    """A unilateral constraint of bodies that touch at a point, in which there may be friction (`DryFriction`).
+    """A unilateral constraint of bodies that touch at a point, perhaps with friction (`DryFriction`).
 
-    Subclasses define where they touch, `touching`, and a `gap` that grows by one metre a metre as the last body moves
-    away.
+    Subclasses define the point of contact, `touching`, and a `gap` that grows by one metre a metre as the last body
+    moves away.
     """
 
     @abc.abstractmethod
@@ -171,16 +171,16 @@ class AbstractRigidContact(AbstractGeometricContact):
 
     def outward(self, space: AbstractSpace, poses: Poses) -> Float[Array, "d"]:
         """The unit vector along which the contact pushes the last body."""
-        moved = lambda x: self.gap(space, poses.at[-1, : space.dimension].set(x))
-        out = jax.grad(moved)(poses[-1, : space.dimension])
+        gap_at = lambda x: self.gap(space, poses.at[-1, : space.dimension].set(x))
+        out = jax.grad(gap_at)(poses[-1, : space.dimension])
         return out / norm(out)
 
     def tangents(self, space: AbstractSpace, poses: Poses, pole: int = 0) -> Float[Array, "n d"]:
-        """Unit vectors along which bodies slip: in the plane the outward normal turned clockwise; in space two, which
-        turn as the normal does from an axis of the first of two bodies, or of the world.
+        """Unit vectors along which bodies slip: in the plane the outward normal turned clockwise; in space two
+        tangents, which turn with the normal, from an axis of the first of two bodies or of the world.
 
-        **Arguments:** `pole`: in space that axis, 1, 2 or 3, negative against it; zero in the plane. The normal must
-        not be opposite to it.
+        **Arguments:** `pole`: in space this axis, 1, 2 or 3, negative for the opposite direction; zero in the plane.
+        The normal must not be opposite to it.
         """
         normal = self.outward(space, poses)
         if not pole:
@@ -199,8 +199,8 @@ class AbstractRigidContact(AbstractGeometricContact):
         return jnp.stack([v if first is None else space.direction(first, v) for v in turned])
 
     def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities, pole: int = 0) -> Float[Array, "n"]:
-        """The velocity [m/s] of the last body, against that of the other one or of the world, at the point where they
-        touch, along the `tangents`.
+        """The velocity [m/s] of the last body relative to the other body or the world, at the point of contact, along
+        the `tangents`.
         """
         point = self.touching(space, poses)
 
@@ -211,7 +211,9 @@ class AbstractRigidContact(AbstractGeometricContact):
         return self.tangents(space, poses, pole) @ relative
 
     def over_ground(self, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"]:
-        """Hook: the velocity [m/s] of one body against what it touches at a point, from that in the world."""
+        """Hook: the velocity [m/s] of a single body relative to the surface that it touches at a point, from its
+        velocity in the world.
+        """
         del point
         return velocity
 
@@ -226,8 +228,7 @@ class RigidContact(AbstractRigidContact):
     scene = jaxmb.Scene([ball], joints=[floor], forces=[jaxmb.Gravity((0.0, -9.81))])
     ```
 
-    The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is a
-    compliant one.
+    The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is compliant.
 
     **Arguments:**
 
@@ -266,7 +267,7 @@ class RigidBallContact(AbstractRigidContact, AbstractPointPair):
     scene = jaxmb.Scene(discs, joints=[meet])
     ```
 
-    **Arguments:** `radius_a`, `radius_b` [m] ≥ 0 about the points, of which one may be zero. The points must not
+    **Arguments:** `radius_a`, `radius_b` [m] ≥ 0 about the points; one of them may be zero. The points must not
     coincide.
     """
 
@@ -276,7 +277,7 @@ class RigidBallContact(AbstractRigidContact, AbstractPointPair):
     def validate(self):
         super().validate()
         if not self.radius_a + self.radius_b > 0:
-            raise ValueError(f"{self.label}: of radius_a and radius_b only one may be zero; give the other one.")
+            raise ValueError(f"{self.label}: only one of radius_a and radius_b may be zero; give the other.")
 
     def numbers_agree(self):
         return super().numbers_agree() & (self.radius_a + self.radius_b > 0)
@@ -288,8 +289,8 @@ class RigidBallContact(AbstractRigidContact, AbstractPointPair):
         return space.point(poses[1], self.point_b) - self.radius_b * self.outward(space, poses)
 
     def shapes(self, space, size):
-        own = round_shapes(space, 0, self.radius_a, self.point_a)
-        return own + round_shapes(space, 1, self.radius_b, self.point_b)
+        first = round_shapes(space, 0, self.radius_a, self.point_a)
+        return first + round_shapes(space, 1, self.radius_b, self.point_b)
 
 
 class RigidPlaneContact(AbstractRigidContact, AbstractPointPair):
@@ -330,7 +331,7 @@ class RigidBoxContact(AbstractRigidContact, AbstractPointPair):
     scene = jaxmb.Scene([wheel], joints=[step])
     ```
 
-    The ball rolls or slides from a face over an edge without an event; where it does, its acceleration jumps.
+    The ball rolls or slides from a face over an edge without an event, but with a jump of its acceleration.
 
     **Arguments:** `size` [m], the lengths of the box about point A along the axes of the frame of `body_a`; `radius`
     [m] > 0 about point B, which stays outside of the box.

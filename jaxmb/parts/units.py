@@ -3,8 +3,7 @@
 import re
 from typing import TypeAlias
 
-# The unit of a number; of a number that belongs to a coordinate the unit for an angle and the unit for a length; None
-# where it is not known.
+# The unit of a number; two units, with an angle and with a length, for a number of a coordinate; None if unknown.
 Unit: TypeAlias = str | tuple[str, str] | None
 
 _POWERS = {
@@ -26,7 +25,7 @@ def power_of_length(unit: str) -> float:
     """The power of the metre in a unit such as `"N m/rad"` or `"kg m²"`, written in metres, kilograms, seconds and
     amperes.
 
-    **Raises:** `ValueError` for anything but a product of powers of SI units over another one.
+    **Raises:** `ValueError` unless it is a product of powers of SI units, perhaps over another product.
     """
     power = 0.0
     for sign, side in zip((1, -1), unit.split("/", 1), strict=False):
@@ -34,8 +33,8 @@ def power_of_length(unit: str) -> float:
             base, _, exponent = word.partition("^")
             if base not in _POWERS or not re.fullmatch(r"(-?\d+(\.\d+)?)?", exponent):
                 raise ValueError(
-                    f"{word!r} in the unit {unit!r} is no power of one of {', '.join(_POWERS)}; write a unit as in "
-                    "'N m/rad' or 'kg m²', '1' for a number without one, and leave it out where it is not known."
+                    f"{word!r} in the unit {unit!r} is not a power of one of {', '.join(_POWERS)}; write a unit as in "
+                    "'N m/rad' or 'kg m²', '1' for a number without unit, and leave it out if it is unknown."
                 )
             power += sign * _POWERS[base] * float(exponent or 1)
     return power

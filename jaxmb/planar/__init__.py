@@ -1,12 +1,12 @@
 # ruff: noqa: I001
 """Parts of planar scenes: bodies, joints, forces, ground and contact.
 
-Units are SI and radians; y is up by convention. Joints have their own coordinates by name, `"hip.angle"` or
+Units are SI and radians; y is up by convention. Joints have coordinates by name, `"hip.angle"` or
 `"slide.displacement"`, which `assemble` takes and `trajectory["hip"]` shows with rates and accelerations. Parts of
-`jaxmb` act on them, such as `JointSpring` and `Motor` on one coordinate, `Tendon` on several. So do `RigidContact` and
-other unilateral constraints, `DryFriction`, `Servo`, `Controller`, and `Force` and other functions of the user's.
-`jaxmb help` lists them. Parts may name a `Frame`, fixed in a body, in place of the body. Classes of your own derive
-from those of `jaxmb.parts`.
+`jaxmb` act on them, such as `JointSpring` and `Motor` on one coordinate, `Tendon` on several. Further parts of `jaxmb`
+are `RigidContact` and other unilateral constraints, `DryFriction`, `Servo`, `Controller`, and `Force` and other
+functions of the user's. `jaxmb help` lists them. Parts may name a `Frame`, fixed in a body, in place of the body. New
+classes derive from the classes of `jaxmb.parts`.
 """
 
 from .._moved import tell_of_moved as _tell_of_moved

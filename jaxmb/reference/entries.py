@@ -1,9 +1,9 @@
 """The public names, each once, by subject.
 
 A name is public in a module that defines it without an underscore, or that imports it in the form that makes it public
-for type checkers, `from .planar import Body as Body`. Where a module has `__all__`, only names in it are. Lines
-`## Joints` are headings of the names below. Names of plain values, such as those of types, have no entry: the
-docstrings of their modules say what they are.
+for type checkers, `from .planar import Body as Body`. If a module has `__all__`, only its names are public. Lines `##
+Joints` are headings of the names below. Names of plain values, such as types, have no entry: the docstrings of their
+modules explain them.
 """
 
 import ast
@@ -25,10 +25,10 @@ PACKAGE = __name__.split(".")[0]
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A public name: of a module, a class or a function, or of a member of a class.
+    """A public name of a module, a class, a function, or a member of a class.
 
-    **Fields:** `name`, as a user writes it after `jaxmb.`; `thing`, what it stands for, of a field its annotation;
-    `owner`, the class of a member.
+    **Fields:** `name`, as a user writes it after `jaxmb.`; `thing`, the object, or the annotation of a field; `owner`,
+    the class of a member.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Entry:
 
     @property
     def is_part(self) -> bool:
-        """Whether it is a class of parts that a scene takes, and not one to derive such classes from."""
+        """Whether it is a class of parts for scenes, not a base class of parts."""
         return self.kind == "class" and issubclass(self.thing, AbstractPart) and not self.short.startswith("Abstract")
 
     @property
@@ -56,25 +56,25 @@ class Entry:
 
     @property
     def text(self) -> str:
-        """Its docstring; of a class with the arguments that the docstring of its own `__init__` explains."""
-        own = self.thing.__doc__ if self.kind != "field" else f"A field; see `{self.name.rpartition('.')[0]}`."
-        texts = [own, vars(self.thing)["__init__"].__doc__] if _explains_arguments(self.thing) else [own]
+        """Its docstring, with the arguments from the docstring of a class's `__init__`."""
+        docstring = self.thing.__doc__ if self.kind != "field" else f"A field; see `{self.name.rpartition('.')[0]}`."
+        texts = [docstring, vars(self.thing)["__init__"].__doc__] if _explains_arguments(self.thing) else [docstring]
         return "\n\n".join(inspect.cleandoc(text) for text in texts if text)
 
     @property
     def summary(self) -> str:
         """The first sentence of its docstring, in one line."""
         paragraph = " ".join(self.text.split("\n\n")[0].split())
-        found = re.match(r".*?[^.]\.(?=\s+[A-Z`*]|$)", paragraph)
-        return found.group() if found else paragraph
+        sentence = re.match(r".*?[^.]\.(?=\s+[A-Z`*]|$)", paragraph)
+        return sentence.group() if sentence else paragraph
 
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
     """Public names that belong together.
 
-    **Fields:** `title`; `module`, the entry of the module that has them, None for names of the package itself;
-    `groups` of entries by their headings; `others`, entries elsewhere for names that the module has as well.
+    **Fields:** `title`; `module`, the entry of their module, None for names of the package itself; `groups` of entries
+    by their headings; `others`, entries elsewhere for names that the module has as well.
     """
 
     title: str
@@ -84,27 +84,27 @@ class Subject:
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Those of all groups."""
+        """The entries of all groups."""
         return tuple(entry for group in self.groups.values() for entry in group)
 
 
 def _explains_arguments(thing: Any) -> bool:
-    own = vars(thing).get("__init__") if inspect.isclass(thing) else None
-    return own is not None and (own.__doc__ or "").startswith("**Arguments:**")
+    constructor = vars(thing).get("__init__") if inspect.isclass(thing) else None
+    return constructor is not None and (constructor.__doc__ or "").startswith("**Arguments:**")
 
 
 def public_names(module: ModuleType) -> dict[str, str]:
-    """The public names of a module, in its order, each with its heading; those of its stub where it has one."""
+    """The public names of a module or its stub, in order, each with its heading."""
     path = Path(inspect.getfile(module))
     stub = path.with_suffix(".pyi")
     source = (stub if stub.exists() else path).read_text(encoding="utf-8")
     headings = {k: line[3:] for k, line in enumerate(source.splitlines()) if line.startswith("## ")}
-    found = {}
+    names = {}
     for node in ast.parse(source).body:
         heading = next((text for k, text in reversed(headings.items()) if k < node.lineno), "")
-        found |= dict.fromkeys(_defined(node), heading)
-    listed = vars(module).get("__all__", found)
-    return {name: heading for name, heading in found.items() if name in listed}
+        names |= dict.fromkeys(_defined(node), heading)
+    listed = vars(module).get("__all__", names)
+    return {name: heading for name, heading in names.items() if name in listed}
 
 
 def _defined(node: ast.stmt) -> list[str]:
@@ -114,21 +114,21 @@ def _defined(node: ast.stmt) -> list[str]:
         case ast.FunctionDef() | ast.ClassDef():
             names = [node.name]
         case ast.Assign():
-            names = [own.id for own in node.targets if isinstance(own, ast.Name)]
+            names = [target.id for target in node.targets if isinstance(target, ast.Name)]
         case _:
             names = []
     return [name for name in names if not name.startswith("_")]
 
 
 def public_modules() -> dict[str, ModuleType]:
-    """The modules that are public names of the package or of one of them, by name, in the package's order."""
+    """The public modules of the package, at any depth, by name, in the package's order."""
 
     def below(path: str, module: ModuleType) -> Iterator[tuple[str, ModuleType]]:
         for name in public_names(module):
-            own = getattr(module, name)
-            if inspect.ismodule(own):
-                yield f"{path}{name}", own
-                yield from below(f"{path}{name}.", own)
+            member = getattr(module, name)
+            if inspect.ismodule(member):
+                yield f"{path}{name}", member
+                yield from below(f"{path}{name}.", member)
 
     return dict(below("", importlib.import_module(PACKAGE)))
 
@@ -140,31 +140,31 @@ def _is_described(thing: Any) -> bool:
 
 @functools.cache
 def subjects() -> tuple[Subject, ...]:
-    """All subjects: those of the package, and then its modules."""
+    """All subjects: first the package's, then its modules'."""
     package = importlib.import_module(PACKAGE)
-    known: dict[int, Entry] = {}
+    seen: dict[int, Entry] = {}
     made = []
     for path, module in {"": package, **public_modules()}.items():
         groups: dict[str, list[Entry]] = {}
         others = []
         for name, heading in public_names(module).items():
             thing = getattr(module, name)
-            if id(thing) in known:
-                others.append(known[id(thing)])
+            if id(thing) in seen:
+                others.append(seen[id(thing)])
             elif _is_described(thing):
-                known[id(thing)] = Entry(f"{path}.{name}".lstrip("."), thing)
-                groups.setdefault(heading, []).append(known[id(thing)])
-        own = {heading: tuple(group) for heading, group in groups.items()}
+                seen[id(thing)] = Entry(f"{path}.{name}".lstrip("."), thing)
+                groups.setdefault(heading, []).append(seen[id(thing)])
+        by_heading = {heading: tuple(group) for heading, group in groups.items()}
         if module is package:
-            made += [Subject(heading, None, {heading: group}) for heading, group in own.items()]
+            made += [Subject(heading, None, {heading: group}) for heading, group in by_heading.items()]
         else:
-            made.append(Subject(f"{PACKAGE}.{path}", Entry(path, module), own, tuple(others)))
+            made.append(Subject(f"{PACKAGE}.{path}", Entry(path, module), by_heading, tuple(others)))
     return tuple(made)
 
 
 @functools.cache
 def entries() -> dict[str, Entry]:
-    """All entries by name, but for members of classes."""
+    """All entries by name, except members of classes."""
     modules = (subject.module for subject in subjects() if subject.module is not None)
     every = (*modules, *(entry for subject in subjects() for entry in subject.entries))
     return {entry.name: entry for entry in every}
@@ -172,34 +172,34 @@ def entries() -> dict[str, Entry]:
 
 @functools.cache
 def other_names() -> dict[str, Entry]:
-    """Entries by the further names that they have: in other modules, and in another spelling."""
-    known = {id(entry.thing): entry for entry in entries().values()}
-    found = {}
+    """Entries by their further names: in other modules, and in another spelling."""
+    by_id = {id(entry.thing): entry for entry in entries().values()}
+    others = {}
     for path, module in {"": importlib.import_module(PACKAGE), **public_modules()}.items():
         for name in public_names(module):
-            entry, own = known.get(id(getattr(module, name))), f"{path}.{name}".lstrip(".")
-            if entry is not None and entry.name != own:
-                found[own] = entry
-    return found
+            entry, full_name = by_id.get(id(getattr(module, name))), f"{path}.{name}".lstrip(".")
+            if entry is not None and entry.name != full_name:
+                others[full_name] = entry
+    return others
 
 
 @functools.cache
 def members(entry: Entry) -> tuple[Entry, ...]:
-    """The methods and properties of a class that have a docstring and that no public base class has."""
+    """The methods and properties of a class with a docstring that no public base class has."""
     inherited = {name for base in bases(entry) for name in _documented(_of_package(base.thing))}
-    own, *others = _of_package(entry.thing)
+    itself, *others = _of_package(entry.thing)
     public = {id(base.thing) for base in bases(entry)}
     of_private = _documented(base for base in others if id(base) not in public)
-    every = {name: thing for name, thing in of_private.items() if name not in inherited} | _documented([own])
+    every = {name: thing for name, thing in of_private.items() if name not in inherited} | _documented([itself])
     return tuple(Entry(f"{entry.name}.{name}", thing, entry.thing) for name, thing in every.items())
 
 
 @functools.cache
 def bases(entry: Entry) -> tuple[Entry, ...]:
     """The entries of the public classes that a class derives from, nearest first."""
-    known = {id(own.thing): own for own in entries().values()}
+    by_id = {id(each.thing): each for each in entries().values()}
     mro = entry.thing.__mro__[1:] if entry.kind == "class" else ()
-    return tuple(known[id(base)] for base in mro if id(base) in known)
+    return tuple(by_id[id(base)] for base in mro if id(base) in by_id)
 
 
 def fields(entry: Entry) -> dict[str, str]:
@@ -208,24 +208,24 @@ def fields(entry: Entry) -> dict[str, str]:
 
 
 def _fields(cls: type) -> dict[str, str]:
-    return {name: own for base in reversed(_of_package(cls)) for name, own in _annotations(base).items()}
+    return {name: annotation for base in reversed(_of_package(cls)) for name, annotation in _annotations(base).items()}
 
 
 def further_fields(entry: Entry, given: Iterable[str]) -> dict[str, str]:
-    """The fields that a class itself has, but for those that are `given` as parameters."""
+    """The fields of a class itself, except the `given` parameters."""
     return {name: annotation for name, annotation in _annotations(entry.thing).items() if name not in given}
 
 
 @functools.cache
 def signature(entry: Entry) -> inspect.Signature | None:
-    """What a function, class or method is called with, with annotations as the source has them; None for others."""
+    """The signature of a function, class or method, with annotations as in the source; None for others."""
     if entry.kind in ("module", "property", "field"):
         return None
     return signature_of(entry.thing, is_method=entry.kind == "method")
 
 
 def signature_of(thing: Any, *, is_method: bool = False) -> inspect.Signature | None:
-    """The signature of a class or function; of a method without the object. None where Python knows none."""
+    """The signature of a class or function, or of a method without the object; None if Python has none."""
     try:
         made = inspect.signature(thing)
     except (TypeError, ValueError):
@@ -235,48 +235,54 @@ def signature_of(thing: Any, *, is_method: bool = False) -> inspect.Signature | 
     if is_class and not written:
         written = _fields(thing)
     parameters = []
-    for name, own in made.parameters.items():
-        annotation = _AsWritten(written[name]) if name in written else own.empty
-        # Dots for a default that is made anew or that cannot be typed.
-        dots = own.default is not own.empty and repr(own.default).startswith("<")
-        default = _AsWritten("...") if dots else own.default
+    for name, parameter in made.parameters.items():
+        annotation = _AsWritten(written[name]) if name in written else parameter.empty
+        # Dots for a default that is computed or cannot be typed.
+        dots = parameter.default is not parameter.empty and repr(parameter.default).startswith("<")
+        default = _AsWritten("...") if dots else parameter.default
         if not (is_method and name == "self"):
-            parameters.append(own.replace(annotation=annotation, default=default))
+            parameters.append(parameter.replace(annotation=annotation, default=default))
     returns = _AsWritten(written["return"]) if "return" in written and not is_class else made.empty
     return inspect.Signature(parameters, return_annotation=returns)
 
 
 class _AsWritten(str):
-    """A text that stands in a signature as it is."""
+    """A text that a signature shows unchanged."""
 
     __repr__ = str.__str__
 
 
 def _written(function: Any) -> dict[str, str]:
-    """The annotations in the source of a function; none where it has no source, as that of a dataclass."""
+    """The annotations in the source of a function; none without a source, as in a dataclass."""
     try:
         tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(function))).body[0]
     except (OSError, TypeError):
         return {}
     if not isinstance(tree, ast.FunctionDef):
         return {}
-    given = [own for own in ast.walk(tree.args) if isinstance(own, ast.arg) and own.annotation is not None]
-    found = {own.arg: ast.unparse(own.annotation) for own in given if own.annotation is not None}
-    return found | ({} if tree.returns is None else {"return": ast.unparse(tree.returns)})
+    given = [
+        argument
+        for argument in ast.walk(tree.args)
+        if isinstance(argument, ast.arg) and argument.annotation is not None
+    ]
+    annotations = {
+        argument.arg: ast.unparse(argument.annotation) for argument in given if argument.annotation is not None
+    }
+    return annotations | ({} if tree.returns is None else {"return": ast.unparse(tree.returns)})
 
 
 @functools.cache
 def _annotations(cls: type) -> dict[str, str]:
-    """Those in the source of a class itself, but for what its objects share."""
+    """The annotations in the source of a class itself, except class variables."""
     tree = ast.parse(inspect.cleandoc(f"\n{inspect.getsource(cls)}")).body[0]
     assert isinstance(tree, ast.ClassDef)
-    found = {}
+    annotations = {}
     for node in tree.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             annotation = ast.unparse(node.annotation)
             if not annotation.startswith(("ClassVar", "AbstractVar")) and not node.target.id.startswith("_"):
-                found[node.target.id] = annotation
-    return found
+                annotations[node.target.id] = annotation
+    return annotations
 
 
 def _of_package(cls: type) -> list[type]:
@@ -285,36 +291,36 @@ def _of_package(cls: type) -> list[type]:
 
 
 def _documented(classes: Iterable[type]) -> dict[str, Any]:
-    """The public methods and properties that some classes define, with docstrings; the first one's of each name."""
-    found = {}
+    """The public methods and properties with docstrings that some classes define; the first for each name."""
+    documented = {}
     for base in classes:
         for name, raw in vars(base).items():
-            if name.startswith("_") or name in found:
+            if name.startswith("_") or name in documented:
                 continue
             is_property = isinstance(raw, property | functools.cached_property)
             thing = raw if is_property else getattr(base, name)
             if (is_property or inspect.isroutine(thing)) and thing.__doc__:
-                found[name] = thing
-    return found
+                documented[name] = thing
+    return documented
 
 
 def find(name: str) -> Entry:
-    """The entry of a public name, with `jaxmb.` or `mb.` before it or not. The module may be left out where no other
-    one has the name, as in `four_bar`.
+    """The entry of a public name, with or without `jaxmb.` or `mb.`. The module may be left out if no other module has
+    the name, as in `four_bar`.
 
     **Raises:** `UnknownNameError` with the nearest names; `ValueError` for a name of several modules.
     """
     plain = re.sub(rf"^({PACKAGE}|mb)\.|\(\)$", "", name.strip())
-    found = _found(plain)
-    if found is not None:
-        return found
+    match = _found(plain)
+    if match is not None:
+        return match
     head, dot, last = plain.rpartition(".")
     owner = _found(head) if dot else None
     if owner is not None and owner.kind == "class":
-        own = {entry.short: entry for entry in (*_fields_of(owner), *_every_member(owner))}
-        if last in own:
-            return own[last]
-        raise unknown("name", plain, [f"{head}.{short}" for short in own])
+        by_short = {entry.short: entry for entry in (*_fields_of(owner), *_every_member(owner))}
+        if last in by_short:
+            return by_short[last]
+        raise unknown("name", plain, [f"{head}.{short}" for short in by_short])
     if dot:
         raise unknown("name", plain, entries())
     error, speaking = unknown("name", plain, _shortest_names()), _speaking_of(plain)
@@ -324,14 +330,14 @@ def find(name: str) -> Entry:
 def _speaking_of(word: str) -> list[str]:
     """Names whose docstrings have an argument or a quantity with this name; a few of the shortest docstrings."""
     code = re.compile(rf"[`(, ]{re.escape(word)}(=|`)")
-    found = [entry for entry in entries().values() if entry.kind != "module" and code.search(entry.text)]
-    return [entry.name for entry in sorted(found, key=lambda entry: len(entry.text))[:6]]
+    matches = [entry for entry in entries().values() if entry.kind != "module" and code.search(entry.text)]
+    return [entry.name for entry in sorted(matches, key=lambda entry: len(entry.text))[:6]]
 
 
 def _found(name: str) -> Entry | None:
-    for known in (entries(), other_names()):
-        if name in known:
-            return known[name]
+    for table in (entries(), other_names()):
+        if name in table:
+            return table[name]
     same = _by_short_name().get(name, [])
     if len(same) > 1:
         listed = " and ".join(repr(entry.name) for entry in same)
@@ -341,21 +347,21 @@ def _found(name: str) -> Entry | None:
 
 @functools.cache
 def _by_short_name() -> dict[str, list[Entry]]:
-    found = {}
+    groups = {}
     for entry in entries().values():
-        found.setdefault(entry.short, []).append(entry)
-    return found
+        groups.setdefault(entry.short, []).append(entry)
+    return groups
 
 
 def _shortest_names() -> list[str]:
     """The shortest names by which entries are found."""
-    known = _by_short_name()
-    return [entry.short if len(known[entry.short]) == 1 else entry.name for entry in entries().values()]
+    by_short = _by_short_name()
+    return [entry.short if len(by_short[entry.short]) == 1 else entry.name for entry in entries().values()]
 
 
 def _every_member(entry: Entry) -> tuple[Entry, ...]:
-    """Those of base classes first, so that a dictionary keeps the nearest."""
-    return tuple(own for base in (*reversed(bases(entry)), entry) for own in members(base))
+    """All members, first from base classes, so that a dictionary keeps the nearest."""
+    return tuple(member for base in (*reversed(bases(entry)), entry) for member in members(base))
 
 
 def _fields_of(entry: Entry) -> tuple[Entry, ...]:

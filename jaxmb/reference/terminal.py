@@ -9,8 +9,8 @@ from .entries import Entry, bases, further_fields, members, signature, subjects
 from .topics import Topic, topics
 
 _HOW = (
-    "`jaxmb help NAME` explains a name, as in `jaxmb help simulate`, of a module all its names, as in "
-    "`jaxmb help planar`, and topics, as in `jaxmb help tolerances`. All topics and public names:"
+    "`jaxmb help NAME` explains a name, such as `jaxmb help simulate`, all names of a module, such as `jaxmb help "
+    "planar`, or a topic, such as `jaxmb help tolerances`. All topics and public names:"
 )
 _BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
 _FENCE = re.compile(r"^( *)```")
@@ -18,10 +18,10 @@ _ITEM = re.compile(r" *(- |\d+\. )")
 
 
 def shown(entry: Entry, width: int = 80, styled: bool = False, every: bool = False) -> str:
-    """What is known of an entry: signature, docstring, and the first sentences of what it contains.
+    """An entry: signature, docstring, and the first sentences of its members.
 
-    **Arguments:** `width`, of the terminal; `styled`: whether it shows bold and coloured text; `every`: whether also
-    the methods and further fields of parts, which systems use and their users do not.
+    **Arguments:** `width`, of the terminal; `styled`: whether it shows bold and coloured text; `every`: whether to
+    include methods and further fields of parts, which only systems use.
     """
     parts = [_styled(_heading(entry, width), styled)]
     parts += [block if is_code else _styled(block, styled) for block, is_code in _filled(entry.text, width)]
@@ -40,40 +40,40 @@ def shown_topic(topic: Topic, width: int = 80, styled: bool = False) -> str:
 
 
 def listed(width: int = 80, styled: bool = False) -> str:
-    """How to go on, all topics, and all public names by subject, each with its first sentence."""
+    """A hint, all topics, and all public names by subject, each with its first sentence."""
     pages = _rows(((name, topic.summary) for name, topic in topics().items()), width)
     parts = [_hanging(_HOW, 0, 0, width), "**Topics**", pages]
     for subject in subjects():
-        # The names of some modules all belong to others.
+        # All names of some modules belong to other modules.
         if subject.entries:
             parts += [f"**{subject.title}**", _table(subject.entries, width)]
     return "\n\n".join(_styled(part, styled) for part in parts)
 
 
 def _heading(entry: Entry, width: int) -> str:
-    """The name as it is called, with a line for each parameter where one line is too short for them."""
-    name, own = f"jaxmb.{entry.name}", signature(entry)
+    """The call of a name, with a line for each parameter if one line is too short."""
+    name, call = f"jaxmb.{entry.name}", signature(entry)
     if entry.kind == "field":
         return f"**{name}**: {entry.thing}"
-    if own is None:
+    if call is None:
         return f"**{name}**"
-    line = f"{name}{own}"
+    line = f"{name}{call}"
     if len(line) <= width:
         return line.replace(name, f"**{name}**", 1)
-    parameters = list(own.parameters.values())
+    parameters = list(call.parameters.values())
     lines = [str(parameter) for parameter in parameters]
     kinds = [parameter.kind for parameter in parameters]
     if inspect.Parameter.KEYWORD_ONLY in kinds and inspect.Parameter.VAR_POSITIONAL not in kinds:
         lines.insert(kinds.index(inspect.Parameter.KEYWORD_ONLY), "*")
-    returns = str(own.replace(parameters=[])).removeprefix("()")
+    returns = str(call.replace(parameters=[])).removeprefix("()")
     return "\n".join([f"**{name}**(", *(f"    {parameter}," for parameter in lines), f"){returns}"])
 
 
 def _of_module(entry: Entry, width: int) -> Iterable[str]:
-    (own,) = [subject for subject in subjects() if subject.module == entry]
-    for heading, group in own.groups.items():
+    (of_module,) = [subject for subject in subjects() if subject.module == entry]
+    for heading, group in of_module.groups.items():
         yield from _section(heading or "Names", group, width)
-    yield from _section("Of other modules", own.others, width)
+    yield from _section("Of other modules", of_module.others, width)
 
 
 def _of_class(entry: Entry, width: int) -> Iterable[str]:
@@ -84,7 +84,7 @@ def _of_class(entry: Entry, width: int) -> Iterable[str]:
         yield "\n".join(["**Further fields**", *lines])
     yield from _section("Methods and properties", members(entry), width)
     for base in bases(entry):
-        inherited = ", ".join(own.short for own in members(base))
+        inherited = ", ".join(member.short for member in members(base))
         if inherited:
             yield "\n".join([f"**From {base.name}**", _hanging(inherited, 4, 4, width)])
 
@@ -96,7 +96,7 @@ def _section(title: str, entries: tuple[Entry, ...], width: int) -> Iterable[str
 
 def _table(entries: Iterable[Entry], width: int) -> str:
     """Names with their first sentences beside them."""
-    return _rows(((own.name if own.owner is None else own.short, own.summary) for own in entries), width)
+    return _rows(((entry.name if entry.owner is None else entry.short, entry.summary) for entry in entries), width)
 
 
 def _rows(rows: Iterable[tuple[str, str]], width: int) -> str:
@@ -123,7 +123,7 @@ def _filled(text: str, width: int) -> Iterable[tuple[str, bool]]:
 
 
 def _blocks(text: str) -> Iterable[list[str]]:
-    """The lines of a text between empty ones, with those of a piece of code together."""
+    """The lines of a text between empty lines; a piece of code stays together."""
     block, in_code = [], False
     for line in text.splitlines():
         if _FENCE.match(line):
@@ -163,7 +163,7 @@ def _hanging_item(lines: list[str], width: int) -> str:
 
 
 def _styled(text: str, styled: bool) -> str:
-    """Bold text and code, in the terminal's way; without styles only the marks of bold text go."""
+    """Bold text and code in the terminal's styles; without styles, bold text only loses its marks."""
     pieces = re.split(r"(`[^`]+`)", text)
     bold = rf"{_BOLD}\1{_PLAIN}" if styled else r"\1"
     pieces[::2] = [re.sub(r"\*\*(?=\S)(.+?)(?<=\S)\*\*", bold, piece) for piece in pieces[::2]]

@@ -1,4 +1,4 @@
-"""Topics: what concerns several names, as markdown pages beside the docstrings."""
+"""Topics that concern several names, as markdown pages beside the docstrings."""
 
 import functools
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Topic(NamedTuple):
-    """A page on what concerns several names.
+    """A page on a topic of several names.
 
     **Fields:** `name`, as in `jaxmb help tolerances`; `title`; `text`, markdown without the title.
     """
@@ -24,7 +24,7 @@ class Topic(NamedTuple):
 
 @functools.cache
 def topics() -> dict[str, Topic]:
-    """All topics by name, in the order of the alphabet."""
+    """All topics by name, in alphabetical order."""
     files = sorted(Path(__file__).with_name("topics").glob("*.md"))
     return {file.stem: Topic(file.stem, *_parted(file.read_text(encoding="utf-8"))) for file in files}
 

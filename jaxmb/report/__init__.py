@@ -4,7 +4,7 @@
   methods that agree.
 - `stress_test(system, state, t1=)`: the true error, or the refusal, of stiff and extreme variants: springs, masses,
   lengths, speeds, redundant joints, tolerances.
-- `check_elements(system, state)`: whether the elementary constraints that joints declare are those of their residuals.
+- `check_elements(system, state)`: whether the elementary constraints that joints declare agree with their residuals.
 """
 
 from .._moved import tell_of_moved as _tell_of_moved

@@ -7,17 +7,17 @@ from ..mechanisms import Mechanism, References
 from ..simulate import simulate
 from .subject import natural_coordinates
 
-# An error is only known where it is this much larger than that of the reference.
+# Least ratio of a known error to the reference's error.
 MARGIN = 10.0
 
 # Below this tolerance round-off dominates.
 _TIGHTEST = 1e-13
-# Times at which the sizes of quantities are looked for.
+# The number of times at which the sizes of quantities are evaluated.
 _TIMES = 21
 
 
 def reference(mechanism: Mechanism, tolerance: float) -> References:
-    """Values at the end of a mechanism's motion: published ones, or those of a run two orders tighter than `tolerance`.
+    """Values at the end of a mechanism's motion: published values, or a run two orders tighter than `tolerance`.
 
     The run is checked by a second method, Dormand–Prince 8, with projection if there are constraints; the largest
     relative difference of the two is the `tolerance` of the result. Sizes are the largest values along the motion.
@@ -35,10 +35,12 @@ def reference(mechanism: Mechanism, tolerance: float) -> References:
     values, check = (np.stack([np.asarray(seen[label]) for label in labels], 1) for seen in (observed, checked))
     sizes = np.max(np.abs(values), axis=0)
     if mechanism.observe is natural_coordinates:
-        # One size of all coordinates, and one of all velocities.
-        sizes = np.array([max(size for size, own in zip(sizes, labels, strict=True) if own[0] == x[0]) for x in labels])
+        # One size for all coordinates, and one for all velocities.
+        sizes = np.array(
+            [max(size for size, other in zip(sizes, labels, strict=True) if other[0] == x[0]) for x in labels]
+        )
     projected = " with projection" if mechanism.system.acceleration_rows else ""
     source = f"Adams at rtol {rtol:.0e}, checked by Dopri8{projected}"
-    known = References(ts[-1:], labels, values[-1:], source, 0.0, sizes)
-    difference = float(np.max(np.abs(values - check)[-1] / known.scales))
-    return References(known.times, labels, known.values, source, difference, sizes)
+    provisional = References(ts[-1:], labels, values[-1:], source, 0.0, sizes)
+    difference = float(np.max(np.abs(values - check)[-1] / provisional.scales))
+    return References(provisional.times, labels, provisional.values, source, difference, sizes)

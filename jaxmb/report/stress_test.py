@@ -28,20 +28,20 @@ from .work_precision import outcome
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Tolerances of references, the second where round-off does not allow the first; and the times that are saved.
+# Tolerances of references, the second if round-off rules out the first; and the number of saved times.
 _TIGHT = (1e-13, 1e-11)
 _TIMES = 21
 
 
 _WORDS = {
-    "small": "small: below what the reference can tell, ten times the difference of its two methods",
+    "small": "small: below the reference's accuracy, ten times the difference of its two methods",
     "unknown": "unknown: fewer than two of Adams, Dopri8 and Hermite reached the end at a tight tolerance",
 }
 _COLUMNS = {"variant": "", "": "", "error": ".1e", "known to": ".0e", "steps": "d"}
 
 
 class _Case(NamedTuple):
-    """One variant: its error, or a word instead; the error that the reference can tell; why it was refused."""
+    """A variant: its error, or a word instead; the accuracy of the reference; the reason of a refusal."""
 
     kind: str
     case: str
@@ -54,7 +54,7 @@ class _Case(NamedTuple):
 class _Trial(NamedTuple):
     """A variant: `build()` returns system, state and t1.
 
-    `truth`, where the motion is that of the given system, is a tuple of one entry, as `_truth` returns it.
+    `truth`: the result of `_truth` in a tuple, if the exact motion is the given system's.
     """
 
     case: str
@@ -80,19 +80,19 @@ def stress_test(
     print(jaxmb.report.stress_test(system, state, t1=1.0, only=("rtol", "mass")))
     ```
 
-    The error is relative to a known motion where there is one: that of the given system for other tolerances, other
-    lengths (by dimensional analysis) and doubled joints. Otherwise two of the methods `Adams`, `Dopri8` and `Hermite`
-    at a tight tolerance give a reference, and errors below ten times their difference are not known. Variants in which
-    only numbers change share one compiled program.
+    For other tolerances, other lengths (by dimensional analysis) and doubled joints, the reference is the motion of the
+    given system. For other variants, two of the methods `Adams`, `Dopri8` and `Hermite` at a tight tolerance give a
+    reference; errors below ten times their difference are unknown. Variants that differ in numbers only share a
+    compiled program.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`, or a mechanism of the library alone; `rtol`; `solver`,
-    default `Adams()`; `singular`: coordinates of a singular position by name, as `fix` of `assemble`, near which the
-    motion is started as well; `only`: the kinds of variants to try, default all: "rtol", "long horizon", "stiffness",
-    "mass", "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
+    default `Adams()`; `singular`: coordinates of a singular position by name, as `fix` of `assemble`, near which a
+    variant starts; `only`: the kinds of variants to try, default all: "rtol", "long horizon", "stiffness", "mass",
+    "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
 
-    **Returns:** a `Table` of variants. `error` is that at the end, relative to the largest coordinate and the largest
-    velocity; a word stands in its place where it is "small", that is less than the reference can tell ("known to"),
-    "unknown", or where the variant cannot be built or its run fails, "refused". Notes say why.
+    **Returns:** a `Table` of variants. `error` is the largest error at the end of coordinates, velocities and internal
+    states, each relative to their largest value; or "small" if less than the accuracy of the reference ("known to"),
+    "unknown", or "refused" if the variant cannot be built or its run fails. Notes give the reasons.
     """
     mechanism = subject(system, state, t1)
     solver = Adams() if solver is None else solver
@@ -107,7 +107,7 @@ def stress_test(
         try:
             for trial in trials(base):
                 cases.append(_judge(kind, trial, solver))
-        except _NotHereError as reason:
+        except _NotApplicableError as reason:
             remarks.append(f"{kind}: {reason}.")
     words = {case.error for case in cases}
     notes = [text for word, text in _WORDS.items() if word in words]
@@ -115,14 +115,14 @@ def stress_test(
     for case in cases:
         if case.message:
             refused.setdefault(case.message, []).append(f"{case.kind} {case.case}")
-    notes += [f"{', '.join(own)}: {text}" for text, own in refused.items()]
+    notes += [f"{', '.join(variants)}: {text}" for text, variants in refused.items()]
     name = f"{mechanism.name}, {mechanism.t1:g} s, {type(solver).__name__} at rtol {rtol:g}"
     draw = functools.partial(_plot, title=name, rtol=rtol)
     return Table(f"{name}: relative error at the end", _COLUMNS, [case[:5] for case in cases], notes + remarks, draw)
 
 
-class _NotHereError(Exception):
-    """Why a kind of variant does not apply."""
+class _NotApplicableError(Exception):
+    """The reason why a kind of variant does not apply."""
 
 
 class _Base(NamedTuple):
@@ -132,11 +132,11 @@ class _Base(NamedTuple):
     truth: Any
 
     def trial(self, case, *, system=None, state=None, t1=None, rtol=None, build=None, truth=None) -> _Trial:
-        own = self.mechanism
+        mechanism = self.mechanism
         given = (
-            own.system if system is None else system,
-            own.state if state is None else state,
-            own.t1 if t1 is None else t1,
+            mechanism.system if system is None else system,
+            mechanism.state if state is None else state,
+            mechanism.t1 if t1 is None else t1,
         )
         return _Trial(case, build or (lambda: given), self.rtol if rtol is None else rtol, truth)
 
@@ -156,7 +156,7 @@ def _scaled(base: _Base, names: Collection[str], factors: Collection[float]) -> 
     values = {name: np.asarray(value) for name, value in parameters(system).items() if name in names}
     for factor in factors:
         changed = {name: factor * value for name, value in values.items()}
-        yield base.trial(f"× {factor:.0e}", build=lambda own=changed: _with(base, with_parameters(system, own)))
+        yield base.trial(f"× {factor:.0e}", build=lambda numbers=changed: _with(base, with_parameters(system, numbers)))
 
 
 def _with(base: _Base, system: Any) -> tuple[Any, State, float]:
@@ -169,7 +169,7 @@ def _stiffness(base: _Base) -> Iterator[_Trial]:
         n for n, unit in units(base.mechanism.system).items() if n.endswith("stiffness") and (unit or "")[:1] == "N"
     ]
     if not any(np.any(values[name]) for name in springs):
-        raise _NotHereError("left out, there are no springs")
+        raise _NotApplicableError("left out, there are no springs")
     yield from _scaled(base, springs, 10.0 ** np.arange(2, 15, 2))
 
 
@@ -177,7 +177,7 @@ def _masses(base: _Base) -> Iterator[_Trial]:
     body = base.mechanism.system.catalogue.motion_names()[0]
     masses = _inertial(base, [body])
     if not masses:
-        raise _NotHereError("left out, there is no body whose mass is a parameter")
+        raise _NotApplicableError("left out, there is no body whose mass is a parameter")
     for trial in _scaled(base, masses, 10.0 ** np.array([-8, -4, -2, 2, 4, 8])):
         yield trial._replace(case=f"{body} {trial.case}")
 
@@ -185,7 +185,7 @@ def _masses(base: _Base) -> Iterator[_Trial]:
 def _alternating_masses(base: _Base) -> Iterator[_Trial]:
     every_other = _inertial(base, base.mechanism.system.catalogue.motion_names()[1::2])
     if not every_other:
-        raise _NotHereError("left out, there are no two bodies whose masses are parameters")
+        raise _NotApplicableError("left out, there are no two bodies whose masses are parameters")
     yield from _scaled(base, every_other, 10.0 ** np.array([-8, -6, -3, 3, 6, 8]))
 
 
@@ -196,44 +196,48 @@ def _inertial(base: _Base, bodies: Collection[str]) -> list[str]:
 
 
 def _lengths(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
+    mechanism = base.mechanism
     for factor in (1e-9, 1e-6, 1e-3, 1e3, 1e6):
         try:
-            scaled = scaled_lengths(own.system, own.state, factor)
+            scaled = scaled_lengths(mechanism.system, mechanism.state, factor)
         except ValueError as reason:
-            raise _NotHereError(f"left out, {str(reason).rstrip('.')}") from None
+            raise _NotApplicableError(f"left out, {str(reason).rstrip('.')}") from None
         yield base.trial(f"× {factor:.0e}", system=scaled[0], state=scaled[1], truth=(base.truth,))
 
 
 def _speeds(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
-    if not (np.any(np.asarray(own.state.u)) and own.system.linear and own.system.drift_free):
-        raise _NotHereError("left out, the motion starts from rest, or velocities are prescribed")
+    mechanism = base.mechanism
+    if not (np.any(np.asarray(mechanism.state.u)) and mechanism.system.linear and mechanism.system.drift_free):
+        raise _NotApplicableError("left out, the motion starts from rest, or velocities are prescribed")
     for factor in (1e-6, 1e-3, 10.0, 1e3):
-        fast = dataclasses.replace(own.state, u=factor * own.state.u)
-        yield base.trial(f"× {factor:.0e}", state=fast, t1=own.t1 / max(factor, 1.0))
+        fast = dataclasses.replace(mechanism.state, u=factor * mechanism.state.u)
+        yield base.trial(f"× {factor:.0e}", state=fast, t1=mechanism.t1 / max(factor, 1.0))
 
 
 def _near_singular(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
+    mechanism = base.mechanism
     if not base.singular:
-        raise _NotHereError("left out, no singular position was named; singular={'crank.angle': …} does")
+        raise _NotApplicableError("left out, no singular position was named, as by singular={'crank.angle': …}")
     for off in 10.0 ** -np.arange(3.0, 13.0, 3.0):
         fix = {name: np.asarray(value) + off for name, value in base.singular.items()}
-        build = lambda fix=fix: (own.system, assemble(own.system, own.state, fix=fix), own.t1)
+        build = lambda fix=fix: (mechanism.system, assemble(mechanism.system, mechanism.state, fix=fix), mechanism.t1)
         yield base.trial(f"{off:.0e} off", build=build)
 
 
 def _doubled(base: _Base) -> Iterator[_Trial]:
-    own = base.mechanism
-    if not (own.system.body_names and own.system.velocity_rows):
-        raise _NotHereError("left out, there are no joints of bodies")
-    yield base.trial("the same", build=lambda: _with(base, doubled(own.system, own.state)), truth=(base.truth,))
-    joint = own.system.constraints.groups[0].group
+    mechanism = base.mechanism
+    if not (mechanism.system.body_names and mechanism.system.velocity_rows):
+        raise _NotApplicableError("left out, there are no joints of bodies")
+    yield base.trial(
+        "the same", build=lambda: _with(base, doubled(mechanism.system, mechanism.state)), truth=(base.truth,)
+    )
+    joint = mechanism.system.constraints.groups[0].group
     if getattr(joint.part, "point_a", None) is None:
-        raise _NotHereError(f"a nearly redundant one is left out, {joint.names[0]!r} has no points of two bodies")
-    off = 1e-6 * float(own.system.length)
-    yield base.trial("1e-06 off", build=lambda: _with(base, doubled(own.system, own.state, off)))
+        raise _NotApplicableError(
+            f"a nearly redundant joint is left out, {joint.names[0]!r} has no points of two bodies"
+        )
+    off = 1e-6 * float(mechanism.system.length)
+    yield base.trial("1e-06 off", build=lambda: _with(base, doubled(mechanism.system, mechanism.state, off)))
 
 
 _KINDS: dict[str, Callable[[_Base], Iterator[_Trial]]] = {
@@ -259,29 +263,29 @@ def _judge(kind: str, trial: _Trial, solver: diffrax.AbstractSolver) -> _Case:
     steps = int(trajectory.stats["num_steps"])
     if not bool(trajectory.result == RESULTS.successful):
         return refused(outcome(trajectory.result), steps)
-    known = _truth(system, state, t1) if trial.truth is None else trial.truth[0]
-    if known is None:
+    reference = _truth(system, state, t1) if trial.truth is None else trial.truth[0]
+    if reference is None:
         return _Case(kind, trial.case, "unknown", None, steps)
-    truth, difference = known
+    truth, difference = reference
     error, known_to = _distance(_natural(system, trajectory.ys), truth), MARGIN * difference
     return _Case(kind, trial.case, "small" if error < known_to else error, known_to, steps)
 
 
 def _truth(system: Any, state: State, t1: float) -> Any:
-    """The motion in natural units and the difference of two methods; None if no two come to the end."""
+    """The motion in natural units and the difference of two methods; None if fewer than two reach the end."""
     for rtol in _TIGHT:
-        found = []
+        motions = []
         for solver in (Adams(), diffrax.Dopri8(), Hermite()):
             trajectory = _run(system, state, t1, rtol, solver)
             if bool(trajectory.result == RESULTS.successful):
-                found.append(_natural(system, trajectory.ys))
-            if len(found) == 2:
-                return found[0], _distance(*found)
+                motions.append(_natural(system, trajectory.ys))
+            if len(motions) == 2:
+                return motions[0], _distance(*motions)
     return None
 
 
 def _run(system, state, t1, rtol, solver):
-    # Arrays, so that other numbers do not compile anew.
+    # Arrays, so that other numbers do not compile again.
     t1, rtol = (jnp.asarray(x, state.q.dtype) for x in (t1, rtol))
     return _compiled(system, state, t1, rtol, solver)
 
@@ -294,8 +298,8 @@ def _compiled(system, state, t1, rtol, solver):
 
 def _natural(system: Any, ys: State) -> tuple[np.ndarray, ...]:
     scaled = lambda values, scale: np.asarray(values) / np.asarray(scale)
-    own = scaled(ys.q, system.coordinate_scale()), scaled(ys.u, system.velocity_scale())
-    return own if ys.z is None else (*own, scaled(ys.z, system.state_scale()))
+    natural = scaled(ys.q, system.coordinate_scale()), scaled(ys.u, system.velocity_scale())
+    return natural if ys.z is None else (*natural, scaled(ys.z, system.state_scale()))
 
 
 def _distance(motion: Any, truth: Any) -> float:

@@ -13,11 +13,12 @@ from ..trajectory import Trajectory
 
 
 def subject(system: AbstractSystem | Mechanism, state: State | None = None, t1: float | None = None) -> Mechanism:
-    """The motion of a report. It is about every parameter by itself, so a system loses its design variables.
+    """The motion of a report. Every parameter counts separately, so a system loses its design variables.
 
-    **Arguments:** a compiled system, a state of it and the end `t1` [s] of the motion; or a mechanism, with its own.
+    **Arguments:** a compiled system, a state of it and the end `t1` [s] of the motion; or a mechanism, perhaps with
+    another end `t1`.
 
-    **Raises:** `ValueError` where one of them is missing or not needed.
+    **Raises:** `ValueError` for a missing or superfluous argument.
     """
     if isinstance(system, AbstractSystem):
         if state is None or t1 is None:
@@ -25,14 +26,14 @@ def subject(system: AbstractSystem | Mechanism, state: State | None = None, t1: 
                 "A report on a system needs a state, from jaxmb.assemble, and t1=, the end of the motion [s]."
             )
         return Mechanism("scene", None, _alone(system), state, 0.0, None, natural_coordinates, "").until(t1)
-    own: Any = system
-    if not hasattr(own, "references") or state is not None:
+    mechanism: Any = system
+    if not hasattr(mechanism, "references") or state is not None:
         raise ValueError(
-            "A report is about a compiled system and a state, from scene.compile() and jaxmb.assemble, or about a "
-            f"mechanism of the library alone; got {type(system).__name__}{'' if state is None else ' and a state'}."
+            "A report needs a compiled system and a state, from scene.compile() and jaxmb.assemble, or a mechanism of "
+            f"the library alone; got {type(system).__name__}{'' if state is None else ' and a state'}."
         )
-    own = dataclasses.replace(own, system=_alone(own.system))
-    return own if t1 is None else own.until(t1)
+    mechanism = dataclasses.replace(mechanism, system=_alone(mechanism.system))
+    return mechanism if t1 is None else mechanism.until(t1)
 
 
 def _alone(system: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Tables: what reports return."""
+"""Tables, the results of reports."""
 
 import dataclasses
 import html
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Table(Printed):
-    """What a report found; `print` and notebooks show it, and `table["error"]` is a column.
+    """The results of a report; `print` and notebooks show them, and `table["error"]` is a column.
 
     **Fields:** `title`; `columns`: their names, each with the format of its numbers, `".1e"`, or "" for words; `rows`
     of numbers, words, and None for an unknown number; `notes`: lines below; `draw(table)`: its matplotlib figure.

@@ -1,4 +1,4 @@
-"""Run times that can be compared with each other on a machine with other load."""
+"""Comparable run times on a machine with other load."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import jax
 def timed_compile(fn: Callable, *args: Any) -> tuple[Callable, float]:
     """Trace and compile a function for its arguments.
 
-    **Returns:** the compiled function, and the time that took [s].
+    **Returns:** the compiled function, and the time taken [s].
     """
     begin = time.perf_counter()
     compiled = eqx.filter_jit(fn).lower(*args).compile()  # pyright: ignore[reportFunctionMemberAccess]
@@ -29,8 +29,8 @@ def interleaved(runs: Sequence[Callable[[], Any]], repeats: int) -> list[tuple[f
         jax.block_until_ready(run())
     times: list[list[float]] = [[] for _ in runs]
     for _ in range(repeats):
-        for own, run in zip(times, runs, strict=True):
+        for durations, run in zip(times, runs, strict=True):
             begin = time.perf_counter()
             jax.block_until_ready(run())
-            own.append(time.perf_counter() - begin)
-    return [tuple(own) for own in times]
+            durations.append(time.perf_counter() - begin)
+    return [tuple(durations) for durations in times]

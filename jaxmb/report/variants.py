@@ -20,8 +20,8 @@ from ..system import AbstractSystem, parameters, with_parameters
 
 
 def units(system: Any) -> dict[str, str | None]:
-    """The units of all parameters by name, `"N/m, N m/rad"` of components with several; None where it is not declared,
-    or a user's function gives it.
+    """The units of all parameters by name, `"N/m, N m/rad"` for components with different units; None if undeclared, or
+    defined by a user's function.
     """
     out: dict[str, str | None] = dict.fromkeys(parameters(system))
     for g in _groups(system):
@@ -40,28 +40,28 @@ def _unit(part: Any, field: str, declared: Declaration) -> str | None:
 
 
 def scaled_lengths(system: Any, state: State, factor: float) -> tuple[Any, State]:
-    """All lengths of a system times a factor, with masses and times as they are.
+    """All lengths of a system times a factor, with unchanged masses and times.
 
     Every parameter is scaled by its unit, so the motion is the same in units of the system's size.
 
-    **Raises:** `ValueError` where a length may hide in a function, or a unit is not known.
+    **Raises:** `ValueError` if a length may hide in a function, or a unit is unknown.
     """
     if system.nz:
-        raise ValueError(f"the internal states {', '.join(system.state_names())} are of no known power of a length.")
+        raise ValueError(f"the internal states {', '.join(system.state_names())} have an unknown power of length.")
     functions = [name for g in _groups(system) if _has_function(g.group.part) for name in g.group.names]
-    known = units(system)
-    unknown = [*functions, *(name for name, unit in known.items() if unit is None)]
+    declared = units(system)
+    unknown = [*functions, *(name for name, unit in declared.items() if unit is None)]
     if unknown or not system.body_names:
         raise ValueError(f"the units of {', '.join(unknown[:3]) or 'a Lagrangian'} are not known")
     values = {}
     for name, value in parameters(system).items():
-        exponents = np.array([power_of_length(unit) for unit in (known[name] or "").split(", ")])
+        exponents = np.array([power_of_length(unit) for unit in (declared[name] or "").split(", ")])
         values[name] = np.asarray(value) * float(factor) ** np.squeeze(exponents)
     scaled = with_parameters(system, values)
     scaled = eqx.tree_at(lambda s: s.length, scaled, system.length * factor)
     natural = lambda s: (s.coordinate_scale(), s.velocity_scale())
-    own = [new / old for new, old in zip(natural(scaled), natural(system), strict=True)]
-    return scaled, State(state.q * own[0], state.u * own[1])
+    factors = [new / old for new, old in zip(natural(scaled), natural(system), strict=True)]
+    return scaled, State(state.q * factors[0], state.u * factors[1])
 
 
 def _has_function(part: Any) -> bool:
@@ -76,9 +76,9 @@ def _groups(system: Any) -> Iterator[Any]:
 
 
 def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSystem:
-    """A scene with its first joint twice; with `shift` [m] the second has its first point off by that along each axis.
+    """A scene with its first joint twice; `shift` [m] moves the second joint's first point along each axis.
 
-    **Raises:** `ValueError` for a scene without joints, and where the scene with both does not compile.
+    **Raises:** `ValueError` for a scene without joints, and if the scene with both joints does not compile.
     """
     joint = first_joint(system)
     kind = "position" if isinstance(joint.part, AbstractConstraint) else "velocity"
@@ -93,7 +93,7 @@ def doubled(system: Any, state: State, shift: float | None = None) -> AbstractSy
 
 
 def first_joint(system: Any) -> Group:
-    """The first group of joints of a scene; `ValueError` where there is none."""
+    """The first group of joints of a scene; `ValueError` without one."""
     if not (system.body_names and system.velocity_rows):
         raise ValueError("there are no joints of bodies")
     return system.constraints.groups[0].group

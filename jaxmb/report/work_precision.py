@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
-# More labels of an axis would overlap.
+# Largest number of labels of an axis without overlap.
 _MOST_TICKS = 7
 
 
@@ -64,20 +64,20 @@ def work_precision(
     print(jaxmb.report.work_precision(system, state, t1=1.0, tolerances=(1e-4, 1e-7), repeats=3))
     ```
 
-    Errors are those of the quantities that a mechanism observes, relative to their sizes; of other systems those of all
-    coordinates, relative to the largest, and of all velocities, in units of the system's size or radians. Reference
-    values are the published ones of a mechanism, or computed by two methods. Every run is compiled before it is timed;
-    then all of them run in turns `repeats` times. Only the end of the motion is saved, so that no run includes
-    interpolation.
+    Errors of a mechanism are errors of the quantities that it observes, relative to their sizes. Errors of other
+    systems are errors of all coordinates and of all velocities, each relative to the largest, in units of the system's
+    size or radians. Reference values are published values of a mechanism, or computed by two methods. Every run is
+    compiled before it is timed; then all run in turns `repeats` times. Only the end of the motion is saved, so that no
+    run includes interpolation.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`; or a mechanism of the library alone; `solvers` by
     name, default `Adams`, and `Tsit5` and `Dopri8` of diffrax with projection; `tolerances`: values of `rtol`, default
     1e-4 … 1e-10; `repeats`: at least 1.
 
-    **Returns:** a `Table` with a row for each solver and tolerance. `error` is the largest one, "small" where it is
-    below the accuracy of the reference, and "failed" where the run did, for which a note says why. Times are the
-    shortest and the median of warm runs, and the time to compile the solver's program, which serves all tolerances, or
-    to read it from disk. `steps` counts rejected ones too; `evaluations` of the accelerations are None if not known.
+    **Returns:** a `Table` with a row for each solver and tolerance. `error` is the largest error, "small" if it is
+    below the accuracy of the reference, and "failed" for a failed run, with a note on the reason. Times are the
+    shortest and the median of warm runs, and the time to compile the solver's program (or read it from disk), which
+    serves all tolerances. `steps` includes rejected steps; `evaluations` of the accelerations are None if unknown.
 
     **Raises:** `ValueError` for no solvers, no tolerances or no repeats, and for a system without state or `t1`.
     """
@@ -88,8 +88,8 @@ def work_precision(
         raise ValueError("work_precision needs at least one solver, one tolerance and one repeat.")
     if not all(0 < rtol < 1 for rtol in tolerances):
         raise ValueError(f"The tolerances must be between 0 and 1, got {', '.join(f'{x:g}' for x in tolerances)}.")
-    known = reference(mechanism, min(tolerances))
-    t1 = float(known.times[-1])
+    references = reference(mechanism, min(tolerances))
+    t1 = float(references.times[-1])
     compiled, costs = [], []
     for solver in solvers.values():
         # Tolerances are an argument of one program for each solver.
@@ -100,18 +100,18 @@ def work_precision(
     times = interleaved(compiled, repeats)
     cases = [(name, rtol) for name in solvers for rtol in tolerances]
     rows, notes = [], []
-    for (name, rtol), run, own, seconds in zip(cases, compiled, times, costs, strict=True):
+    for (name, rtol), run, durations, seconds in zip(cases, compiled, times, costs, strict=True):
         trajectory = run()
         error: Any = "failed"
         if bool(trajectory.result == RESULTS.successful):
-            error = _error(mechanism, known, trajectory)
+            error = _error(mechanism, references, trajectory)
         else:
             notes.append(f"{name} at {rtol:.0e}: {outcome(trajectory.result)}")
         steps, rejected = (int(trajectory.stats[key]) for key in ("num_steps", "num_rejected_steps"))
-        spans = 1e3 * min(own), 1e3 * float(np.median(own)), seconds
+        spans = 1e3 * min(durations), 1e3 * float(np.median(durations)), seconds
         rows.append((name, float(rtol), error, *spans, steps, rejected, evaluations(solvers[name], trajectory.stats)))
-    accuracy = MARGIN * known.tolerance
-    source = [f"reference: {known.source}; good to {known.tolerance:.0e}"]
+    accuracy = MARGIN * references.tolerance
+    source = [f"reference: {references.source}; good to {references.tolerance:.0e}"]
     if "small" in [row[2] for row in rows]:
         source.append(f"small: below the reference's accuracy, {accuracy:.0e}")
     title = f"{mechanism.name}, {t1:g} s: largest relative error at the end"
@@ -129,10 +129,10 @@ def _simulation(solver, t1):
     return lambda system, state, rtol: simulate(system, state, t1=t1, rtol=rtol, solver=solver, throw=False)
 
 
-def _error(mechanism: Mechanism, known: References, trajectory) -> float | str:
-    errors = dataclasses.replace(mechanism, references=known).errors(trajectory)
+def _error(mechanism: Mechanism, references: References, trajectory) -> float | str:
+    errors = dataclasses.replace(mechanism, references=references).errors(trajectory)
     largest = max(float(error[-1]) for error in errors.values())
-    return "small" if largest < MARGIN * known.tolerance else largest
+    return "small" if largest < MARGIN * references.tolerance else largest
 
 
 def _plot(table: Table, title: str, accuracy: float) -> "Figure":
@@ -143,9 +143,9 @@ def _plot(table: Table, title: str, accuracy: float) -> "Figure":
     panels = figure.subplots(1, 2, sharey=True)
     quantities = (("run time, warm [ms]", "run [ms]"), ("evaluations", "evaluations"))
     for axes, (label, quantity) in zip(panels, quantities, strict=True):
-        found = list(zip(table["solver"], table[quantity], table["error"], strict=True))
+        rows = list(zip(table["solver"], table[quantity], table["error"], strict=True))
         for k, solver in enumerate(dict.fromkeys(table["solver"])):
-            points = [(x, error) for own, x, error in found if own == solver and x is not None]
+            points = [(x, error) for name, x, error in rows if name == solver and x is not None]
             points = [(x, error) for x, error in points if not isinstance(error, str)]
             if points:
                 axes.loglog(*zip(*points, strict=True), "osD^v<>"[k % 7] + "-", color=f"C{k % 10}", label=solver)
@@ -164,7 +164,7 @@ def _plot(table: Table, title: str, accuracy: float) -> "Figure":
 
 
 def _ticks(low, high):
-    """Round numbers between two limits, as many as have room for their labels."""
+    """Round numbers between two limits, as many as their labels allow."""
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     for digits in ((1, 2, 5), (1, 3), (1,)):
         values = np.sort(np.outer(decades, digits).ravel())

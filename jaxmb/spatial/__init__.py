@@ -2,11 +2,11 @@
 """Parts of spatial scenes: bodies, joints, forces, ground and contact.
 
 Units are SI and radians; Euler parameters are scalar first, and angular velocities are in the body frame. Joints have
-their own coordinates by name, `"hip.angle"` or `"slide.displacement"`, which `assemble` takes and `trajectory["hip"]`
-shows with rates and accelerations. Parts of `jaxmb` act on them, such as `JointSpring` and `Motor` on one coordinate,
-`Tendon` on several. So do `RigidContact` and other unilateral constraints, `DryFriction`, `Servo`, `Controller`, and
-`Force` and other functions of the user's. `jaxmb help` lists them. Parts may name a `Frame`, fixed in a body, in place
-of the body. Classes of your own derive from those of `jaxmb.parts`.
+coordinates by name, `"hip.angle"` or `"slide.displacement"`, which `assemble` takes and `trajectory["hip"]` shows with
+rates and accelerations. Parts of `jaxmb` act on them, such as `JointSpring` and `Motor` on one coordinate, `Tendon` on
+several. Further parts of `jaxmb` are `RigidContact` and other unilateral constraints, `DryFriction`, `Servo`,
+`Controller`, and `Force` and other functions of the user's. `jaxmb help` lists them. Parts may name a `Frame`, fixed in
+a body, in place of the body. New classes derive from the classes of `jaxmb.parts`.
 """
 
 from .._moved import tell_of_moved as _tell_of_moved

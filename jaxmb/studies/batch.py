@@ -1,4 +1,4 @@
-"""Batches in blocks: a function of many members, for as many at once as the cache of a core holds."""
+"""Batches in blocks: a function of many members, as many at once as fit the cache of a core."""
 
 import functools
 import math
@@ -19,15 +19,15 @@ from ..linalg.arrays import ARRAYS
 from ..linalg.members import in_blocks
 from ..parts.names import names_arguments
 
-# The bytes that the loops of a block of members may carry from step to step, and the most members of a block.
+# Largest number of bytes carried from step to step by the loops of a block, and largest number of members of a block.
 _CARRIED, _MOST = 2**20, 64
 # Ratio of the bytes that the equations of a loop body write to the bytes that its fused kernels read and write (rule of
 # thumb).
 _FUSED = 3
-# Members that stand side by side fill a vector register with their numbers in double precision. Loops that carry more
-# bytes than these for a member, as of Bricard's mechanism, would compile for minutes.
+# Members side by side fill a vector register with their numbers in double precision. Loops that carry more than these
+# bytes for a member, such as Bricard's mechanism, would compile for minutes.
 _SIDE_BY_SIDE, _MOST_SIDE_BY_SIDE = 8, 2**14
-# An array of several axes with at least so many rows is a table; a step writes one row of it.
+# Least number of rows of an array of several axes that counts as a table, of which a step writes one row.
 _LONG = 1024
 
 
@@ -50,20 +50,20 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
 
     - `function`: of any arguments by position, pytrees of arrays, to a pytree of arrays; it is traced by JAX.
     - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
-        which the numbers that the largest loop of the function carries from step to step stay in the cache of a core.
-        It is 1 if that loop becomes one kernel, by `setup(compile="for speed")`: this is as fast, and no member waits
-        for another. It is 8 by `setup(compile="for batches")`, with members side by side in the registers of a
-        processor. A function without loops has one block, and so have all functions on other devices than a CPU.
+        which the numbers carried by the function's largest loop stay in the cache of a core. It is 1 if that loop
+        becomes one kernel, by `setup(compile="for speed")`: this is as fast, and no member waits for another. It is 8
+        by `setup(compile="for batches")`, with members side by side in the registers of a processor. A function without
+        loops has one block, and so have all functions on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array. Its results have members
-    along axis 0 as well. It is compiled at its first call. Values that are no arrays, such as names, are the same for
-    all members, and so are values that the function refers to. The last block is filled up with the last member, which
-    takes time and changes nothing. The function has derivatives in all modes; reverse mode keeps the values that it
-    needs of all blocks at once.
+    along axis 0 as well. It is compiled at its first call. Values other than arrays, such as names, are the same for
+    all members, and so are values that the function refers to. The last block is filled up with copies of the last
+    member, which costs time and does not change results. The function has derivatives in all modes; reverse mode keeps
+    the values that it needs from all blocks at once.
 
-    **Raises:** `ValueError` for a size that is no integer of at least 1; for arguments without members or of different
-    numbers of members; for a function that needs an argument as a number; and for an operation without a rule for
-    batches, which `size=1` does not need.
+    **Raises:** `ValueError` for a size that is not an integer of at least 1; for arguments without members or of
+    different numbers of members; for a function that needs an argument as a number; and for an operation without a rule
+    for batches, which `size=1` does not need.
     """
     if not callable(function):
         raise ValueError(f"batch needs a function, got {function!r}.")
@@ -72,8 +72,8 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     @eqx.filter_jit
     def of_all(members, count):
         arrays, shared = eqx.partition(members, lambda x: isinstance(x, ARRAYS))
-        member = Member(lambda own: function(*eqx.combine(own, shared)), jax.tree.map(lambda x: x[0], arrays))
-        together = lambda own: member.block(jax.tree.leaves(own)[0].shape[0])(own)
+        member = Member(lambda block: function(*eqx.combine(block, shared)), jax.tree.map(lambda x: x[0], arrays))
+        together = lambda block: member.block(jax.tree.leaves(block)[0].shape[0])(block)
         return in_blocks(together, arrays, min(size or member.block_size(count), count))
 
     @functools.wraps(function)
@@ -96,7 +96,7 @@ class Member:
             self._program = self._function.trace(self._like).jaxpr
         except NEED_NUMBERS as error:
             raise ValueError(
-                "The function cannot be batched: it needs the number of an argument, and each member has another one. "
+                "The function cannot be batched: it needs the number of an argument, which differs between members. "
                 f"Use jnp.where or jax.lax.cond for `if`, and jax.numpy for NumPy. ({error})"
             ) from error
 
@@ -152,8 +152,8 @@ def _loops(program: Any) -> Iterator[tuple[int, int]]:
         if equation.primitive.name in ("while", "scan"):
             # A scan does not carry the results of single steps.
             yield _bytes(equation.outvars[: _loop_values(equation)]), sum(map(_written, inner))
-        for own in inner:
-            yield from _loops(own)
+        for inner_program in inner:
+            yield from _loops(inner_program)
 
 
 def _loop_values(equation: Any) -> int:
@@ -164,8 +164,8 @@ def _loop_values(equation: Any) -> int:
 
 def _written(program: Any) -> int:
     """The bytes that the equations of a program write, with one turn of each loop."""
-    found = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
-    return sum(sum(map(_written, inner)) if inner else _bytes(equation.outvars) for equation, inner in found)
+    pairs = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
+    return sum(sum(map(_written, inner)) if inner else _bytes(equation.outvars) for equation, inner in pairs)
 
 
 def _inner(equation: Any) -> list[Any]:
@@ -201,9 +201,9 @@ def _count(members: tuple[Any, ...]) -> int:
     if not counts:
         raise ValueError("A batch needs an array with members along axis 0, got none.")
     (first, count), *others = counts.items()
-    for name, own in others:
-        if own != count:
-            raise ValueError(f"{first} has {count} members, but {name} has {own}.")
+    for name, number in others:
+        if number != count:
+            raise ValueError(f"{first} has {count} members, but {name} has {number}.")
     if count == 0:
         raise ValueError(f"A batch needs at least one member, and {first} has none.")
     return count

@@ -9,15 +9,15 @@ from jaxtyping import Float
 
 # Damping of the first step, and its smallest value.
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
-# The largest gap that counts as closed, and the smallest share of a step towards closed gaps.
+# The largest gap that counts as closed, and the smallest fraction of a step towards closed gaps.
 _CLOSED, _LEAST_SHARE = 1e-9, 2.0**-5
 
 
 class Linearised(NamedTuple):
     """A model of an objective at one point: its gradient is `Jᵀ r`, and `Jᵀ J` approximates its second derivatives.
 
-    **Fields:** `residuals` r and their `jacobian` J, infinite where the simulation fails; `objective`, default
-    `½ |r|²`; `gaps`, which are to be zero, and their derivatives, `closing`, of full row rank.
+    **Fields:** `residuals` r and their `jacobian` J, infinite where the simulation fails; `objective`, default `½
+    |r|²`; `gaps`, to be closed to zero, and their derivatives, `closing`, of full row rank.
     """
 
     residuals: Any
@@ -33,7 +33,7 @@ class Linearised(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """The end of an iteration: `z`, the number of trials without those of halved steps, whether it converged, and the
+    """The end of an iteration: `z`, the number of trials except halved steps, whether it converged, and the
     objective.
     """
 
@@ -62,20 +62,20 @@ def levenberg_marquardt(
 ) -> Minimum:
     """Minimise an objective from its linearised residuals; trials that fail are rejected.
 
-    A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt), subject to
-    `c + C s = 0` where there are gaps c; then `f + ν |c|₁` is to decrease, and a step that is rejected is halved first.
-    The damping μ follows the gain, the ratio of the decrease to that of the linear model.
+    A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt), subject to `c + C s =
+    0` for gaps c. With gaps the merit function is `f + ν |c|₁`, and a rejected step is halved first. The damping μ
+    follows the gain, the ratio of the actual decrease to the linear model's.
 
-    Where the model promises a decrease of less than `tol` times the objective, errors of the motions, which differ from
-    step to step, are more than that: the objective does not tell good steps from bad ones any more. These steps are
-    taken without it, as long as each is less than a tenth of the one before.
+    If the model promises a decrease of less than `tol` times the objective, the varying errors of the motions exceed
+    it, and the objective cannot judge a step. Such steps are taken without it, as long as each is less than a tenth of
+    the previous step.
 
     Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
 
     **Arguments:** `linearised`: residuals and their Jacobian, or a `Linearised`; `tol`: change of the unknowns and of
     the objective at which to stop, absolute and relative; `limit`: largest number of evaluations of `linearised`;
-    `held`: a mask of the unknowns that stay as they are; `move(z, step)`: the point after a step, and `size(z, step)`
-    of a step, for points that are no vectors.
+    `held`: a mask of the fixed unknowns; `move(z, step)`: the point after a step, and `size(z, step)` of a step, for
+    points that are not vectors.
     """
     return minimise_together(lambda zs: [linearised(zs[0])], [z], tol, limit, held, move, size)[0]
 
@@ -92,16 +92,16 @@ def minimise_together(
     """`levenberg_marquardt` from several starts, whose trials are evaluated together."""
     runs = [_trials(z, tol, limit, held, move, size) for z in starts]
     points = [next(run) for run in runs]
-    found: dict[int, Minimum] = {}
-    while len(found) < len(runs):
+    minima: dict[int, Minimum] = {}
+    while len(minima) < len(runs):
         models = linearised(points)
         for k, run in enumerate(runs):
-            if k not in found:
+            if k not in minima:
                 try:
                     points[k] = run.send(Linearised(*models[k]))
                 except StopIteration as end:
-                    found[k] = end.value
-    return [found[k] for k in range(len(runs))]
+                    minima[k] = end.value
+    return [minima[k] for k in range(len(runs))]
 
 
 def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size) -> Generator[Any, Linearised, Minimum]:
@@ -119,13 +119,13 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
         whole[slice(None) if held is None else ~held] = step
         point = move(z, whole)
         trial, objective = _numbers((yield point), held), model.value
-        gap, later = (np.sum(np.abs(own.gaps)) for own in (model, trial))
+        gap, later = (np.sum(np.abs(either.gaps)) for either in (model, trial))
         decrease = objective - trial.value + weight * (gap - later)
         change = model.jacobian @ step
         predicted = weight * share * gap - model.residuals @ change - 0.5 * change @ change
         gain = decrease / predicted if predicted > 0 else 0.0
         settled = predicted <= tol * (1 + abs(objective)) and abs(decrease) <= np.sqrt(tol) * (1 + abs(objective))
-        # With more damping a step may promise little far from the minimum.
+        # More damping may make the promise small far from the minimum.
         hidden = settled and damping <= _FIRST_DAMPING and predicted <= tol * abs(objective) and _closed(model)
         length = size(z, whole)
         if hidden and length > 0.1 * last:
@@ -148,12 +148,12 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
 
 
 def _numbers(model: Linearised, held: np.ndarray | None) -> Linearised:
-    """A model for NumPy, of the unknowns that change; its objective is infinite where something is not finite."""
+    """A model for NumPy, of the unknowns that change; its objective is infinite if a part is not finite."""
     free = slice(None) if held is None else ~held
     residuals, jacobian = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
     gaps = np.zeros(0) if model.gaps is None else np.asarray(model.gaps)
     closing = np.zeros((0, jacobian.shape[1])) if model.closing is None else np.asarray(model.closing)[:, free]
-    finite = all(np.all(np.isfinite(own)) for own in (jacobian, gaps, closing))
+    finite = all(np.all(np.isfinite(array)) for array in (jacobian, gaps, closing))
     return Linearised(residuals, jacobian, model.value if finite else np.inf, np.where(finite, gaps, 0.0), closing)
 
 

@@ -21,8 +21,8 @@ else:
 
 Bounds = tuple[ArrayLike | None, ArrayLike | None]
 
-# An estimate is at an end of its range where it has come closer to it than this, relative to where it started, and its
-# distance from a bound is less than `_INDISTINCT` standard deviations.
+# An estimate is at an end of its range if its distance from it is below this fraction of the start's distance, and
+# below `_INDISTINCT` standard deviations.
 _NEAR, _INDISTINCT = 1e-3, 0.1
 
 
@@ -46,40 +46,40 @@ class AbstractRange(eqx.Module):
 
     @abc.abstractmethod
     def at_end(self, z: Float[Array, "n"], deviations: np.ndarray) -> np.ndarray:
-        """Which components of the value are at an end of the range, a bound or infinity, as far as can be told.
+        """Whether each component of the value is at an end of the range, a bound or infinity, as far as the data tell.
 
-        They have come a thousand times closer to it than they started (closer than a thousandth of the width to one of
-        two bounds), and what is left is small compared with their standard `deviations`: a component that is close to a
-        bound but determined well enough to tell it from the bound is not at it.
+        Its distance from the end has shrunk to a thousandth of the start's (to a thousandth of the width between two
+        bounds), and is small against its standard `deviations`. A component close to a bound, but distinguishable from
+        it by the data, is not at the bound.
         """
 
     @property
     def ends(self) -> tuple[Array, Array] | None:
-        """Both bounds, each of the value's shape; None where one is missing."""
+        """Both bounds, each of the value's shape; None if one is missing."""
         return None
 
     @property
     def componentwise(self) -> bool:
-        """Whether every component of the value belongs to one component of `z`."""
+        """Whether every component of the value depends on one component of `z`."""
         return self.size == self.start.size
 
     def free_components(self, value: Array) -> Float[Array, "n"]:
-        """As many components of a value as determine it."""
+        """Components that determine the value."""
         return value.reshape(-1)
 
     def draw(self, random: np.random.Generator) -> Float[Array, "n"]:
-        """A vector somewhere in the range, not far from the start."""
+        """A random vector in the range, not far from the start."""
         return jnp.asarray(random.standard_normal(self.size), self.start.dtype)
 
 
 def _indistinct(distance: np.ndarray, before: np.ndarray, deviations: np.ndarray) -> np.ndarray:
-    """Whether what is left of a distance from a bound says nothing."""
+    """Whether the remaining distance from a bound is insignificant."""
     distance = np.abs(distance)
     return (distance < _NEAR * before) & ~(distance > _INDISTINCT * deviations)
 
 
 def _lost(distance: np.ndarray, before: np.ndarray, deviations: np.ndarray) -> np.ndarray:
-    """Whether a value has run so far away that nothing tells how far."""
+    """Whether a value has moved away insignificantly far towards infinity."""
     distance = np.abs(distance)
     return (distance > np.abs(before) / _NEAR) & ~(distance > deviations)
 
@@ -101,8 +101,8 @@ class WholeLine(AbstractRange):
 
 
 class Box(WholeLine):
-    """Values between bounds that methods keep by themselves, infinite where there is none: `start + scale z`, never out
-    of bounds by rounding.
+    """Values between bounds that the method keeps, infinite if missing: `start + scale z`, never out of bounds by
+    rounding.
     """
 
     low: Array
@@ -158,7 +158,7 @@ class Interval(AbstractRange):
         return self.low, self.high
 
     def draw(self, random):
-        # Between two bounds every value is as likely as any other.
+        # Between two bounds all values are equally likely.
         return self.locate(self.low + (self.high - self.low) * random.uniform(size=self.start.shape))
 
     def _logit(self, value):
@@ -167,11 +167,11 @@ class Interval(AbstractRange):
 
 
 class Inertia(AbstractRange):
-    """Inertia matrices that a distribution of mass can have: their principal moments satisfy the triangle inequalities.
+    """Inertia matrices of mass distributions: their principal moments satisfy the triangle inequalities.
 
     `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite: `Σ = C T Tᵀ Cᵀ`, with `C Cᵀ`
-    the start's, and T lower triangular with `exp z` on its diagonal. About the mass centre, which is where bodies have
-    their frame, the pseudo-inertia matrix is block diagonal, of Σ and the mass; it is positive definite if both are.
+    the start's, and T lower triangular with `exp z` on its diagonal. About the mass centre the pseudo-inertia matrix is
+    block diagonal, with blocks Σ and the mass; it is positive definite if both are.
 
     Source: C. Rucker and P. M. Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE Robotics and Automation
     Letters 7(2), 2022.
@@ -194,15 +194,15 @@ class Inertia(AbstractRange):
         return lower + jnp.diag(jnp.exp(diagonal) - diagonal)
 
     def locate(self, value):
-        start, own = (jnp.linalg.cholesky(second_moments(inertia)) for inertia in (self.start, value))
-        lower = jnp.linalg.solve(start, own)
+        start, target = (jnp.linalg.cholesky(second_moments(inertia)) for inertia in (self.start, value))
+        lower = jnp.linalg.solve(start, target)
         diagonal = jnp.diag(lower)
         return (lower + jnp.diag(jnp.log(diagonal) - diagonal))[self._below]
 
     def at_end(self, z, deviations):
-        # The singular values of T are roots of how much of the start is left in a direction.
-        there = np.linalg.svd(np.asarray(self._factor(z)), compute_uv=False)
-        near = there[-1] < _NEAR or there[0] > 1 / _NEAR
+        # The squared singular values of T are the remaining fractions of the start in some directions.
+        factors = np.linalg.svd(np.asarray(self._factor(z)), compute_uv=False)
+        near = factors[-1] < _NEAR or factors[0] > 1 / _NEAR
         return np.full(self.start.shape, near)
 
     def free_components(self, value):
@@ -249,14 +249,14 @@ class FreeParameters(eqx.Module):
         return {name: r.start for name, r in zip(self.names, self.ranges, strict=True)}
 
     def at_end(self, z: Float[Array, "n"], deviations: Float[np.ndarray, "values"]) -> np.ndarray:
-        """Which of all values, raveled one after the other, are at an end of their ranges."""
+        """Whether each of all values, raveled one after the other, is at an end of its range."""
         out, ends = [], np.cumsum([r.start.size for r in self.ranges])
-        for name, r, own in zip(self.names, self.ranges, np.split(deviations, ends[:-1]), strict=True):
-            out.append(np.ravel(r.at_end(z[self.place(name)], own.reshape(r.start.shape))))
+        for name, r, part in zip(self.names, self.ranges, np.split(deviations, ends[:-1]), strict=True):
+            out.append(np.ravel(r.at_end(z[self.place(name)], part.reshape(r.start.shape))))
         return np.concatenate(out)
 
     def ends(self) -> list[tuple[float, float] | None]:
-        """Both bounds of each of all values, raveled one after the other; None where one is missing."""
+        """Both bounds of all values, raveled one after the other; None if one is missing."""
         out: list[tuple[float, float] | None] = []
         for r in self.ranges:
             ends = [None] * r.start.size
@@ -268,14 +268,14 @@ class FreeParameters(eqx.Module):
         return jnp.concatenate([r.locate(values[name]) for name, r in zip(self.names, self.ranges, strict=True)])
 
     def log_volume(self, z: Float[Array, "n"]) -> Float[Array, ""]:
-        """`log |∂ values / ∂ z|`, of as many components of the values as determine them."""
+        """`log |∂ values / ∂ z|`, for components that determine the values."""
         parts = jnp.split(z, np.cumsum([r.size for r in self.ranges])[:-1])
         each = zip(self.ranges, parts, strict=True)
         jacobians = [jax.jacfwd(lambda z, r=r: r.free_components(r(z)))(part) for r, part in each]
         return jnp.sum(jnp.stack([jnp.linalg.slogdet(matrix)[1] for matrix in jacobians]))
 
     def place(self, name: str) -> slice:
-        """Where the components of a parameter stand in the vector."""
+        """The components of a parameter in the vector."""
         number = self.names.index(name)
         first = sum(r.size for r in self.ranges[:number])
         return slice(first, first + self.ranges[number].size)
@@ -286,13 +286,13 @@ def range_of(
 ) -> AbstractRange:
     """The range of one parameter.
 
-    **Arguments:** `own`: an array of the parameter's shape and type; `positive`: whether it stays positive, or a matrix
-    of inertia; `scale`: a typical change, default the size of the start.
+    **Arguments:** `own`: an array of the parameter's shape and type; `positive`: whether it stays positive, or an
+    inertia matrix; `scale`: a typical change, default the size of the start.
     """
     if isinstance(start, eqx.Module):
         raise ValueError(
-            f"The start of {name!r} must be numbers, got a {type(start).__name__}; leave it out, and set the weights "
-            "that it starts from by with_parameters."
+            f"The start of {name!r} must be numbers, got a {type(start).__name__}; leave it out, and set the initial "
+            "weights by with_parameters."
         )
     value = jnp.asarray(start, own.dtype)
     if value.shape != own.shape:
@@ -313,7 +313,7 @@ def range_of(
 
 
 def typical_change(value: Array) -> Array:
-    """The sizes of components, for those that are zero the size of the largest one, or one."""
+    """The sizes of components; for zeros the size of the largest component, or one."""
     largest = jnp.max(jnp.abs(value), initial=0.0)
     return jnp.where(value == 0, jnp.where(largest > 0, largest, jnp.ones_like(largest)), jnp.abs(value))
 
@@ -330,7 +330,7 @@ def range_between(start: Array, low: Array, high: Array, scale: Array) -> Abstra
 
 def _inertia(name: str, value: Array, bounds: Bounds | None) -> Inertia:
     if bounds is not None:
-        raise ValueError(f"{name!r} is a matrix and stays that of a body; it takes no bounds.")
+        raise ValueError(f"{name!r} is a matrix that stays the inertia of a body; it takes no bounds.")
     if not np.allclose(value, value.T) or np.any(np.linalg.eigvalsh(value) <= 0):
         raise ValueError(f"The start of {name!r} must be a symmetric positive definite matrix.")
     least = np.min(np.linalg.eigvalsh(second_moments(value)))

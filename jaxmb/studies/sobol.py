@@ -8,6 +8,6 @@ def sobol_points(count: int, size: int, seed: int) -> Float[np.ndarray, "count s
     """The first points of a scrambled Sobol sequence in the unit cube, from `scipy.stats.qmc`."""
     from scipy.stats import qmc
 
-    # SciPy warns of a number that is no power of two.
+    # SciPy warns if the number is not a power of two.
     sequence = qmc.Sobol(size, rng=np.random.default_rng(seed))
     return sequence.random_base2((count - 1).bit_length())[:count]

@@ -1,13 +1,12 @@
 """Pictures of motions and of their stability.
 
-`show` and `plot_mechanism` draw wheels, pins, springs, tracks and terrain; other bodies are bars from their mass
-centre to where parts act. `show` also takes shapes of your own: `shapes={"crank": jaxmb.shapes.Box((1.0, 0.1, 0.1))}`,
-or `shapes.Mesh.read(file)`; a user-defined part has them from its methods `shapes` and `path`. A picture shows the
-saved states and nothing between them, and takes about 0.9 MB, of which 0.82 MB are viser's viewer; it is complete
-without a network and keeps playing in notebooks that are exported to HTML.
+`show` and `plot_mechanism` draw wheels, pins, springs, tracks and terrain; other bodies are bars from the mass centre
+to the points where parts act. `show` also takes other shapes: `shapes={"crank": jaxmb.shapes.Box((1.0, 0.1, 0.1))}`, or
+`shapes.Mesh.read(file)`; a user-defined part defines them by its methods `shapes` and `path`. A picture shows the saved
+states only. It takes about 0.9 MB, including 0.82 MB for viser's viewer, needs no network, and also plays in notebooks
+exported to HTML.
 
-Figures need the extra `jaxmb[plot]`, moving pictures `jaxmb[view]`; matplotlib and viser are imported when one is
-made.
+Figures need the extra `jaxmb[plot]`, moving pictures `jaxmb[view]`; matplotlib and viser are imported when needed.
 """
 
 from .animation import MovingPicture as MovingPicture, save_html as save_html, show as show

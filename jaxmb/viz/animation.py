@@ -20,9 +20,9 @@ from .stage import SceneNode, page
 Motions = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
 Shapes = Mapping[str, AbstractShape | Sequence[AbstractShape]]
 
-# A motion that lasts for less or more than this [s] is not shown in real time.
+# Shortest and longest motion [s] that is shown in real time.
 _SHORTEST, _LONGEST = 2.0, 60.0
-# An event is named for this long [s] of playing; of those that are to be seen at once at most this many are.
+# The time of playing [s] for which an event is named, and the largest number of simultaneous names.
 _SEEN, _AT_ONCE = 0.5, 3
 
 
@@ -30,8 +30,8 @@ _SEEN, _AT_ONCE = 0.5, 3
 class MovingPicture:
     """A moving picture, which notebooks show.
 
-    **Fields:** `html`: a page of its own, complete without a network; `height` [pixels] in a notebook; `frames`: how
-    many times are shown.
+    **Fields:** `html`: a page that needs no network; `height` [pixels] in a notebook; `frames`: the number of times
+    shown.
     """
 
     html: str = dataclasses.field(repr=False)
@@ -45,7 +45,7 @@ class MovingPicture:
         return path
 
     def _repr_html_(self) -> str:
-        # A frame within the output, since a notebook that is exported or sent keeps that and no files beside it.
+        # A frame within the output, which an exported or sent notebook keeps, unlike separate files.
         style = f"width: 100%; height: {self.height}px; border: 1px solid #ddd"
         return f'<iframe srcdoc="{html.escape(self.html)}" style="{style}"></iframe>'
 
@@ -63,33 +63,32 @@ def show(
     overlay: bool = False,
     height: int = 480,
 ) -> MovingPicture:
-    """A moving picture of one or several motions, to be seen in a notebook, or saved as a page.
+    """A moving picture of one or several motions, for a notebook or saved as a page.
 
     ```python
     picture = jaxmb.viz.show(motion, points="bar", reactions="pin")  # In a notebook it is seen.
     ```
 
-    It has a time slider, a button that plays and pauses, a choice of speeds, and a list of what is shown; the mouse
-    turns, shifts and zooms it. It shows the saved states at their times, with nothing between them: a motion to look
-    at is saved at 30 times a second or more, by `saveat=`.
+    It has a time slider, a button that plays and pauses, a choice of speeds, and a list of the objects; the mouse
+    turns, shifts and zooms it. It shows the saved states at their times only: save the motion at 30 or more times a
+    second, by `saveat=`.
 
-    Bodies are drawn in the shapes of their parts, such as wheels, as bars from their mass centre to the points where
-    parts act on them, or, where there are none, as the cuboid with their inertia; springs, rods and tracks between
-    their points; terrain and planes as far as the motion reaches. Shapes have no effect on the motion.
+    Bodies are drawn in the shapes of their parts, such as wheels, or as bars from the mass centre to the points where
+    parts act. Without such points a body is the cuboid with its inertia. Springs, rods and tracks are drawn between
+    their points, terrain and planes as far as the motion reaches. Shapes have no effect on the motion.
 
     **Arguments:**
 
-    - `trajectory`: a motion of a scene; a list, or a dictionary by name, of several, such as one before and one after a
+    - `trajectory`: a motion of a scene; a list of motions, or a dictionary by name, such as motions before and after a
         change, or members of a sweep.
-    - `points`: the name of a body (its mass centre), frame or joint that leaves a trail, or several.
-    - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale,
-        on the last body of a joint, and on each body of a force element.
-    - `shapes`: shapes of bodies by name, one or several from `jaxmb.shapes`, each placed in the frame of its body, in
-        place of the default; `"ground"` as well.
-    - `frames`: how many of the saved times are shown at most.
-    - `speed`: of playing, 1 for real time; the default is 1, but for motions that are over within 2 s or last for more
-        than a minute what makes them last so long. The slider shows the time of playing, the picture that of the
-        motion.
+    - `points`: the names of bodies (mass centres), frames or joints that leave a trail, or a single name.
+    - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale.
+        Arrows act on the last body of a joint, and on each body of a force element.
+    - `shapes`: shapes of bodies by name, instead of the default, one or several from `jaxmb.shapes`, each placed in the
+        frame of its body; also of the `"ground"`.
+    - `frames`: the largest number of saved times that are shown.
+    - `speed` of playing, 1 for real time. By default motions play in real time, but for at least 2 s and at most a
+        minute. The slider shows the time of playing, the picture the time of the motion.
     - `overlay`: show several motions in one place, each in a colour, instead of side by side.
     - `height` [pixels], in a notebook.
 
@@ -104,33 +103,33 @@ def show(
             raise ValueError(f"{name} must be a positive number, got {value!r}.")
     points, reactions, forces = (_listed(names) for names in (points, reactions, forces))
     shapes = shapes or {}
-    for own in _named(trajectory).values():
-        check_shapes(own.system, shapes)
+    for single in _named(trajectory).values():
+        check_shapes(single.system, shapes)
     motions = [
-        motion(name, chosen(own, frames), shapes, COLORS[k % len(COLORS)] if overlay else None)
-        for k, (name, own) in enumerate(_named(trajectory).items())
+        motion(name, chosen(single, frames), shapes, COLORS[k % len(COLORS)] if overlay else None)
+        for k, (name, single) in enumerate(_named(trajectory).items())
     ]
-    forces_of = [_arrows(own, reactions, forces) for own in motions]
+    forces_of = [_arrows(single, reactions, forces) for single in motions]
     view = scenery.View.of(motions, overlay)
     strength = _strength(forces_of)
-    # So that the side of a square of the grid is a round force [N].
+    # The side of a square of the grid is then a round force [N].
     square = scenery.round_number(4 * strength * view.cell / view.size) if strength > 0 else 0.0
     scale = view.cell / square if square else 0.0
-    first, last = min(own.times[0] for own in motions), max(own.times[-1] for own in motions)
+    first, last = min(single.times[0] for single in motions), max(single.times[-1] for single in motions)
     speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST))
     played: list[tuple[np.ndarray, Sequence[SceneNode]]] = []
-    for own, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
+    for single, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
         drawn = {"points": points, "arrows": arrows, "scale": scale, "thickness": 0.0035 * view.size}
-        nodes = own.nodes(offset, view.grain, **drawn)
-        played.append(((own.times - first) / speed, nodes))
-    still, clock = scenery.nodes(motions, view), np.unique(np.concatenate([own.times for own in motions]))
+        nodes = single.nodes(offset, view.grain, **drawn)
+        played.append(((single.times - first) / speed, nodes))
+    background, clock = scenery.nodes(motions, view), np.unique(np.concatenate([single.times for single in motions]))
     notes = [f"{speed:.3g} × real time"] if speed != 1 else []
     notes += [f"arrows {square:g} N a square"] if square else []
     played += [
-        (np.zeros(1), still),
+        (np.zeros(1), background),
         ((clock - first) / speed, [scenery.clock(clock, notes, _marks(motions, clock, speed), view)]),
     ]
-    return MovingPicture(page(played, view.camera), height, max(own.times.size for own in motions))
+    return MovingPicture(page(played, view.camera), height, max(single.times.size for single in motions))
 
 
 def save_html(trajectory: Motions, path: str | Path, **options: Any) -> Path:
@@ -144,50 +143,52 @@ def save_html(trajectory: Motions, path: str | Path, **options: Any) -> Path:
 
 
 def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
-    """Names without repetitions; a single one counts as several."""
+    """Names without repetitions, from one or several."""
     return tuple(dict.fromkeys((names,) if isinstance(names, str) else names))
 
 
 def _named(trajectory: Motions) -> dict[str, Trajectory]:
     if isinstance(trajectory, Mapping):
-        motions = {str(name): own for name, own in trajectory.items()}
+        motions = {str(name): single for name, single in trajectory.items()}
     elif isinstance(trajectory, Sequence):
-        motions = {str(k): own for k, own in enumerate(trajectory, 1)}
+        motions = {str(k): single for k, single in enumerate(trajectory, 1)}
     else:
         motions = {"": trajectory}
     if not motions:
         raise ValueError("There is no motion to show.")
-    for own in motions.values():
-        if not (hasattr(own, "system") and hasattr(own, "ts")):
-            raise ValueError(f"show takes motions as simulate returns them, got {type(own).__name__}.")
+    for single in motions.values():
+        if not (hasattr(single, "system") and hasattr(single, "ts")):
+            raise ValueError(f"show takes motions returned by simulate, got {type(single).__name__}.")
     return motions
 
 
 def _marks(motions: Sequence[Motion], clock: np.ndarray, speed: float) -> list[str]:
-    """The events that are named at each time."""
-    found = [
-        (event.time, f"{own.name} {event.part}: {event.kind}".strip())
-        for own in motions
-        if own.trajectory.found_events is not None
-        for event in own.trajectory.events
+    """The names of events at each time."""
+    events = [
+        (event.time, f"{single.name} {event.part}: {event.kind}".strip())
+        for single in motions
+        if single.trajectory.found_events is not None
+        for event in single.trajectory.events
     ]
     out = []
     for t in clock:
-        own = dict.fromkeys(text for time, text in found if time <= t < time + _SEEN * speed)
-        out.append(", ".join(list(own)[-_AT_ONCE:]))
+        names = dict.fromkeys(text for time, text in events if time <= t < time + _SEEN * speed)
+        out.append(", ".join(list(names)[-_AT_ONCE:]))
     return out
 
 
-def _arrows(own: Motion, reactions: Sequence[str], forces: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    out = {f"reactions/{name}": own.reaction(name) for name in reactions}
-    return out | {f"forces/{name}": own.force(name) for name in forces}
+def _arrows(
+    single: Motion, reactions: Sequence[str], forces: Sequence[str]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    out = {f"reactions/{name}": single.reaction(name) for name in reactions}
+    return out | {f"forces/{name}": single.force(name) for name in forces}
 
 
 def _strength(forces_of: Sequence[Mapping[str, tuple[np.ndarray, np.ndarray]]]) -> float:
     """The force [N] that the largest arrow exceeds for a tenth of the time."""
     largest = [
-        np.max([np.linalg.norm(force, axis=-1).max(axis=-1) for _, force in own.values()], axis=0)
-        for own in forces_of
-        if own
+        np.max([np.linalg.norm(force, axis=-1).max(axis=-1) for _, force in arrows.values()], axis=0)
+        for arrows in forces_of
+        if arrows
     ]
     return float(np.quantile(np.concatenate(largest), 0.9)) if largest else 0.0

@@ -1,4 +1,4 @@
-"""Figures, with matplotlib imported when one is made."""
+"""Figures; matplotlib is imported when needed."""
 
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 def new_figure(width: float, height: float) -> "Figure":
     """An empty figure of a size in inches, without a window or any global state.
 
-    **Raises:** `ImportError` naming the extra to install if matplotlib is not there.
+    **Raises:** `ImportError` that names the extra to install if matplotlib is missing.
     """
     try:
         import matplotlib.figure  # noqa: F401

@@ -18,25 +18,25 @@ from .solids import COLORS, solids
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Beyond this many bodies a legend and paths hide more than they tell.
+# Largest number of bodies with a legend and paths.
 _FEW = 8
-# Beyond this many times a title is too long.
+# Largest number of times in a title.
 _TIMES = 6
 _EDGE: Color = (40, 40, 40)
 
 
 def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
-    """Draw the bodies at evenly spaced saved times, earlier ones fainter, with the paths of their mass centres.
+    """Draw the bodies at evenly spaced saved times, fainter at earlier times, with the paths of their mass centres.
 
     ```python
     jaxmb.viz.plot_mechanism(motion, frames=4).savefig("poses.png")
     ```
 
-    Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars from their mass centre to
-    the points where parts act on them, in space as lines; springs, rods and tracks between their points; in the plane
-    with terrain. There are paths and a legend where there are at most 8 bodies.
+    Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars (in space lines) from the
+    mass centre to the points where parts act. Springs, rods and tracks are drawn between their points, and in the plane
+    the terrain. Up to 8 bodies have paths and a legend.
 
-    **Arguments:** `trajectory`: a motion of a planar or spatial scene; `frames`: how many poses to draw, at least 1.
+    **Arguments:** `trajectory`: a motion of a planar or spatial scene; `frames`: the number of poses, at least 1.
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
     left out.
@@ -59,11 +59,13 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     figure = new_figure(8.0, 6.0)
     axes: Any = figure.add_subplot(projection=None if picture.planar else "3d")
     draw = _draw_areas if picture.planar else _draw_edges
-    # What stands on the ground is drawn once.
-    draw(axes, picture, [own for own in shapes if own[0] == GROUND and own[1].primitive != "ground"], 0, 1.0)
+    # Objects on the ground are drawn once.
+    draw(
+        axes, picture, [placed for placed in shapes if placed[0] == GROUND and placed[1].primitive != "ground"], 0, 1.0
+    )
     for order, time in enumerate(shown):
         fade = (order + 1) / len(shown)
-        draw(axes, picture, [own for own in shapes if own[0] != GROUND], time, fade)
+        draw(axes, picture, [placed for placed in shapes if placed[0] != GROUND], time, fade)
         _draw_paths(axes, picture, time, fade)
     bodies = [name for name in picture.positions if name != GROUND]
     if len(bodies) <= _FEW:
@@ -90,7 +92,7 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
 
 def _draw_areas(axes, picture, shapes, time, fade):
     areas = [(_in_world(picture, body, area(shape), time), shape.color) for body, shape in shapes]
-    for corners, color in sorted(areas, key=lambda own: float(np.mean(own[0][:, 2]))):
+    for corners, color in sorted(areas, key=lambda polygon: float(np.mean(polygon[0][:, 2]))):
         axes.fill(
             *corners[:, :2].T, facecolor=_faded(color, fade), edgecolor=_faded(_EDGE, fade), linewidth=0.4, zorder=2
         )
@@ -124,5 +126,5 @@ def _in_world(picture, body, points, time):
 
 
 def _faded(color, share):
-    """A colour as matplotlib takes it, mixed with white."""
+    """A colour of matplotlib, mixed with white."""
     return tuple(1 - share * (1 - np.array(color) / 255))

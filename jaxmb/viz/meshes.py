@@ -1,4 +1,4 @@
-"""Triangle meshes of unit size, of which shapes are scaled copies, and of the ground."""
+"""Triangle meshes of unit size, scaled by shapes, and of the ground."""
 
 import functools
 from typing import NamedTuple

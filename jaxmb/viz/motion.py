@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Beyond this many lines a legend hides more than it tells.
+# Largest number of lines with a legend.
 _LEGEND = 8
 # A residual of exactly zero has no logarithm.
 _ROUNDING = 1e-17
-# A component that varies by less than this, relative to the largest value of its kind, is at rest.
+# Components that vary by less than this, relative to the largest value of their kind, are at rest.
 _STILL = 1e-9
 
-# The kinds of quantities in the order of their panels, with the panels' labels; the rate of a kind is the next one.
+# The kinds of quantities in the order of their panels, with the panels' labels; each kind is followed by its rate.
 _LABELS = {
     "position": "position [m]",
     "velocity": "velocity [m/s]",
@@ -46,7 +46,7 @@ _CHECKS = ("energy", "residuals")
 
 
 class _Line(NamedTuple):
-    """A component of a quantity along a motion: that of the part or coordinate `name`, numbered or the only one."""
+    """A component of a quantity of the part or coordinate `name` along a motion, numbered or the only component."""
 
     name: str
     component: int | None
@@ -61,23 +61,22 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
     jaxmb.viz.plot_motion(motion, ["bar.angle", "pin.force", "energy"]).savefig("motion.png")
     ```
 
-    By default all that moves is shown: positions and velocities of the mass centres of the bodies; angles and angular
-    velocities, in the plane of the bodies, in space of the joints; displacements of sliding joints; the coordinates of
-    a system without bodies and their rates q̇; with the energy and the residuals of constraints. A component that stays
-    at one value, such as the height of a trolley on a level rail, is left out. Events of contacts and dry friction are
-    vertical lines, solid at impacts and dotted where there is no impulse.
+    By default all moving quantities are shown: positions and velocities of mass centres; angles and angular velocities,
+    of bodies in the plane and of joints in space; displacements of sliding joints; the coordinates of a system without
+    bodies and their rates q̇; with the energy and the residuals of constraints. A constant component, such as the
+    height of a trolley on a level rail, is left out. Events of contacts and dry friction are vertical lines, solid at
+    impacts, dotted without an impulse.
 
     **Arguments:**
 
     - `trajectory`: a motion saved at several times.
-    - `names`: what to show instead. A body, joint, frame or part with internal states stands for all quantities of its
-        motion; single quantities have names such as `"piston.position"`, `"slide.displacement"`, `"hip.angle_rate"` and
-        `"A.force"`; there are also `"energy"` and `"residuals"`.
+    - `names` of quantities to show instead, such as `"piston.position"`, `"slide.displacement"`, `"hip.angle_rate"`,
+        `"A.force"`, `"energy"` and `"residuals"`. The name of a body, joint, frame or part with internal states selects
+        all quantities of its motion.
 
     **Returns:** a matplotlib `Figure` with one panel for each kind of quantity [s; m, rad and their rates; N, N m; J].
-    Of the components along x, y and z in a panel the first is solid, then come dashed and dotted ones.
-    `figure.savefig(path)` writes it; as the last line of a notebook's cell it is shown. Times that a run did not reach
-    are left out.
+    In a panel the components along x, y and z are solid, dashed and dotted. `figure.savefig(path)` writes it; as the
+    last line of a notebook's cell it is shown. Times that a run did not reach are left out.
 
     **Raises:** `ValueError` for an unknown name, a batch or fewer than two times; `ImportError` without matplotlib.
     """
@@ -100,14 +99,14 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
     return figure
 
 
-# Which quantities
+# Selection of quantities
 
 
 def _default(system) -> list[str]:
     """The quantities that describe a motion."""
-    known = system.quantities()
-    # In space a body has no angle, so that those of joints are shown.
-    flat = any(f"{name}.angle" in known for name in system.catalogue.motion_names())
+    quantities = system.quantities()
+    # In space a body has no angle: angles of joints are shown.
+    flat = any(f"{name}.angle" in quantities for name in system.catalogue.motion_names())
     kinds = ("displacement",) if flat else ("angle", "displacement")
     of_bodies = _quantities(system, system.catalogue.motion_names())
     of_bodies = [name for name in of_bodies if flat or _kind(system, name) != _RATES["angle"]]
@@ -116,32 +115,32 @@ def _default(system) -> list[str]:
 
 
 def _quantities(system, names: Iterable[str]) -> list[str]:
-    """The quantities that names stand for."""
-    known = system.quantities()
+    """The quantities selected by names."""
+    quantities = system.quantities()
     out: dict[str, None] = {}
     for name in names:
-        of_part = [own for own in known if own.startswith(f"{name}.") and not known[own].of_forces]
+        of_part = [key for key in quantities if key.startswith(f"{name}.") and not quantities[key].of_forces]
         shown = (name,) if "." in name else (name, f"{name}_rate")
-        # The Euler parameters of a body say little to the eye.
-        found = [quantity for quantity in shown if quantity in known]
-        found += [quantity for quantity in of_part if not quantity.endswith(".orientation")]
-        if not found:
+        # Plots of Euler parameters are hard to read.
+        selected = [quantity for quantity in shown if quantity in quantities]
+        selected += [quantity for quantity in of_part if not quantity.endswith(".orientation")]
+        if not selected:
             what = "body, joint or quantity" if system.body_names else "coordinate"
-            parts = dict.fromkeys(quantity.split(".")[0] for quantity in known)
-            raise unknown(what, name, (*parts, *known, *_CHECKS))
-        out |= dict.fromkeys(found)
+            parts = dict.fromkeys(quantity.split(".")[0] for quantity in quantities)
+            raise unknown(what, name, (*parts, *quantities, *_CHECKS))
+        out |= dict.fromkeys(selected)
     return list(out)
 
 
 def _split(system, quantity: str) -> tuple[str, str, bool]:
-    """The part or coordinate that a quantity belongs to, what is measured of it, and whether its rate is."""
+    """The part or coordinate of a quantity, the quantity without it, and whether it is a rate."""
     is_rate = quantity.endswith("_rate") and quantity not in system.coordinate_names()
     part, _, field = (quantity.removesuffix("_rate") if is_rate else quantity).partition(".")
     return part, field or "coordinate", is_rate
 
 
 def _kind(system, quantity: str) -> str:
-    """What a quantity measures; angles of bodies and joints, also of joints with several, are of one kind."""
+    """The kind of a quantity; all angles of bodies and joints are of one kind."""
     _, field, is_rate = _split(system, quantity)
     kind = "angle" if field in _ANGLES else field
     if is_rate:
@@ -154,7 +153,7 @@ def _panels(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list
     out: dict[str, list[_Line]] = {}
     for quantity in quantities:
         part, field, _ = _split(trajectory.system, quantity)
-        # One of several angles of a joint has its whole name.
+        # Several angles of a joint have their whole names.
         name = f"{part}.{field}" if field in _ANGLES else part
         values = np.asarray(trajectory.quantity(quantity))
         columns = values.reshape(values.shape[0], -1).T
@@ -165,14 +164,14 @@ def _panels(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list
 
 
 def _moving(panels: dict[str, list[_Line]]) -> dict[str, list[_Line]]:
-    """Without the components that stay at one value, and their rates."""
+    """The panels without constant components and their rates."""
     out = dict(panels)
     for kind in _WITH_RATES:
         if kind in panels:
             size = max(float(np.max(np.abs(line.values))) for line in panels[kind])
-            still = {line[:2] for line in panels[kind] if np.ptp(line.values) <= _STILL * size}
-            for own in (kind, _RATES[kind]):
-                out[own] = [line for line in panels[own] if line[:2] not in still]
+            constant = {line[:2] for line in panels[kind] if np.ptp(line.values) <= _STILL * size}
+            for group in (kind, _RATES[kind]):
+                out[group] = [line for line in panels[group] if line[:2] not in constant]
     return {kind: lines for kind, lines in out.items() if lines}
 
 
@@ -180,7 +179,7 @@ def _moving(panels: dict[str, list[_Line]]) -> dict[str, list[_Line]]:
 
 
 def _places(number: int) -> tuple["Figure", list["Axes"]]:
-    """A figure with axes in two columns; an odd one at the end is as wide as both."""
+    """A figure with axes in two columns; an odd panel at the end is as wide as both."""
     rows = (number + 1) // 2
     figure = new_figure(9.0, max(3.0, 2.6 * rows) if number > 1 else 3.5)
     layout: Any = [[str(2 * row), str(min(2 * row + 1, number - 1))] for row in range(rows)]
@@ -200,16 +199,16 @@ def _draw(axes: "Axes", t: np.ndarray, lines: Sequence[_Line]) -> None:
 
 
 def _draw_events(places: Sequence["Axes"], t: np.ndarray, trajectory: Trajectory) -> None:
-    """Vertical lines in all panels, which the legend of the first one names."""
+    """Vertical lines in all panels, named by the legend of the first panel."""
     from matplotlib.collections import LineCollection
 
-    found = [] if trajectory.found_events is None else trajectory.events
+    events = [] if trajectory.found_events is None else trajectory.events
     for style, struck in (("-", True), (":", False)):
-        own = [event for event in found if (event.impulse != 0) == struck and t[0] <= event.time <= t[-1]]
-        kinds = ", ".join(sorted({event.kind for event in own}))
-        lines = [[(event.time, 0.0), (event.time, 1.0)] for event in own]
-        for k, axes in enumerate(places if own else ()):
-            # In units of the panel upwards, so that its limits stay those of the motion.
+        drawn = [event for event in events if (event.impulse != 0) == struck and t[0] <= event.time <= t[-1]]
+        kinds = ", ".join(sorted({event.kind for event in drawn}))
+        lines = [[(event.time, 0.0), (event.time, 1.0)] for event in drawn]
+        for k, axes in enumerate(places if drawn else ()):
+            # In units of the panel's height, so that the limits still follow the motion.
             across = axes.get_xaxis_transform()
             label = kinds if k == 0 else None
             marks = LineCollection(

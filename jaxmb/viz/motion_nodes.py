@@ -29,8 +29,8 @@ _FORCE: Color = (20, 120, 60)
 class Motion:
     """A motion to be shown.
 
-    **Fields:** `name`, "" for the only one; `trajectory`, with the states that are shown; `picture` of it; `solids`:
-    shapes with their bodies; `tint`: the one colour of all bodies, None for one each.
+    **Fields:** `name`, "" for a single motion; `trajectory`, with the shown states; `picture` of it; `solids`: shapes
+    with their bodies; `tint`: a colour for all bodies, None for one each.
     """
 
     name: str
@@ -45,13 +45,13 @@ class Motion:
 
     @property
     def grounds(self) -> list[Any]:
-        """The ground of the motion, which is drawn as far as the motion reaches."""
+        """The ground, drawn as far as the motion reaches."""
         return [shape for _, shape in self.solids if shape.primitive == "ground"]
 
     @functools.cached_property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Least and greatest coordinates [m] that bodies reach."""
-        bounded = [own for own in self.solids if own[1].primitive != "ground"]
+        bounded = [solid for solid in self.solids if solid[1].primitive != "ground"]
         position, _ = self._placed(bounded)
         reach = np.array([_reach(shape) for _, shape in bounded])[:, None]
         low, high = [position.min(axis=0) - reach], [position.max(axis=0) + reach]
@@ -64,40 +64,40 @@ class Motion:
         """World positions and orientations of shapes, shapes (times, n, 3) and (times, n, 4)."""
         turn = np.stack([self.picture.orientations[body] for body, _ in placed], axis=1)
         place = np.stack([self.picture.positions[body] for body, _ in placed], axis=1)
-        own = np.stack([shape.position for _, shape in placed])
+        positions = np.stack([shape.position for _, shape in placed])
         turned = np.broadcast_to([shape.orientation for _, shape in placed], turn.shape)
         so3 = stage.viser().transforms.SO3
-        return place + so3(turn).apply(np.broadcast_to(own, place.shape)), (so3(turn) @ so3(turned)).wxyz
+        return place + so3(turn).apply(np.broadcast_to(positions, place.shape)), (so3(turn) @ so3(turned)).wxyz
 
     # Points and forces
 
     def point(self, name: str) -> Float[np.ndarray, "times 3"]:
-        """World positions of a body, of a frame, or of the point of a part on the last of its bodies.
+        """World positions of a body, of a frame, or of a part's point on the last of its bodies.
 
         **Raises:** `ValueError` for an unknown name.
         """
-        known = self.trajectory.system.quantities()
-        if f"{name}.position" in known:
+        quantities = self.trajectory.system.quantities()
+        if f"{name}.position" in quantities:
             return _in_space(self.trajectory.quantity(f"{name}.position"))
-        parts = {own: anchors for own, anchors in self.picture.parts.items() if anchors.points[-1] is not None}
+        parts = {key: anchors for key, anchors in self.picture.parts.items() if anchors.points[-1] is not None}
         if name in parts:
             return self._anchor(parts[name].bodies[-1], parts[name].points[-1])
-        places = [own.removesuffix(".position") for own in known if own.endswith(".position")]
+        places = [key.removesuffix(".position") for key in quantities if key.endswith(".position")]
         raise unknown("point, a body, frame or joint,", name, [*places, *parts])
 
     def reaction(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Points and forces [N] of a joint's reaction on the last of its bodies that moves, shape (times, 1, 3)."""
+        """Points and forces [N] of a joint's reaction on the last of its moving bodies, shape (times, 1, 3)."""
         force = _in_space(self.trajectory.reactions[name].force)
         part = self.picture.parts[name]
         last = max(k for k, body in enumerate(part.bodies) if body != GROUND)
         return self._anchor(part.bodies[last], part.points[last])[:, None], force[:, None]
 
     def force(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Points and forces [N] of an applied force on each of its bodies that move, shape (times, bodies, 3)."""
+        """Points and forces [N] of an applied force on each of its moving bodies, shape (times, bodies, 3)."""
         wrenches, part = np.asarray(self.trajectory.forces[name]), self.picture.parts[name]
-        own = [k for k, body in enumerate(part.bodies) if body != GROUND]
-        points = [self._anchor(part.bodies[k], part.points[k]) for k in own]
-        return np.stack(points, axis=1), _in_space(wrenches[:, own, : 2 if self.picture.planar else 3])
+        moving = [k for k, body in enumerate(part.bodies) if body != GROUND]
+        points = [self._anchor(part.bodies[k], part.points[k]) for k in moving]
+        return np.stack(points, axis=1), _in_space(wrenches[:, moving, : 2 if self.picture.planar else 3])
 
     def _anchor(self, body, point):
         turn, place = self.picture.orientations[body], self.picture.positions[body]
@@ -141,12 +141,12 @@ class Motion:
                 kind = shape.primitive if shape.primitive != "own" else f"mesh {k} of {body}"
                 groups.setdefault(f"{kind}{' of the ground' if body == GROUND else ''}", []).append((body, shape))
         out = []
-        for name, own in groups.items():
-            shape = own[0][1]
+        for name, members in groups.items():
+            shape = members[0][1]
             mesh = unit_mesh(shape.primitive) if shape.primitive != "own" else Triangles(shape.vertices, shape.faces)
-            position, orientation = self._placed(own)
-            scales = np.broadcast_to([shape.scale for _, shape in own], position.shape)
-            colors = np.array([shape.color for _, shape in own])
+            position, orientation = self._placed(members)
+            scales = np.broadcast_to([shape.scale for _, shape in members], position.shape)
+            colors = np.array([shape.color for _, shape in members])
             args = position + offset, orientation, scales, colors
             out.append(stage.instances(f"{prefix}/solids/{name}", mesh, *args, grain))
         return out
@@ -189,18 +189,20 @@ def motion(
 
 
 def check_shapes(system: AbstractSystem, given: Mapping[str, AbstractShape | Sequence[AbstractShape]]) -> None:
-    """Raise a `ValueError` for shapes of unknown bodies and for anything but shapes, before a picture is computed."""
-    known = (*system.body_names, GROUND)
-    for body, own in given.items():
-        if body not in known:
-            raise unknown("body", body, known)
-        listed = own if isinstance(own, Sequence) else [own]
+    """Raise a `ValueError` for shapes of unknown bodies and for other objects than shapes, before a picture is
+    computed.
+    """
+    names = (*system.body_names, GROUND)
+    for body, body_shapes in given.items():
+        if body not in names:
+            raise unknown("body", body, names)
+        listed = body_shapes if isinstance(body_shapes, Sequence) else [body_shapes]
         if not all(isinstance(shape, AbstractShape) for shape in listed):
-            raise ValueError(f"The shapes of {body!r} must be one or several from jaxmb.shapes, got {own!r}.")
+            raise ValueError(f"The shapes of {body!r} must be one or several from jaxmb.shapes, got {body_shapes!r}.")
 
 
 def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
-    """The motion at no more than `frames` of its saved times, in ascending order.
+    """The motion at up to `frames` of its saved times, in ascending order.
 
     **Raises:** `ValueError` for a batch, for a motion saved at fewer than two times, and for states that are not
     finite.
@@ -214,9 +216,9 @@ def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
     near = near - (wanted - ts[near - 1] < ts[near] - wanted)
     rows = order if ts.size <= frames else order[np.unique(near)]
     ys = jax.tree.map(lambda y: np.asarray(y)[rows], trajectory.ys)
-    found = dataclasses.replace(trajectory, ts=jax.numpy.asarray(trajectory.ts)[rows], ys=jax.device_put(ys))
-    check_finite(found)
-    return found
+    selection = dataclasses.replace(trajectory, ts=jax.numpy.asarray(trajectory.ts)[rows], ys=jax.device_put(ys))
+    check_finite(selection)
+    return selection
 
 
 def _in_space(values):
@@ -236,7 +238,7 @@ def _reach(shape):
 
 
 def _trail(points):
-    """Segments of the way so far; those to come have no length yet. Shape (times, times − 1, 2, 3)."""
+    """Segments of the path so far; later segments have zero length. Shape (times, times − 1, 2, 3)."""
     n = len(points)
     ends = np.minimum(np.arange(n)[None, :], np.arange(n)[:, None])
     return np.stack([points[ends[:, :-1]], points[ends[:, 1:]]], axis=2)

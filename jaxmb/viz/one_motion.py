@@ -1,4 +1,4 @@
-"""The motion that a picture shows: one of a batch's, without the times that a run did not reach."""
+"""The single motion that a picture shows, without times that a run did not reach."""
 
 import jax
 import numpy as np
@@ -10,25 +10,25 @@ from ..trajectory import Trajectory
 def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
     """A single motion, without the padding of a run that ended early.
 
-    **Arguments:** `name` of the picture, for messages; `least`: how many times it needs.
+    **Arguments:** `name` of the picture, for messages; `least`: the number of times that it needs.
 
     **Raises:** `ValueError` for a batch, and for a motion that was saved at fewer times.
     """
     if trajectory.ts is None or trajectory.ts.ndim != 1:
         shape = () if trajectory.ts is None else trajectory.ts.shape[:-1]
         raise ValueError(
-            f"{name} shows single motions, and this is a batch of shape {shape}; choose members of it, such as "
+            f"{name} shows single motions, but this is a batch of shape {shape}; choose members of it, such as "
             "jax.tree.map(lambda leaf: leaf[0], trajectory), and show them one by one; viz.show takes a list or a "
             "dictionary of them."
         )
-    found = trajectory.trimmed()
-    if found.ts.shape[0] < least:
+    trimmed = trajectory.trimmed()
+    if trimmed.ts.shape[0] < least:
         count = ("one time", "two times")[least - 1]
-        if found.ts.shape[0] < trajectory.ts.shape[0] and not bool(trajectory.result == RESULTS.successful):
+        if trimmed.ts.shape[0] < trajectory.ts.shape[0] and not bool(trajectory.result == RESULTS.successful):
             why = RESULTS[trajectory.result]  # pyright: ignore[reportInvalidTypeArguments]
-            raise ValueError(f"{name} needs a motion that came to {count} or more at which it is saved: {why}")
+            raise ValueError(f"{name} needs a motion that reached {count} or more at which it is saved: {why}")
         raise ValueError(f"{name} needs a motion saved at {count} or more; give simulate saveat=…")
-    return found
+    return trimmed
 
 
 def check_finite(trajectory: Trajectory) -> None:

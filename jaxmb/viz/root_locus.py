@@ -12,7 +12,7 @@ from .figure import new_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Below this, relative to the largest eigenvalue, one counts as zero.
+# Eigenvalues below this, relative to the largest, count as zero.
 _ZERO = 1e-6
 
 
@@ -23,8 +23,8 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     jaxmb.viz.plot_root_locus(locus, labels=["swing"]).savefig("locus.png")  # `locus` is that of `jaxmb.root_locus`.
     ```
 
-    A mode has one colour, a pair of conjugate eigenvalues is one mode, and modes that stay at zero are left out.
-    Circles are at the first value. Where the system is unstable the background is grey.
+    Each mode has a colour; a pair of conjugate eigenvalues is one mode, and modes that stay at zero are left out.
+    Circles mark the first value, and a grey background an unstable system.
 
     **Arguments:** `locus`: from `root_locus`; `labels` of the modes in the order of their eigenvalues at the last
     value, by falling imaginary and then by falling real part, default "mode 1", ….
@@ -65,7 +65,7 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
 
 
 def _modes(eigenvalues):
-    """The eigenvalues along the parameter of each mode that does not stay at zero, conjugate ones together."""
+    """The eigenvalues along the parameter of each mode that does not stay at zero, conjugates together."""
     size, left, out = np.max(np.abs(eigenvalues)), list(eigenvalues.T), []
     left = [values for values in left if np.max(np.abs(values)) > _ZERO * size]
     while left:

@@ -1,4 +1,4 @@
-"""Places of motions in a picture, its camera, and what is around them: ground, grids and labels."""
+"""Places of motions in a picture, its camera, and its ground, grids and labels."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from ..parts.shapes import GROUND, along
 from . import meshes, stage
 from .motion_nodes import Motion
 
-# Vertical fields of view of planar and of spatial pictures; the narrow one shows nearly no perspective.
+# Vertical fields of view of planar and of spatial pictures; the narrow field shows nearly no perspective.
 _FRONT_ANGLE, _ANGLE = np.radians(8.0), np.radians(35.0)
 # Width over height of a picture.
 _ASPECT = 1.6
@@ -20,10 +20,10 @@ _ASPECT = 1.6
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Where motions stand and how they are seen.
+    """The places of motions and the view of them.
 
-    **Fields:** `offsets` [m] of the motions; `low` and `high`: corners [m] of what all of them reach; `size` [m] of one
-    motion; `camera`; `cell` [m] of grids.
+    **Fields:** `offsets` [m] of the motions; `low` and `high`: corners [m] of the region that all reach; `size` [m] of
+    one motion; `camera`; `cell` [m] of grids.
     """
 
     offsets: list[Float[np.ndarray, "3"]]
@@ -35,19 +35,19 @@ class View:
 
     @property
     def grain(self) -> float:
-        """The length [m] below which nothing is seen."""
+        """The length [m] below which nothing is visible."""
         return 2e-5 * self.size
 
     @classmethod
     def of(cls, motions: Sequence[Motion], overlay: bool) -> "View":
         """Motions in rows and columns, or all in one place."""
         planar, up = motions[0].picture.planar, motions[0].picture.up
-        if any(own.picture.planar != planar for own in motions):
+        if any(single.picture.planar != planar for single in motions):
             raise ValueError("Planar and spatial motions cannot be shown in one picture; show each by itself.")
-        bounds = np.array([own.bounds for own in motions])
+        bounds = np.array([single.bounds for single in motions])
         extent = np.max(bounds[:, 1] - bounds[:, 0], axis=0)
         size = float(np.linalg.norm(extent))
-        # The two directions of rows and columns: across the picture, and down it or into its depth.
+        # The directions of rows and columns: across the picture, and down or into its depth.
         right, deep = _across(planar, up)
         n, step = len(motions), 1.15 * extent + 0.1 * size
         columns = _columns(n, abs(step @ right), abs(step @ deep))
@@ -56,7 +56,7 @@ class View:
             for k in range(n):
                 place = (k % columns) * abs(step @ right) * right + (k // columns) * abs(step @ deep) * deep
                 offsets[k] = place
-        corners = np.array([own.bounds + offset for own, offset in zip(motions, offsets, strict=True)])
+        corners = np.array([single.bounds + offset for single, offset in zip(motions, offsets, strict=True)])
         low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
         cell = round_number(float(np.max(extent)) / 12)
         return cls(offsets, low, high, size, _camera(planar, up, low, high), cell)
@@ -76,7 +76,7 @@ def _across(planar, up):
 
 
 def _columns(n, width, height):
-    """How many columns make rows and columns of a size nearest to the picture's shape."""
+    """The number of columns with which rows and columns are nearest to the picture's shape."""
     shape = lambda columns: columns * width / (np.ceil(n / columns) * height)
     return min(range(1, n + 1), key=lambda columns: abs(np.log(shape(columns) / _ASPECT)))
 
@@ -95,19 +95,19 @@ def _camera(planar, up, low, high):
 
 
 def nodes(motions: Sequence[Motion], view: View) -> list[stage.SceneNode]:
-    """What does not move: the ground, or a grid, and the names of the motions."""
+    """Fixed objects: the ground, or a grid, and the names of the motions."""
     up, planar = motions[0].picture.up, motions[0].picture.planar
     out, surfaces, level = [], [], []
-    for own, offset in zip(motions, view.offsets, strict=True):
-        for ground in own.grounds:
+    for single, offset in zip(motions, view.offsets, strict=True):
+        for ground in single.grounds:
             place = (ground.position + offset, ground.orientation)
             if planar or ground.height is not None:
-                surfaces.append((_mesh(ground, own, planar), *place))
+                surfaces.append((_mesh(ground, single, planar), *place))
             else:
                 level.append(place)
     surfaces, level = _distinct(surfaces), _distinct(level)
-    out += [_surface(f"/ground/{k}", *own) for k, own in enumerate(surfaces)]
-    out += [_grid(f"/ground/level {k}", view, *own, solid=True) for k, own in enumerate(level)]
+    out += [_surface(f"/ground/{k}", *arguments) for k, arguments in enumerate(surfaces)]
+    out += [_grid(f"/ground/level {k}", view, *arguments, solid=True) for k, arguments in enumerate(level)]
     if planar:
         behind = np.array([0.0, 0.0, view.low[2] - 0.02 * view.size])
         out.append(_grid("/grid", view, behind, along((0.0, 0.0, 1.0)), share=5.0))
@@ -118,19 +118,19 @@ def nodes(motions: Sequence[Motion], view: View) -> list[stage.SceneNode]:
 
 
 def _names(motions, view):
-    """Above each motion its name; where they overlap one above the other, with a ball of the motion's colour."""
+    """The name above each motion; names of overlapping motions are stacked, with a ball of the motion's colour."""
     up, out = view.camera.up, []
-    for k, (own, offset) in enumerate(zip(motions, view.offsets, strict=True)):
-        low, high = own.bounds
+    for k, (single, offset) in enumerate(zip(motions, view.offsets, strict=True)):
+        low, high = single.bounds
         top = (low + high) / 2 + offset + up * (0.5 * abs((high - low) @ up) + 0.03 * view.size)
-        if own.tint is not None:
+        if single.tint is not None:
             top = top + 0.06 * (len(motions) - 1 - k) * view.size * up
             left = np.cross(up, view.camera.position - view.camera.target)
             ball = top - 0.03 * view.size * left / np.linalg.norm(left)
-            out.append(_ball(f"/names/color of {own.name}", ball, 0.012 * view.size, own.tint))
-        if own.name:
-            anchor = "bottom-center" if own.tint is None else "center-left"
-            out.append(stage.label(f"/names/{own.name}", [own.name], top, anchor))
+            out.append(_ball(f"/names/color of {single.name}", ball, 0.012 * view.size, single.tint))
+        if single.name:
+            anchor = "bottom-center" if single.tint is None else "center-left"
+            out.append(stage.label(f"/names/{single.name}", [single.name], top, anchor))
     return out
 
 
@@ -147,12 +147,12 @@ def clock(times: Float[np.ndarray, "times"], notes: Sequence[str], marks: Sequen
     return stage.label("/clock", texts, view.camera.bottom)
 
 
-def _mesh(ground, own, planar):
+def _mesh(ground, motion, planar):
     """The mesh of the ground below a motion, in the ground's axes."""
-    low, high = own.bounds
+    low, high = motion.bounds
     if planar:
         depth = 0.02 * float(np.max(high - low))
-        return meshes.strip(ground, *_wider(low, high, 0.08), depth, 3 * own.picture.width)
+        return meshes.strip(ground, *_wider(low, high, 0.08), depth, 3 * motion.picture.width)
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
     turned = (corners - ground.position) @ rotation_matrix(ground.orientation)
     return meshes.sheet(ground, *_wider(turned.min(axis=0), turned.max(axis=0), 0.25))
@@ -164,15 +164,15 @@ def _wider(low, high, share):
 
 
 def _distinct(groups):
-    """Without those whose arrays equal those of an earlier one."""
+    """The groups without repetitions of equal arrays."""
     out = []
-    for own in groups:
-        leaves = jax.tree.leaves(own)
+    for group in groups:
+        leaves = jax.tree.leaves(group)
         same = lambda other, leaves=leaves: all(
             np.array_equal(a, b) for a, b in zip(leaves, jax.tree.leaves(other), strict=True)
         )
         if not any(map(same, out)):
-            out.append(own)
+            out.append(group)
     return out
 
 
@@ -193,7 +193,7 @@ def _surface(name, mesh, position, orientation):
 
 
 def _grid(name, view, position, orientation, *, share=1.7, solid=False):
-    """Squares of the view's cell in a plane through a position; `share`: of its side to what the motions reach."""
+    """Squares of the view's cell in a plane through a position; `share`: its side over the reach of the motions."""
     normal, middle = rotation_matrix(orientation)[:, 2], (view.low + view.high) / 2
     shift = middle - position - ((middle - position) @ normal) * normal
     section = 5 * view.cell

@@ -22,14 +22,14 @@ _COIL = np.array([0.0, 0.15, *np.linspace(0.2, 0.8, 12), 0.85, 1.0])
 
 
 def area(shape: AbstractShape) -> Float[np.ndarray, "corners 3"]:
-    """The corners [m] of what a shape covers in the plane, its convex hull, in the axes of its body."""
+    """The corners [m] of the convex hull of a shape in the plane, in the axes of its body."""
     vertices = getattr(shape, "vertices", None)
     points = np.concatenate(_EDGES[shape.primitive]) if vertices is None else vertices
     return hull(list(_placed(shape, points)))
 
 
 def edges(shape: AbstractShape) -> list[Float[np.ndarray, "points 3"]]:
-    """The edges [m] of a shape in the axes of its body; of a bar its middle line, of a surface of triangles none."""
+    """The edges [m] of a shape in the axes of its body; the middle line of a bar, none of a surface of triangles."""
     if shape.primitive == "cylinder" and shape.scale[2] > 3 * shape.scale[0]:
         return [_placed(shape, np.stack([-_UP, _UP]))]
     return [_placed(shape, line) for line in _EDGES.get(shape.primitive, [])]
@@ -40,7 +40,7 @@ def _placed(shape, points):
 
 
 def stroke(line: Line, time: int, width: float) -> Float[np.ndarray, "points 3"]:
-    """The points [m] of the line of a part at a time: of a spring a zigzag, of a belt a closed line."""
+    """The points [m] of the line of a part at a time: a zigzag for a spring, a closed line for a belt."""
     points = line.points[time]
     if line.kind == "belt":
         return np.concatenate([points, points[:1]])

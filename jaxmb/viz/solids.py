@@ -1,4 +1,6 @@
-"""The shapes by which a picture shows bodies: those given, those of their parts, or bars to where parts act."""
+"""The shapes by which a picture shows bodies: given shapes, shapes of their parts, or bars to the points where parts
+act.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,7 +31,7 @@ Placed = tuple[str, Any]
 def solids(
     picture: Picture, given: Mapping[str, AbstractShape | Sequence[AbstractShape]], tint: Color | None
 ) -> list[Placed]:
-    """All shapes with the names of the bodies that they are fixed in.
+    """All shapes with the names of their bodies.
 
     **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies,
     default one for each.
@@ -41,19 +43,21 @@ def solids(
     out: list[Placed] = []
     for k, name in enumerate(picture.positions):
         if name in given:
-            own = given[name]
-            own = [own] if isinstance(own, AbstractShape) else list(own)
+            body_shapes = given[name]
+            body_shapes = [body_shapes] if isinstance(body_shapes, AbstractShape) else list(body_shapes)
             if name in picture.centres:
                 # Bodies are placed by their mass centres.
-                own = [shape.moved(-picture.centres[name], np.array([1.0, 0.0, 0.0, 0.0])) for shape in own]
+                body_shapes = [
+                    shape.moved(-picture.centres[name], np.array([1.0, 0.0, 0.0, 0.0])) for shape in body_shapes
+                ]
         elif name == GROUND:
-            own = [_support(point, picture.up, width) for point in points[name]]
+            body_shapes = [_support(point, picture.up, width) for point in points[name]]
         else:
-            own = _linkage(points[name], picture.planar, width)
-            if not own and not of_parts[name]:
-                own = _equivalent(*picture.inertias[name], width)
+            body_shapes = _linkage(points[name], picture.planar, width)
+            if not body_shapes and not of_parts[name]:
+                body_shapes = _equivalent(*picture.inertias[name], width)
         color = _GROUND if name == GROUND else tint or COLORS[k % len(COLORS)]
-        out += [(name, shape.colored(color)) for shape in (*own, *of_parts[name])]
+        out += [(name, shape.colored(color)) for shape in (*body_shapes, *of_parts[name])]
     return out
 
 
@@ -64,12 +68,12 @@ def _attachments(picture):
         for body, point in zip(part.bodies, part.points, strict=True):
             if point is not None:
                 points[body][tuple(np.round(point, 9))] = point
-    return {name: list(own.values()) for name, own in points.items()}
+    return {name: list(distinct.values()) for name, distinct in points.items()}
 
 
 def _linkage(points, planar, width):
-    """In the plane a plate through three points and more; else bars from the mass centre to the points, and a ball at
-    the mass centre.
+    """A plate through three or more points in the plane; otherwise bars from the mass centre to the points, and a ball
+    at the mass centre.
     """
     if planar and len(points) > 2:
         corners = hull([np.zeros(3), *points])

@@ -14,13 +14,13 @@ from .meshes import Triangles
 if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
 
-# The console that is quiet while a picture is recorded is the same for all threads.
+# All threads share the console, which is quiet while a picture is recorded.
 _RECORDS = threading.Lock()
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneNode:
-    """A part of the scene that is added once and then changes.
+    """An object of the scene that is added once and then changes.
 
     **Fields:** `add(scene, **first)`: adds it with its properties at the first time and returns viser's handle;
     `varying`: properties by name, a sequence over the times of its motion.
@@ -33,7 +33,7 @@ class SceneNode:
 def viser() -> Any:
     """The package viser, imported when a picture is made.
 
-    **Raises:** `ImportError` naming the extra to install if it is not there.
+    **Raises:** `ImportError` that names the extra to install if it is missing.
     """
     try:
         import viser
@@ -52,8 +52,8 @@ def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[SceneNode]]]
         scene.configure_default_lights(True, cast_shadow=camera.shadows)
         handles = [
             (times, node, node.add(scene, **{name: values[0] for name, values in node.varying.items()}))
-            for times, own in nodes
-            for node in own
+            for times, group in nodes
+            for node in group
         ]
         recording = server.get_scene_serializer()
         now = 0.0
@@ -64,7 +64,7 @@ def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[SceneNode]]]
                 k = int(np.searchsorted(times, time))
                 if 0 < k < len(times) and times[k] == time:
                     _update(handle, node.varying, k)
-        # The last state is seen for as long as any other.
+        # The last state is shown for a while as well.
         recording.insert_sleep(now / 100)
         return recording.as_html()
 
@@ -77,7 +77,7 @@ def _update(handle, varying, k):
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """Where a picture is seen from: vectors in the world [m], the vertical field of view [rad]."""
+    """The view of a picture: vectors in the world [m], the vertical field of view [rad]."""
 
     position: np.ndarray
     target: np.ndarray
@@ -104,7 +104,7 @@ class Camera:
 @contextmanager
 def _server() -> "Iterator[ViserServer]":
     """A server that records a scene; it listens on this machine only, and nobody connects to it."""
-    # The server announces its address, which is of no use here.
+    # The server announces its address, which is useless here.
     import rich
 
     with _RECORDS:
@@ -132,7 +132,7 @@ def instances(
     colors: np.ndarray,
     grain: float,
 ) -> SceneNode:
-    """Copies of one mesh; `grain` [m]: the length below which their motion is not seen."""
+    """Copies of one mesh; `grain` [m]: the length below which their motion is invisible."""
 
     def add(scene: "SceneApi", batched_positions, batched_wxyzs, batched_scales):
         return scene.add_batched_meshes_simple(
@@ -182,6 +182,6 @@ def label(name: str, texts: Sequence[str], position: np.ndarray, anchor: Any = "
 
 
 def rounded(values: np.ndarray, grain: float) -> np.ndarray:
-    """Single precision, to the power of two below `grain`: such numbers take less room when they are compressed."""
+    """Single precision, rounded to the power of two below `grain`, which compresses better."""
     unit = 2.0 ** np.floor(np.log2(grain))
     return (np.round(np.asarray(values) / unit) * unit).astype(np.float32)

@@ -137,7 +137,7 @@ def test_the_readme_quotes_what_is_printed():
 
 @pytest.mark.parametrize(
     "given, told",
-    [("3", ", of which computations take 3"), ("auto", ", NPROC=auto, which is no number: all of them"), ("", "")],
+    [("3", "; computations take 3"), ("auto", ", NPROC=auto, which is not a number: all of them"), ("", "")],
 )
 def test_threads(given, told, monkeypatch):
     monkeypatch.delenv("PJRT_NPROC", raising=False)

@@ -151,7 +151,7 @@ def test_stops_and_actuators_count_the_turns_of_an_angle():
     mujoco.mj_forward(model, data)
     # f = (5 + 0.3 l) control + 0.2 − 5 l with l = 1.5 · 3.5.
     assert data.actuator_force[0] == pytest.approx((5 + 0.3 * 5.25) * 0.7 + 0.2 - 5 * 5.25, rel=1e-13)
-    assert notes == ("Stops are MuJoCo's limits, of its own stiffness: 'stop'.",)
+    assert notes == ("Stops are MuJoCo's limits, with its stiffness: 'stop'.",)
 
 
 @pytest.mark.slow(but=("equality2",))

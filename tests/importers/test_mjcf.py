@@ -110,7 +110,7 @@ def test_joints_in_succession_move_as_in_mujoco():
     check_dynamics(model, 3, scale=0.5)
     assert model.coordinates["k3"] == "k1 k2 k3.angle_3"
     assert any("Joints 'k1', 'k2', 'k3' in succession are the Composite 'k1 k2 k3'" in note for note in model.notes)
-    assert not any("counts in half a turn" in note for note in model.notes)
+    assert not any("limited to half a turn" in note for note in model.notes)
 
 
 @pytest.mark.slow
@@ -275,7 +275,7 @@ def test_inertia_names_and_frames():
             "",
             "hip h2 h3",
             "Composite",
-            "counts in half a turn, between the angles at which the three axes lie in one plane: 'h2'",
+            "is limited to half a turn, between the angles at which the three axes lie in one plane: 'h2'",
         ),
     ],
 )
@@ -302,8 +302,13 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
     "joints, more, head, message",
     [
         (TWICE, "", "", "Joints in succession to 'a' are degenerate, hinge 'p1', hinge 'p3' are parallel hinges"),
-        (joint("s1", "slide") + joint("s2", "slide"), "", "", "slide 's1', slide 's2' slide in directions that depend"),
-        (FOUR, "", "", "hinge 'h0', hinge 'h1', hinge 'h2', hinge 'h3' turn in more ways than the three"),
+        (
+            joint("s1", "slide") + joint("s2", "slide"),
+            "",
+            "",
+            "slide 's1', slide 's2' slide in linearly dependent directions",
+        ),
+        (FOUR, "", "", "hinge 'h0', hinge 'h1', hinge 'h2', hinge 'h3' have more than three rotations"),
         (FLAT, "", "", "the axes of the hinges 'f1', 'f2', 'f3' lie in one plane in the middle of the range of 'f2'"),
         (
             HINGE,
@@ -315,7 +320,7 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
             HINGE,
             '<actuator><muscle name="m" joint="hip" lengthrange="-1 1"/></actuator>',
             "",
-            "Actuator 'm' has dynamics of its own",
+            "Actuator 'm' has dynamics other than a filter",
         ),
         (
             HINGE,
@@ -339,7 +344,7 @@ FLAT = joint("f1", axis="0 0 1") + joint("f2", axis="1 0 0") + joint("f3", axis=
             HINGE,
             '<actuator><plugin joint="hip" plugin="mujoco.pid"><config key="kp" value="1"/></plugin></actuator>',
             '<extension><plugin plugin="mujoco.pid"/></extension>',
-            "Plugins are not known; remove them from the file",
+            "Plugins are not supported; remove them from the file",
         ),
     ],
 )

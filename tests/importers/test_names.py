@@ -121,7 +121,7 @@ def test_a_link_of_sdf_that_is_called_ground(static):
             MASS,
             ["world", "b"],
             "world",
-            ("A link called world that has an <inertial> is no ground, and moves as its joints let it: 'world'.",),
+            ("A link called world that has an <inertial> is not the ground, and moves as its joints allow: 'world'.",),
         ),
     ],
     ids=["without mass", "with mass"],
@@ -133,7 +133,7 @@ def test_a_link_of_sdf_that_is_called_world(inside, bodies, parent, notes):
 
 def test_a_root_of_urdf_that_is_called_world():
     """It is the ground, which is said where its mass is lost."""
-    note = "The root link 'world' is the ground, whatever its mass, though base='free': give it another name."
+    note = "The root link 'world' is the ground, whatever its mass, despite base='free': give it another name."
     for inside, base, notes in (("", "free", ()), (link("x"), "fixed", ()), (link("x"), "free", (note,))):
         text = robot(link("world", inside), link("b"), joint("j", "world", "b")).replace("<link name='x'>", "")
         found = importers.urdf(text.replace("</link></link>", "</link>"), base=base)
@@ -210,7 +210,7 @@ def test_joints_and_links_that_are_called_as_those_of_a_universal_joint():
     ids=["urdf", "sdf"],
 )
 def test_joints_of_one_name_are_refused(read, text):
-    with pytest.raises(ValueError, match=r"The text:\d: joint 'j' is there twice"):
+    with pytest.raises(ValueError, match=r"The text:\d: joint 'j' occurs twice"):
         read(text)
 
 
@@ -226,7 +226,7 @@ def test_a_scene_with_names_that_mujoco_has():
     exported = importers.to_mjcf(
         mb.Scene([body], joints=balls, forces=[rubber], frames=[spatial.Frame("rubber a", "ground")]).compile()
     )
-    assert "Bodies have other names, since MuJoCo has these: 'world → world body'." in exported.notes
+    assert "Bodies have other names, since MuJoCo reserves these: 'world → world body'." in exported.notes
     back = importers.mjcf(exported.text)
     assert [own.name for own in back.scene.bodies] == ["world body"]
     assert back.coordinates == {"ball 0": "ball 0.rotation"}

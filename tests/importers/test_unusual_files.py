@@ -130,7 +130,7 @@ def test_a_machine_on_a_mocap_body():
         (
             '<actuator><position name="m" joint="hip" timeconst=".1" ctrlrange="-1 1"/><general name="n" joint="hip" '
             'dyntype="filter" dynprm=".1" actrange="-1 1"/></actuator>',
-            "Actuator 'n' has a range of its activation that the control may leave",
+            "Actuator 'n' has a range of activation that the control may leave",
         ),
         (
             '<actuator><general name="m" joint="hip" dyntype="filter" dynprm="0"/></actuator>',
@@ -174,13 +174,13 @@ def test_a_mimic_with_an_offset_is_an_equality_of_mujoco():
     q = [own for name in system.body_names for k in [other.body(name).id] for own in (data.xipos[k], data.xquat[k])]
     residual = system.position_residual(0.0, jnp.concatenate([jnp.asarray(own) for own in q]))
     assert float(np.max(np.abs(residual))) == pytest.approx(abs(row), rel=1e-12) and abs(row) > 0.2
-    assert "Couplings see angles of hinges up to half a turn from their zeros: 'r mimic'." in found.notes
+    assert "Couplings see angles of hinges only up to half a turn from their zeros: 'r mimic'." in found.notes
 
 
 def test_a_range_of_zero_is_none():
     text = robot(link("a"), link("b"), joint("j", "a", "b", inside="<axis xyz='0 1 0'/><limit effort='1'/>"))
     found = importers.urdf(text)
-    assert "Limits that leave no range are taken for none: 'j'." in found.notes and "j stop" not in kinds(found)
+    assert "Limits without a range are ignored: 'j'." in found.notes and "j stop" not in kinds(found)
 
 
 def test_fixed_joints_are_frames_also_where_a_file_keeps_them():
@@ -204,7 +204,7 @@ def test_fixed_joints_are_frames_also_where_a_file_keeps_them():
         (model(body("a"), "<frame name='f'/>"), "The text:3: <frame> within a model is not read"),
         (
             model(body("a"), hinge("j", "world", "a", axis="<xyz expressed_in='b'>0 1 0</xyz>")),
-            "The text:3: the axis of 'j' is expressed in 'b', which is no link",
+            "The text:3: the axis of 'j' is expressed in 'b', which is not a link",
         ),
         (model(body("a")).replace("name='m'", "name='m' placement_frame='a'"), "placement_frame is not read"),
         (

@@ -112,12 +112,12 @@ def test_a_planar_joint():
         ),
         (
             robot(link("a"), link("b"), link("c"), joint("j", "b", "c"), joint("k", "c", "b")),
-            "The text:1: the links make no tree: no joints lead from 'a' to 'b', 'c'",
+            "The text:1: the links do not form a tree: no joints lead from 'a' to 'b', 'c'",
         ),
-        (robot(link("a"), joint("j", "a", "b")), r"The text:3: joint 'j' has the child 'b', and there is no such link"),
+        (robot(link("a"), joint("j", "a", "b")), r"The text:3: joint 'j' has the child 'b', but there is no such link"),
         (
             robot(link("a"), link("b", ""), joint("j", "a", "b")),
-            "There is no moving link .base='free' sets.* no mass: 'b'. Give them an <inertial>",
+            "There is no moving link .base='free' sets.* Massless links were left out: 'b'. Give them an <inertial>",
         ),
         (
             robot(link("a"), link("b", INERTIAL.replace('"2"', '"0"')), joint("j", "a", "b")),
@@ -127,7 +127,7 @@ def test_a_planar_joint():
             robot(link("a"), link("b"), joint("j", "a", "b", inside="<axis xyz='0 0 0'/>")),
             "the axis of joint 'j' is zero",
         ),
-        (robot(link("a"), link("a")), "The text:3: link 'a' is there twice"),
+        (robot(link("a"), link("a")), "The text:3: link 'a' occurs twice"),
         (robot(link("a"), link("b"), joint("j", "a", "b"), joint("k", "a", "b")), "'b' is the child of several joints"),
         (
             robot(link("a"), link("b"), joint("j", "a", "b", inside="<limit lower='1' upper='0'/>")),
@@ -306,7 +306,9 @@ def bomb(root):
 
 @pytest.mark.parametrize("read, root", [(importers.urdf, "robot"), (importers.sdf, "sdf")])
 def test_declared_entities_are_refused(read, root):
-    with pytest.raises(ValueError, match="The text:2: a document type or an entity is declared, which is not read"):
+    with pytest.raises(
+        ValueError, match="The text:2: a document type or an entity is declared, which is not supported"
+    ):
         read(bomb(root))
 
 
@@ -398,7 +400,7 @@ def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
         assert len(found.shapes["a"]) == count
         (missing,) = (names for note, names in found.named.items() if note.startswith("Mesh files are missing"))
         assert len(missing) == 6 - count
-    with pytest.raises(ValueError, match=r"package_dirs: .*nowhere is no folder"):
+    with pytest.raises(ValueError, match=r"package_dirs: .*nowhere is not a folder"):
         importers.urdf(path, package_dirs=[tmp_path / "nowhere"])
 
 
@@ -549,4 +551,4 @@ def test_a_ball_of_bullet_and_a_fixed_joint_that_follows():
         )
     )
     assert found.coordinates["neck"] == "neck.rotation" and kinds(found)["neck"] == "Spherical"
-    assert "Fixed joints follow no other: their <mimic> has no effect: 'pin'." in found.notes
+    assert "Fixed joints do not move, so their <mimic> has no effect: 'pin'." in found.notes

@@ -281,7 +281,10 @@ BAD = {
         {"constraints": [Nonholonomic("cone", lambda t, q, v, p: jnp.sqrt(jnp.dot(v, v)))]},
         "cone: its derivative",
     ),
-    "frame of too many": ({"kinematics": QuasiVelocityFrame(lambda t, q, p: jnp.ones((2, 3)), 3)}, "at most as many"),
+    "frame of too many": (
+        {"kinematics": QuasiVelocityFrame(lambda t, q, p: jnp.ones((2, 3)), 3)},
+        "at most one per coordinate",
+    ),
     "frame that does not span": (
         {"kinematics": QuasiVelocityFrame(lambda t, q, p: jnp.ones((2, 2)), 2), "equations": Hamel()},
         "not independent",

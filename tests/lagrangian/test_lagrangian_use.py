@@ -85,7 +85,7 @@ def test_equal_functions_make_equal_structures(system):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"coordinates": ("t", "y", "z")}, "'t' is something else"),
+        ({"coordinates": ("t", "y", "z")}, "'t' has another meaning"),
         ({"coordinates": ("x", "y")}, "need as many names"),
         ({"kinetic": lambda t, q, v, p: v}, r"^kinetic must be a scalar, got shape \(3,\)"),
         ({"potential": lambda t, q, p: q}, r"^potential must be a scalar, got shape \(3,\)"),

@@ -404,17 +404,17 @@ def test_arguments_of_simulate(pendulum, case):
 
 
 NAMES = {
-    "an argument of numpy.savez": ("file", "'file' is something else"),
-    "a column of the motion": ("energy", "'energy' is something else"),
+    "an argument of numpy.savez": ("file", "'file' has another meaning"),
+    "a column of the motion": ("energy", "'energy' has another meaning"),
     "a path": ("../x", "'../x' cannot be saved.*slashes"),
     "a folder": ("a/b", "'a/b' cannot be saved"),
     "a path of Windows": ("a\\b", "cannot be saved"),
     "a drive": ("c:", "'c:' cannot be saved"),
     "hidden": (".x", "'.x' cannot be saved"),
-    "empty": ("", "a string that is not empty, got ''"),
-    "number": (1, "a string that is not empty, got 1"),
-    "none": (None, "a string that is not empty, got None"),
-    "list": (["x"], "a string that is not empty"),
+    "empty": ("", "a non-empty string, got ''"),
+    "number": (1, "a non-empty string, got 1"),
+    "none": (None, "a non-empty string, got None"),
+    "list": (["x"], "a non-empty string"),
 }
 
 

@@ -71,5 +71,5 @@ def test_one_of_two_balls_may_be_a_point():
     bodies = [mb.planar.PointMass("a", mass=1.0), mb.planar.PointMass("b", mass=1.0, position=(1.0, 0.0))]
     meet = lambda radius: mb.RigidBallContact("meet", "a", "b", radius_a=0.0, radius_b=radius)
     mb.Scene(bodies, joints=[meet(0.1)]).compile()
-    with pytest.raises(ValueError, match="'meet': of radius_a and radius_b only one may be zero; give the other one"):
+    with pytest.raises(ValueError, match="'meet': only one of radius_a and radius_b may be zero; give the other"):
         mb.Scene(bodies, joints=[meet(0.0)]).compile()

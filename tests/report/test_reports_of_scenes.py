@@ -81,7 +81,7 @@ def test_stress_of_a_scene_with_internal_states():
     state = mb.assemble(system, fix={"motor.force": 4.0}, rates={"pin.angle": 1.0})
     report = stress_test(system, state, t1=0.5, rtol=1e-8, only=["rtol", "lengths", "initial speed", "doubled joint"])
     errors = {(kind, case): error for kind, case, error, *_ in report.rows}
-    assert "lengths: left out, the internal states motor.force are of no known power of a length" in str(report)
+    assert "lengths: left out, the internal states motor.force have an unknown power of length" in str(report)
     assert {kind for kind, _ in errors} == {"rtol", "initial speed", "doubled joint"}
     assert errors["rtol", "1e-04"] > errors["rtol", "1e-08"] > 0
     for key in (("rtol", "1e-08"), ("doubled joint", "the same"), ("initial speed", "× 1e+01")):

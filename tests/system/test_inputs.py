@@ -210,7 +210,7 @@ def test_inputs_that_cannot_be(pendulum, inputs, message):
     ("arguments", "message"),
     [
         (([0.0, 1.0, 0.5], [1.0, 2.0, 3.0]), "ts must ascend, got 1 before 0.5"),
-        (([0.0, 1.0], [1.0, np.nan]), "values must be finite, got another at t = 1"),
+        (([0.0, 1.0], [1.0, np.nan]), "values must be finite, got a non-finite value at t = 1"),
         (([0.0, np.inf], [1.0, 2.0]), "ts must be finite"),
         (([0.0], [1.0]), "at least two times"),
         (([0.0, 1.0], [1.0, 2.0, 3.0]), r"got shapes \(2,\) and \(3,\)"),

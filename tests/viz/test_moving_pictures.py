@@ -299,7 +299,7 @@ def test_motions_that_cannot_be_shown(pendulum):
     spoilt = dataclasses.replace(trajectory, ys=jax.tree.map(lambda y: y.at[3].set(jnp.nan), trajectory.ys))
     with pytest.raises(ValueError, match=r"at 1\.5 s is not finite"):
         viz.show(spoilt)
-    with pytest.raises(ValueError, match="simulate returns them, got State"):
+    with pytest.raises(ValueError, match="returned by simulate, got State"):
         viz.show([trajectory.ys])
     with pytest.raises(ValueError, match="no motion"):
         viz.show([])

@@ -18,8 +18,8 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
 
     - `name`, of the body.
     - `position` [m], shape (2,), of the origin of the frame, and `angle` [rad]: a guess that `assemble` improves.
-    - `velocity` [m/s], shape (2,), of the origin, and `angular_velocity` [rad/s]: a guess as well. Where joints
-        contradict them `assemble` changes both, and `assemble(rates=)` prescribes one.
+    - `velocity` [m/s], shape (2,), of the origin, and `angular_velocity` [rad/s]: a guess as well. `assemble` changes
+        both if joints contradict them, and `assemble(rates=)` prescribes either.
     """
 
     name: str = fields.name()
@@ -49,14 +49,13 @@ class Body(AbstractRigidBody):
     from_its_end = planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), centre=(0.5, 0.0))
     ```
 
-    Points that parts have on the body are in its frame, and those of force elements that are left out are its origin;
-    functions see the pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion,
-    `Trajectory["name"]`, and the moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body
-    shows the motion of the origin.
+    The points of parts on the body are in its frame; omitted points of force elements are its origin. Functions see the
+    pose and the velocity of the frame. The body's coordinates `"name.x"`, its motion `Trajectory["name"]`, and the
+    moments in `Trajectory.forces` refer to the mass centre; a `Frame` on the body shows the motion of the origin.
 
     **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `centre` [m], shape (2,), the mass
-    centre in the frame, default its origin. Where a changed `"name.centre"` moves the mass centre, the guess of the
-    frame stays.
+    centre in the frame, default its origin. If a changed `"name.centre"` moves the mass centre, the guess of the frame
+    stays.
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")

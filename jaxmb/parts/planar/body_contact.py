@@ -1,7 +1,7 @@
 """Compliant contact between bodies in the plane: a disc of one body on plates or discs of others.
 
-The laws are those of contact with terrain: the force is a function of the depth to which the disc has entered the other
-body, so contact adds no constraint and no event.
+The laws are the same as for contact with terrain. The force is a function of the penetration depth, so contact adds no
+constraint or event.
 """
 
 import abc
@@ -28,7 +28,7 @@ Surface = tuple[Array, ...]
 
 
 class _Disc:
-    """A disc whose centre is fixed in a body; `middle` is where that is in the world."""
+    """A disc whose centre is fixed in a body; `middle` is its centre in the world."""
 
     def __init__(self, pose, velocity, centre, space):
         self.pose, self.velocity, self.space = pose, velocity, space
@@ -44,19 +44,19 @@ class _Disc:
 
 
 class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
-    """Base class of contacts of one disc with other bodies. Subclasses define the numbers of each of the others
-    (`surfaces`), and with these the distance of the disc's centre from its surface (`distance`) and how much of the
-    force acts (`share`), as functions of the place of that centre in the other body's frame.
+    """Base class of contacts of one disc with other bodies. Subclasses define numbers for each other body (`surfaces`),
+    the distance from its surface (`distance`) and the fraction of the force that acts (`share`). Both are functions of
+    these numbers and of the disc's centre in the other body's frame.
 
     The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
 
     **Arguments:**
 
-    - `name`, of the contact; `bodies`: names, first that of the body of the disc, then those of the others, one that is
-        touched at several places for each of them.
+    - `name`, of the contact; `bodies`: names, first the disc's body, then the others; a body touched at several places
+        is repeated.
     - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
     - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
-    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, the depth from which on it acts fully.
+    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, from which on it acts fully.
     - `smoothing` [m] > 0. At a distance d a depth of `smoothing² / (4 d)` remains.
     """
 
@@ -85,33 +85,33 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
 
     @abc.abstractmethod
     def share(self, place: Vector, surface: Surface) -> Number:
-        """Fraction of the force, from 0 to 1, where the disc's centre is at a point of the other body's frame."""
+        """Fraction of the force, from 0 to 1, with the disc's centre at a point of the other body's frame."""
 
     def may_vary(self, keys):
         return keys[0] in ("normal", "friction", "damping", "damping_depth", "smoothing")
 
     def wrenches(self, space, poses, velocities, t):
         disc = _Disc(poses[0], velocities[0], self.centre, space)
-        own = lambda *other: self._pair(space, disc, *other)
-        on_disc, on_others = jax.vmap(own)(poses[1:], velocities[1:], self.surfaces())
+        pair = lambda *other: self._pair(space, disc, *other)
+        on_disc, on_others = jax.vmap(pair)(poses[1:], velocities[1:], self.surfaces())
         return jnp.concatenate([jnp.sum(on_disc, axis=0, keepdims=True), on_others])
 
     def energy(self, space, poses, t):
         centre = space.point(poses[0], self.centre)
-        own = lambda pose, surface: self._energy(space.body_point(pose, centre), surface)
-        return jnp.sum(jax.vmap(own)(poses[1:], self.surfaces()))
+        energy_of = lambda pose, surface: self._energy(space.body_point(pose, centre), surface)
+        return jnp.sum(jax.vmap(energy_of)(poses[1:], self.surfaces()))
 
     def gaps(self, space, poses, t):
         centre = space.point(poses[0], self.centre)
-        own = lambda pose, surface: self.clearance(space.body_point(pose, centre), surface)
-        return jax.vmap(own)(poses[1:], self.surfaces())
+        clearance_of = lambda pose, surface: self.clearance(space.body_point(pose, centre), surface)
+        return jax.vmap(clearance_of)(poses[1:], self.surfaces())
 
     @property
     def gap_width(self):
         return self.smoothing
 
     def clearance(self, place: Vector, surface: Surface) -> Number:
-        """How far [m] the disc is from where a force acts, negative where it does."""
+        """Distance [m] of the disc from the region of force, negative inside it."""
         return self.distance(place, surface) - self.radius
 
     def shapes(self, space, size):
@@ -125,7 +125,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         return self.share(place, surface) * self.normal.energy(self._depth(place, surface))
 
     def _pair(self, space, disc, pose, velocity, surface):
-        """Wrenches on the disc's body and on another one."""
+        """Wrenches on the disc's body and on another body."""
         place = space.body_point(pose, disc.middle)
         elastic = -space.direction(pose, jax.grad(self._energy)(place, surface))
         normal = space.direction(pose, jax.grad(self.distance)(place, surface))
@@ -135,8 +135,8 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         return on_disc, on_others[0] + space.point_force(pose, place, -elastic)
 
     def _losses(self, space, disc, poses, velocities, normal, share, depth):
-        """Wrenches of damping and friction on the disc's body, and on those that touch it with one surface, each of
-        which takes an equal part.
+        """Wrenches of damping and friction on the disc's body, and, in equal parts, on the bodies that form the
+        surface.
         """
         equal = 1.0 / len(poses)
 
@@ -149,7 +149,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
 
         engaged = share * step(depth / self.damping_depth)
         relative = disc.velocity_at(disc.middle) - surface_velocity(disc.middle)
-        # Normal forces pass through the centre, so that they have the same wrench there as at the deepest point.
+        # Normal forces pass through the centre: their wrench is the same there as at the deepest point.
         push = -self.damping * engaged * jnp.dot(relative, normal) * normal
         on_disc, on_others = disc.wrench(disc.middle, push), reactions(disc.middle, push)
         if self.friction is None:
@@ -162,14 +162,14 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         return on_disc + disc.wrench(touching, rub), on_others + reactions(touching, rub)
 
     def _rows(self, value, shape):
-        """A number given once, or once for each of the other bodies, as one for each."""
+        """A number for each other body, from a single number or from one for each."""
         return jnp.broadcast_to(value, (len(self.bodies) - 1, *shape))
 
     def _check_rows(self, **shapes):
         n = len(self.bodies) - 1
         if n < 1:
             raise ValueError(
-                f"{self.label}: bodies must name the disc's body and then at least one other, got {n + 1}."
+                f"{self.label}: bodies must name the disc's body and then at least one other body, got {n + 1}."
             )
         for field, shape in shapes.items():
             given = getattr(self, field).shape
@@ -187,23 +187,22 @@ class PlateContact(AbstractBodyContact):
     system = jaxmb.Scene([bar, ball], joints=[pin], forces=[on]).compile()
     ```
 
-    A plate bears on both sides: it pushes a disc to the side on which the disc's centre is, so one whose centre is
-    driven across the line leaves on the other side. Near its ends the force fades: the depth is measured from the
-    plate's line, and the potential is that of `normal` times a step with two continuous derivatives, from one at the
-    distance `edge` before the end to zero as far behind it. A disc that rolls from a plate to the next one in line is
-    thus borne by both as by one, whatever its depth.
+    A plate bears on both sides: it pushes a disc to the side of the disc's centre. A disc whose centre is driven across
+    the line leaves on the other side. Near the ends the force fades. The depth is measured from the plate's line; the
+    potential is the energy of `normal` times a C² step, from one at the distance `edge` before the end to zero as far
+    behind it. Two plates in line thus bear a disc like a single plate, at any depth.
 
-    Plates of a chain that bends away from the disc leave a gap at its corners, where neither of two plates bears. With
-    `chain=True` the plates form a closed chain, each beginning where the one before it ends, and their corners bear:
-    the depth is measured from the point between the two ends, the potential is that of `normal` times the share that
-    both plates leave, and each of them takes half of the force.
+    In a chain that bends away from the disc, neither plate bears at a corner. With `chain=True` the plates form a
+    closed chain, each beginning at the end of the previous plate, and the corners bear as well. The depth at a corner
+    is measured from the point between the two ends; the potential is the energy of `normal` times the fraction left by
+    both plates, and each plate takes half of the force.
 
     **Arguments:**
 
     - `start`, `end` [m] of the plates, fixed in their bodies, shape (2,) or (plates, 2).
     - `edge` [m] > 0, at most half as long as a plate.
-    - `chain`: whether the plates, in the order of `bodies`, are those of a closed chain, three at least. Their ends
-        meet at the given poses, within `edge`.
+    - `chain`: whether the plates, in the order of `bodies`, form a closed chain of at least three. Their ends meet at
+        the given poses, within `edge`.
     """
 
     start: fields.Number = fields.parameter(shape=None, unit="m")
@@ -214,7 +213,7 @@ class PlateContact(AbstractBodyContact):
     def validate(self):
         self._check_rows(start=(2,), end=(2,))
         if self.chain and len(self.bodies) < 4:
-            raise ValueError(f"{self.label}: a closed chain has three plates at least, got {len(self.bodies) - 1}.")
+            raise ValueError(f"{self.label}: a closed chain has at least three plates, got {len(self.bodies) - 1}.")
         start, end = self.surfaces()
         shortest = float(jnp.min(norm(end - start)))
         if not 0 < 2 * self.edge <= shortest:
@@ -225,15 +224,15 @@ class PlateContact(AbstractBodyContact):
 
     def complete(self, space, poses):
         if self.chain:
-            starts, ends = (jax.vmap(space.point)(poses[1:], own) for own in self.surfaces())
+            starts, ends = (jax.vmap(space.point)(poses[1:], end_points) for end_points in self.surfaces())
             apart = norm(jnp.roll(starts, -1, axis=0) - ends)
             k = int(jnp.argmax(apart))
             if apart[k] > self.edge:
                 before, after = self.bodies[1 + k], [*self.bodies[1:], self.bodies[1]][k + 1]
                 raise ValueError(
-                    f"{self.label}: in a chain each plate must begin where the one before it ends, within edge, but "
-                    f"that of {after!r} begins {float(apart[k]):g} m from the end of that of {before!r}; join them, or "
-                    "leave chain out."
+                    f"{self.label}: in a chain each plate must begin at the end of the previous plate, within edge, "
+                    f"but the plate of {after!r} begins {float(apart[k]):g} m from the end of the plate of {before!r}; "
+                    "join them, or leave chain out."
                 )
         return self
 
@@ -260,7 +259,7 @@ class PlateContact(AbstractBodyContact):
         if not self.chain:
             return out
         disc = _Disc(poses[0], velocities[0], self.centre, space)
-        corner = lambda *own: self._corner(space, disc, *own)
+        corner = lambda *arguments: self._corner(space, disc, *arguments)
         on_disc, on_ends, on_starts = jax.vmap(corner)(*_corners(poses[1:], velocities[1:], *self.surfaces()))
         return out + jnp.concatenate(
             [jnp.sum(on_disc, axis=0, keepdims=True), on_ends + jnp.roll(on_starts, 1, axis=0)]
@@ -272,17 +271,17 @@ class PlateContact(AbstractBodyContact):
             return out
         middle = space.point(poses[0], self.centre)
 
-        def own(poses, _, starts, ends):
+        def corner_energy(poses, _, starts, ends):
             first, second = (space.body_point(pose, middle) for pose in poses)
             return self._corner_energy(first, second, middle - _between(space, poses, starts, ends), starts, ends)
 
-        return out + jnp.sum(jax.vmap(own)(*_corners(poses[1:], poses[1:], *self.surfaces())))
+        return out + jnp.sum(jax.vmap(corner_energy)(*_corners(poses[1:], poses[1:], *self.surfaces())))
 
     def _fade(self, inside):
         return step(0.5 * (inside / self.edge + 1.0))
 
     def _corner_share(self, first, second, starts, ends):
-        """What both plates leave near the end of the first and the start of the second, without a kink."""
+        """The fraction left by both plates near the end of the first and the start of the second, without a kink."""
         (past, _), length = _along(first, starts[0], ends[0])
         (ahead, _), _ = _along(second, starts[1], ends[1])
         return step(1.0 - self._fade(length - past) - self._fade(ahead))
@@ -294,7 +293,9 @@ class PlateContact(AbstractBodyContact):
         return self._corner_share(first, second, starts, ends) * self.normal.energy(self._corner_depth(way))
 
     def _corner(self, space, disc, poses, velocities, starts, ends):
-        """Wrenches on the disc's body, on that of the plate that ends at a corner, and on that of the next one."""
+        """Wrenches at a corner on the disc's body, on the body of the plate that ends there, and on the body of the
+        next plate.
+        """
         first, second = (space.body_point(pose, disc.middle) for pose in poses)
         way = disc.middle - _between(space, poses, starts, ends)
         slopes = jax.grad(self._corner_energy, (0, 1, 2))(first, second, way, starts, ends)
@@ -311,7 +312,7 @@ class PlateContact(AbstractBodyContact):
 
 
 def _along(place, start, end):
-    """A point's coordinates along and across the way from start to end, and its length."""
+    """A point's coordinates along and across the line from start to end, and the length of the line."""
     way, d = end - start, place - start
     length = norm(way)
     return (jnp.dot(d, way) / length, (way[0] * d[1] - way[1] * d[0]) / length), length
@@ -323,7 +324,7 @@ def _corners(poses, velocities, starts, ends):
 
 
 def _between(space, poses, starts, ends):
-    """The point in the middle between the end of a plate and the start of the next."""
+    """The midpoint between the end of a plate and the start of the next."""
     return 0.5 * (space.point(poses[0], ends[0]) + space.point(poses[1], starts[1]))
 
 

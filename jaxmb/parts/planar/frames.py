@@ -20,10 +20,10 @@ class Frame(AbstractPlanarPart, AbstractFrame):
 
     Joints, forces and contacts may name it in place of a body. Along a motion it has `position`, `velocity` and
     `acceleration` of its origin (world axes), `angle`, `angular_velocity`, `angular_acceleration`, and
-    `specific_force`, what an accelerometer measures: acceleration less gravity, in the frame's axes [m/s²].
+    `specific_force`, the reading of an accelerometer: acceleration less gravity, in the frame's axes [m/s²].
 
     **Arguments:** `body`: the name of a body or frame; `position` [m], shape (2,), of its origin, and `angle` [rad], of
-    its axes, in that body's frame.
+    its axes, in the body's frame.
     """
 
     position: fields.Number = fields.point(body=0, default=(0.0, 0.0), sizes=False)

@@ -42,7 +42,7 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
     system = jaxmb.Scene([bar], joints=[pin]).compile()
     ```
 
-    Its coordinate is `angle` [rad], that of `body_b` less that of `body_a`: zero where both bodies have the same angle.
+    Its coordinate is `angle` [rad], `angle_b − angle_a`.
     """
 
     rows: ClassVar[int] = 2
@@ -76,7 +76,7 @@ class Fixed(AbstractPlanarPart, AbstractJoint):
 
     **Arguments:**
 
-    - `angle` [rad]: that of `body_b` less that of `body_a`, default that of the given poses.
+    - `angle` [rad]: `angle_b − angle_a`, default from the given poses.
     """
 
     angle: fields.Number = fields.parameter(unit="rad", optional=True)
@@ -103,9 +103,8 @@ class PointOnLine(AbstractPlanarPart, AbstractAxisJoint):
     system = jaxmb.Scene([block], joints=[slot]).compile()
     ```
 
-    Its coordinates are `displacement` [m], how far B is from A along the slot, zero where they coincide, and `angle`
-    [rad], that of `body_b` less that of `body_a`, zero where both bodies have the same angle. If the points are given
-    by a world `point`, where they coincide, the displacement is zero at the given poses.
+    Its coordinates are `displacement` [m], from A to B along the slot, and `angle` [rad], `angle_b − angle_a`. If a
+    world `point` gives both points, the displacement is zero at the given poses.
     """
 
     rows: ClassVar[int] = 1
@@ -136,14 +135,13 @@ class Prismatic(AbstractPlanarPart, AbstractAxisJoint):
     system = jaxmb.Scene([piston], joints=[slide]).compile()
     ```
 
-    Its coordinate is `displacement` [m], how far B is from A along the axis, zero where they coincide. If the points
-    are given by a world `point`, where they coincide, the displacement is zero at the given poses, wherever the body
-    then is; give `point_a` and `point_b` to count from a place of your own. Where B is along the axis has no effect on
-    the motion, and a picture shows the slide next to the mass centre of `body_b`.
+    Its coordinate is `displacement` [m], from A to B along the axis. If a world `point` gives both points, it is zero
+    at the given poses, wherever the body is; give `point_a` and `point_b` for another origin. The place of B along the
+    axis does not affect the motion, and a picture shows the slide next to the mass centre of `body_b`.
 
     **Arguments:**
 
-    - `angle` [rad]: that of `body_b` less that of `body_a`, default that of the given poses.
+    - `angle` [rad]: `angle_b − angle_a`, default from the given poses.
     """
 
     angle: fields.Number = fields.parameter(unit="rad", optional=True)
@@ -185,7 +183,7 @@ def _normal(axis):
 
 
 def _aligned(angle):
-    """The relative angle is this: the sine of the difference vanishes."""
+    """The relative angle is `angle`: the sine of the difference vanishes."""
     x: Any = np.array([1.0, 0.0])
     y = np.array([0.0, 1.0])
     along = rotate_2d(-angle, x)
@@ -208,7 +206,7 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     system = jaxmb.Scene([bead], joints=[ring]).compile()
     ```
 
-    Its coordinate is `angle` [rad], that of `body_b` less that of `body_a`: zero where both bodies have the same angle.
+    Its coordinate is `angle` [rad], `angle_b − angle_a`.
 
     **Arguments:**
 
@@ -243,15 +241,14 @@ class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     system = jaxmb.Scene(wheels, joints=[*axles, mesh]).compile()
     ```
 
-    It has no coordinates of its own; those of the axles have angles.
+    It has no coordinates; the joints of the axles have angles.
 
     **Arguments:**
 
-    - `name`, of the pair; `body_a`, `body_b`: the two gears by name, each of which another joint holds on its axle.
-    - `ratio`, not zero: of the speed of `body_b` to that of `body_a`, negative for an external mesh (−radius_a /
-        radius_b).
+    - `name`, of the pair; `body_a`, `body_b`: the two gears by name; another joint holds each on its axle.
+    - `ratio`, not zero: speed of `body_b` over speed of `body_a`, negative for an external mesh (−radius_a / radius_b).
     - `carrier`: the body that holds both axles, default the ground.
-    - `offset` [rad], default that of the given poses.
+    - `offset` [rad], default from the given poses.
     """
 
     ratio: fields.Number = fields.parameter(unit="1", sign="nonzero")
@@ -281,8 +278,8 @@ class RackAndPinion(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     system = jaxmb.Scene([pinion, rack], joints=[axle, rail, mesh]).compile()
     ```
 
-    A pinion on top of a rack along x, turning clockwise, moves towards +x of the rack. The pair has no coordinates of
-    its own; those of the axle and of the rail have them.
+    A pinion on top of a rack along x, turning clockwise, moves towards +x of the rack. The pair has no coordinates; the
+    joints of axle and rail have them.
 
     **Arguments:**
 
@@ -290,7 +287,7 @@ class RackAndPinion(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     - `radius` [m] > 0 of the pinion; `point_a` [m], shape (2,): its centre A, fixed in `body_a`.
     - `point_b` [m], shape (2,): a point B of the rack; `axis_b`, unit, shape (2,): its direction; both fixed in
         `body_b`.
-    - `offset` [m], default that of the given poses.
+    - `offset` [m], default from the given poses.
     """
 
     radius: fields.Number = fields.length(sign="positive")

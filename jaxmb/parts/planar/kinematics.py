@@ -78,7 +78,7 @@ def _prepared(pose):
 
 
 def _cos_sin(pose):
-    """Each as an array of one, which spares a reshape."""
+    """Each as an array of one element, which saves a reshape."""
     if _prepared(pose):
         return pose[3:4], pose[4:5]
     xp, angle = namespace(pose), pose[2:3]
@@ -97,7 +97,7 @@ def _turned_back(pose, v):
 
 def _quarter_turn(v):
     """Counter-clockwise."""
-    # Not by v[::-1]: XLA simplifies reversals of one constant one by one, each in a pass over the whole program.
+    # Not by v[::-1]: XLA simplifies reversals of a constant one by one, each in a pass over the whole program.
     return namespace(v).concatenate([-v[1:], v[:1]])
 
 

@@ -17,7 +17,7 @@ class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialF
     The bodies need no hinge; in space, and on a hinge, use `JointSpring`.
 
     **Arguments:** `stiffness` [N m/rad] ≥ 0; `damping` [N m s/rad] ≥ 0; `free_angle` [rad] of `angle_b − angle_a`,
-    default that of the given poses.
+    default from the given poses.
     """
 
     stiffness: fields.Number = fields.parameter(unit="N m/rad", sign="non-negative")

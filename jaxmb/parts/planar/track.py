@@ -32,16 +32,16 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
 
     Its tension is `pretension + stiffness (length − free_length)`, the same all around, and its potential `pretension
     (length − free_length) + ½ stiffness (length − free_length)²`. Without `radii` the track is a polygon through the
-    points. With `radii` it wraps circles, joined by their common tangents, and slides on them without friction, so it
-    drives no wheel. In both cases it is assumed to touch every wheel, even one that has risen above the line between
-    its neighbours.
+    points. With `radii` it wraps circles, joined by their common tangents. It slides on them without friction and
+    drives no wheel. In both cases it is assumed to touch every wheel, even a wheel that has risen above the line
+    between its neighbours.
 
     **Arguments:**
 
-    - `path`: pairs (body, point), in the order of the track, at least 3 of them; points [m] are body-fixed, shape (2,).
-        A body may occur several times.
+    - `path`: at least 3 pairs (body, point), in the order of the track; points [m] are body-fixed, shape (2,). A body
+        may occur several times.
     - `pretension` [N] ≥ 0, at the free length; `stiffness` [N/m] ≥ 0.
-    - `free_length` [m], default that of the given poses.
+    - `free_length` [m], default from the given poses.
     - `radii` [m] ≥ 0, shape (points,), of circles around the points, inside a track whose path is counter-clockwise.
 
     **Fields:** `bodies`, each once; `owners`, for each point the index of its body among them; `points`.
@@ -91,21 +91,21 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
             if xp.any(distance <= xp.abs(more)):
                 raise ValueError(f"{self.label}: a circle lies in its neighbour; remove it or make it smaller.")
             _, _, turn = self._tangents(self._lines(space, poses))
-            # Where a turn is next to the ends of its range, rounding decides whether all add up to one.
+            # For a turn next to an end of its range, rounding decides whether all add up to one.
             if xp.abs(xp.sum(turn) - 2 * np.pi) > 1.0 or xp.any(xp.abs(turn - 0.5 * np.pi) > np.pi - 1e-6):
                 raise ValueError(f"{self.label}: a path with radii must be counter-clockwise; reverse its order.")
         return self.filled(free_length=self.length(space, poses))
 
     def _lines(self, space, poses):
-        """From each point to the next."""
+        """The vectors from each point to the next."""
         points = self._centres(space, poses)
         return namespace(points).roll(points, -1, axis=0) - points
 
     def _centres(self, space, poses) -> Any:
-        own = poses[np.array(self.owners)], self.points
-        if namespace(*own) is np:
-            return np.stack([space.point(*pair) for pair in zip(*own, strict=True)])
-        return jax.vmap(space.point)(*own)
+        pairs = poses[np.array(self.owners)], self.points
+        if namespace(*pairs) is np:
+            return np.stack([space.point(*pair) for pair in zip(*pairs, strict=True)])
+        return jax.vmap(space.point)(*pairs)
 
     def length(self, space, poses: Float[Array, "k p"]) -> Float[Array, ""]:
         """Length of the track [m]."""
@@ -121,8 +121,8 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         return xp.sum(straight) + xp.dot(self.radii, turn), along
 
     def _tangents(self, d):
-        """Of the straight parts along the lines of centres `d`: lengths, unit vectors, and the angles by which the
-        track turns before each, on a circle.
+        """Lengths and unit vectors of the straight parts along the lines of centres `d`, and the angles of the turns on
+        the circles before each.
         """
         xp = namespace(d, self.radii)
         square = xp.sum(d * d, axis=1)
@@ -163,10 +163,10 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
     def wrenches(self, space, poses, velocities, t):
         length, along = self._measured(self._lines(space, poses))
         tension = self.pretension + self.stiffness * (length - self.free_length)
-        # The length of a taut line changes with the ends of its straight parts alone, also where it wraps circles.
+        # The length of a taut line changes only with the ends of its straight parts, also around circles.
         pull = tension * (along - jnp.roll(along, 1, axis=0))
-        own = jax.vmap(space.point_force)(poses[np.array(self.owners)], self.points, pull)
-        return placed_sums(np.array(self.owners), len(self.bodies))(own)
+        forces = jax.vmap(space.point_force)(poses[np.array(self.owners)], self.points, pull)
+        return placed_sums(np.array(self.owners), len(self.bodies))(forces)
 
     def energy(self, space, poses, t):
         stretch = self.length(space, poses) - self.free_length

@@ -15,7 +15,7 @@ from ...linalg.roots import reciprocal_root
 from ..elements import Product, perpendicular
 
 Vector3 = Float[Array, "3"]
-# The elementary joints that coordinates belong to, by what these are.
+# The kind of elementary joint of a coordinate, by its quantity.
 _KINDS = {"angle": "hinge", "length": "slide", "rotation": "ball"}
 
 # Angles nearer to half a turn than 0.1 rad count as opposite, by their cosine plus one.
@@ -23,8 +23,8 @@ _OPPOSITE = 0.005
 
 
 class ElementaryJoint(NamedTuple):
-    """A `"hinge"`, `"slide"` or `"ball"` that a joint consists of: the `name` and the `value` of its coordinate, and a
-    `point` [m] and its `axis` in the world, zero for a ball.
+    """A `"hinge"`, `"slide"` or `"ball"` in a joint: the `name` and the `value` of its coordinate, a `point` [m] on it
+    and its `axis` in the world, zero for a ball.
     """
 
     kind: str
@@ -46,9 +46,9 @@ def joints_through_b(space, part, poses: Float[Array, "2 p"], **axes: Any) -> li
 def perpendiculars(axis: Vector3) -> Float[Array, "2 3"]:
     """Two directions that make a right-handed orthogonal triad `(u, v, axis)`, u of unit length.
 
-    They are recomputed from `axis` at every use, so that derivatives with respect to `axis` are right.
+    They are recomputed from `axis` at every use, so that derivatives with respect to `axis` are correct.
     """
-    # The coordinate axis least parallel to `axis` (no fixed one serves all): a choice without derivative.
+    # The coordinate axis least parallel to `axis` (no fixed axis serves all): a choice without derivative.
     xp = namespace(axis)
     k = xp.argmin(abs(axis if xp is np else jax.lax.stop_gradient(axis)))
     u = rot.cross((np.arange(3) == k).astype(axis.dtype), axis)
@@ -72,11 +72,10 @@ def across(axis: Vector3, w: Vector3) -> Float[Array, "2"]:
 
 
 def half_sine(sine: Float[Array, "n"], cosine: Float[Array, ""]) -> Float[Array, "n"]:
-    """The vector of twice the sine of half an angle [rad, for small angles], along that of its sine.
+    """Twice the sine of half an angle [rad, for small angles], as a vector along the vector of its sine.
 
-    Sine and cosine may have a common factor, of which the result does not depend; it is zero where both are. It
-    vanishes where the angle does, and there has the first and second derivatives of the sine. It does not vanish half a
-    turn away, where its length is two.
+    A common factor of sine and cosine does not affect the result, which is zero if both are zero. It vanishes with the
+    angle, and there has the first and second derivatives of the sine. Half a turn away its length is two.
     """
     xp = namespace(sine, cosine)
     square = add_up([*(s * s for s in sine), cosine * cosine])
@@ -86,7 +85,7 @@ def half_sine(sine: Float[Array, "n"], cosine: Float[Array, ""]) -> Float[Array,
     size = square * scale
     opposite = size + cosine < _OPPOSITE * size
     half = xp.where(opposite, size, size + cosine)
-    # Near half a turn the direction of the sine is undetermined, and any one leads back.
+    # Near half a turn the direction of the sine is undetermined, and any direction leads back.
     away = 2.0 * (np.arange(sine.shape[0]) == 0) - sine * scale
     return xp.where(defined, xp.where(opposite, away, sine * reciprocal_root(0.5 * size * half)), 0.0)
 
@@ -109,8 +108,8 @@ def rotation_error(part, poses: Float[Array, "k p"]) -> Vector3:
 def cosine_sine(space, part, poses: Float[Array, "k p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Cosine and sine of the angle from `x_a` to `x_b` about `axis_a`, as products of direction components.
 
-    Only the parts perpendicular to `axis_a` count; the two have a common factor, which is 1 where `x_a` and `x_b` are
-    perpendicular to it.
+    Only the parts perpendicular to `axis_a` count. Both have a common factor, which is 1 if `x_a` and `x_b` are
+    perpendicular to `axis_a`.
     """
     x = direction_in_a(space, poses, part.x_b)
     y_a = rot.cross(part.axis_a, part.x_a)
@@ -137,15 +136,14 @@ def rotation_vector(part, poses: Float[Array, "k p"]) -> Vector3:
     square = vector @ vector
     small = square < 1e-16
     sine = jax.numpy.sqrt(jax.numpy.where(small, 1.0, square))
-    # Near zero twice the vector part, whose derivatives are right there as well.
+    # Near zero twice the vector part, whose derivatives are also correct there.
     return jax.numpy.where(small, 2.0, 2 * jax.numpy.arctan2(sine, cosine) / sine) * vector
 
 
 def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
     """Fill `x_a` and `x_b` so that the angle between them about `axis_a` is zero at the given poses, if None.
 
-    Where a part has an `axis_b` that is not parallel to `axis_a` at these poses, they are those after the shortest turn
-    of B that makes it parallel.
+    If `axis_b` is not parallel to `axis_a` at these poses, B is first turned the shortest way to make it parallel.
     """
     axis_b = getattr(part, "axis_b", None)
     if (part.x_a is None) != (part.x_b is None):
@@ -163,9 +161,9 @@ def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
 
 
 def _carried(x: Vector3, start: Vector3, end: Vector3) -> Vector3:
-    """A vector perpendicular to the direction `start`, after the shortest turn of that to the direction `end`."""
+    """A vector perpendicular to the direction `start`, after the shortest turn from `start` to `end`."""
     half = 1.0 + start @ end
-    # Between opposite directions any turn by half a turn is a shortest one.
+    # Between opposite directions any half turn is shortest.
     turned = x if half < 1e-12 else x - (end @ x) / half * (start + end)
     return turned / np.sqrt(turned @ turned)
 
@@ -184,5 +182,5 @@ def aligned(part) -> tuple[Product, ...]:
 
 
 def with_given_orientation(part, poses: Float[Array, "k p"]):
-    """Fill `orientation`, Euler parameters of B relative to A, with that of the given poses, if it is None."""
+    """Fill `orientation`, Euler parameters of B relative to A, from the given poses, if it is None."""
     return part if part.orientation is not None else part.filled(orientation=rot.normalize(relative_orientation(poses)))

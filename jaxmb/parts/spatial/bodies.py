@@ -29,8 +29,8 @@ class AbstractRigidBody(AbstractSpatialPart, AbstractBody):
     - `position` [m], shape (3,), of the origin of the frame, and `orientation`, shape (4,), unit Euler parameters
         (scalar first) from body to world: a guess that `assemble` improves.
     - `velocity` [m/s], shape (3,), of the origin in the world frame, and `angular_velocity` [rad/s], shape (3,), in the
-        body frame: a guess as well. Where joints contradict them `assemble` changes both, and `assemble(rates=)`
-        prescribes one.
+        body frame: a guess as well. `assemble` changes both if joints contradict them, and `assemble(rates=)`
+        prescribes either.
     """
 
     name: str = fields.name()
@@ -59,18 +59,17 @@ class Body(AbstractRigidBody):
     leaning = spatial.Body("top", mass=1.0, inertia=(0.002, 0.002, 0.003), orientation=tilted, centre=(0.0, 0.0, 0.1))
     ```
 
-    Points that parts have on the body are in its frame, and those of force elements that are left out are its origin;
-    functions see the pose and the velocity of the frame. The body's coordinates, `"name.x"`, its motion,
-    `Trajectory["name"]`, and the moments in `Trajectory.forces` are those of the mass centre; a `Frame` on the body
-    shows the motion of the origin.
+    The points of parts on the body are in its frame; omitted points of force elements are its origin. Functions see the
+    pose and the velocity of the frame. The body's coordinates `"name.x"`, its motion `Trajectory["name"]`, and the
+    moments in `Trajectory.forces` refer to the mass centre; a `Frame` on the body shows the motion of the origin.
 
     **Arguments:**
 
     - `mass` [kg] > 0.
     - `inertia` [kg m²], shape (3, 3), about the mass centre in body axes, symmetric and positive definite (products of
         inertia enter as `−∫ x y dm`); or shape (3,), its diagonal, in principal axes.
-    - `centre` [m], shape (3,), the mass centre in the frame, default its origin. Where a changed `"name.centre"` moves
-        the mass centre, the guess of the frame stays.
+    - `centre` [m], shape (3,), the mass centre in the frame, default its origin. If a changed `"name.centre"` moves the
+        mass centre, the guess of the frame stays.
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")
@@ -110,7 +109,7 @@ def _check_inertia(body: AbstractRigidBody) -> None:
         )
     if moments[2] > (moments[0] + moments[1]) * (1 + 1e-9):
         raise ValueError(
-            f"{body.label}: inertia violates the triangle inequality, no principal moment may exceed the sum of the "
+            f"{body.label}: inertia violates the triangle inequality: no principal moment may exceed the sum of the "
             f"other two, got {moments.tolist()} kg m²; check that it is about the mass centre, in body axes, with "
             "products of inertia of the right sign."
         )

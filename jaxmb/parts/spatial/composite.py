@@ -30,7 +30,7 @@ from .axes import (
 
 _COORDINATES = {"hinge": "angle", "slide": "displacement", "ball": "rotation"}
 _SYMBOLS = {"hinge": pin, "slide": sleeve, "ball": lambda point, size, axis: ball(point, size)}
-# The sine of the angle between two axes, or the volume of three directions, from which on they are independent.
+# Least sine of the angle between independent axes, and least volume of three independent directions.
 _INDEPENDENT = 1e-6
 
 
@@ -44,27 +44,27 @@ class Composite(AbstractSpatialPart, AbstractJoint):
     system = jaxmb.Scene([arm], joints=[joint]).compile()
     ```
 
-    From `body_a` to `body_b` there are, in any order, up to three hinges, or a ball, and up to three slides. Their
+    From `body_a` to `body_b` there are, in any order, up to three hinges, or a ball, and up to three slides. The
     coordinates are `angle_1`, … [rad] of the hinges and `displacement_1`, … [m] of the slides, each kind numbered in
-    this order, and of a ball `rotation` [rad], shape (3,), as in `Spherical`. The placement of B in A is the product of
-    all turns and shifts. Coordinates follow from it in closed form: the angles from the relative attitude, and then the
+    this order; a ball has `rotation` [rad], shape (3,), as in `Spherical`. The placement of B in A is the product of
+    all turns and shifts. The coordinates follow from it in closed form: the angles from the relative attitude, then the
     displacements from the relative position, which is linear in them.
 
-    Where all coordinates are zero, the two points coincide, the relative attitude is `orientation`, and the joints have
-    the directions `axes`; so they are at the given poses, if `point` is given and `orientation` is not. Hinges that
-    follow each other are not parallel. Of three hinges the second turns by less than half a turn, between the two
-    angles at which the three axes lie in one plane; there the angles are not smooth.
+    If all coordinates are zero, the two points coincide, the relative attitude is `orientation`, and the joints have
+    the directions `axes`. This holds at the given poses if `point` is given and `orientation` is not. Consecutive
+    hinges must not be parallel. The second of three hinges turns by less than half a turn, between the two angles at
+    which the three axes lie in a plane; there the angles are not smooth.
 
     **Arguments:**
 
     - `sequence`: the words `"hinge"`, `"slide"` and `"ball"` from A to B.
-    - `axes`, shape (n, 3), unit, one for each word (that of a ball has no effect), in the axes of `body_a`; or in the
-        world at the given poses, `axes_W`.
+    - `axes`, shape (n, 3), unit, one for each word (a ball's has no effect), in the axes of `body_a`; or in the world
+        at the given poses, `axes_W`.
     - `points` [m], shape (hinges, 3), one on each hinge, in the frame of `body_a`, or in the world, `points_W`; by
         default point A for all of them.
-    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` where all
-        coordinates are zero, default that of the given poses.
-    - `middle` [rad], default zero: the second of three angles counts in the half turn that contains it.
+    - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` with all
+        coordinates zero, default from the given poses.
+    - `middle` [rad], default zero: the second of three angles is taken in the half turn that contains it.
 
     Source: R. W. Brockett, "Robotic manipulators and the product of exponentials formula", Mathematical Theory of
     Networks and Systems, 1984; of three axes in any directions, P. B. Davenport, "Rotations about nonorthogonal axes",
@@ -97,7 +97,7 @@ class Composite(AbstractSpatialPart, AbstractJoint):
             if given is not None and len(given) != needed:
                 raise ValueError(f"{self.label}: {name} must have {needed} rows for {self.sequence}, got {len(given)}.")
         if axes is None:
-            return  # The world axes that are missing have a message of their own.
+            return  # Missing world axes have another message.
         why = degenerate(self.sequence, axes, [f"{word} {k}" for k, word in enumerate(self.sequence, 1)])
         if why:
             raise ValueError(f"{self.label}: {why}.")
@@ -107,8 +107,8 @@ class Composite(AbstractSpatialPart, AbstractJoint):
             raise ValueError(f"{self.label}: middle is an angle of the second of three hinges; leave it out.")
         if abs(np.sin(self.middle - flat_angle(*self._of("hinge", axes)))) < _INDEPENDENT:
             raise ValueError(
-                f"{self.label}: where the second angle is {float(self.middle):g}, the three axes lie in one plane: "
-                "give another middle, within the range of this angle."
+                f"{self.label}: at the second angle {float(self.middle):g}, the three axes lie in one plane; give "
+                "another middle, within the range of this angle."
             )
 
     def complete(self, space, poses):
@@ -130,11 +130,11 @@ class Composite(AbstractSpatialPart, AbstractJoint):
             values["slide"] = iter(_components(ways, at - start))
         if "ball" in self.sequence:
             values["ball"] = iter([rotation_vector(self, poses)])
-        own = zip(coordinate_names(self.sequence), self.sequence, strict=True)
-        return {name: next(values[word]) for name, word in own}
+        named = zip(coordinate_names(self.sequence), self.sequence, strict=True)
+        return {name: next(values[word]) for name, word in named}
 
     def elementary_joints(self, space, poses):
-        """The first one is fixed in A, each other one where the coordinates of those before it put it."""
+        """The first is fixed in A; the coordinates of the previous joints place the others."""
         values, out = self.coordinates(space, jnp.asarray(poses)), []
         points = itertools.repeat(self.point_a) if self.points is None else iter(self.points)
         place, turn = poses[0][:3], rot.normalize(poses[0][3:7])
@@ -163,9 +163,9 @@ class Composite(AbstractSpatialPart, AbstractJoint):
 
     def _of(self, word, rows):
         """The rows that belong to the joints of one kind."""
-        return [row for own, row in zip(self.sequence, rows, strict=True) if own == word]
+        return [row for kind, row in zip(self.sequence, rows, strict=True) if kind == word]
 
-    # Below, a turn is that of B, in A, since all coordinates were zero.
+    # Below, the turn is the rotation of B in A from zero coordinates.
 
     def _turn(self, poses):
         """Euler parameters of the turn."""
@@ -180,12 +180,12 @@ class Composite(AbstractSpatialPart, AbstractJoint):
         return rot.rotate(self.orientation, direction_in_a(space, poses[::-1], v))
 
     def _held_turn(self, space, poses):
-        """What the joints hold of the turn [rad, if it is small]."""
+        """The components of the turn that the joints hold [rad, if small]."""
         hinges = self._of("hinge", self.axes)
         if "ball" in self.sequence or len(hinges) == 3:
             return jnp.zeros(0, poses.dtype)
         if len(hinges) == 2:
-            # Turns about either axis leave the angle between them as it is.
+            # Turns about either axis do not change the angle between them.
             first, last = hinges
             change = rot.dot(first, self._after_turn(space, poses, last) - last)
             return (change / rot.norm(rot.cross(first, last)))[None]
@@ -215,8 +215,8 @@ class Composite(AbstractSpatialPart, AbstractJoint):
         return self.middle + shortest(flat + side * jnp.arctan2(jnp.sqrt(square), cosine) - self.middle)
 
     def _place(self, space, poses):
-        """In A, where the point of B is without the displacements [m], and three directions, of which the first are
-        those of the slides; none if there are no slides.
+        """In A: the place of the point of B without the displacements [m], and three directions, the slides first; none
+        without slides.
         """
         slides = self.sequence.count("slide")
         angles = functools.cache(lambda: self._angles(space, poses))
@@ -247,28 +247,29 @@ def coordinate_names(sequence: Sequence[str]) -> list[str]:
 
 
 def degenerate(sequence: Sequence[str], axes: Float[ArrayLike, "n 3"], names: Sequence[str]) -> str | None:
-    """Why joints in succession have no coordinates that the placement of their bodies determines; None if they have.
+    """The reason why the placement of the bodies does not determine the coordinates of joints in succession; None if it
+    does.
 
-    **Arguments:** `axes` where all coordinates are zero; `names` of the joints.
+    **Arguments:** `axes` at zero coordinates; `names` of the joints.
     """
     axes = np.asarray(axes)
-    kinds = {word: [k for k, own in enumerate(sequence) if own == word] for word in _COORDINATES}
+    kinds = {word: [k for k, kind in enumerate(sequence) if kind == word] for word in _COORDINATES}
     listed = lambda which: ", ".join(str(names[k]) for k in which)
     hinges, slides, balls = kinds["hinge"], kinds["slide"], kinds["ball"]
     if len(hinges) + 3 * len(balls) > 3:
-        return f"{listed(sorted(hinges + balls))} turn in more ways than the three that there are"
+        return f"{listed(sorted(hinges + balls))} have more than three rotations"
     for a, b in itertools.pairwise(hinges):
         if not np.linalg.norm(np.cross(axes[a], axes[b])) > _INDEPENDENT:
             return f"{listed([a, b])} are parallel hinges in succession"
-    own = axes[slides].reshape(-1, 3)
-    if len(slides) > 3 or not np.linalg.det(own @ own.T) > _INDEPENDENT**2:
-        return f"{listed(slides)} slide in directions that depend on each other"
+    directions = axes[slides].reshape(-1, 3)
+    if len(slides) > 3 or not np.linalg.det(directions @ directions.T) > _INDEPENDENT**2:
+        return f"{listed(slides)} slide in linearly dependent directions"
     return None
 
 
 def flat_angle(first: Vector3, second: Vector3, last: Vector3) -> Float[Array, ""]:
-    """The angle [rad] about the second of three axes that brings the last into one plane with the others, on the side
-    of the first.
+    """The angle [rad] about the second of three axes that brings the last into a plane with the others, on the side of
+    the first.
     """
     away = rot.dot(first, last) - rot.dot(first, second) * rot.dot(second, last)
     return namespace(first, second, last).arctan2(rot.dot(first, rot.cross(second, last)), away)

@@ -20,12 +20,12 @@ class Frame(AbstractSpatialPart, AbstractFrame):
     ```
 
     Joints, forces and contacts may name it in place of a body. Along a motion it has `position`, `velocity` and
-    `acceleration` of its origin (world axes), `orientation` (Euler parameters), and in the frame's own axes
-    `angular_velocity` (what a gyroscope measures), `angular_acceleration` and `specific_force`, what an accelerometer
-    measures: acceleration less gravity [m/s²].
+    `acceleration` of its origin (world axes), and `orientation` (Euler parameters). In the frame's axes it has
+    `angular_velocity` (a gyroscope's reading), `angular_acceleration`, and `specific_force` (an accelerometer's
+    reading: acceleration less gravity [m/s²]).
 
     **Arguments:** `body`: the name of a body or frame; `position` [m], shape (3,), of its origin, and `orientation`,
-    shape (4,), unit Euler parameters from its axes to those of the body, in that body's frame.
+    shape (4,), unit Euler parameters from its axes to the body's.
     """
 
     position: fields.Number = fields.point(body=0, default=(0.0, 0.0, 0.0), sizes=False)

@@ -1,11 +1,11 @@
 """Spatial joints.
 
-In their classes `A` and `B` are the world positions of the two points, `d = B − A`, `a` and `b` the two axes, `u` and
-`v` two unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
+In their classes `A` and `B` are the world positions of the two points, `d = B − A`, and `a` and `b` the two axes. `u`
+and `v` are unit vectors fixed in `body_a` and perpendicular to `a`; all rows are Φ = 0.
 
-Where axes are parallel, they point the same way. Their rows are those of the tilt, the components along u and v of
-`2 sin(θ/2)` times the unit vector of `b` across `a`, with the angle θ between the axes: they vanish only where the axes
-agree, and not where they point against each other.
+Parallel axes point the same way. Their rows are the tilt: the components along u and v of `2 sin(θ/2)` times the unit
+vector of `b` across `a`, with the angle θ between the axes. The tilt vanishes only if the axes agree, not if they are
+opposite.
 """
 
 from typing import ClassVar
@@ -46,12 +46,12 @@ def _parallel(space, part, poses):
 
 
 class AbstractOriented(AbstractSpatialPart, AbstractJoint):
-    """A joint that knows a relative attitude.
+    """A joint with a given relative attitude.
 
     **Arguments:**
 
     - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` that is kept, or
-        where the coordinates are zero; default the attitude at the given poses.
+        at zero coordinates; default from the given poses.
     """
 
     orientation: fields.Number = fields.attitude(optional=True)
@@ -95,7 +95,7 @@ class Spherical(AbstractOriented):
 
 
 class AbstractAxial(AbstractSpatialPart, AbstractJoint):
-    """A joint with an axis in each body, about which one turns in the other.
+    """A joint with an axis in each body, about which the bodies turn.
 
     **Arguments:**
 
@@ -118,8 +118,7 @@ class AbstractAxial(AbstractSpatialPart, AbstractJoint):
 
 class Revolute(AbstractAxial):
     """A hinge: points A and B of two bodies coincide and two axes are parallel. Rows 5: d from A to B (3), and the tilt
-    (2), the components across the axis of `2 sin(θ/2)` times the unit vector of the axis of B across that of A, with
-    the angle θ between the axes.
+    (2): with the angle θ between the axes, `2 sin(θ/2)` times the unit vector of the axis of B across the axis of A.
 
     ```python
     arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
@@ -161,16 +160,17 @@ class Universal(AbstractSpatialPart, AbstractJoint):
     system = jaxmb.Scene([arm], joints=[cross]).compile()
     ```
 
-    Its coordinates are `angle_a`, the turn of the cross in `body_a` about `axis_a`, and `angle_b`, that of `body_b` on
-    the cross about `axis_b` [rad], both zero at the given poses: the relative attitude is a turn by the one, the
-    attitude at zero, and a turn by the other. They are smooth in every position of the joint.
+    Its coordinates [rad] are `angle_a`, the turn of the cross in `body_a` about `axis_a`, and `angle_b`, the turn of
+    `body_b` on the cross about `axis_b`; both are zero at the given poses. The relative attitude is the product of the
+    turn by `angle_a`, the attitude at zero, and the turn by `angle_b`. The angles are smooth in every position of the
+    joint.
 
     **Arguments:**
 
     - `axis_a`, `axis_b`, unit, shape (3,): the arms of the cross, fixed in `body_a` and in `body_b`; each may be given
         in the world at the given poses instead, as `axis_a_W` and `axis_b_W`.
-    - `x_a`, `x_b`, unit, shape (3,): where both angles are zero, the direction in `body_a` of `axis_b`, and that in
-        `body_b` of `axis_a`; default those at the given poses.
+    - `x_a`, `x_b`, unit, shape (3,): at zero angles, the direction in `body_a` of `axis_b`, and the direction in
+        `body_b` of `axis_a`; default from the given poses.
     """
 
     axis_a: fields.Number = fields.axis(body=0, optional=True)
@@ -187,7 +187,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
             cosine = float(self.axis_a_W @ self.axis_b_W)
             if abs(cosine) > 1e-6:
                 raise ValueError(
-                    f"{self.label}: axis_a_W and axis_b_W must be perpendicular, their product is {cosine:.6g}."
+                    f"{self.label}: axis_a_W and axis_b_W must be perpendicular, but their product is {cosine:.6g}."
                 )
 
     @property
@@ -199,7 +199,7 @@ class Universal(AbstractSpatialPart, AbstractJoint):
         return jnp.concatenate([separation(space, self, poses), cosine[None]])
 
     def complete(self, space, poses):
-        # The direction of each axis in the other body, perpendicular to that body's own.
+        # The direction of each axis in the other body, perpendicular to the other body's axis.
         return self.filled(
             x_a=direction_in_a(space, poses, self.axis_b), x_b=direction_in_a(space, poses[::-1], self.axis_a)
         )
@@ -229,14 +229,14 @@ class Gimbal(AbstractOriented):
     system = jaxmb.Scene([arm], joints=[gimbal]).compile()
     ```
 
-    Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the first axis, which is fixed in
-    `body_a`, the second and the third, which is fixed in `body_b`; all are zero at the given poses, unless
-    `orientation` is given. They are smooth except where the second is a quarter turn, in (−π/2, π/2).
+    Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the three axes; the first is fixed in
+    `body_a`, the third in `body_b`. All are zero at the given poses, unless `orientation` is given. They are smooth
+    except where the second is a quarter turn, in (−π/2, π/2).
 
     **Arguments:**
 
-    - `axis_1`, `axis_2`, `axis_3`, unit, shape (3,), perpendicular to each other: the axes where all angles are zero,
-        in the axes of `body_a`; or in the world at the given poses, `axis_1_W`, `axis_2_W`, `axis_3_W`.
+    - `axis_1`, `axis_2`, `axis_3`, unit, shape (3,), perpendicular to each other: the axes at zero angles, in the axes
+        of `body_a`; or in the world at the given poses, `axis_1_W`, `axis_2_W`, `axis_3_W`.
     """
 
     axis_1: fields.Number = fields.axis(body=0, optional=True)
@@ -265,8 +265,8 @@ class Gimbal(AbstractOriented):
         triad = jnp.stack([self.axis_1, self.axis_2, self.axis_3])
         # The second and third axes, turned with B.
         turned = multiply(relative_orientation(poses), conjugate(self.orientation))
-        moved = jnp.stack([rotate(turned, own) for own in triad], axis=1)
-        c = jnp.sum(triad[:, :, None] * moved[None], axis=1)
+        turned_axes = jnp.stack([rotate(turned, axis) for axis in triad], axis=1)
+        c = jnp.sum(triad[:, :, None] * turned_axes[None], axis=1)
         # With a left-handed triad the turns about its axes, and so all sines, have the other sign.
         hand = jnp.where(dot(cross(self.axis_1, self.axis_2), self.axis_3) > 0, 1.0, -1.0)
         return {
@@ -282,8 +282,8 @@ class Gimbal(AbstractOriented):
             rotate(first, self.axis_2),
             direction_in_a(space, poses, unrotate(self.orientation, self.axis_3)),
         )
-        own = {f"angle_{k}": space.direction(poses[0], axis) for k, axis in enumerate(axes, 1)}
-        return joints_through_b(space, self, poses, **own)
+        directions = {f"angle_{k}": space.direction(poses[0], axis) for k, axis in enumerate(axes, 1)}
+        return joints_through_b(space, self, poses, **directions)
 
 
 class AbstractSliding(AbstractAxial):
@@ -313,8 +313,8 @@ class Cylindrical(AbstractSliding):
     ```
 
     Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
-    given poses, unless these are given; and `displacement` [m], how far B is from A along the axis: zero where they
-    coincide, so at the given poses if both are given by a world `point`.
+    given poses, unless these are given; and `displacement` [m], from A to B along the axis, zero at the given poses if
+    a world `point` gives both.
     """
 
     rows: ClassVar[int] = 4
@@ -334,7 +334,7 @@ class Cylindrical(AbstractSliding):
 
 
 class Screw(AbstractSliding):
-    """A screw: two axes stay on one line and turning advances B. Rows 5: those of `Cylindrical` (4), and the thread
+    """A screw: two axes stay on one line and turning advances B. Rows 5: the rows of `Cylindrical` (4), and the thread
     (1).
 
     ```python
@@ -344,17 +344,17 @@ class Screw(AbstractSliding):
     ```
 
     Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
-    given poses, unless these are given; and `displacement` [m], how far B is from A along the axis: zero where they
-    coincide, so at the given poses if both are given by a world `point`.
+    given poses, unless these are given; and `displacement` [m], from A to B along the axis, zero at the given poses if
+    a world `point` gives both.
 
     With the angle θ, the displacement s and ψ = θ − 2π (s − offset)/pitch, the last row is `pitch/2π · 2 sin(ψ/2) = 0`
-    with ψ in (−π, π], written with products of direction components: it is periodic in θ and in s, as the screw is, and
-    so holds for any number of turns; near zero its value is the axial error [m].
+    with ψ in (−π, π]. It is periodic in θ and in s, like the screw, and holds for any number of turns; near zero its
+    value is the axial error [m].
 
     **Arguments:**
 
     - `pitch` [m], not zero: the advance of B along the axis per turn, positive for a right-handed screw.
-    - `offset` [m]: the displacement where the angle is zero, default that which the given poses ask for.
+    - `offset` [m]: the displacement at zero angle, default from the given poses.
     """
 
     pitch: fields.Number = fields.parameter(unit="m", sign="nonzero")
@@ -387,12 +387,11 @@ class Prismatic(AbstractOriented, AbstractAxisJoint):
     ```
 
     The rotation is twice the vector part of the Euler parameters from `orientation` to the relative attitude: the
-    rotation vector [rad] when small, and zero only where they agree, for either sign of the bodies' Euler parameters.
+    rotation vector [rad] if small, and zero only if they agree, for either sign of the bodies' Euler parameters.
 
-    Its coordinate is `displacement` [m], how far B is from A along the axis, zero where they coincide. If the points
-    are given by a world `point`, where they coincide, the displacement is zero at the given poses, wherever the body
-    then is; give `point_a` and `point_b` to count from a place of your own. Where B is along the axis has no effect on
-    the motion, and a picture shows the slide next to the mass centre of `body_b`.
+    Its coordinate is `displacement` [m], from A to B along the axis. If a world `point` gives both points, it is zero
+    at the given poses, wherever the body is; give `point_a` and `point_b` for another origin. The place of B along the
+    axis does not affect the motion, and a picture shows the slide next to the mass centre of `body_b`.
     """
 
     rows: ClassVar[int] = 5
@@ -431,8 +430,7 @@ class Planar(AbstractAxial):
 
     Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
     given poses, unless these are given; and `displacement` [m], shape (2,), the components of d along `x_a` and along
-    the cross product of `axis_a` and `x_a`: zero where B is next to A, so at the given poses if both are given by a
-    world `point`.
+    the cross product of `axis_a` and `x_a`: zero at the given poses if a world `point` gives both.
     """
 
     rows: ClassVar[int] = 3

@@ -12,8 +12,8 @@ from ..space import AbstractSpace
 
 
 def _places_of_moves():
-    """Where the rates of a prepared pose along unit velocities stand among 0, 1, the halves of its Euler parameters and
-    the entries of its matrix, and their negatives: each is one of these.
+    """The indices of the rates of a prepared pose along unit velocities: each rate is 0, 1, half an Euler parameter, an
+    entry of the matrix, or the negative of these.
     """
     stored = {"half": 2, "matrix": 10}
     place = np.zeros((6, 16), int)

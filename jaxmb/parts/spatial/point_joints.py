@@ -19,7 +19,7 @@ class PointOnPlane(AbstractSpatialPart, AbstractAxisJoint):
     system = jaxmb.Scene([arm], joints=[table]).compile()
     ```
 
-    It has no coordinates of its own.
+    It has no coordinates.
     """
 
     rows: ClassVar[int] = 1
@@ -42,8 +42,8 @@ class PointOnLine(AbstractSpatialPart, AbstractAxisJoint):
     system = jaxmb.Scene([arm], joints=[slot]).compile()
     ```
 
-    Its coordinate is `displacement` [m], how far B is from A along the slot: zero where they coincide, so at the given
-    poses if both are given by a world `point`.
+    Its coordinate is `displacement` [m], from A to B along the slot, zero at the given poses if a world `point` gives
+    both.
     """
 
     rows: ClassVar[int] = 2

@@ -24,7 +24,7 @@ class AbstractRolling(AbstractSpatialPart):
     - `radius` [m] > 0; `centre` [m], shape (3,), of the disc or sphere, fixed in the body, default the origin of its
         frame.
     - `point` [m] and `normal` (unit), shape (3,), of the plane in the world, default the plane z = 0. As an input,
-        `"rolling.point"` is that of a plane that moves.
+        `"rolling.point"` moves the plane.
     """
 
     name: str = fields.name()
@@ -55,8 +55,7 @@ def _uphill(space, part, pose):
 def _lowest_rim_point(space, part, pose):
     """From the centre of a disc to the lowest point of its rim over the plane [m], `ρ = −r m/|m|`.
 
-    The direction does not depend on the lengths of e and n. For a disc that lies flat, which has no lowest point, ρ =
-    0.
+    The direction does not depend on the lengths of e and n. A disc that lies flat has no lowest point: ρ = 0.
     """
     m, _, length = _uphill(space, part, pose)
     return -part.radius * m / jnp.where(length > 0, length, 1.0)
@@ -81,7 +80,7 @@ class RollingDisc(AbstractDisc, AbstractCompound):
     ```
 
     The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, with
-    the normal e of the plane and the axle n. The disc must never lie flat. It has no coordinates of its own.
+    the normal e of the plane and the axle n. The disc must never lie flat. The part has no coordinates.
     """
 
     def components(self):
@@ -131,7 +130,7 @@ class RollingSphere(AbstractRolling, AbstractCompound):
     system = jaxmb.Scene([ball], joints=[rolling]).compile()
     ```
 
-    It has no coordinates of its own.
+    It has no coordinates.
 
     **Arguments:** `spin` [rad/s], of a turntable: the rate at which the plane turns about its normal through `point`,
     default a plane at rest.
@@ -163,7 +162,8 @@ class SphereContact(AbstractRolling, AbstractConstraint):
 
 
 class SphereRolling(AbstractRolling, AbstractVelocityConstraint):
-    """A sphere that moves with the plane where they touch. Rows 2: `Ċ − r ω × e − spin e × (C − point)` in the plane.
+    """A sphere that moves with the plane at the point of contact. Rows 2: `Ċ − r ω × e − spin e × (C − point)` in the
+    plane.
 
     With a turntable the rows do not vanish at rest.
     """

@@ -1,4 +1,4 @@
-"""The posterior density of unknowns, for samplers such as those of blackjax and numpyro."""
+"""The posterior density of unknowns, for samplers such as blackjax and numpyro."""
 
 import equinox as eqx
 import jax
@@ -12,11 +12,11 @@ from .problem import Problem
 class LogDensity(eqx.Module):
     """The logarithm of a posterior density as a function of the unconstrained vector, up to a constant.
 
-    It is the density of the vector: the likelihood times the priors, which are uniform where none is given, times the
-    volume of the values that belong to a change of the vector. `−∞` where a simulation fails, with derivatives of zero.
-    `jax.grad`, `jit` and `vmap` apply.
+    It is the density of the vector: the likelihood times the priors, uniform by default, times the Jacobian determinant
+    of the values with respect to the vector. `−∞` if a simulation fails, with derivatives of zero. `jax.grad`, `jit`
+    and `vmap` apply.
 
-    **Fields:** `start`: the vector of the estimates, where a chain may start.
+    **Fields:** `start`: the vector of the estimates, a start for a chain.
     """
 
     problem: Problem
@@ -58,5 +58,5 @@ def _log_density(z, *, problem):
 @_log_density.def_jvp
 def _log_density_jvp(primals, tangents, *, problem):
     value, gradient = jax.value_and_grad(_value)(primals[0], problem)
-    # Where there is no density there is no way up either.
+    # Without a density the gradient is zero.
     return value, jnp.where(jnp.isfinite(value), gradient, 0.0) @ tangents[0]

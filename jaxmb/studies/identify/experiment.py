@@ -1,4 +1,4 @@
-"""One measured motion: what was measured, from which initial state, and what was different from other ones."""
+"""One measured motion: its data, its initial state, and its differences from other motions."""
 
 import contextlib
 import dataclasses
@@ -41,13 +41,14 @@ class Experiment:
 
     **Arguments:**
 
-    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as of `identify`.
-        `Measurements` have their own `ts`; `sigma` replaces that of `identify` and of sensors.
-    - `inputs`: as of `simulate`.
-    - `parameters`: what is known for this experiment alone, by name; the estimates of others do not replace it.
+    - `measured`, `ts`, `state`, `fix`, `rates`, `t0`, `sigma`, `residual`, `free_initial`: as in `identify`.
+        `Measurements` contain their `ts`; `sigma` replaces the noise levels of `identify` and of sensors.
+    - `inputs`: as in `simulate`.
+    - `parameters`: known values for this experiment alone, by name; estimates from other experiments do not replace
+        them.
     - `own`: names of unknowns with a value for this experiment alone: `own=("A.friction",)` makes `"exp2/A.friction"`.
-    - `name`: in front of these unknowns; default `"exp1"`, `"exp2"`, ….
-    - `held_out`: whether the data are only predicted, for `Identification.held_out`, and not fitted.
+    - `name`: prefix of these unknowns; default `"exp1"`, `"exp2"`, ….
+    - `held_out`: whether the data are not fitted, only predicted, for `Identification.held_out`.
     """
 
     measured: Any = None
@@ -75,9 +76,8 @@ class Initial(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a simulation with some parameters shows: the misfit, the predicted readings by sensor, the state at the last
-    time, and how the simulation ended. Where it failed the misfit is infinite. What a residual function returns is a
-    reading of the name `"residual"`.
+    """The outcome of a simulation with some parameters: the misfit, infinite after a failure; the predicted readings by
+    sensor, with a residual function's result as `"residual"`; the last state; and the simulation's result.
     """
 
     rows: Rows
@@ -87,10 +87,10 @@ class Seen(NamedTuple):
 
 
 class ExperimentModel(eqx.Module):
-    """An experiment as a function of its unknowns, which are called without the experiment's name.
+    """An experiment as a function of its unknowns, named without the experiment's prefix.
 
-    **Fields:** `unknowns`: their names and shapes; `changed`: which of them are parameters of the system; `initial`:
-    which are of the initial state; `assembled`: whether the initial state is `state`, whatever they are.
+    **Fields:** `unknowns`: their names and shapes; `changed`: the unknown parameters of the system; `initial`: the
+    unknowns of the initial state; `assembled`: whether the initial state is `state` for all unknowns.
     """
 
     unknowns: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
@@ -110,7 +110,7 @@ class ExperimentModel(eqx.Module):
 
     @property
     def size(self) -> float:
-        """The size of what is measured, in units of the noise."""
+        """The size of the data, in units of the noise."""
         return 1 + max((channel.size for channel in self.channels), default=0.0)
 
     def named(self, flat: Float[Array, "values"]) -> dict[str, Array]:
@@ -126,14 +126,14 @@ class ExperimentModel(eqx.Module):
     def start(
         self, system: AbstractSystem, theta: Mapping[str, Array], throw: bool | None = False
     ) -> tuple[AbstractSystem, State]:
-        """The system with these unknowns, and its initial state; NaN if there is none, or with `throw` as `assemble`
-        has it.
+        """The system with these unknowns, and its initial state; NaN if there is none, or as `throw` of `assemble`
+        specifies.
         """
         system = self.changed_system(system, theta)
         if self.assembled:
             return system, self.state
-        fix = self.fix | {own.name: theta[label] for label, own in self.initial if not own.is_rate}
-        rates = self.rates | {own.name: theta[label] for label, own in self.initial if own.is_rate}
+        fix = self.fix | {entry.name: theta[label] for label, entry in self.initial if not entry.is_rate}
+        rates = self.rates | {entry.name: theta[label] for label, entry in self.initial if entry.is_rate}
         return system, assemble(system, self.state, fix=fix, rates=rates, t=self.t0, throw=throw)
 
     def simulated(
@@ -144,10 +144,10 @@ class ExperimentModel(eqx.Module):
         options: Mapping[str, Any],
     ) -> Trajectory:
         """The motion from an initial state."""
-        own = {} if self.inputs is None else {"inputs": self.inputs}
+        inputs = {} if self.inputs is None else {"inputs": self.inputs}
         moves = any(channel.delayed for channel in self.channels)
         with contextlib.nullcontext() if moves else frozen_times():
-            return simulate(system, state, t0=self.t0, t1=ts[-1], saveat=ts, throw=False, **(dict(options) | own))
+            return simulate(system, state, t0=self.t0, t1=ts[-1], saveat=ts, throw=False, **(dict(options) | inputs))
 
     def seen(
         self,
@@ -156,29 +156,29 @@ class ExperimentModel(eqx.Module):
         theta: Mapping[str, Array],
         options: Mapping[str, Any],
     ) -> Seen:
-        """What the sensors show of the motion from an initial state."""
+        """The outcome of the motion from an initial state."""
         late = [channel for channel in self.channels if channel.delayed]
         series = [self.ts, *(channel.times(self.ts, self.t0, theta) for channel in late)]
         saved = jnp.concatenate(series) if late else self.ts
-        # Sensors with a delay see the motion at other times: all of them are saved in order.
+        # Sensors with a delay see the motion at other times: all times are saved in order.
         order = jnp.argsort(saved) if late else np.arange(saved.size)
         trajectory = self.simulated(system, state, saved[order] if late else saved, options)
         places = jnp.argsort(order).reshape(len(series), -1) if late else np.arange(saved.size)[None]
         readings, rows = {}, []
         for channel in self.channels:
-            own = places[1 + late.index(channel) if channel.delayed else 0]
+            places_of_sensor = places[1 + late.index(channel) if channel.delayed else 0]
             quantity = trajectory.quantity(channel.quantity)
-            readings[channel.name] = channel.read(quantity[own] if late else quantity, theta)
+            readings[channel.name] = channel.read(quantity[places_of_sensor] if late else quantity, theta)
             rows.append(channel.rows(readings[channel.name], theta, self.loss))
         if self.residual is not None:
             with traced_by_jax("the residual function", "the motion"):
                 readings[RESIDUAL] = jnp.asarray(self.residual(trajectory))
             rows.append(_of_user(readings[RESIDUAL], self.loss))
         joined = Rows(
-            jnp.concatenate([own.residuals for own in rows]),
-            jnp.concatenate([own.present for own in rows]),
-            jnp.concatenate([own.scores for own in rows]),
-            jnp.sum(jnp.stack([own.objective for own in rows])),
+            jnp.concatenate([part.residuals for part in rows]),
+            jnp.concatenate([part.present for part in rows]),
+            jnp.concatenate([part.scores for part in rows]),
+            jnp.sum(jnp.stack([part.objective for part in rows])),
         )
         ok = (trajectory.result == RESULTS.successful) & jnp.isfinite(joined.objective)
         fails = lambda x: jnp.where(ok, x, jnp.inf)
@@ -194,7 +194,7 @@ def _of_user(residuals: Array, loss: Loss) -> Rows:
 
 
 def with_times(experiment: Experiment, where: str = "") -> Experiment:
-    """An experiment with what was measured by name, and with times."""
+    """An experiment with measured data by name, and with times."""
     measured: Any = experiment.measured
     if have_times(measured):
         if experiment.ts is not None:
@@ -203,12 +203,12 @@ def with_times(experiment: Experiment, where: str = "") -> Experiment:
     elif measured is not None and not isinstance(measured, Mapping):
         raise ValueError(f"identify: {BY_NAME}; got an object of type {type(measured).__name__}{where}.")
     if experiment.ts is None:
-        raise ValueError(f"ts{where} is missing: the times of what was measured.")
+        raise ValueError(f"ts{where} is missing: the times of the data.")
     return experiment
 
 
 def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, np.ndarray]]:
-    """All times of an experiment in order, and for each measured name which of them are its own."""
+    """All times of an experiment in order, and for each measured name the indices of its times."""
     names: tuple[str, ...] = tuple(experiment.measured or ())
     given: Any = experiment.ts
     if not isinstance(given, Mapping):
@@ -221,14 +221,14 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
             raise unknown("measured name with times", name, names)
     missing = [name for name in names if name not in given]
     if missing:
-        raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all that was measured.")
+        raise ValueError(f"ts is given by name but not for {missing[0]!r}; give the times of all measured quantities.")
     each = {name: np.asarray(measured_times(given[name], experiment.t0, name)) for name in names}
     ts = np.unique(np.concatenate(list(each.values())))
-    return jnp.asarray(ts), {name: np.searchsorted(ts, own) for name, own in each.items()}
+    return jnp.asarray(ts), {name: np.searchsorted(ts, times) for name, times in each.items()}
 
 
 def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
-    """Measured times, of all or of one name, or a `ValueError` that says what is wrong with them."""
+    """Measured times, of all or of one name, or a `ValueError` that explains the mistake."""
     label = f"ts[{name!r}]" if name else "ts"
     times = np.asarray(ts, dtype=float)
     if times.ndim != 1 or times.size == 0:
@@ -260,7 +260,8 @@ def channels_of(
 ) -> tuple[Channel, ...]:
     """The readings of an experiment, checked.
 
-    **Arguments:** `free`: names of unknowns, without the experiment's; `places`: which of `ts` each name has.
+    **Arguments:** `free`: names of unknowns, without the experiment's prefix; `places`: for each name its indices in
+    `ts`.
     """
     measured: Any = experiment.measured
     if (measured is None) == (experiment.residual is None):
@@ -271,19 +272,19 @@ def channels_of(
         return ()
     if not measured:
         raise ValueError("measured is empty: give at least one quantity by name.")
-    shapes = {name: own.shape for name, own in system.quantities().items()}
-    known = dict.fromkeys((*sensors, *shapes))
+    shapes = {name: quantity.shape for name, quantity in system.quantities().items()}
+    available = dict.fromkeys((*sensors, *shapes))
     for name in (*measured, *(experiment.sigma or {})):
-        if name not in known:
-            raise unknown("quantity", name, known)
+        if name not in available:
+            raise unknown("quantity", name, available)
     for name in experiment.sigma or {}:
         if name not in measured:
             raise ValueError(f"sigma is given for {name!r}, which is not measured.")
-    own = dict(sigma or {}) | dict(experiment.sigma or {})
+    deviations = dict(sigma or {}) | dict(experiment.sigma or {})
     out, levels = [], {}
     for name, data in measured.items():
         sensor = sensors.get(name, Sensor(name))
-        deviation = own.get(name, sensor.sigma)
+        deviation = deviations.get(name, sensor.sigma)
         levels[name] = deviation is not None or f"{name}.sigma" in free
         shape = shapes[sensor.quantity]
         late = f"{name}.delay" in free
@@ -292,21 +293,21 @@ def channels_of(
             _check_delay(channel, np.asarray(ts), float(np.asarray(experiment.t0)))
         out.append(channel)
     if any(levels.values()) and not all(levels.values()):
-        missing = next(name for name, there in levels.items() if not there)
+        missing = next(name for name, is_given in levels.items() if not is_given)
         raise ValueError(f"sigma is given for other quantities but not for {missing!r}; give all or none.")
     return tuple(out)
 
 
 def _check_delay(channel, ts, t0):
     """Raise a `ValueError` for readings of the motion before it begins."""
-    there = np.asarray(channel.present).reshape(ts.size, -1).any(axis=1)
-    # Times that are computed differ by rounding errors.
+    is_present = np.asarray(channel.present).reshape(ts.size, -1).any(axis=1)
+    # Computed times differ by rounding errors.
     rounding = 8 * np.finfo(ts.dtype).eps * np.max(np.abs([t0, *ts]))
-    early = ts[there & (ts - float(channel.delay) < t0 - rounding)]
+    early = ts[is_present & (ts - float(channel.delay) < t0 - rounding)]
     if early.size:
         raise ValueError(
-            f"Sensor {channel.name!r} has a delay of {float(channel.delay):g} s, so what it reads at {early[0]:g} s is "
-            f"the motion before t0 = {t0:g}. Start t0 earlier, or leave out samples before "
+            f"Sensor {channel.name!r} has a delay of {float(channel.delay):g} s, so its reading at {early[0]:g} s "
+            f"shows the motion before t0 = {t0:g}. Start t0 earlier, or leave out samples before "
             f"{t0 + float(channel.delay):g} s, or put NaN in their place."
         )
 
@@ -333,10 +334,10 @@ def initial_unknown(system: AbstractSystem, name: str) -> Initial:
 
 
 def known_parameters(system: AbstractSystem, experiment: Experiment) -> dict[str, Array]:
-    """The parameters that are known for an experiment alone."""
+    """The known parameters of one experiment."""
     given = experiment.parameters or {}
-    known = parameters(with_parameters(system, given))
-    return {name: known[name] for name in given}
+    values = parameters(with_parameters(system, given))
+    return {name: values[name] for name in given}
 
 
 def arrays(values: Mapping[str, VectorLike] | None) -> dict[str, Bool[Array, "..."]]:

@@ -1,4 +1,4 @@
-"""The end of an identification, for the studies that go on from it."""
+"""The end of an identification, from which further studies continue."""
 
 import dataclasses
 import functools
@@ -18,13 +18,13 @@ from .residuals import Outlier, Series, outliers, series
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """The problem, the point where the iteration ended, and what is known of it there.
+    """The problem, the final point of the iteration, and the results there.
 
-    **Fields:** `z`: the vector of the unknowns; `objective`: minus the logarithm of likelihood and prior; `ends`: the
-    same and the unknowns of every start, the best first; `residuals` of the data, in units of the noise; `jacobian` of
-    all rows, along the directions in which the unknowns may change, which are the columns of `along` (the components of
-    z where it is None); `readings`: the predicted ones by experiment and sensor; `iterations`: the number of trials;
-    `success`: whether the iteration converged; `segments` and `continuity` of multiple shooting.
+    **Fields:** `z`: the vector of the unknowns; `objective`: minus the logarithm of likelihood and prior; `ends`:
+    objective and unknowns of every start, the best first; `residuals` of the data, in units of the noise; `jacobian` of
+    all rows, along the columns of `along`, the free directions of z (None for its components); `readings`: predictions
+    by experiment and sensor; `iterations`: the number of trials; `success`: whether the iteration converged; `segments`
+    and `continuity` of multiple shooting.
     """
 
     problem: Problem
@@ -49,7 +49,7 @@ class Fit:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """Where the estimates started from."""
+        """The starting values of the estimates."""
         return {name: np.asarray(value) for name, value in self.problem.free.start.items()}
 
     @functools.cached_property
@@ -59,7 +59,7 @@ class Fit:
 
     @functools.cached_property
     def uncertainty(self) -> Covariance:
-        """The covariance of the components, and what the data do not determine."""
+        """The covariance of the components, and the undetermined directions."""
         problem, data = self.problem, self.residuals
         changes = np.asarray(jax.jacfwd(problem.free.flat)(self.z))
         if self.along is not None:
@@ -70,7 +70,7 @@ class Fit:
 
     @property
     def dispersion(self) -> float:
-        """The factor of twice a difference of the objective over a χ² variable."""
+        """The ratio of twice a difference of the objective to a χ² variable."""
         if not self.problem.loss.robust:
             return 1.0
         return self.uncertainty.noise**2 * float(np.mean(self.problem.loss.influence(self.residuals)[1]))
@@ -87,7 +87,7 @@ class Fit:
 
     @property
     def combinations(self) -> tuple[dict[str, float], ...]:
-        """The changes, relative to the estimates, that do so together."""
+        """The joint changes, relative to the estimates, that do not change the residuals."""
         return combinations(self.components, flat(self.parameters), self.uncertainty)
 
     @functools.cached_property
@@ -141,7 +141,7 @@ class Fit:
         return f"{self.residuals.size} residuals, rms {self.rms:.3g}{unit}"
 
     def whole_motions(self, what: str) -> None:
-        """Raise a `ValueError` for what needs simulations from start to end, after multiple shooting."""
+        """Raise a `ValueError` after multiple shooting, for studies that need simulations from start to end."""
         if self.segments > 1:
             raise ValueError(
                 f"{what} simulates whole motions; identify again with segments=1, from the estimates as starts."

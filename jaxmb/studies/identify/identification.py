@@ -1,4 +1,4 @@
-"""Results of `identify`: estimates, how certain they are, and what follows from them."""
+"""Results of `identify`: estimates, their uncertainty, and further studies."""
 
 import dataclasses
 import functools
@@ -31,48 +31,47 @@ class Identification(Printed, Fit):
 
     **Fields:**
 
-    - `parameters`: estimates by name; `start`: where they started from.
-    - `converged`: whether the iteration converged and nothing speaks against its end; otherwise `warnings` say what
-        does, and what helps. `message`: the same in one sentence, which starts with "converged" only if it did.
+    - `parameters`: estimates by name; `start`: their starting values.
+    - `converged`: whether the iteration converged and all tests of the fit passed; otherwise `warnings` give reasons
+        and remedies. `message`: the same in one sentence, which starts with "converged" only if true.
     - `deviations`: standard deviations by name, of the same shapes, from the residuals' Jacobian at the solution.
-        Without `sigma` the noise is estimated from the residuals; with a robust loss as well: they are then those of
-        Huber's M-estimate, which hold whatever the distribution of the noise. Infinite for parameters that the data do
-        not determine. NaN where they mean nothing: if the iteration did not converge or the residuals are no noise of
-        the size of `sigma`, for an estimate at an end of its range, and where the noise is to be estimated from no more
-        residuals than there are parameters.
-    - `covariance`: of all components, in the order of `components`, the names of all scalar components; of the problem
-        that is linearised at the solution, also where that means nothing.
+        Without `sigma`, or with a robust loss, the noise is estimated from the residuals; a robust loss gives the
+        deviations of Huber's M-estimate, valid for any distribution of the noise. Infinite for parameters that the data
+        do not determine. NaN if meaningless: the iteration did not converge; the residuals are not noise of the size of
+        `sigma`; the estimate is at an end of its range; or unknown noise has no more residuals than parameters.
+    - `covariance` of all components, in the order of `components`, the names of all scalar components; from the problem
+        linearised at the solution, also if meaningless.
     - `undetermined`: names of components that can change, alone or together, without changing the residuals;
-        `combinations`: the changes, relative to the estimates, that do so together.
-    - `residuals`: of the data at the solution, predicted minus measured, in units of the noise (of the range of the
-        readings where it is not known); `rms`: their root mean square; `outliers`: those beyond five standard
-        deviations of the noise, each an `Outlier`.
-    - `iterations`: how many trials were simulated; of multiple shooting without steps that were halved.
+        `combinations`: these joint changes, relative to the estimates.
+    - `residuals`: of the data at the solution, predicted minus measured, in units of the noise (of the readings' range
+        if it is unknown); `rms`: their root mean square; `outliers`: residuals beyond five standard deviations of the
+        noise, each an `Outlier`.
+    - `iterations`: the number of simulated trials; in multiple shooting without halved steps.
     - `system`, `state`: with the estimated parameters, ready for `simulate`; of the first experiment.
     - `systems`, `states`: the same by experiment.
-    - `objectives`: of every start, the smallest first: minus the logarithm of likelihood and prior.
-    - `continuity`: the largest gap between segments, of multiple shooting.
-    - `reasons`: in a few words, why components have no standard deviation, by their names.
+    - `objectives` of all starts, the smallest first: minus the logarithm of likelihood and prior.
+    - `continuity`: the largest gap between segments in multiple shooting.
+    - `reasons` for missing standard deviations, in a few words, by component.
     """
 
     @functools.cached_property
     def verdict(self) -> Verdict:
-        """What speaks against the estimates."""
+        """The tests' objections to the estimates."""
         return judge(self)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What speaks against the estimates, and what helps."""
+        """Objections to the estimates, with remedies."""
         return self.verdict.warnings
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why components have no standard deviation, by their names."""
+        """Reasons for missing standard deviations, by component."""
         return self.verdict.reasons
 
     @property
     def converged(self) -> bool:
-        """Whether the iteration converged and nothing speaks against its end."""
+        """Whether the iteration converged and all tests of the fit passed."""
         return not self.warnings
 
     @property
@@ -82,7 +81,7 @@ class Identification(Printed, Fit):
             return f"{_NO_FIT}: {'; '.join(self.warnings)}"
         if not self.outliers:
             return "converged"
-        lighter = "; if these are errors of measurement, loss='soft_l1' or 'huber' lets them weigh less"
+        lighter = "; if these are errors of measurement, loss='soft_l1' or 'huber' reduces their weight"
         cure = "" if self.problem.loss.robust else lighter
         return f"converged, with residuals beyond 5 σ (`outliers`), {len(self.outliers)} in number{cure}"
 
@@ -93,22 +92,22 @@ class Identification(Printed, Fit):
         out[[self.reasons.get(name, UNDETERMINED) != UNDETERMINED for name in self.components]] = np.nan
         ends = np.cumsum([value.size for value in self.parameters.values()])
         each = zip(self.parameters.items(), np.split(out, ends[:-1]), strict=True)
-        return {name: own.reshape(value.shape) for (name, value), own in each}
+        return {name: part.reshape(value.shape) for (name, value), part in each}
 
     @property
     def held_out(self) -> dict[str, HeldOut]:
-        """How well the experiments that were held out are predicted, by their names."""
+        """The quality of prediction of held-out experiments, by name."""
         return held_out(self)
 
     def profile(self, component: str, *, level: float = 0.95, values: ArrayLike | None = None) -> Profile:
-        """The profile likelihood of one component: all others are fitted anew to each of its values.
+        """The profile likelihood of one component: all others are refitted for each of its values.
 
-        **Arguments:** `component`: one of `components`, but of no matrix; `level` of the interval; `values`: default
-        steps of half a standard deviation from the estimate, until they are beyond the ends of the interval.
+        **Arguments:** `component`: one of `components`, not of a matrix; `level` of the interval; `values`: default
+        steps of half a standard deviation from the estimate, until beyond the ends of the interval.
 
-        **Returns:** a `Profile`. Without known noise levels, the ratios are those of the likelihood with the noise
-        level that is most likely for each value. With a robust loss they are those of the objective, divided by the
-        ratio of the mean square of its slopes to its mean curvature, which has a χ² distribution.
+        **Returns:** a `Profile`. Without known noise levels, the ratios are likelihood ratios with the most likely
+        noise level for each value. With a robust loss, twice the differences of the objective are divided by the mean
+        square of its slopes over its mean curvature, which makes them χ² distributed.
 
         **Raises:** `ValueError` for an unknown component, a level that is not between 0 and 1, values out of bounds,
         and after multiple shooting.
@@ -127,8 +126,8 @@ class Identification(Printed, Fit):
 
         If the fit did not converge, or does not explain its data, there are no bands: they are NaN.
 
-        **Arguments:** `quantities`: names, as `Trajectory.quantity` takes them; `ts`: times [s], default those of the
-        data; `experiment`: its name, default the first; `level`: probability within the band, 0.95 for 95 %.
+        **Arguments:** `quantities`: names for `Trajectory.quantity`; `ts`: times [s], default the data's; `experiment`:
+        its name, default the first; `level`: probability within the band, 0.95 for 95 %.
 
         **Raises:** `ValueError` for unknown names, wrong times, a level that is not between 0 and 1, and after multiple
         shooting.
@@ -138,7 +137,7 @@ class Identification(Printed, Fit):
     def logdensity(self) -> LogDensity:
         """The posterior density as a function of an unconstrained vector, for samplers.
 
-        With a robust loss the likelihood is the exponential of minus that loss, of noise with long tails.
+        With a robust loss the likelihood is the exponential of minus the loss, for noise with long tails.
 
         **Raises:** `ValueError` if the noise level of a sensor is neither known nor free, and after multiple shooting.
         """
@@ -165,7 +164,7 @@ class Identification(Printed, Fit):
 
     @property
     def _rows(self) -> list[tuple[str, str, str, str]]:
-        """For each component its name, start, estimate, and standard deviation, or why there is none."""
+        """For each component its name, start, estimate, and standard deviation, or the reason for its absence."""
         columns = zip(self.components, *map(flat, (self.start, self.parameters, self.deviations)), strict=True)
         return [(name, f"{a:.6g}", f"{b:.6g}", self.reasons.get(name, f"{c:.2g}")) for name, a, b, c in columns]
 
@@ -180,7 +179,10 @@ class Identification(Printed, Fit):
             [
                 headline,
                 *(f"- {reason}" for reason in reasons),
-                *(f"{name:{width}}  {start:>12}  {value:>12}  {own:>12}" for name, start, value, own in table),
+                *(
+                    f"{name:{width}}  {start:>12}  {value:>12}  {deviation:>12}"
+                    for name, start, value, deviation in table
+                ),
                 f"{self.size_of_residuals}, {self.iterations} iterations",
             ]
         )

@@ -26,11 +26,11 @@ from .sensors import Sensor
 from .shooting import shoot
 from .unknowns import Prior, experiments_by_name, sensors_by_name, unknowns
 
-# A parameter that changes the residuals by less than this, relative to the size of what is measured, has no effect.
+# A parameter has no effect if it changes the residuals by less than this, relative to the size of the data.
 _NO_EFFECT = 1e-10
 
 
-@functools.partial(names_arguments, gone={"method": "it is Levenberg–Marquardt; optax needs a loss of your own"})
+@functools.partial(names_arguments, gone={"method": "it is Levenberg–Marquardt; optax needs a user-defined loss"})
 def identify(
     system: AbstractSystem,
     measured: Any = None,
@@ -55,7 +55,7 @@ def identify(
     tol: float = 1e-8,
     **options: Any,
 ) -> Identification:
-    """Estimate parameters so that the simulated motion fits a measured one, by nonlinear least squares.
+    """Estimate parameters by nonlinear least squares, so that the simulated motion fits the measured motion.
 
     ```python
     ts = np.linspace(0.1, 2.0, 20)
@@ -67,67 +67,76 @@ def identify(
     **Arguments:**
 
     - `system`: a compiled scene, or another system.
-    - `measured`: what was measured at `ts`, by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position":
-        (times, 2)}`. Names are those of `sensors`, of `Trajectory[body]` (`position`, `velocity`, `angle`,
-        `orientation`, `angular_velocity`) and of its reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
+    - `measured`: data at `ts` by name, with time as axis 0: `{"rocker.angle": (times,), "rod.position": (times, 2)}`.
+        Names are names of `sensors`, of quantities of `Trajectory[body]` (`position`, `velocity`, `angle`,
+        `orientation`, `angular_velocity`) and of reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
         coordinates and their rates q̇, `"theta"` and `"theta_rate"`, shape (times,), and generalized forces of its
-        constraints, `"A.force"`, shape (times, nu). NaN marks a sample that is missing. Angles are compared without
-        wrapping. Instead, `Measurements`, with their times, which `read_measurements` makes of files and tables; or
-        an `Experiment` or a list of them, each with its own data, times and initial state.
-    - `ts`: times [s], shape (times,), increasing, from `t0` on. Where sensors have times of their own, by name of what
-        was measured: `ts={"encoder": (times1,), "gyro": (times2,)}`; each measured array has the length of its own.
-    - `free`: what to estimate: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the
-        system's values. Every experiment has the same value, unless the name is among its `own`: that unknown is
-        called `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it,
-        `"encoder.bias"`, and are estimated as one number or, from a start with one for each component of the quantity,
-        as many; noise levels by maximum likelihood.
+        constraints, `"A.force"`, shape (times, nu). NaN marks a missing sample. Angles are compared without wrapping.
+        Or `Measurements` with their times, from files and tables by `read_measurements`; or one or a list of
+        `Experiment`, each with its own data, times and initial state.
+    - `ts`: times [s], shape (times,), increasing, from `t0` on. Different times of sensors are given by measured name:
+        `ts={"encoder": (times1,), "gyro": (times2,)}`.
+    - `free`: the unknowns: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the system's
+        values. All experiments share a value, unless an experiment has the name in its `own`: its unknown is then
+        `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it, `"encoder.bias"`.
+        Each is a single number, or has a component for each of the quantity if its start has; noise levels are
+        estimated by maximum likelihood.
 
-    **The initial state**, at `t0`, is found anew for every value of the parameters by `assemble(guess=state, fix=fix,
-    rates=rates)`; a `state` that satisfies the constraints whatever the free parameters is therefore kept as it is.
-    `free_initial` names coordinates and rates of it that are unknown, `("crank.angle", "crank.angle_rate")`, or gives
+    **The initial state**, at `t0`, is recomputed for every value of the parameters by `assemble(guess=state, fix=fix,
+    rates=rates)`; a `state` that satisfies the constraints for all values of the free parameters is therefore
+    unchanged. `free_initial` names its unknown coordinates and rates, `("crank.angle", "crank.angle_rate")`, or gives
     their starting values by name; these unknowns are called `"initial.crank.angle"`.
 
     **Other arguments:**
 
     - `sensors`: instruments between quantities and data.
-    - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the measured ones. Without
-        it every quantity is weighted by its own range, and the noise is estimated from the residuals.
+    - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the data. Without it every
+        quantity is weighted by its range, and the noise is estimated from the residuals.
     - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Parameters that parts declare
-        to be positive, such as masses and moments of inertia, stay so without bounds, and inertia matrices stay
-        those of a body, positive definite and with principal moments that satisfy the triangle inequalities; the
-        parameters of a `LagrangianSystem` have no such declaration. Unbounded parameters are scaled by their start.
-    - `prior`: `(mean, deviation)` by name, of a normal distribution that is known before the measurement. Needs the
-        noise levels, known or free.
+        to be positive, such as masses and moments of inertia, stay positive without bounds. Inertia matrices stay
+        positive definite, with principal moments that satisfy the triangle inequalities. The parameters of a
+        `LagrangianSystem` have no such declaration. Unbounded parameters are scaled by their start.
+    - `prior`: `(mean, deviation)` by name, of a normal distribution. Needs the noise levels, known or free.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of residuals in units of
         their noise, with time as axis 0.
-    - `loss`: how residuals r, in units of σ, weigh: the fit minimises `½ Σ ρ(r²)`, with ρ of "linear", least squares,
-        or, for data with outliers, of "soft_l1", `2 (√(1 + r²) − 1)`, or "huber", `r²` up to one σ and `2 |r| − 1`
-        beyond. The latter two need `sigma` in numbers, or a residual function. They are those of
-        `scipy.optimize.least_squares`; a residual beyond about one σ pulls as one of σ. Deviations are then estimated
-        from the residuals, as those of Huber's M-estimate.
-    - `starts`: how many points to start from, the first one that of `free`, the others drawn with `seed` between the
-        bounds or, where there are none, from a normal distribution of the size of the start; or further starting
-        values, one mapping for each start. They are simulated in one batch, and the best minimum is returned.
-    - `segments`: more than one is multiple shooting, for motions that are chaotic or unstable, which a simulation over
-        the whole time does not follow: each experiment is cut into so many segments of nearly as many samples,
-        simulated in one batch from states of their own, which are joined as the iteration goes on.
+    - `loss`: the weight of residuals r, in units of σ. The fit minimises `½ Σ ρ(r²)`, as in
+        `scipy.optimize.least_squares`: "linear" is least squares; for data with outliers, "soft_l1" is `2 (√(1 + r²) −
+        1)`, and "huber" is `r²` up to one σ and `2 |r| − 1` beyond. The robust losses need `sigma` in numbers, or a
+        residual function. A residual beyond about one σ then has the influence of one σ, and deviations are estimated
+        from the residuals (Huber's M-estimate).
+    - `starts`: the number of starting points. The first is `free`; the others are drawn with `seed`: between two
+        bounds, or from a normal distribution of the size of the start (log-normal for positive parameters and a single
+        bound). Or further starting values, one mapping for each start. They are simulated in one batch, and the best
+        minimum is returned.
+    - `segments`: more than one is multiple shooting, for chaotic or unstable motions that a simulation over the whole
+        time does not follow. Each experiment is cut into this number of segments of nearly equal numbers of samples.
+        They are simulated in one batch from separate initial states, which the iteration joins.
     - `max_iterations` of Levenberg–Marquardt, whose derivatives are in forward mode, best up to some dozens of
         parameters; `tol`: change of unknowns and residuals, absolute and relative, at which to stop.
     - `options`: passed on to `simulate`: `rtol`, `solver`, `manifold`, `max_steps`, …
 
-    A trial at which the mechanism cannot be assembled or the simulation fails is rejected, and a smaller step is tried.
+    A trial is rejected, and a smaller step tried, if the mechanism cannot be assembled or the simulation fails.
 
-    **Returns:** an `Identification`. It is `converged` only if the iteration converged and nothing speaks against its
-    end: residuals far beyond `sigma`, or without it no closer to the data than a constant; residuals that are no noise,
-    by their signs, their autocorrelation or their correlation with what is predicted; an estimate at an end of its
-    range, or one that the data do not determine; another of the `starts` that fits as well elsewhere. `warnings` say
-    what it is, and what helps.
+    **Returns:** an `Identification`. It is `converged` only if the iteration converged and all tests passed. The tests
+    object to residuals far beyond `sigma`, or without `sigma` no closer to the data than a constant; to residuals that
+    are not noise by their signs, their autocorrelation or their correlation with the prediction; to estimates at an end
+    of their range, or not determined by the data; and to another of the `starts` with an equal fit elsewhere.
+    `warnings` give the reasons and remedies.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, fewer data than unknowns,
     and if the simulation with the starting values fails or a free parameter has no effect on the residuals there.
     """
-    own = {"ts": ts, "state": state, "fix": fix, "rates": rates, "residual": residual, "free_initial": free_initial}
-    problem = _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss_named(loss), options)
+    per_experiment = {
+        "ts": ts,
+        "state": state,
+        "fix": fix,
+        "rates": rates,
+        "residual": residual,
+        "free_initial": free_initial,
+    }
+    problem = _problem(
+        system, measured, per_experiment, t0, sensors, sigma, free, bounds, prior, loss_named(loss), options
+    )
     limit, segments = whole_number("max_iterations", max_iterations), whole_number("segments", segments)
     points = _starts(problem, starts, seed)
     if segments > 1:
@@ -156,16 +165,16 @@ def identify(
     )
 
 
-def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, loss, options) -> Problem:
+def _problem(system, measured, per_experiment, t0, sensors, sigma, free, bounds, prior, loss, options) -> Problem:
     for argument, value in (("sigma", sigma), ("bounds", bounds), ("prior", prior)):
         if value is not None and not isinstance(value, Mapping):
             raise ValueError(f"identify: {argument} is given by name, such as {{'crank.angle': …}}; got {value!r}.")
     several = [measured] if hasattr(measured, "held_out") else measured
     if have_times(measured) or not isinstance(several, list | tuple):
-        experiments = {"": with_times(Experiment(measured, **own, t0=t0))}
+        experiments = {"": with_times(Experiment(measured, **per_experiment, t0=t0))}
     else:
-        given = [name for name, value in own.items() if value is not None and name != "free_initial"]
-        given += [name for name, value in (("free_initial", own["free_initial"]), ("t0", t0)) if value]
+        given = [name for name, value in per_experiment.items() if value is not None and name != "free_initial"]
+        given += [name for name, value in (("free_initial", per_experiment["free_initial"]), ("t0", t0)) if value]
         if given:
             arguments = ", ".join(f"{name}=…" for name in dict.fromkeys(("ts", given[0])))
             raise ValueError(f"{given[0]} belongs to each experiment: jaxmb.Experiment(measured, {arguments}).")
@@ -184,7 +193,7 @@ def _problem(system, measured, own, t0, sensors, sigma, free, bounds, prior, los
         known_noise=_known_noise(experiments, named, sigma, trials),
     )
     if loss.robust and not (problem.known_noise and np.all(~level_mask(problem))):
-        raise ValueError(f"loss={loss.name!r} needs to know from where on a residual is large: give sigma, as numbers.")
+        raise ValueError(f"loss={loss.name!r} needs the size of a large residual: give sigma, as numbers.")
     if priors.names and not problem.known_noise:
         raise ValueError(
             f"The prior of {priors.names[0]!r} is weighed against noise of a known size: give sigma, or free the noise "
@@ -237,18 +246,18 @@ def _least_squares(problem: Problem, points: list[Array], tol: float, limit: int
     levels = level_mask(problem)
     if not levels.any():
         return minimise_together(linearised, points, tol, limit)
-    # First the motion, with the noise levels as they are, and then both, from the levels that the first fit shows.
+    # First the motion is fitted with fixed noise levels, then both, from the levels that the first fit shows.
     coarse = 1e-3 if levels.sum() < levels.size else np.inf
-    found = minimise_together(linearised, points, coarse, limit, levels) if np.isfinite(coarse) else None
-    starts = points if found is None else [minimum.z for minimum in found]
+    coarse_minima = minimise_together(linearised, points, coarse, limit, levels) if np.isfinite(coarse) else None
+    starts = points if coarse_minima is None else [minimum.z for minimum in coarse_minima]
     starts = [with_likely_levels(problem, z, linearise(problem, z).readings) for z in starts]
     refined = minimise_together(linearised, starts, tol, limit)
-    before = [0] * len(points) if found is None else [minimum.iterations for minimum in found]
-    return [own._replace(iterations=own.iterations + more) for own, more in zip(refined, before, strict=True)]
+    before = [0] * len(points) if coarse_minima is None else [minimum.iterations for minimum in coarse_minima]
+    return [result._replace(iterations=result.iterations + more) for result, more in zip(refined, before, strict=True)]
 
 
 def _check_start(problem: Problem, model: Model) -> None:
-    fitted = [number for number, own in enumerate(problem.fitted) if own]
+    fitted = [number for number, is_fitted in enumerate(problem.fitted) if is_fitted]
     for number, result in zip(fitted, model.results, strict=True):
         if not bool(result == RESULTS.successful):
             text = RESULTS[result]  # pyright: ignore[reportInvalidTypeArguments]
@@ -257,7 +266,7 @@ def _check_start(problem: Problem, model: Model) -> None:
             try:
                 problem.trials[number].start(problem.system, problem.own(number, problem.free.start), throw=None)
             except ValueError as error:
-                # It names the coordinates, of fix, rates and free_initial together.
+                # The message names the coordinates of fix, rates and free_initial together.
                 text = str(error)
             raise ValueError(f"The simulation{where} fails with the starting values: {text}")
     residuals, jacobian = model.plain.residuals, model.plain.jacobian
@@ -268,11 +277,11 @@ def _check_start(problem: Problem, model: Model) -> None:
     for name in problem.free.names:
         if not np.any(effect[problem.free.place(name)] > _NO_EFFECT):
             raise ValueError(
-                f"{name!r} has no effect on what was measured; leave it out of free, or measure more. Where the motion "
-                "starts at rest in an equilibrium, state=, fix= or rates= gives it another start."
+                f"{name!r} has no effect on the data; leave it out of free, or measure more. If the motion starts at "
+                "rest in an equilibrium, give another start by state=, fix= or rates=."
             )
     data = model.data + sum(int(np.size(mean)) for mean in problem.priors.means)
     if data < problem.free.size:
         raise ValueError(
-            f"There are {data} measured numbers for {problem.free.size} unknown ones; measure more, or free fewer."
+            f"There are {data} measured numbers for {problem.free.size} unknowns; measure more, or free fewer."
         )

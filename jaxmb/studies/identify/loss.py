@@ -1,7 +1,7 @@
-"""Loss functions of residuals: the square, or less where a residual is large.
+"""Loss functions of residuals: the square, or less for large residuals.
 
 A fit minimises `½ Σ ρ(r²)` of the residuals r, which are in units of the standard deviation σ of the noise. The names
-and the functions ρ are those of `scipy.optimize.least_squares`.
+and the functions ρ are as in `scipy.optimize.least_squares`.
 
 Source: B. Triggs, P. F. McLauchlan, R. I. Hartley and A. W. Fitzgibbon, "Bundle Adjustment — A Modern Synthesis", in:
 Vision Algorithms: Theory and Practice, Springer 2000; P. J. Huber, "Robust Statistics", Wiley 1981, chapter 7.
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# The least share of a residual's weight that stands for its second derivative. The exact one vanishes beyond σ for
-# Huber's loss, and steps from a start at which all residuals are large would have no length.
+# The least fraction of a residual's weight that replaces its second derivative. The exact derivative vanishes beyond σ
+# for Huber's loss, and without it steps would have no length if all residuals are large.
 _LEAST_CURVATURE = 0.1
 
 
@@ -41,14 +41,14 @@ class Loss(NamedTuple):
         """Residuals and Jacobian such that `Jᵀ r` is the gradient and `Jᵀ J` approximates the second derivatives."""
         if not self.robust:
             return residuals, jacobian
-        # Where a simulation failed, residuals are infinite, and their objective rejects them.
+        # After a failed simulation, residuals are infinite, and their objective rejects them.
         with np.errstate(invalid="ignore", divide="ignore"):
             slope = self.slope(residuals**2)
             size = np.sqrt(np.maximum(self.influence(residuals)[1], _LEAST_CURVATURE * slope))
             return slope / size * residuals, size[:, None] * jacobian
 
     def influence(self, residuals: Float[np.ndarray, "rows"]) -> tuple[np.ndarray, np.ndarray]:
-        """`ψ = r ρ'(r²)`, by which each residual pulls at the estimates, and its derivative."""
+        """`ψ = r ρ'(r²)`, the influence of each residual on the estimates, and its derivative."""
         squares = residuals**2
         slope = self.slope(squares)
         return residuals * slope, slope + 2 * squares * self.curvature(squares)

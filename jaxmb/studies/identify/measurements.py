@@ -13,8 +13,8 @@ _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 
 class Measurements(NamedTuple):
-    """Measured data: `ts` [s], shape (times,), and `values` by name with time as axis 0, as `identify` and
-    `Experiment` take them: `identify(system, data, …)`.
+    """Measured data: `ts` [s], shape (times,), and `values` by name with time as axis 0, for `identify(system, data,
+    …)` and `Experiment`.
 
     ```python
     data = jaxmb.Measurements(ts=np.array([0.1, 0.2, 0.3]), values={"bar.angle": np.array([0.44, 0.25, -0.05])})
@@ -25,7 +25,7 @@ class Measurements(NamedTuple):
     values: dict[str, np.ndarray]
 
 
-# What to give in place of anything else.
+# The accepted forms of data.
 BY_NAME = (
     "measured is given by name, such as {'crank.angle': array}, or by jaxmb.Experiment(measured, ts=…), and "
     "jaxmb.read_measurements reads files and tables"
@@ -33,7 +33,7 @@ BY_NAME = (
 
 
 def have_times(measured: Any) -> bool:
-    """Whether measured data have values by name and their own times, as `Measurements` do."""
+    """Whether measured data have values by name and times, like `Measurements`."""
     return hasattr(measured, "ts") and isinstance(getattr(measured, "values", None), Mapping)
 
 
@@ -49,17 +49,17 @@ def read_measurements(
 
     **Arguments:**
 
-    - `source`: the path of a file; a table with `columns` and columns by name, such as those of pandas and polars; or a
-        Dataset, such as `Trajectory.to_xarray` makes, whose variables have the dimension of time and at most one more.
-    - `columns`: for each quantity or sensor the name of its column, or of one column for each component:
-        `{"rod.angle": "phi", "rod.position": ["x", "y"]}`; default every column but that of time, by its own name.
+    - `source`: the path of a file; a table with `columns` and columns by name, such as in pandas and polars; or a
+        Dataset, such as from `Trajectory.to_xarray`, whose variables have the dimension of time and at most one more.
+    - `columns`: for each quantity or sensor the name of its column, or a list of columns, one for each component:
+        `{"rod.angle": "phi", "rod.position": ["x", "y"]}`; default all columns except time, by their names.
     - `time`: the column of times [s], which must increase.
 
-    **Returns:** `Measurements`; empty cells, and those that say `nan`, `NA` or `null`, are NaN, which marks a missing
-    sample.
+    **Returns:** `Measurements`; NaN marks missing samples, from empty cells or `nan`, `NA` and `null`.
 
-    **Raises:** `ValueError` naming missing and repeated columns, the line and column of a cell that is no number, times
-    that are missing or out of order, and tables with fewer than two rows. `FileNotFoundError` if there is no such file.
+    **Raises:** `ValueError` that names missing and repeated columns, the line and column of a cell that is not a
+    number, missing or unordered times; and for tables with fewer than two rows. `FileNotFoundError` if the file is
+    missing.
     """
     if isinstance(source, str | Path):
         named = _of_file(Path(source))
@@ -70,13 +70,17 @@ def read_measurements(
         raise unknown("column of time", time, named)
     columns = {name: name for name in named if name != time} if columns is None else columns
     if not columns:
-        raise ValueError(f"{label} has no column but that of time.")
+        raise ValueError(f"{label} has no column except time.")
     values = {}
-    for name, own in columns.items():
-        for column in (own,) if isinstance(own, str) else own:
+    for name, column_names in columns.items():
+        for column in (column_names,) if isinstance(column_names, str) else column_names:
             if column not in named:
                 raise unknown("column", column, named)
-        values[name] = named[own] if isinstance(own, str) else np.stack([named[column] for column in own], axis=1)
+        values[name] = (
+            named[column_names]
+            if isinstance(column_names, str)
+            else np.stack([named[column] for column in column_names], axis=1)
+        )
     ts = named[time]
     if ts.size < 2:
         raise ValueError(f"{label} has {ts.size} rows; there are too few data.")
@@ -133,7 +137,7 @@ def _of_frame(frame: Any) -> dict[str, np.ndarray]:
         try:
             out[name] = np.asarray(frame[column].to_numpy(), float)
         except (TypeError, ValueError):
-            raise ValueError(f"Column {name!r} of the table holds something that is no number.") from None
+            raise ValueError(f"Column {name!r} of the table contains a value that is not a number.") from None
     return out
 
 

@@ -1,4 +1,4 @@
-"""Predictions of the estimates, how certain they are, and how they compare with data that were held out."""
+"""Predictions of the estimates, their uncertainty, and their comparison with held-out data."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,10 +22,9 @@ from .problem import jacobian_and_value
 class Prediction:
     """Quantities of a motion with their uncertainty.
 
-    **Fields:** `ts` [s]; by name of the quantity `values`, their standard `deviations`, and the ends of the band that
-    holds the true value with probability `level`, `low` and `high`; times are axis 0. A deviation is infinite where the
-    quantity depends on what the data do not determine, and NaN where the fit did not converge, or does not
-    explain its data.
+    **Fields:** `ts` [s]; by name of the quantity `values`, their standard `deviations`, and the ends `low` and `high`
+    of the band that contains the true value with probability `level`; times are axis 0. A deviation is infinite if the
+    quantity depends on undetermined unknowns, and NaN if the fit did not converge, or does not explain its data.
     """
 
     ts: np.ndarray
@@ -64,16 +63,16 @@ def predict(
     columns = problem.columns(number)
     flat = jnp.asarray(np.asarray(problem.free.flat(fit.z))[columns])
     jacobians, values = _predicted(problem.system, trial, problem.options, names, ts, flat)
-    found = fit.uncertainty
+    uncertainty = fit.uncertainty
     width = float(ndtri((1 + level) / 2))
     out, deviations = {}, {}
     for name in names:
         jacobian = np.asarray(jacobians[name])
         out[name] = np.asarray(values[name])
-        deviation = np.linalg.norm(jacobian @ found.root[columns], axis=-1)
-        if found.lost.shape[1]:
-            along = np.max(np.abs(jacobian @ found.lost[columns]), axis=-1)
-            size = np.max(np.abs(jacobian)[..., None] * np.abs(found.lost[columns]), initial=0.0)
+        deviation = np.linalg.norm(jacobian @ uncertainty.root[columns], axis=-1)
+        if uncertainty.lost.shape[1]:
+            along = np.max(np.abs(jacobian @ uncertainty.lost[columns]), axis=-1)
+            size = np.max(np.abs(jacobian)[..., None] * np.abs(uncertainty.lost[columns]), initial=0.0)
             deviation = np.where(along > 1e-6 * size, np.inf, deviation)
         deviations[name] = deviation if trusted else np.full_like(deviation, np.nan)
     low = {name: out[name] - width * deviations[name] for name in names}
@@ -94,10 +93,10 @@ def _predicted(system, trial, options, names, ts, flat) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class HeldOut:
-    """How well data that were not fitted are predicted.
+    """The quality of prediction of data that were not fitted.
 
     **Fields:** `residuals` of the samples, predicted minus measured, weighted by the noise level (by the range of the
-    readings where it is not known); `rms`: their root mean square; `readings`: predicted, by sensor, at its times.
+    readings if it is unknown); `rms`: their root mean square; `readings`: predicted, by sensor, at its times.
     """
 
     residuals: np.ndarray
@@ -106,7 +105,7 @@ class HeldOut:
 
 
 def held_out(fit: Fit) -> dict[str, HeldOut]:
-    """The prediction of every experiment that was held out, by its name."""
+    """The prediction of every held-out experiment, by its name."""
     problem = fit.problem
     values, out = problem.free(fit.z), {}
     for number, (name, fitted) in enumerate(zip(problem.names, problem.fitted, strict=True)):
@@ -114,8 +113,8 @@ def held_out(fit: Fit) -> dict[str, HeldOut]:
             continue
         seen = _seen(problem.system, problem.trials[number], problem.options, problem.own(number, values))
         residuals = np.asarray(seen.rows.residuals)[np.asarray(seen.rows.present)]
-        own = {channel.name: np.asarray(channel.places) for channel in problem.trials[number].channels}
-        readings = {sensor: np.asarray(reading)[own.get(sensor, ...)] for sensor, reading in seen.readings.items()}
+        places = {channel.name: np.asarray(channel.places) for channel in problem.trials[number].channels}
+        readings = {sensor: np.asarray(reading)[places.get(sensor, ...)] for sensor, reading in seen.readings.items()}
         out[name] = HeldOut(residuals, float(np.sqrt(np.mean(residuals**2))), readings)
     return out
 

@@ -26,9 +26,9 @@ from .unknowns import Priors
 class Problem(eqx.Module):
     """Experiments that share unknowns.
 
-    **Fields:** `names` of the experiments; `sources`: for each of them the names of its unknowns among all; `fitted`:
-    which of them are fitted, the others are held out; `known_noise`: whether the noise level of every reading is known,
-    or an unknown of its own.
+    **Fields:** `names` of the experiments; `sources`: for each the names of its unknowns among all; `fitted`: for each
+    whether it is fitted, otherwise it is held out; `known_noise`: whether the noise level of every reading is known, or
+    an unknown.
     """
 
     system: AbstractSystem
@@ -43,12 +43,12 @@ class Problem(eqx.Module):
 
     @property
     def loss(self) -> Loss:
-        """The loss, which all experiments have in common."""
+        """The loss of all experiments."""
         return self.trials[0].loss
 
     @property
     def rtol(self) -> float:
-        """The relative tolerance of the motions, without a step size controller of one's own."""
+        """The relative tolerance of the motions, if no step size controller is given."""
         finest = 10 * float(jnp.finfo(jnp.result_type(float)).eps)
         return max(float(np.max(np.asarray(self.options.get("rtol", DEFAULT_RTOL)))), finest)
 
@@ -62,7 +62,7 @@ class Problem(eqx.Module):
         return self.trials[number].start(self.system, self.own(number, self.free(z)))
 
     def objective(self, z: Float[Array, "n"]) -> Float[Array, ""]:
-        """Minus the logarithm of likelihood and priors, up to a constant; infinite where a simulation fails."""
+        """Minus the logarithm of likelihood and priors, up to a constant; infinite if a simulation fails."""
         values = self.free(z)
         total = 0.5 * jnp.sum(self.priors(values) ** 2).astype(z.dtype)
         for number, trial in enumerate(self.trials):
@@ -72,19 +72,19 @@ class Problem(eqx.Module):
         return total
 
     def columns(self, number: int) -> np.ndarray:
-        """Where the unknowns of one experiment stand among the components of all."""
+        """The indices of an experiment's unknowns among the components of all."""
         ends = np.cumsum([0, *(r.start.size for r in self.free.ranges)])
         places = {name: np.arange(*ends[k : k + 2]) for k, name in enumerate(self.free.names)}
-        own = [places[name] for name in self.sources[number]]
-        return np.concatenate(own) if own else np.zeros(0, int)
+        indices = [places[name] for name in self.sources[number]]
+        return np.concatenate(indices) if indices else np.zeros(0, int)
 
 
 class Model(NamedTuple):
     """A `Linearised` with its parts.
 
-    **Fields:** `linearised`, with residuals weighted by the loss, and `plain`, as they are; `data`: the number of
-    residuals that are of data, the first ones; those of priors and noise levels follow; `results`: how each simulation
-    ended; `readings`: predictions by experiment and sensor.
+    **Fields:** `linearised`, with residuals weighted by the loss, and `plain`, unweighted; `data`: the number of
+    residuals of data, which come first, before priors and noise levels; `results` of the simulations; `readings`:
+    predictions by experiment and sensor.
     """
 
     linearised: Linearised
@@ -95,9 +95,9 @@ class Model(NamedTuple):
 
 
 def linearise(problem: Problem, z: Float[Array, "n"]) -> Model:
-    """Residuals of everything that is fitted and their derivatives with respect to the vector.
+    """Residuals of all fitted experiments and their derivatives with respect to the vector.
 
-    Experiments of the same structure share one compiled program, whose derivatives are those in their own unknowns.
+    Experiments of the same structure share one compiled program, which differentiates in their own unknowns.
     """
     return linearise_batch(problem, [z])[0]
 
@@ -105,22 +105,22 @@ def linearise(problem: Problem, z: Float[Array, "n"]) -> Model:
 def linearise_batch(problem: Problem, zs: Sequence[Float[Array, "n"]]) -> list[Model]:
     """The same at several points, simulated as one batch."""
     charts = [values_and_derivatives(problem, z) for z in zs]
-    found = {}
+    outcomes = {}
     for number, trial in enumerate(problem.trials):
         if problem.fitted[number]:
             columns = problem.columns(number)
             flats = [jnp.asarray(values[columns]) for values, *_ in charts]
-            found[number] = list(map(numbers, linearised_trials(problem.system, trial, problem.options, flats)))
-    return [_joined(problem, chart, {n: seen[k] for n, seen in found.items()}) for k, chart in enumerate(charts)]
+            outcomes[number] = list(map(numbers, linearised_trials(problem.system, trial, problem.options, flats)))
+    return [_joined(problem, chart, {n: seen[k] for n, seen in outcomes.items()}) for k, chart in enumerate(charts)]
 
 
 def values_and_derivatives(problem: Problem, z: Float[Array, "n"]) -> tuple[np.ndarray, ...]:
-    """All values one after the other, their derivatives, and the rows of the priors with theirs."""
+    """All values one after the other, their derivatives, and the rows of the priors with their derivatives."""
     return tuple(map(np.asarray, _chart(problem.free, problem.priors, z)))
 
 
 def linearised_trials(system, trial, options, flats: Sequence[Array]) -> list[tuple[Seen, Any]]:
-    """What one experiment shows for several values of its unknowns, with the derivatives of the misfit's rows."""
+    """The outcomes of one experiment for several values of its unknowns, with the derivatives of the misfit's rows."""
     if len(flats) == 1:
         return [_linearised(system, trial, options, flats[0])]
     batch = _linearised_batch(system, trial, options, jnp.stack(flats))
@@ -149,7 +149,7 @@ def _with_jacobian(system, trial, options, flat):
 
 
 def jacobian_and_value(fn: Callable[[Array], tuple[Any, Any]], flat: Float[Array, "n"]) -> tuple[Any, Any]:
-    """The derivatives of the first of two results, also in no unknowns, and the second one."""
+    """The derivatives of the first of two results, also without unknowns, and the second result."""
     if flat.size:
         return jax.jacfwd(fn, has_aux=True)(flat)
     out, value = fn(flat)
@@ -163,14 +163,14 @@ def _chart(free, priors, z):
 
 
 def numbers(tree: Any) -> Any:
-    """A tree whose arrays are those of NumPy."""
+    """A tree with arrays of NumPy."""
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree)
 
 
-def _joined(problem, chart, found) -> Model:
+def _joined(problem, chart, outcomes) -> Model:
     _, derivatives, prior_rows, prior_jacobian = chart
     residuals, jacobians, scores, score_jacobians, objective = [], [], [], [], 0.5 * prior_rows @ prior_rows
-    for number, (seen, (of_residuals, of_scores)) in found.items():
+    for number, (seen, (of_residuals, of_scores)) in outcomes.items():
         inward, rows = derivatives[problem.columns(number)], seen.rows
         residuals.append(rows.residuals[rows.present])
         jacobians.append(of_residuals[rows.present] @ inward)
@@ -182,14 +182,14 @@ def _joined(problem, chart, found) -> Model:
         np.vstack([*jacobians, prior_jacobian, *score_jacobians]),
         objective,
     )
-    data = sum(own.size for own in residuals)
-    results = tuple(seen.result for seen, _ in found.values())
-    readings = {problem.names[n]: seen.readings for n, (seen, _) in found.items()}
+    data = sum(part.size for part in residuals)
+    results = tuple(seen.result for seen, _ in outcomes.values())
+    readings = {problem.names[n]: seen.readings for n, (seen, _) in outcomes.items()}
     return Model(weighted(problem, plain, data), plain, data, results, readings)
 
 
 def weighted(problem: Problem, plain: Linearised, data: int) -> Linearised:
-    """The linearised objective, whose first rows, those of data, weigh by the loss."""
+    """The linearised objective, with the rows of data, which come first, weighted by the loss."""
     residuals, jacobian = problem.loss.weighted(plain.residuals[:data], plain.jacobian[:data])
     return Linearised(
         np.concatenate([residuals, plain.residuals[data:]]),
@@ -201,16 +201,16 @@ def weighted(problem: Problem, plain: Linearised, data: int) -> Linearised:
 def with_likely_levels(
     problem: Problem, z: Float[Array, "n"], readings: Mapping[str, Mapping[str, np.ndarray]]
 ) -> Float[Array, "n"]:
-    """The vector with the noise levels that are most likely for predicted readings, by experiment and sensor."""
+    """The vector with the most likely noise levels for predicted readings, by experiment and sensor."""
     values = {name: np.asarray(value) for name, value in problem.free(z).items()}
     squares: dict[str, list] = {}
     for number, source, channel in _levels(problem):
         if problem.fitted[number]:
             level = channel.level(readings[problem.names[number]][channel.name], values[source])
             squares.setdefault(source, []).append((level**2, int(np.sum(channel.present))))
-    for source, own in squares.items():
-        total = sum(count for _, count in own)
-        level = np.sqrt(sum(square * count for square, count in own) / total)
+    for source, terms in squares.items():
+        total = sum(count for _, count in terms)
+        level = np.sqrt(sum(square * count for square, count in terms) / total)
         if np.all(level > 0) and np.all(np.isfinite(level)):
             place, number = problem.free.place(source), problem.free.names.index(source)
             z = z.at[place].set(problem.free.ranges[number].locate(jnp.asarray(level, z.dtype)))
@@ -218,7 +218,7 @@ def with_likely_levels(
 
 
 def level_mask(problem: Problem) -> np.ndarray:
-    """Which components of the vector are noise levels."""
+    """The mask of noise levels among the components of the vector."""
     mask = np.zeros(problem.free.size, bool)
     for _, source, _ in _levels(problem):
         mask[problem.free.place(source)] = True

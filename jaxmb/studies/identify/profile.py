@@ -1,4 +1,4 @@
-"""Profile likelihood: how well the data hold up against every value of one parameter.
+"""Profile likelihood: the fit of the data for every value of one parameter.
 
 Source: D. M. Bates and D. G. Watts, "Nonlinear Regression Analysis and Its Applications", Wiley 1988, chapter 6.
 """
@@ -15,17 +15,17 @@ from ..minimise import Minimum, levenberg_marquardt
 from .fit import Fit
 from .problem import linearise
 
-# Values on either side of the estimate before the search for the ends of the interval is given up.
+# Largest number of values on either side of the estimate in the search for the ends of the interval.
 _MOST = 24
 
 
 @dataclasses.dataclass(frozen=True)
 class Profile:
-    """The likelihood of one parameter, all others fitted anew to each of its values.
+    """The likelihood of one parameter, with all others refitted for each of its values.
 
-    **Fields:** `component`; `values`, in order; `ratios`: twice the logarithm of the ratio between the largest
-    likelihood and that with each value; `interval`: the values within `level`, by the χ² distribution with one degree
-    of freedom, infinite on a side where the data exclude nothing; `fits`: whether each fit converged; `parameters`: the
+    **Fields:** `component`; `values`, in order; `ratios`: twice the logarithm of the ratio of the largest likelihood to
+    the likelihood with each value; `interval`: the values within `level`, by the χ² distribution with one degree of
+    freedom, infinite on a side where the data exclude no value; `fits`: whether each fit converged; `parameters`: the
     values of all parameters, by name, along the first axis.
     """
 
@@ -45,18 +45,18 @@ def profile(fit: Fit, component: str, *, level: float = 0.95, values=None) -> Pr
         raise unknown("component", component, fit.components)
     fit.whole_motions("A profile")
     held, limit = _Held(fit, component), float(ndtri((1 + level) / 2)) ** 2
-    found = [(held.best, 0.0, Minimum(fit.z, 0, fit.success, fit.objective))]
+    points = [(held.best, 0.0, Minimum(fit.z, 0, fit.success, fit.objective))]
     if values is None:
         for sign in (1, -1):
-            found += held.along(held.best + sign * held.step * np.arange(1, _MOST + 1), 1.2 * limit)
+            points += held.along(held.best + sign * held.step * np.arange(1, _MOST + 1), 1.2 * limit)
     else:
         values = np.sort(np.asarray(values, float))
-        found += held.along(values[values >= held.best]) + held.along(values[values < held.best][::-1])
-    found = sorted(found, key=lambda own: own[0])
-    places, ratios = (np.array([own[k] for own in found]) for k in (0, 1))
+        points += held.along(values[values >= held.best]) + held.along(values[values < held.best][::-1])
+    points = sorted(points, key=lambda point: point[0])
+    places, ratios = (np.array([point[k] for point in points]) for k in (0, 1))
     low, high = (_end(places, ratios, held.best, limit, sign) for sign in (-1, 1))
     keep = np.ones(places.size, bool) if values is None else np.isin(places, values)
-    minima = [minimum for (*_, minimum), there in zip(found, keep, strict=True) if there]
+    minima = [minimum for (*_, minimum), is_kept in zip(points, keep, strict=True) if is_kept]
     each = [fit.problem.free(minimum.z) for minimum in minima]
     return Profile(
         component=component,
@@ -65,7 +65,7 @@ def profile(fit: Fit, component: str, *, level: float = 0.95, values=None) -> Pr
         interval=(low, high),
         level=level,
         fits=np.array([minimum.success for minimum in minima]),
-        parameters={name: np.stack([np.asarray(own[name]) for own in each]) for name in fit.parameters},
+        parameters={name: np.stack([np.asarray(fitted[name]) for fitted in each]) for name in fit.parameters},
     )
 
 
@@ -80,7 +80,7 @@ class _Held:
             raise ValueError(
                 f"{self.name!r} is a matrix whose components cannot be held alone; profile another parameter."
             )
-        self.number = [own for own in fit.components if own.split("[")[0] == self.name].index(component)
+        self.number = [other for other in fit.components if other.split("[")[0] == self.name].index(component)
         self.mask = np.zeros(free.size, bool)
         self.mask[free.place(self.name).start + self.number] = True
         self.best = float(np.ravel(fit.parameters[self.name])[self.number])
@@ -88,9 +88,9 @@ class _Held:
         self.step = step if np.isfinite(step) and step > 0 else 0.1 * (abs(self.best) or 1.0)
 
     def along(self, values, limit: float = np.inf) -> list[tuple[float, float, Minimum]]:
-        """Values, ratios and fits, each started from the last, up to a ratio beyond the limit.
+        """Values, ratios and fits, each started from the previous fit, up to a ratio beyond the limit.
 
-        **Raises:** `ValueError` for a value out of bounds if there is no limit; otherwise that is the end.
+        **Raises:** `ValueError` for a value out of bounds if there is no limit; otherwise the search ends there.
         """
         out, z = [], self.fit.z
         for value in values:
@@ -129,7 +129,9 @@ class _Held:
 
 
 def _end(values, ratios, best, limit, sign) -> float:
-    """Where the ratio reaches a limit on one side: the root of the signed root of the ratio, which is nearly linear."""
+    """The value at which the ratio reaches a limit on one side, by the signed root of the ratio, which is nearly
+    linear.
+    """
     side = (values - best) * sign >= 0
     distance, root = (values[side] - best) * sign, np.sqrt(np.maximum(ratios[side], 0.0))
     order = np.argsort(distance)
@@ -138,7 +140,7 @@ def _end(values, ratios, best, limit, sign) -> float:
     if beyond.size == 0:
         return sign * np.inf
     k = beyond[0]
-    # Through three neighbours, so that the error of interpolation is small against the interval.
+    # Three neighbours make the error of interpolation small against the interval.
     near = slice(max(k - 2, 0), k + 1)
     fit = np.polynomial.Polynomial.fit(root[near], distance[near], min(2, k))
     return best + sign * float(fit(np.sqrt(limit)))

@@ -14,7 +14,7 @@ from .prediction import held_out
 from .profile import Profile, profile
 from .residuals import Outlier
 
-# Outliers that are listed.
+# Largest number of listed outliers.
 _MOST = 50
 
 _STYLE = (
@@ -30,7 +30,7 @@ def write_report(
     rows: Sequence[tuple[str, ...]],
     profiles: Sequence[str],
 ) -> Path:
-    """As `Identification.report`; `verdict`: its lines, `rows`: those of the table of estimates."""
+    """As `Identification.report`; `verdict`: its lines, `rows` of the table of estimates."""
     path = Path(path)
     path = path if path.suffix == ".html" else path / "identification.html"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,7 +49,7 @@ def write_report(
         readings = fit.readings[name] if fitted else held_out(fit)[name].readings
         for channel in trial.channels:
             label = " ".join(filter(None, (name, channel.name, "" if fitted else "(held out)")))
-            far = [own for own in fit.outliers if (own.experiment, own.sensor) == (name, channel.name)]
+            far = [outlier for outlier in fit.outliers if (outlier.experiment, outlier.sensor) == (name, channel.name)]
             predicted = np.asarray(readings[channel.name])
             parts += [f"<h2>{html.escape(label)}</h2>", _fit_figure(trial, channel, predicted, fitted, far)]
     if fit.outliers:
@@ -85,27 +85,27 @@ def _image(figure: Any) -> str:
 
 def _outliers(outliers: Sequence[Outlier]) -> str:
     """The outliers in a table, the largest first."""
-    shown = sorted(outliers, key=lambda own: -abs(own.residual))[:_MOST]
+    shown = sorted(outliers, key=lambda outlier: -abs(outlier.residual))[:_MOST]
     rows = [
         (
-            " ".join(filter(None, (own.experiment, own.sensor))),
-            ", ".join(map(str, own.sample)),
-            f"{own.t:.6g}",
-            f"{own.residual:.3g} σ",
+            " ".join(filter(None, (outlier.experiment, outlier.sensor))),
+            ", ".join(map(str, outlier.sample)),
+            f"{outlier.t:.6g}",
+            f"{outlier.residual:.3g} σ",
         )
-        for own in shown
+        for outlier in shown
     ]
     more = "" if len(shown) == len(outliers) else f"<p>and {len(outliers) - len(shown)} smaller ones</p>"
     return _table(("sensor", "sample", "time [s]", "fitted − measured"), rows) + more
 
 
 def _fit_figure(trial, channel, predicted, fitted, far: Sequence[Outlier]) -> str:
-    """Measured samples and the fit above, what is between them below; residuals beyond 5 σ have a ring."""
+    """Measured samples and the fit above, their difference below; residuals beyond 5 σ have a ring."""
     figure, (above, below) = _axes(2, 5.0)
-    own = np.asarray(channel.places)
-    ts = np.asarray(trial.ts)[own]
-    measured = np.where(channel.present, channel.values, np.nan)[own].reshape(ts.size, -1)
-    predicted = (predicted[own] if fitted else predicted).reshape(ts.size, -1)
+    places = np.asarray(channel.places)
+    ts = np.asarray(trial.ts)[places]
+    measured = np.where(channel.present, channel.values, np.nan)[places].reshape(ts.size, -1)
+    predicted = (predicted[places] if fitted else predicted).reshape(ts.size, -1)
     shape = np.shape(channel.values)[1:]
     for outlier in far:
         sample, component = outlier.sample[0], int(np.ravel_multi_index(outlier.sample[1:], shape)) if shape else 0
@@ -125,7 +125,7 @@ def _fit_figure(trial, channel, predicted, fitted, far: Sequence[Outlier]) -> st
 
 def _correlations(fit: Fit) -> str:
     deviations = fit.uncertainty.deviations
-    # What is not determined has no correlation: a square without colour.
+    # Undetermined components have no correlation: a square without colour.
     sizes = np.where(np.isfinite(deviations) & (deviations > 0), deviations, np.nan)
     correlations = np.where(np.isfinite(fit.covariance), fit.covariance, np.nan) / np.outer(sizes, sizes)
     figure, (axes,) = _axes(1, 1.5 + 0.4 * len(fit.components))
@@ -136,12 +136,12 @@ def _correlations(fit: Fit) -> str:
     return _image(figure)
 
 
-def _profile_figure(found: Profile) -> str:
+def _profile_figure(likelihood: Profile) -> str:
     figure, (axes,) = _axes(1, 3.0)
-    axes.plot(found.values, found.ratios, "o-")
-    for end in found.interval:
+    axes.plot(likelihood.values, likelihood.ratios, "o-")
+    for end in likelihood.interval:
         if np.isfinite(end):
             axes.axvline(end, color="0.6", linestyle="--")
-    axes.set_xlabel(found.component)
+    axes.set_xlabel(likelihood.component)
     axes.set_ylabel("2 log of the likelihood ratio")
     return _image(figure)

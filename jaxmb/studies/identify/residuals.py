@@ -9,17 +9,17 @@ from .experiment import RESIDUAL, ExperimentModel
 from .problem import Problem
 from .sensors import Channel
 
-# What is left of a fit does not matter below half a standard deviation of the noise that is known, or, where the noise
-# is not known, below a thousandth of the range of what was measured: about the errors of simulations and instruments.
+# Negligible residuals, in standard deviations of known noise, and for unknown noise relative to the data's range: about
+# the errors of simulations and instruments.
 _SMALL, _SMALL_OF_RANGE = 0.5, 1e-3
-# Residuals beyond so many standard deviations are outliers: one in two million of normal noise.
+# Outliers are residuals beyond this number of standard deviations: one in two million of normal noise.
 _FAR = 5.0
-# From so many samples on, the noise is known from their median, which outliers do not change.
+# Least number of samples whose median, which outliers do not change, estimates the noise.
 _MANY = 20
 
 
 class Bias(NamedTuple):
-    """Whether a sensor's offset is `free`, and if so, whether `components` of the sensor or `experiments` share it."""
+    """Whether a sensor's offset is `free`, and whether `components` of the sensor or `experiments` share it."""
 
     free: bool
     components: bool = False
@@ -30,9 +30,9 @@ class Series(NamedTuple):
     """The residuals of one component of a sensor in order of time, predicted minus measured.
 
     **Fields:** `label`; `experiment`, `sensor` and `component`, an index; `residuals` in units of `sigma` (one each),
-    or of the range where the noise is not known; `known`: whether it is, from before the fit; `small`: the size of
-    residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: the indices in what was measured;
-    `bias` of the sensor. Where a residual function was given, `predicted` and `ts` are empty.
+    or of the range for unknown noise; `known`: whether the noise was known before the fit; `small`: the size of
+    residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: indices in the data; `bias` of the
+    sensor. With a residual function, `predicted` and `ts` are empty.
     """
 
     label: str
@@ -57,8 +57,8 @@ class Series(NamedTuple):
 class Outlier(NamedTuple):
     """A residual beyond five standard deviations of the noise.
 
-    **Fields:** `experiment`, `sensor`; `sample`: the index in what was measured; `t` [s], NaN for what a
-    residual function returns; `residual`: predicted minus measured, in standard deviations.
+    **Fields:** `experiment`, `sensor`; `sample`: the index in the data; `t` [s], NaN for a residual function;
+    `residual`: predicted minus measured, in standard deviations.
     """
 
     experiment: str
@@ -73,7 +73,7 @@ def series(
     values: Mapping[str, np.ndarray],
     readings: Mapping[str, Mapping[str, Any]],
 ) -> tuple[Series, ...]:
-    """The residuals of everything that was fitted, from the unknowns by name and the readings at them."""
+    """The residuals of all fitted data, from the unknowns by name and their readings."""
     out = []
     for number, (name, trial, fitted) in enumerate(zip(problem.names, problem.trials, problem.fitted, strict=True)):
         if fitted and trial.residual is not None:
@@ -92,8 +92,8 @@ def _bias(problem: Problem, number: int, channel: Channel) -> Bias:
     if name not in shapes:
         return Bias(free=False)
     source = problem.sources[number][list(shapes).index(name)]
-    fitted = [own for own, fitted in zip(problem.sources, problem.fitted, strict=True) if fitted]
-    shared = sum(source in own for own in fitted) > 1
+    fitted = [names for names, fitted in zip(problem.sources, problem.fitted, strict=True) if fitted]
+    shared = sum(source in names for names in fitted) > 1
     return Bias(free=True, components=not shapes[name] and channel.values.ndim > 1, experiments=shared)
 
 
@@ -102,17 +102,17 @@ def _of_channel(
 ) -> Iterator[Series]:
     ts, measured, present = (np.asarray(x) for x in (trial.ts, channel.values, channel.present))
     sigma = np.broadcast_to(np.asarray(channel.sigma if level is None else level), measured.shape)
-    own = np.full(ts.size, -1)
-    own[np.asarray(channel.places)] = np.arange(channel.places.size)
-    known = known_noise and level is None
+    sample_index = np.full(ts.size, -1)
+    sample_index[np.asarray(channel.places)] = np.arange(channel.places.size)
+    is_known = known_noise and level is None
     for component in np.ndindex(measured.shape[1:]):
-        there = present[(slice(None), *component)]
-        at = (there, *component)
-        if not there.any():
+        is_present = present[(slice(None), *component)]
+        at = (is_present, *component)
+        if not is_present.any():
             continue
         label = " ".join(filter(None, (experiment, channel.name + _indices(component))))
         unit = sigma[at]
-        small = _SMALL if known else _SMALL_OF_RANGE * float(channel.range) / float(np.max(unit))
+        small = _SMALL if is_known else _SMALL_OF_RANGE * float(channel.range) / float(np.max(unit))
         yield Series(
             label=label,
             experiment=experiment,
@@ -120,11 +120,11 @@ def _of_channel(
             component=component,
             residuals=(predicted[at] - measured[at]) / unit,
             sigma=unit,
-            known=known,
+            known=is_known,
             small=small,
             predicted=predicted[at],
-            ts=ts[there],
-            samples=own[there],
+            ts=ts[is_present],
+            samples=sample_index[is_present],
             bias=bias,
         )
 
@@ -152,19 +152,19 @@ def _of_user(experiment: str, trial: ExperimentModel, residuals: np.ndarray) -> 
         )
 
 
-def outliers(found: tuple[Series, ...]) -> tuple[Outlier, ...]:
+def outliers(all_series: tuple[Series, ...]) -> tuple[Outlier, ...]:
     """The residuals beyond five standard deviations, in order of experiments, sensors and times."""
     out = []
-    for own in found:
-        sizes = np.abs(own.residuals)
+    for single in all_series:
+        sizes = np.abs(single.residuals)
         level = 1.0
-        if not own.known:
-            middle = np.median(sizes) / 0.6745 if sizes.size >= _MANY else np.sqrt(own.square)
-            level = max(float(middle), own.small)
+        if not single.known:
+            middle = np.median(sizes) / 0.6745 if sizes.size >= _MANY else np.sqrt(single.square)
+            level = max(float(middle), single.small)
         for k in np.flatnonzero(sizes > _FAR * level):
-            t = float(own.ts[k]) if own.ts.size else np.nan
-            sample = (int(own.samples[k]), *map(int, own.component))
-            out.append(Outlier(own.experiment, own.sensor, sample, t, float(own.residuals[k] / level)))
+            t = float(single.ts[k]) if single.ts.size else np.nan
+            sample = (int(single.samples[k]), *map(int, single.component))
+            out.append(Outlier(single.experiment, single.sensor, sample, t, float(single.residuals[k] / level)))
     return tuple(out)
 
 

@@ -17,7 +17,7 @@ from .problem import Model, Problem, numbers, values_and_derivatives, weighted
 
 
 class Lanes(NamedTuple):
-    """The segments of one experiment: trials stacked along axis 0, and how many samples each has."""
+    """The segments of one experiment: trials stacked along axis 0, and the number of samples of each."""
 
     number: int
     trials: ExperimentModel
@@ -26,7 +26,7 @@ class Lanes(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The vector of the unknowns, and for each experiment the states at the starts of its segments with charts there.
+    """The vector of the unknowns, and for each experiment the initial states of its segments with charts.
 
     A chart has bases of the tangent spaces, of q and of u, and the map from changes of both to its coordinates.
     """
@@ -41,20 +41,22 @@ class Place(NamedTuple):
         return self.z.size + sum(onto[..., 0].size for *_, onto in self.charts)
 
     def split(self, vector: Any) -> list[Any]:
-        """The coordinates of the charts in such a vector, for each experiment in the shape (segments, coordinates)."""
+        """The coordinates of the charts in a vector of all, for each experiment in the shape (segments,
+        coordinates).
+        """
         ends = np.cumsum([self.z.size, *(onto[..., 0].size for *_, onto in self.charts)])
         each = zip(self.charts, ends[:-1], ends[1:], strict=True)
         return [vector[begin:end].reshape(onto.shape[:2]) for (*_, onto), begin, end in each]
 
 
 def segmented(name: str, number: int, trial: ExperimentModel, segments: int) -> Lanes:
-    """An experiment in segments of nearly as many samples, shorter ones filled up with missing samples."""
+    """An experiment in segments of nearly equal length, shorter segments filled up with missing samples."""
     where = f" of experiment {name!r}" if name else ""
     if trial.residual is not None:
         raise ValueError(f"The residual function{where} looks at the whole motion; multiple shooting needs measured=.")
     late = [channel.name for channel in trial.channels if channel.delayed]
     if late:
-        raise ValueError(f"Sensor {late[0]!r}{where} has a delay, which multiple shooting cannot have.")
+        raise ValueError(f"Sensor {late[0]!r}{where} has a delay, which multiple shooting does not support.")
     if not 1 < segments <= trial.ts.size:
         raise ValueError(f"segments must lie between 1 and the number of times, {trial.ts.size}, got {segments}.")
     groups = np.array_split(np.arange(trial.ts.size), segments)
@@ -62,18 +64,22 @@ def segmented(name: str, number: int, trial: ExperimentModel, segments: int) -> 
     out, before = [], trial.t0
     for group in groups:
         index = np.append(group, np.full(longest - len(group), group[-1]))
-        there = np.arange(longest) < len(group)
+        is_used = np.arange(longest) < len(group)
         channels = [
             eqx.tree_at(
                 lambda c: (c.values, c.present, c.sigma),
                 channel,
-                (channel.values[index], channel.present[index] & _column(there, channel.present), channel.sigma[index]),
+                (
+                    channel.values[index],
+                    channel.present[index] & _column(is_used, channel.present),
+                    channel.sigma[index],
+                ),
             )
             for channel in trial.channels
         ]
         out.append(eqx.tree_at(lambda t: (t.ts, t.t0, t.channels), trial, (trial.ts[index], before, tuple(channels))))
         before = trial.ts[group[-1]]
-    arrays, static = zip(*(eqx.partition(own, eqx.is_array) for own in out), strict=True)
+    arrays, static = zip(*(eqx.partition(element, eqx.is_array) for element in out), strict=True)
     return Lanes(number, jax.tree.map(lambda *x: jnp.stack(x), *arrays), static[0], tuple(map(len, groups)))
 
 
@@ -82,7 +88,7 @@ def _column(mask: np.ndarray, like: Array) -> np.ndarray:
 
 
 def first_place(problem: Problem, lanes: tuple[Lanes, ...], z: Array) -> Place:
-    """The initial state of each experiment at the starts of all its segments."""
+    """The initial state of each experiment, repeated for all its segments."""
     several = lambda x, count: jnp.broadcast_to(x, (count, *x.shape))
     starts = [(problem.start(lane.number, z)[1], len(lane.samples)) for lane in lanes]
     states = [State(several(state.q, count), several(state.u, count)) for state, count in starts]
@@ -90,23 +96,23 @@ def first_place(problem: Problem, lanes: tuple[Lanes, ...], z: Array) -> Place:
 
 
 def moved(problem: Problem, lanes: tuple[Lanes, ...], place: Place, step: np.ndarray) -> Place:
-    """The place after a step, the states back on the constraints of the new parameters."""
+    """The place after a step, with the states projected on the constraints of the new parameters."""
     change = jnp.asarray(step, place.z.dtype)
     z, states = place.z + change[: place.z.size], []
     each = zip(lanes, place.states, place.charts, place.split(change), strict=True)
     for lane, state, charts, move in each:
-        trial, flat = problem.trials[lane.number], _own_values(problem, lane, z)
+        trial, flat = problem.trials[lane.number], _values_of(problem, lane, z)
         states.append(_on_constraints(problem.system, trial, flat, lane.trials.t0, state, charts[:2], move))
     return _placed(problem, lanes, z, states)
 
 
 def _placed(problem, lanes, z, states) -> Place:
     each = zip(lanes, states, strict=True)
-    charts = tuple(_charts(problem, lane, _own_values(problem, lane, z), state) for lane, state in each)
+    charts = tuple(_charts(problem, lane, _values_of(problem, lane, z), state) for lane, state in each)
     return Place(z, tuple(states), charts)
 
 
-def _own_values(problem, lane, z):
+def _values_of(problem, lane, z):
     """The unknowns of one experiment, one after the other."""
     return jnp.asarray(values_and_derivatives(problem, z)[0][problem.columns(lane.number)])
 
@@ -118,17 +124,19 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     residuals, jacobian, scores, score_rows, gaps, closing = [], [], [], [], [], []
     readings, objective = {}, 0.5 * prior_rows @ prior_rows
     columns = place.split(np.arange(total))
-    for lane, state, charts, own in zip(lanes, place.states, place.charts, columns, strict=True):
-        trial, flat = problem.trials[lane.number], _own_values(problem, lane, place.z)
+    for lane, state, charts, lane_columns in zip(lanes, place.states, place.charts, columns, strict=True):
+        trial, flat = problem.trials[lane.number], _values_of(problem, lane, place.z)
         inward = derivatives[problem.columns(lane.number)]
-        found = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
-        seen, (rows, levels, starts, ends) = numbers(found)
+        outcome = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
+        seen, (rows, levels, starts, ends) = numbers(outcome)
 
-        def whole(by_unknowns, by_states, inward=inward, own=own):
-            """Derivatives in the unknowns of the experiment and in each segment's state as those in all unknowns."""
+        def whole(by_unknowns, by_states, inward=inward, lane_columns=lane_columns):
+            """Derivatives in all unknowns, from derivatives in the experiment's unknowns and in each segment's
+            state.
+            """
             out = np.zeros((*by_unknowns.shape[:2], total))
             out[..., :n] = by_unknowns @ inward
-            for k, these in enumerate(own):
+            for k, these in enumerate(lane_columns):
                 out[k][:, these] = by_states[k]
             return out
 
@@ -151,7 +159,7 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     prior_whole = np.pad(prior_jacobian, ((0, 0), (0, total - n)))
     whole_rows = np.concatenate([*residuals, prior_rows, *scores])
     plain = Linearised(whole_rows, np.vstack([*jacobian, prior_whole, *score_rows]), objective)
-    data = sum(own.size for own in residuals)
+    data = sum(part.size for part in residuals)
     linearised = weighted(problem, plain, data)._replace(gaps=np.concatenate(gaps), closing=np.vstack(closing))
     return Model(linearised, plain, data, (), readings)
 
@@ -163,7 +171,7 @@ def _on_constraints(system, trial, flat, ts, states, tangents, moves) -> State:
 
 
 def _near(system, t, state, tangents, w) -> State:
-    """The state closest to a chart's point; the chart's coordinates are first those of q, then those of u."""
+    """The state closest to a chart's point; the chart's coordinates are first of q, then of u."""
     positions, velocities = tangents
     split = positions.shape[1]
     guess = State(state.q + positions @ w[:split], state.u + velocities @ w[split:])
@@ -214,7 +222,7 @@ def _constraint_jacobians(system, trial, flat, ts, states):
 
 @eqx.filter_jit
 def _linearised_lanes(system, trials, static, options, flat, states, tangents):
-    """What every segment shows; and residuals, scores, start and end with their derivatives, in one batch."""
+    """The outcome of every segment; and residuals, scores, start and end with their derivatives, in one batch."""
 
     def lane(trial, state, along):
         trial = eqx.combine(trial, static)

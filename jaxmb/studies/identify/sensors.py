@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._types import Scalar, VectorLike
 from .loss import Loss
 
-# What can be unknown of a sensor.
+# The possible unknowns of a sensor.
 SENSOR_FIELDS = ("bias", "gain", "delay", "sigma")
 
 
@@ -27,12 +27,12 @@ class Sensor:
 
     **Arguments:**
 
-    - `quantity`: the name of x, as `Trajectory.quantity` takes it: `"rod.angle"`, `"A.force"`.
-    - `name`: of the sensor, in measured data and in front of its unknowns, `"encoder.bias"`; default the quantity's.
+    - `quantity`: the name of x for `Trajectory.quantity`: `"rod.angle"`, `"A.force"`.
+    - `name` of the sensor, in measured data and as prefix of its unknowns, `"encoder.bias"`; default the quantity's.
     - `bias`, in the unit of the readings, and `gain`: numbers, or one for each component of the quantity.
-    - `delay` [s]: how late the reading shows the motion.
+    - `delay` [s] of the reading.
     - `sigma`: standard deviation of the noise in the unit of the readings, a number or one for each component; None if
-        it is not known. That of an `Experiment` replaces it there.
+        unknown. `sigma` of an `Experiment` replaces it there.
     """
 
     quantity: str
@@ -51,9 +51,9 @@ class Sensor:
 class Rows(eqx.Module):
     """The misfit of readings.
 
-    **Fields:** `residuals`, weighted, zero where a sample is missing; `present` marks the others; `scores`: one for
-    every unknown noise level, whose derivative times itself is the gradient of the objective, and whose squared
-    derivative is the expected second derivative; `objective`: minus the logarithm of the likelihood, up to a constant.
+    **Fields:** `residuals`, weighted, zero for missing samples; `present` marks the others; `scores`, one for every
+    unknown noise level: a score times its derivative is the gradient of the objective, and its squared derivative the
+    expected second derivative; `objective`: minus the logarithm of the likelihood, up to a constant.
     """
 
     residuals: Float[Array, "rows"]
@@ -65,9 +65,9 @@ class Rows(eqx.Module):
 class Channel(eqx.Module):
     """The readings of one sensor in one experiment, with its known numbers.
 
-    **Fields:** `values` and `present`, shape (times, …), at the times of all sensors of the experiment together, where
-    one that has times of its own lacks the others' samples; `sigma` broadcasts to them; `places`: which of the times
-    are the sensor's own; `delayed`: whether it sees the motion at other times.
+    **Fields:** `values` and `present`, shape (times, …), at the times of all sensors of the experiment, absent at times
+    of other sensors only; `sigma` broadcasts to them; `places`: the indices of the sensor's times; `delayed`: whether
+    it sees the motion at other times.
     """
 
     name: str = eqx.field(static=True)
@@ -82,16 +82,16 @@ class Channel(eqx.Module):
     sigma: Array
 
     def times(self, ts: Float[Array, "times"], t0: Array, theta: Mapping[str, Array]) -> Float[Array, "times"]:
-        """When the motion was as the readings at `ts` show it; not before `t0`."""
+        """The times of the motion that the readings at `ts` show; not before `t0`."""
         return jnp.maximum(ts - theta.get(f"{self.name}.delay", self.delay), t0)
 
     def read(self, quantity: Float[Array, "times *shape"], theta: Mapping[str, Array]) -> Float[Array, "times *shape"]:
-        """The readings that a motion gives, without noise."""
+        """The readings of a motion, without noise."""
         gain, bias = (self._each(theta.get(f"{self.name}.{key}", getattr(self, key))) for key in ("gain", "bias"))
         return gain * quantity + bias
 
     def rows(self, predicted: Float[Array, "times *shape"], theta: Mapping[str, Array], loss: Loss) -> Rows:
-        """How far predicted readings are from the measured ones; a loss but the linear one needs a known `sigma`."""
+        """The misfit of predicted readings; a loss other than the linear needs a known `sigma`."""
         difference = jnp.where(self.present, predicted - self.values, jnp.zeros_like(predicted))
         level = theta.get(f"{self.name}.sigma")
         if level is None:
@@ -99,7 +99,7 @@ class Channel(eqx.Module):
             none = jnp.zeros((0,), residuals.dtype)
             objective = 0.5 * jnp.sum(loss.rho(residuals**2))
             return Rows(residuals.reshape(-1), self.present.reshape(-1), none, objective)
-        # The expected second derivatives do not couple noise levels with what the residuals depend on.
+        # The expected second derivatives do not couple noise levels with other unknowns.
         residuals = difference / self._each(lax.stop_gradient(level))
         spread = tuple(range(difference.ndim - level.ndim)) if level.ndim else None
         count = jnp.sum(self.present, axis=spread).astype(residuals.dtype).reshape(-1)
@@ -112,7 +112,7 @@ class Channel(eqx.Module):
         return Rows(residuals.reshape(-1), self.present.reshape(-1), scores, objective)
 
     def level(self, predicted: np.ndarray, like: Any) -> np.ndarray:
-        """The noise level that is most likely for predicted readings; `like`: an array of its shape."""
+        """The most likely noise level for predicted readings; `like`: an array of its shape."""
         difference = np.where(self.present, np.asarray(predicted) - np.asarray(self.values), 0.0)
         spread = tuple(range(difference.ndim - like.ndim)) if like.ndim else None
         return np.sqrt(np.sum(difference**2, axis=spread) / np.maximum(np.sum(self.present, axis=spread), 1))
@@ -146,17 +146,17 @@ def readings_of(
 ) -> Channel:
     """The readings of a sensor, checked.
 
-    **Arguments:** `sigma`: standard deviation of the noise, None if it is not known: readings are weighted by their
-    range then; `shape` of the quantity at one time; `places` of the sensor's times among all; `times`: their number.
+    **Arguments:** `sigma`: standard deviation of the noise; None if unknown, readings are then weighted by their range;
+    `shape` of the quantity at one time; `places` of the sensor's times among all; `times`: their number.
     """
     name = sensor.label
     try:
         data = np.asarray(data, dtype=dtype)
     except (TypeError, ValueError):
         raise ValueError(f"Measured {name!r} must be an array of numbers, NaN where a sample is missing.") from None
-    own = places.size
-    if data.shape != (own, *shape):
-        raise ValueError(f"Measured {name!r} must have shape {(own, *shape)} for {own} times, got {data.shape}.")
+    count = places.size
+    if data.shape != (count, *shape):
+        raise ValueError(f"Measured {name!r} must have shape {(count, *shape)} for {count} times, got {data.shape}.")
     if np.any(np.isinf(data)):
         raise ValueError(f"Measured {name!r} is infinite at sample {np.argwhere(np.isinf(data))[0][0]}.")
     present = ~np.isnan(data)
@@ -180,10 +180,10 @@ def readings_of(
     )
 
 
-def _among_all(own: np.ndarray, places: np.ndarray, times: int, otherwise: Any) -> np.ndarray:
-    """What a sensor has at its own times, at the times of all sensors."""
-    out = np.full((times, *own.shape[1:]), otherwise, own.dtype)
-    out[places] = own
+def _among_all(values: np.ndarray, places: np.ndarray, times: int, otherwise: Any) -> np.ndarray:
+    """Values at a sensor's times, expanded to the times of all sensors."""
+    out = np.full((times, *values.shape[1:]), otherwise, values.dtype)
+    out[places] = values
     return out
 
 

@@ -1,13 +1,13 @@
 """Multiple shooting on the constraint manifold: long motions that are chaotic or unstable, in short segments.
 
 The states at the starts of segments are unknowns, each in independent coordinates: a chart of the constraint manifold
-takes w to the state closest to `x + T w`, with T a basis of the tangent space at x. That each segment begins where the
-last one ends are equality constraints `c = 0`. Each step solves
+maps w to the state closest to `x + T w`, with a basis T of the tangent space at x. Equality constraints `c = 0` join
+the start of each segment to the end of the previous segment. Each step solves
 
     minimise ½ |r + J s|² + ½ μ |D s|²  subject to  c + C s = 0
 
-by orthogonal factorisation of C, which a recursion over the segments would be without its growth. Charts are then moved
-to the new states.
+by orthogonal factorisation of C, which avoids the growth of a recursion over the segments. Charts are then moved to the
+new states.
 
 Source: H. G. Bock, "Recent Advances in Parameter Identification Techniques for O.D.E.", in: Numerical Treatment of
 Inverse Problems in Differential and Integral Equations, Birkhäuser 1983.
@@ -23,15 +23,15 @@ from ..minimise import Linearised, levenberg_marquardt, null_basis
 from .problem import Problem, level_mask, with_likely_levels
 from .segments import Place, evaluated, first_place, moved, segmented
 
-# Trials of all segments, each for its own data, before they are joined, and their tolerance.
+# Largest number of trials in which each segment fits its own data, before all are joined, and their tolerance.
 _ALONE, _COARSE = 13, 1e-3
 
 
 class Shot(NamedTuple):
-    """Where multiple shooting ended.
+    """The end of multiple shooting.
 
-    **Fields:** as of `Fit`: `jacobian` is along the directions that keep the motion continuous, `along` says how z
-    changes along them, and `continuity` is the largest gap.
+    **Fields:** as in `Fit`: `jacobian` along the directions that keep the motion continuous, `along` with the changes
+    of z along them, and `continuity`, the largest gap.
     """
 
     z: Array
@@ -64,7 +64,7 @@ def shoot(problem: Problem, z: Float[Array, "n"], segments: int, tol: float, lim
     place = _each_to_its_data(evaluate, move, first_place(problem, lanes, z))
     if level_mask(problem).any():
         place = place._replace(z=with_likely_levels(problem, place.z, evaluate(place).readings))
-    # The states follow from the unknowns where the motion is continuous.
+    # In a continuous motion, the states follow from the unknowns.
     size = lambda place, step: float(np.max(np.abs(step[: z.size]) / (1 + np.abs(place.z))))
     end = levenberg_marquardt(lambda place: evaluate(place).linearised, place, tol, limit, move=move, size=size)
     model = evaluate(end.z)
@@ -83,9 +83,9 @@ def shoot(problem: Problem, z: Float[Array, "n"], segments: int, tol: float, lim
 
 
 def _each_to_its_data(evaluate, move, place: Place) -> Place:
-    """The states from which each segment alone fits its data, with the parameters as they are.
+    """The states from which each segment alone fits its data, with unchanged parameters.
 
-    They are only where the joint iteration starts, and weigh all residuals by their squares.
+    They only start the joint iteration, and are fitted by least squares.
     """
 
     def alone(place):

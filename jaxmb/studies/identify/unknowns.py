@@ -49,7 +49,7 @@ class Priors(eqx.Module):
 
 
 class Unknowns(NamedTuple):
-    """Unknowns, the experiments as functions of theirs, and for each of those the names of its unknowns among all."""
+    """Unknowns, the experiments as functions of theirs, and for each experiment the names of its unknowns among all."""
 
     free: FreeParameters
     trials: tuple[ExperimentModel, ...]
@@ -58,7 +58,7 @@ class Unknowns(NamedTuple):
 
 
 class _Unknown(NamedTuple):
-    """One unknown before it has a range: its start, a typical change, whether it is positive, and where it must be."""
+    """One unknown before it has a range: its start, a typical change, whether it is positive, and its bounds."""
 
     start: Any
     like: Array
@@ -68,13 +68,13 @@ class _Unknown(NamedTuple):
 
 
 def experiments_by_name(experiments: Sequence[Experiment]) -> dict[str, Experiment]:
-    """Experiments by their names, which are made where they are missing."""
+    """Experiments by name; missing names are generated."""
     out = {}
     for number, experiment in enumerate(experiments, 1):
         check_kind("An experiment", experiment, Experiment, "a jaxmb.Experiment", BY_NAME)
         name = f"exp{number}" if experiment.name is None else experiment.name
         if name in out or not name or "/" in name:
-            raise ValueError(f"The name {name!r} of an experiment must be its own, not empty and without '/'.")
+            raise ValueError(f"The name {name!r} of an experiment must be unique, not empty and without '/'.")
         out[name] = with_times(experiment, f" of experiment {name!r}")
     if not any(not experiment.held_out for experiment in out.values()):
         raise ValueError("There is no experiment to fit: give one or more that are not held_out.")
@@ -106,38 +106,38 @@ def unknowns(
 ) -> Unknowns:
     """Unknowns with their starts, ranges and priors, and the experiments that depend on them.
 
-    **Arguments:** as of `identify`; the name of a single experiment may be empty, its unknowns then have no prefix.
+    **Arguments:** as in `identify`; the name of a single experiment may be empty, its unknowns then have no prefix.
 
     **Raises:** `ValueError` for unknown names and wrong values.
     """
     given = dict(free) if isinstance(free, Mapping) else dict.fromkeys((free,) if isinstance(free, str) else free)
-    experiments = {name: _with_named(name, own, given) for name, own in experiments.items()}
-    if not given and not any(own.own or own.free_initial for own in experiments.values()):
+    experiments = {name: _with_named(name, single, given) for name, single in experiments.items()}
+    if not given and not any(single.own or single.free_initial for single in experiments.values()):
         raise ValueError("Nothing is free: give the names of the parameters, or their starting values by name.")
     _check_names(system, experiments, sensors, given)
-    found: dict[str, _Unknown] = {}
+    collected: dict[str, _Unknown] = {}
     trials, sources = [], []
     for name, experiment in experiments.items():
-        trial, own = _trial(system, name, experiment, sensors, given, sigma, loss, found)
+        trial, source_names = _trial(system, name, experiment, sensors, given, sigma, loss, collected)
         trials.append(trial)
-        sources.append(own)
+        sources.append(source_names)
     _check_measured(system, experiments, sensors, sigma)
     for name in given:
-        if name not in found:
+        if name not in collected:
             raise ValueError(f"{name!r} is unknown to every experiment that is fitted; leave it out of free.")
-    order = [name for name in given if name in found] + [name for name in found if name not in given]
+    order = [name for name in given if name in collected] + [name for name in collected if name not in given]
     limits = _within_design(system, _for_each("bounds", bounds, order), order)
-    ranges = [_range(name, found[name], limits.get(name)) for name in order]
+    ranges = [_range(name, collected[name], limits.get(name)) for name in order]
     return Unknowns(
         FreeParameters(tuple(order), tuple(ranges)),
         tuple(trials),
         tuple(sources),
-        _priors(_for_each("a prior", prior, order), found),
+        _priors(_for_each("a prior", prior, order), collected),
     )
 
 
 def _within_design(system: AbstractSystem, limits: Mapping[str, Bounds], order: Sequence[str]) -> dict[str, Bounds]:
-    """Bounds by name, with those of design variables."""
+    """Bounds by name, including the bounds of design variables."""
     out, declared = dict(limits), design_bounds(system)
     for name in order:
         base = name.rpartition("/")[2]
@@ -147,54 +147,56 @@ def _within_design(system: AbstractSystem, limits: Mapping[str, Bounds], order: 
 
 
 def _with_named(prefix: str, experiment: Experiment, given: Mapping[str, Any]) -> Experiment:
-    """The experiment with those unknowns that `free` names as its own: `"exp2/A.friction"`, `"initial.crank.angle"`."""
+    """The experiment with the unknowns that `free` names with its prefix: `"exp2/A.friction"`,
+    `"initial.crank.angle"`.
+    """
     before = f"{prefix}/" if prefix else ""
     ours = [name.removeprefix(before) for name in given if name.startswith(before or "initial.")]
     initial = [name.removeprefix("initial.") for name in ours if name.startswith("initial.")]
-    own = [name for name in ours if not name.startswith("initial.")]
+    own_names = [name for name in ours if not name.startswith("initial.")]
     named = experiment.free_initial
     named = (named,) if isinstance(named, str) else named
     starts = dict.fromkeys(initial) | (dict(named) if isinstance(named, Mapping) else dict.fromkeys(named))
-    own = tuple(dict.fromkeys((*experiment.own, *own)))
-    if experiment.held_out and (own or starts):
-        raise ValueError(f"Experiment {prefix!r} is held out and can have no unknowns of its own; give their values.")
-    return dataclasses.replace(experiment, own=own, free_initial=starts)
+    own_names = tuple(dict.fromkeys((*experiment.own, *own_names)))
+    if experiment.held_out and (own_names or starts):
+        raise ValueError(f"Experiment {prefix!r} is held out and cannot have its own unknowns; give their values.")
+    return dataclasses.replace(experiment, own=own_names, free_initial=starts)
 
 
 def _check_names(system, experiments, sensors, given) -> None:
     """Refuse names that are neither parameters nor numbers of a sensor."""
-    measured = dict.fromkeys(name for own in experiments.values() for name in (own.measured or {}))
+    measured = dict.fromkeys(name for experiment in experiments.values() for name in (experiment.measured or {}))
     of_sensors = [f"{name}.{key}" for name in dict.fromkeys((*sensors, *measured)) for key in SENSOR_FIELDS]
-    own = parameters(system)
+    values = parameters(system)
     for name in of_sensors:
-        if name in own:
+        if name in values:
             raise ValueError(f"{name!r} is a parameter of the system as well as of a sensor; rename the sensor.")
-    known = dict.fromkeys((*own, *of_sensors))
+    allowed = dict.fromkeys((*values, *of_sensors))
     prefixes = tuple(f"{name}/" for name in experiments if name) or ("initial.",)
-    for name in (*given, *(name for own in experiments.values() for name in own.own)):
-        if not name.startswith(prefixes) and name not in known:
-            raise unknown("parameter", name, known)
+    for name in (*given, *(name for single in experiments.values() for name in single.own)):
+        if not name.startswith(prefixes) and name not in allowed:
+            raise unknown("parameter", name, allowed)
 
 
 def _check_measured(system, experiments, sensors, sigma) -> None:
-    """Refuse sensors and noise levels of what is not measured, and noise levels that are given twice."""
-    known = dict.fromkeys((*sensors, *system.quantities()))
-    measured = dict.fromkeys(name for own in experiments.values() for name in (own.measured or {}))
+    """Refuse sensors and noise levels of quantities that are not measured, and noise levels given twice."""
+    available = dict.fromkeys((*sensors, *system.quantities()))
+    measured = dict.fromkeys(name for experiment in experiments.values() for name in (experiment.measured or {}))
     for name in sigma or {}:
-        if name not in known:
-            raise unknown("quantity", name, known)
+        if name not in available:
+            raise unknown("quantity", name, available)
         if name not in measured:
             raise ValueError(f"sigma is given for {name!r}, which is not measured.")
         if name in sensors and sensors[name].sigma is not None:
             raise ValueError(f"sigma of {name!r} is given twice, by sigma= and by its Sensor; leave one of them out.")
     for name in sensors:
         if name not in measured:
-            there = ", ".join(map(repr, measured)) or "nothing"
-            raise ValueError(f"The data of sensor {name!r} are missing: measured by name is {there}.")
+            listed = ", ".join(map(repr, measured)) or "nothing"
+            raise ValueError(f"The data of sensor {name!r} are missing: measured by name is {listed}.")
 
 
 def _assembled(experiment, system, guess, **prescribed):
-    """The initial state of an experiment, which the error names if it cannot be assembled."""
+    """The initial state of an experiment; an error of assembly names the experiment."""
     try:
         return assemble(system, guess, **prescribed)
     except ValueError as error:
@@ -203,16 +205,18 @@ def _assembled(experiment, system, guess, **prescribed):
         raise ValueError(f"Experiment {experiment!r}: {error}") from error
 
 
-def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tuple[ExperimentModel, tuple[str, ...]]:
-    """One experiment, whose unknowns are added to those that are found."""
+def _trial(
+    system, prefix, experiment, sensors, given, sigma, loss, collected
+) -> tuple[ExperimentModel, tuple[str, ...]]:
+    """One experiment, whose unknowns are added to `collected`."""
     ts, places = times_of(experiment)
     label = lambda name: f"{prefix}/{name}" if prefix else name
-    known = known_parameters(system, experiment)
-    own = {*experiment.own}
+    known_values = known_parameters(system, experiment)
+    own_names = {*experiment.own}
     shared = [name for name in given if "/" not in name and not name.startswith("initial.")]
     local = list(dict.fromkeys((*shared, *experiment.own)))
     channels = channels_of(system, experiment, sensors, sigma, frozenset(local), ts, places)
-    values, positive = parameters(system) | known, system.parameter_table.positive()
+    values, positive = parameters(system) | known_values, system.parameter_table.positive()
     by_name = {f"{channel.name}.{key}": (channel, key) for channel in channels for key in SENSOR_FIELDS}
 
     def start_of(name, default):
@@ -224,26 +228,26 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
     unknown_here: dict[str, tuple[str, _Unknown]] = {}
     changed = []
     for name in local:
-        source = label(name) if name in own else name
+        source = label(name) if name in own_names else name
         if name in by_name:
             unknown_here[name] = source, _of_sensor(*by_name[name], start_of(name, None), ts, experiment.t0, sensors)
         elif name in values:
-            if name in known and name not in own:
+            if name in known_values and name not in own_names:
                 continue
             changed.append(name)
             unknown_here[name] = source, _Unknown(start_of(name, values[name]), values[name], name in positive)
-        elif name in own:
+        elif name in own_names:
             raise ValueError(f"{name!r} belongs to a sensor that experiment {prefix!r} has not measured.")
 
     guess = system.guess if experiment.state is None else experiment.state
     known_rates = system.rate_names()
     fix = arrays(experiment.fix)
-    # By the names of rates, so that an unknown rate takes the place of one that is given by its coordinate's name.
+    # By the names of rates, so that an unknown rate replaces a rate given by its coordinate's name.
     rates = {
         full if (full := f"{name}_rate") in known_rates else name: x for name, x in arrays(experiment.rates).items()
     }
     initial = tuple((f"initial.{name}", initial_unknown(system, name)) for name in experiment.free_initial)
-    same = with_parameters(system, known)
+    same = with_parameters(system, known_values)
     if initial:
         state = _assembled(prefix, same, guess, fix=fix, rates=rates, t=experiment.t0)
         sizes = system.coordinate_scale(), system.velocity_scale()
@@ -253,16 +257,16 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
             vector, size = (state.u, sizes[1]) if what.is_rate else (state.q, sizes[0])
             start = start_of(name, vector[index] if chosen is None else chosen)
             unknown_here[name] = label(name), _Unknown(start, vector[index], False, size[index])
-    # Coordinates of joints have parameters of their own.
+    # Coordinates of joints have parameters of their own_names.
     of_bodies = fix.keys() <= system.coordinate_names().keys() and rates.keys() <= known_rates.keys()
     assembled = not initial and of_bodies and not constraints_depend_on(same, experiment.t0, guess, changed)
     if assembled:
-        # What is the same for all values is found, and differentiated, once.
+        # Values that are the same for all trials are computed, and differentiated, once.
         guess = _assembled(prefix, same, guess, fix=fix, rates=rates, t=experiment.t0)
     if not experiment.held_out:
         for source, what in unknown_here.values():
-            first = found.setdefault(source, what)
-            found[source] = first._replace(below=min(first.below, what.below))
+            first = collected.setdefault(source, what)
+            collected[source] = first._replace(below=min(first.below, what.below))
     trial = ExperimentModel(
         unknowns=tuple((name, np.shape(what.like)) for name, (_, what) in unknown_here.items()),
         changed=tuple(changed),
@@ -271,7 +275,7 @@ def _trial(system, prefix, experiment, sensors, given, sigma, loss, found) -> tu
         channels=channels,
         residual=experiment.residual,
         loss=loss,
-        known=known,
+        known=known_values,
         state=guess,
         fix=fix,
         rates=rates,
@@ -287,15 +291,17 @@ def _of_sensor(channel: Channel, key: str, start, ts, t0, sensors) -> _Unknown:
     sensor = sensors.get(channel.name, Sensor(channel.quantity))
     width = jnp.asarray(channel.range, ts.dtype)
     if key == "sigma":
-        own = width if sensor.sigma is None else jnp.asarray(sensor.sigma, ts.dtype)
-        return _Unknown(own if start is None else start, own if start is None else jnp.asarray(start, ts.dtype), True)
-    own = getattr(channel, key)
+        level = width if sensor.sigma is None else jnp.asarray(sensor.sigma, ts.dtype)
+        return _Unknown(
+            level if start is None else start, level if start is None else jnp.asarray(start, ts.dtype), True
+        )
+    number = getattr(channel, key)
     if key == "delay":
-        there = np.asarray(channel.present).reshape(ts.shape[0], -1).any(axis=1)
-        below = float(ts[np.argmax(there)]) - float(t0)
+        is_present = np.asarray(channel.present).reshape(ts.shape[0], -1).any(axis=1)
+        below = float(ts[np.argmax(is_present)]) - float(t0)
         span = (ts[-1] - ts[0]) / 10 if ts.size > 1 else ts[-1]
-        return _Unknown(own if start is None else start, own, False, span, below)
-    like = own if start is None else jnp.asarray(start, ts.dtype)
+        return _Unknown(number if start is None else start, number, False, span, below)
+    like = number if start is None else jnp.asarray(start, ts.dtype)
     shapes = (), channel.values.shape[1:]
     if like.shape not in shapes:
         raise ValueError(f"{key} of sensor {channel.name!r} must be a number or have shape {shapes[1]}.")
@@ -308,27 +314,27 @@ def _range(name: str, what: _Unknown, bounds: Bounds | None):
         if not float(jnp.max(jnp.asarray(what.start))) < what.below:
             raise ValueError(
                 f"The start of {name!r} must be smaller than {what.below:g} s, the time from t0 to the first sample: "
-                "before t0 there is no motion to see. Start t0 earlier, or leave out the first samples."
+                "there is no motion before t0. Start t0 earlier, or leave out the first samples."
             )
         bounds = low, what.below if high is None else min(float(np.max(high)), what.below)
     return range_of(name, what.start, what.like, bounds, positive=what.positive, scale=what.scale)
 
 
 def _for_each(what: str, given: Mapping[str, Any] | None, names: Sequence[str]) -> dict[str, Any]:
-    """What is given for unknowns, also by the name that those of several experiments have in common."""
+    """Values for unknowns, also by the common name of the unknowns of several experiments."""
     out = {}
     for name, value in (given or {}).items():
-        own = [full for full in names if name in (full, full.split("/", 1)[-1])]
-        if not own:
+        full_names = [full for full in names if name in (full, full.split("/", 1)[-1])]
+        if not full_names:
             raise unknown(f"free parameter with {what}", name, names)
-        out |= {full: value for full in own if full == name or full not in (given or {})}
+        out |= {full: value for full in full_names if full == name or full not in (given or {})}
     return out
 
 
-def _priors(given: Mapping[str, Prior], found: Mapping[str, _Unknown]) -> Priors:
+def _priors(given: Mapping[str, Prior], collected: Mapping[str, _Unknown]) -> Priors:
     means, deviations = [], []
     for name, pair in given.items():
-        like = found[name].like
+        like = collected[name].like
         try:
             mean, deviation = (np.broadcast_to(np.asarray(x, like.dtype), like.shape) for x in pair)
         except (TypeError, ValueError):

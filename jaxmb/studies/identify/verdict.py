@@ -1,7 +1,7 @@
-"""Tests of a fit: of the residuals, of the estimates, and of the ends of several starts.
+"""Tests of a fit: of the residuals, the estimates, and the ends of several starts.
 
-Every test of residuals accuses a right fit with normal noise with a probability of about one in a million. It accuses
-only where the misfit is not small compared with the noise either: a significant difference may not matter.
+Every test of residuals rejects a correct fit with normal noise with a probability of about one in a million. It also
+rejects only if the misfit is not small compared with the noise: a significant difference may not matter.
 
 Source: L. Ljung, "System Identification: Theory for the User", 2nd ed., Prentice Hall 1999, chapter 16; J. D. Gibbons
 and S. Chakraborti, "Nonparametric Statistical Inference", 5th ed., CRC Press 2011, chapter 3 (runs); R. Leipnik,
@@ -20,29 +20,29 @@ from .fit import Fit, flat
 from .loss import Loss
 from .residuals import Outlier, Series
 
-# The probability at which a test accuses a right fit.
+# The significance level of a test.
 _LEVEL = 1e-6
-# Residuals whose root mean square is larger than this are beyond σ; whose median is larger, relative to that of normal
-# noise, where large residuals are expected.
+# Residuals are beyond σ if their root mean square is larger than this; with a robust loss, if their median is larger,
+# relative to the median of normal noise.
 _BEYOND, _BEYOND_MEDIAN = 1.25, 2.0
-# A smaller share of residuals beyond five standard deviations may be outliers.
+# A smaller fraction of residuals beyond five standard deviations may be outliers.
 _FEW = 0.1
 # The median of the absolute value of a standard normal variable.
 _MEDIAN = 0.6745
-# Residuals are no noise if this share of their mean square, or more, follows from others.
+# Residuals are not noise if at least this fraction of their mean square is predictable.
 _SHARE = 0.2
-# Two minima that differ by less than this, in twice the logarithm of the likelihood ratio, fit as well as each other;
-# their estimates contradict each other where they differ by more than so many standard deviations.
+# Two minima fit equally well if twice the logarithm of their likelihood ratio is less than this; their estimates
+# contradict each other if they differ by more than this number of standard deviations.
 _AS_WELL, _APART = 10.0, 5.0
-# Why a component has no standard deviation where it can change without changing the residuals.
+# The reason for a missing standard deviation of a component that can change without changing the residuals.
 UNDETERMINED = "undetermined"
 
 
 class Verdict(NamedTuple):
-    """What speaks against a fit.
+    """Objections to a fit.
 
-    **Fields:** `doubts`: what speaks against the estimates as a whole; `reasons`: in a few words, why components have
-    no standard deviation, by their names; `warnings`: all that was found, and what helps.
+    **Fields:** `doubts`: objections to the estimates as a whole; `reasons` for missing standard deviations, in a few
+    words, by component; `warnings`: all objections, with remedies.
     """
 
     doubts: tuple[str, ...]
@@ -58,7 +58,7 @@ class Tried(NamedTuple):
 
 
 def judge(fit: Fit) -> Verdict:
-    """What speaks against the end of an iteration."""
+    """The objections to the end of an iteration."""
     finite, starts = np.isfinite(fit.ends[0][0]), len(fit.ends)
     doubts = [] if fit.success else ["the iteration did not converge; try another start, or more iterations"]
     if finite:
@@ -70,10 +70,8 @@ def judge(fit: Fit) -> Verdict:
     if fit.undetermined:
         finer = f", or simulate with a smaller rtol than {fit.problem.rtol:g}"
         warnings.append(
-            f"the data do not determine {', '.join(fit.undetermined)} separately (`combinations` says which changes "
-            "leave the residuals as they are): free fewer of them, or measure more"
-            + finer
-            * (fit.problem.rtol > DEFAULT_RTOL)
+            f"the data do not determine {', '.join(fit.undetermined)} separately (`combinations` lists changes that do "
+            "not change the residuals): free fewer of them, or measure more" + finer * (fit.problem.rtol > DEFAULT_RTOL)
         )
         reasons |= dict.fromkeys(fit.undetermined, UNDETERMINED)
     for name, words in _at_ends(fit):
@@ -91,8 +89,8 @@ def _at_ends(fit: Fit) -> Iterator[tuple[str, str]]:
     free = fit.problem.free
     reached = free.at_end(fit.z, fit.uncertainty.deviations)
     each = zip(fit.components, reached, flat(fit.start), flat(fit.parameters), free.ends(), strict=True)
-    for name, there, start, value, bounds in each:
-        if not there:
+    for name, is_reached, start, value, bounds in each:
+        if not is_reached:
             continue
         cure = "restrict it to plausible values (bounds=)"
         if bounds is not None:
@@ -100,33 +98,35 @@ def _at_ends(fit: Fit) -> Iterator[tuple[str, str]]:
         yield (
             name,
             f"{name} = {value:.3g} is at an end of its range, from a start at {start:.3g}: {cure}, try other starts "
-            "(starts=), or leave it out of free if its effect is nothing",
+            "(starts=), or leave it out of free if it has no effect",
         )
 
 
 def _of_other_starts(fit: Fit) -> Iterator[str]:
     others = [(value, np.asarray(fit.problem.free.flat(z))) for value, z in fit.ends if np.isfinite(value)]
-    known, noise = fit.problem.known_noise, fit.uncertainty.noise
-    # Noise that the residuals show is at least what matters, or rounding would tell two ends apart.
+    known_noise, noise = fit.problem.known_noise, fit.uncertainty.noise
+    # The estimated noise has a lower bound, since otherwise rounding would distinguish two ends.
     least = max(part.small for part in fit.series) / noise if noise > 0 else np.inf
-    least = 1.0 if known and not fit.problem.loss.robust else max(1.0, least)
-    count = None if known else fit.residuals.size
+    least = 1.0 if known_noise and not fit.problem.loss.robust else max(1.0, least)
+    count = None if known_noise else fit.residuals.size
     return of_starts(others, fit.components, fit.uncertainty.deviations * least, count, fit.dispersion * least**2)
 
 
 def of_residuals(
-    found: Sequence[Series], far: Sequence[Outlier], directions: int, loss: Loss, tried: Tried
+    series: Sequence[Series], far: Sequence[Outlier], directions: int, loss: Loss, tried: Tried
 ) -> list[str]:
-    """What the residuals of a fit say against it, and what helps that was not done yet.
+    """The objections of the residuals to a fit, with remedies that were not tried yet.
 
-    **Arguments:** `directions`: how many combinations of unknowns were fitted; `loss`: a robust one expects some
-    residuals that are large.
+    **Arguments:** `directions`: the number of fitted combinations of unknowns; `loss`: a robust loss expects some large
+    residuals.
     """
-    known, unknown = ([own for own in found if own.known is there] for there in (True, False))
+    with_known_noise, unknown = (
+        [single for single in series if single.known is is_known] for is_known in (True, False)
+    )
     out = [
-        *(_beyond(known, len(far), directions, loss.robust) if known else ()),
+        *(_beyond(with_known_noise, len(far), directions, loss.robust) if with_known_noise else ()),
         *(_explains_nothing(unknown) if unknown else ()),
-        *_no_noise(found, directions, loss),
+        *_not_noise(series, directions, loss),
     ]
     return [*out[:-1], f"{out[-1]}. {_cures(tried)}"] if out else []
 
@@ -136,7 +136,7 @@ def _cures(tried: Tried) -> str:
     starts = "other starts (starts=)" if tried.starts == 1 else "more starts (starts=)"
     pieces = "shorter pieces (segments=)"
     if tried.segments > 1:
-        # Multiple shooting has one start, that of `free`.
+        # Multiple shooting has one start, `free`.
         starts, pieces = "another start (free=)", f"shorter pieces than these {tried.segments} (segments=)"
     return (
         f"Either {ended} ended in a local minimum: try {starts}, a range of plausible values (bounds=) and, for a "
@@ -144,14 +144,14 @@ def _cures(tried: Tried) -> str:
     )
 
 
-def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Iterator[str]:
-    """The sum of squares against its χ² distribution, of all residuals and of each series; or the sign test that the
-    median is that of normal noise.
+def _beyond(series: list[Series], far: int, directions: int, robust: bool) -> Iterator[str]:
+    """The test of the sum of squares against its χ² distribution, for all residuals and for each series; for a robust
+    loss the sign test of the median against normal noise.
     """
-    whole = np.concatenate([own.residuals for own in found])
+    whole = np.concatenate([single.residuals for single in series])
     groups = {"": (whole, directions)}
-    if len(found) > 1:
-        groups |= {f"those of {own.label}": (own.residuals, 0) for own in found}
+    if len(series) > 1:
+        groups |= {f"those of {single.label}": (single.residuals, 0) for single in series}
     worst = None
     for label, (residuals, fitted) in groups.items():
         count, squares = residuals.size - fitted, float(np.sum(residuals**2))
@@ -176,48 +176,48 @@ def _beyond(found: list[Series], far: int, directions: int, robust: bool) -> Ite
     yield text
 
 
-def _explains_nothing(found: list[Series]) -> Iterator[str]:
+def _explains_nothing(series: list[Series]) -> Iterator[str]:
     """Whether constants, one for each series, are closer to the data: an F test."""
     left = right = 0.0
-    for own in found:
-        measured = own.residuals - own.predicted / own.sigma
-        left += float(np.sum(own.residuals**2))
+    for single in series:
+        measured = single.residuals - single.predicted / single.sigma
+        left += float(np.sum(single.residuals**2))
         right += float(np.sum((measured - np.mean(measured)) ** 2))
-    small = sum(own.residuals.size * own.small**2 for own in found)
-    constants, rest = len(found), sum(own.residuals.size for own in found) - len(found)
-    # Both sums of squares are χ² distributed if nothing but noise is left, and if the truth is constant; if it is not,
-    # the test accuses less often.
+    small = sum(single.residuals.size * single.small**2 for single in series)
+    constants, rest = len(series), sum(single.residuals.size for single in series) - len(series)
+    # Both sums of squares are χ² distributed if the residuals are noise and the truth is constant; otherwise the test
+    # rejects less often.
     if rest > 0 and left - right > small and special.betainc(rest / 2, constants / 2, right / left) < _LEVEL:
         explained = 1 - left / right if right > 0 else -np.inf
         yield f"the fit explains nothing: constants would be closer to the data (R² = {explained:.3g})"
 
 
-def _no_noise(found: Sequence[Series], directions: int, loss: Loss) -> Iterator[str]:
-    """Whether residuals follow from others: from their signs, from earlier ones, or from what is predicted."""
+def _not_noise(series: Sequence[Series], directions: int, loss: Loss) -> Iterator[str]:
+    """Whether residuals are predictable: from their signs, from earlier residuals, or from the prediction."""
     told = []
-    for own in found:
-        # What outliers have to do with each other is no matter: each counts by its influence on the estimates.
-        residuals = loss.influence(own.residuals)[0]
+    for single in series:
+        # Correlations between outliers do not matter: each counts by its influence on the estimates.
+        residuals = loss.influence(single.residuals)[0]
         square = float(np.mean(residuals**2))
-        if square <= own.small**2 or residuals.size < 3:
+        if square <= single.small**2 or residuals.size < 3:
             continue
-        for reason, share, chance in dependences(own, residuals, directions):
-            # `share` of the mean square is no noise.
-            matters = share > _SHARE and share * square > own.small**2
-            if matters and chance * len(found) < _LEVEL:
-                told.append(f"those of {own.label} {reason}{_offset(own)}")
+        for reason, share, chance in dependences(single, residuals, directions):
+            # `share` of the mean square is not noise.
+            matters = share > _SHARE and share * square > single.small**2
+            if matters and chance * len(series) < _LEVEL:
+                told.append(f"those of {single.label} {reason}{_offset(single)}")
                 break
     hidden = len(told) - 3
     if told:
         more = f", and of {hidden} other series as well" if hidden > 0 else ""
-        yield f"the residuals are no noise: {', '.join(told[:3])}{more}"
+        yield f"the residuals are not noise: {', '.join(told[:3])}{more}"
 
 
-def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
-    """How residuals depend on others, the share of their mean square that does, and the probability for noise."""
+def dependences(series: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
+    """How residuals depend on others, the dependent fraction of their mean square, and the probability under noise."""
     n = r.size
     changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
-    # Of normal noise, which the fitted directions may have made a little smoother.
+    # For normal noise, which the fitted directions may have made slightly smoother.
     yield (
         f"change their sign {changes} times in {n} samples",
         float(np.cos(np.pi * changes / (n - 1))),
@@ -225,9 +225,9 @@ def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[s
     )
     lags = np.arange(1, max(n // 4, 1) + 1)
     total = float(np.sum(r**2))
-    # Of all lags at once, with as many zeros as samples so that none meets one from the other end.
+    # The correlations at all lags at once, padded with zeros against wrap-around.
     correlations = np.fft.irfft(np.abs(np.fft.rfft(r, 2 * n)) ** 2)[lags] / total
-    # Residuals of a fit are correlated by as much as the share of directions that were fitted.
+    # A fit correlates its residuals by up to the ratio of fitted directions to samples.
     sizes = np.maximum(np.abs(correlations) - directions / n, 0.0)
     lag = int(np.argmax(sizes))
     yield (
@@ -235,30 +235,30 @@ def dependences(own: Series, r: np.ndarray, directions: int) -> Iterator[tuple[s
         float(sizes[lag]),
         lags.size * _correlation(float(sizes[lag]), n),
     )
-    if own.predicted.size:
-        follows = (own.predicted - np.mean(own.predicted)) / own.sigma
+    if series.predicted.size:
+        follows = (series.predicted - np.mean(series.predicted)) / series.sigma
         norm = float(np.sum(follows**2))
         if norm > 0:
             correlation = float(np.sum(follows * r)) / np.sqrt(norm * total)
             yield (
-                f"follow what is predicted (correlation {correlation:.2g})",
+                f"are correlated with the prediction (correlation {correlation:.2g})",
                 correlation**2,
                 _correlation(abs(correlation), n),
             )
 
 
-def _offset(own: Series) -> str:
-    """A hint where most of the residuals is an offset: how it becomes free, as far as it is not."""
-    differences = own.residuals * own.sigma
+def _offset(series: Series) -> str:
+    """A hint if the residuals are mostly an offset: how to free it."""
+    differences = series.residuals * series.sigma
     mean = float(np.mean(differences))
-    if not own.ts.size or mean**2 < 0.5 * float(np.mean(differences**2)):
+    if not series.ts.size or mean**2 < 0.5 * float(np.mean(differences**2)):
         return ""
-    text, bias = f" and are {mean:.3g} on average", f"'{own.sensor}.bias'"
-    if not own.bias.free:
+    text, bias = f" and are {mean:.3g} on average", f"'{series.sensor}.bias'"
+    if not series.bias.free:
         return f"{text} (does the sensor count from another zero? Its offset, {bias}, can be free)"
-    if own.bias.components:
+    if series.bias.components:
         return f"{text} (its offset, {bias}, is one number for all components: start from one for each)"
-    if own.bias.experiments:
+    if series.bias.experiments:
         return f"{text} (its offset, {bias}, is one for all experiments: name it in their own=, not in free)"
     return f"{text}, though the offset, {bias}, is free"
 
@@ -269,12 +269,12 @@ def chi_squared(value: float, freedoms: int) -> float:
 
 
 def _fair_trials(successes: float, trials: int) -> float:
-    """The probability of so many successes, or fewer, of trials that are as likely to fail."""
+    """The probability of at most this number of successes in fair trials."""
     return float(special.betainc(trials - successes, successes + 1, 0.5)) if successes < trials else 1.0
 
 
 def _correlation(size: float, count: int) -> float:
-    """The probability that the correlation of noise with something else is of this size or larger."""
+    """The probability that noise has a correlation of this size or larger."""
     return float(special.betaincc(0.5, (count - 1) / 2, min(size**2, 1.0)))
 
 
@@ -285,17 +285,17 @@ def of_starts(
     count: int | None,
     dispersion: float,
 ) -> Iterator[str]:
-    """Whether another start ends as well, at other estimates.
+    """Whether another start fits equally well, at other estimates.
 
     **Arguments:** `ends`: objective and components of every start, the best first; `deviations` of the components;
-    `count` of residuals, where the noise is not known; `dispersion`: the factor of twice the differences of the
-    objective over a χ² variable.
+    `count` of residuals if the noise is unknown; `dispersion`: the ratio of twice the differences of the objective to a
+    χ² variable.
     """
     best, estimates = ends[0]
     for objective, others in ends[1:]:
         ratio = 2 * (objective - best) / dispersion
         if count is not None:
-            # Misfits that do not matter do not distinguish one minimum from another.
+            # Negligible misfits do not distinguish minima.
             small = 0.5 * count * 1e-6
             ratio = count * np.log((objective + small) / (best + small))
         apart = np.abs(others - estimates) / deviations
@@ -304,6 +304,6 @@ def of_starts(
         if ratio < _AS_WELL and apart[k] > _APART:
             yield (
                 f"another start fits as well with {components[k]} = {others[k]:.6g} instead of {estimates[k]:.6g}: the "
-                "data do not tell which is right; bounds= can exclude one, and other or longer measurements tell"
+                "data do not decide between them; exclude one by bounds=, or take other or longer measurements"
             )
             return

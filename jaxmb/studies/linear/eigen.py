@@ -1,4 +1,4 @@
-"""Eigenvalues and eigenvectors of a real matrix without symmetry, with derivatives where they are simple."""
+"""Eigenvalues and eigenvectors of a real matrix without symmetry, with derivatives of simple ones."""
 
 from typing import Any
 
@@ -13,16 +13,16 @@ from jaxtyping import Array, Bool, Complex, Float
 def eigen(
     A: Float[Array, "n n"], kept: Bool[Array, "n"]
 ) -> tuple[Complex[Array, "n"], Complex[Array, "n n"], Bool[Array, "n"]]:
-    """Eigenvalues and right eigenvectors of the block of a matrix that some rows and columns form.
+    """Eigenvalues and right eigenvectors of a block of a matrix.
 
-    Derivatives of a simple eigenvalue and of its eigenvector follow from the equation `A v = λ v` with one component
-    of v held; that of λ is `wᵀ dA v / wᵀ v`, w the left eigenvector. Of a repeated eigenvalue they do not exist and
-    are not finite.
+    Derivatives of a simple eigenvalue and of its eigenvector follow from the equation `A v = λ v` with one component of
+    v held; the derivative of λ is `wᵀ dA v / wᵀ v`, with the left eigenvector w. For a repeated eigenvalue they do not
+    exist and are not finite.
 
-    **Arguments:** `A`; `kept`: which rows and columns count. The others have eigenvalues zero.
+    **Arguments:** `A`; `kept`: the rows and columns of the block. The others have eigenvalues zero.
 
-    **Returns:** the eigenvalues in order of their sizes, of a pair the one with positive imaginary part first; the
-    eigenvectors as columns, their largest component is one; and which of them are of the kept block.
+    **Returns:** the eigenvalues in order of their sizes, in a pair the positive imaginary part first; the eigenvectors
+    as columns, with largest component one; and the mask of eigenvalues of the block.
     """
     block = jnp.where(kept[:, None] & kept[None, :], A, jnp.zeros_like(A))
     values, vectors = jnp.linalg.eig(block)
@@ -30,15 +30,15 @@ def eigen(
     values, vectors = values[order], vectors[:, order]
     largest = jnp.argmax(jnp.abs(vectors), axis=0)
     vectors = vectors / jnp.take_along_axis(vectors, largest[None, :], axis=0)
-    # A row and a column of zeros are an eigenvector of their own.
-    own = jnp.sum(jnp.where(kept[:, None], 0.0, jnp.abs(vectors)), axis=0) < 0.5
-    return values, vectors, own
+    # A row and a column of zeros have a unit vector as eigenvector.
+    of_block = jnp.sum(jnp.where(kept[:, None], 0.0, jnp.abs(vectors)), axis=0) < 0.5
+    return values, vectors, of_block
 
 
 @eigen.defjvp
 def _eigen_jvp(primals, tangents) -> Any:
     (A, kept), (dA, _) = primals, tangents
-    values, vectors, own = eigen(A, kept)
+    values, vectors, inside = eigen(A, kept)
     both = kept[:, None] & kept[None, :]
     A, dA = (jnp.where(both, x, 0.0).astype(vectors.dtype) for x in (A, dA))
     largest = jnp.argmax(jnp.abs(lax.stop_gradient(vectors)), axis=0)
@@ -48,12 +48,12 @@ def _eigen_jvp(primals, tangents) -> Any:
     def of_one(value, vector, k, of_block):
         bordered = jnp.zeros_like(unit).at[:n, :n].set(A - value * unit[:n, :n])
         bordered = bordered.at[:n, n].set(-vector).at[n, :n].set(unit[k, :n])
-        # Rows that do not count are held; a mode of such a row does not change.
+        # Rows outside the block are held; their modes do not change.
         bordered = jnp.where(jnp.append(kept, True)[:, None], bordered, unit)
         bordered = jnp.where(of_block, bordered, unit)
         change = jnp.linalg.solve(bordered, jnp.append(-(dA @ vector), jnp.zeros((), A.dtype)))
         change = jnp.where(of_block, change, jnp.zeros_like(change))
         return change[n], change[:n]
 
-    dvalues, dvectors = jax.vmap(of_one, in_axes=(0, 1, 0, 0), out_axes=(0, 1))(values, vectors, largest, own)
-    return (values, vectors, own), (dvalues, dvectors, np.zeros(own.shape, jax.dtypes.float0))
+    dvalues, dvectors = jax.vmap(of_one, in_axes=(0, 1, 0, 0), out_axes=(0, 1))(values, vectors, largest, inside)
+    return (values, vectors, inside), (dvalues, dvectors, np.zeros(inside.shape, jax.dtypes.float0))

@@ -39,9 +39,9 @@ class Floquet(eqx.Module):
     periodic.multipliers, periodic.monodromy, periodic.states
     ```
 
-    **Fields:** `monodromy` (k, k): the perturbations after a period from those before it; `states`, their names, of
-    which the first `coordinates` are coordinates and the others rates; `basis` (nq + nu, k): the changes of all
-    coordinates and velocities with them; `period` [s].
+    **Fields:** `monodromy` (k, k): the map of perturbations over a period; `states`, their names, first `coordinates`
+    coordinates, then rates; `basis` (nq + nu, k): the changes of all coordinates and velocities with them; `period`
+    [s].
     """
 
     monodromy: Float[Array, "k k"]
@@ -52,8 +52,8 @@ class Floquet(eqx.Module):
 
     @property
     def multipliers(self) -> Complex[Array, "k"]:
-        """Eigenvalues of the monodromy matrix, the largest first: the motion is unstable if one exceeds 1 in size.
-        That of the motion itself is 1 where nothing depends on time. Simple ones are differentiable.
+        """Eigenvalues of the monodromy matrix, the largest first: the motion is unstable if one exceeds 1 in size. The
+        multiplier of the motion itself is 1 for an autonomous system. Simple multipliers are differentiable.
         """
         kept = jnp.ones(len(self.states), bool)
         return eigen(self.monodromy, kept)[0][::-1]
@@ -110,15 +110,15 @@ def floquet(
     - `system`, `state`: a compiled scene, or another system, and a consistent state of the motion at the time `t` [s].
     - `period` [s], positive.
     - `coordinates`, `rates`: names of states, as in `linearise`.
-    - `ignorable`: names of coordinates that may advance in a period, on which nothing depends: the place of a vehicle.
-        Angles of bodies may make whole turns.
-    - `rtol`, `solver`: of `simulate`.
+    - `ignorable`: names of cyclic coordinates, which may advance in a period, such as the place of a vehicle. Angles of
+        bodies may make whole turns.
+    - `rtol`, `solver`: as in `simulate`.
 
     **Returns:** a `Floquet`; differentiable with respect to the parameters, the state and the period in forward mode.
 
     **Raises:** `ValueError` for unknown names, a period that is not positive, a state that violates the constraints,
-    and a motion that does not return after the period, with the coordinates in which it differs. Under a trace the
-    result is NaN instead.
+    and a motion that does not return after the period, with the coordinates that differ. Under a trace the result is
+    NaN instead.
     """
     check_system("floquet", system)
     check_no_states("floquet", system)
@@ -132,22 +132,24 @@ def floquet(
     names = check_state_names(system, t, state, coordinates, rates)
     free = [_indices(system, name) for name in checked_names("coordinate", ignorable)]
     state = consistent(system, t, State(system.normalize(state.q), state.u))
-    own = eqx.filter_jit(perturbations)(system, t, state, names)
-    if not is_traced((system, state, own.regular)) and not np.all(np.asarray(own.regular)):
+    perturbed = eqx.filter_jit(perturbations)(system, t, state, names)
+    if not is_traced((system, state, perturbed.regular)) and not np.all(np.asarray(perturbed.regular)):
         raise ValueError("The state is singular, or the named coordinates or rates are not independent in it.")
-    end, pushed = _flow(system, state, own.basis, t, period, rtol, solver)
+    end, pushed = _flow(system, state, perturbed.basis, t, period, rtol, solver)
     distance, pushed = _return(system, state, end, pushed, np.concatenate([np.zeros(0, int), *free]))
     sizes = jnp.concatenate([system.coordinate_scale(), system.velocity_scale() * 2 * np.pi / period])
     far = jnp.abs(distance) / sizes > jnp.maximum(_CLOSED, _OF_TOLERANCE * jnp.asarray(rtol))
-    bad = jnp.any(far) | ~jnp.all(own.regular) | ~jnp.all(jnp.isfinite(pushed))
-    monodromy = own.reading @ pushed
+    bad = jnp.any(far) | ~jnp.all(perturbed.regular) | ~jnp.all(jnp.isfinite(pushed))
+    monodromy = perturbed.reading @ pushed
     if is_traced((monodromy, bad)):
         monodromy = nan_where(bad, monodromy, (system, state, t, period))
     elif not bool(jnp.all(jnp.isfinite(pushed))):
-        raise RuntimeError("The motion or its derivatives could not be integrated over the period; simulate it to see.")
+        raise RuntimeError(
+            "The motion or its derivatives could not be integrated over the period; simulate the motion to see why."
+        )
     elif bad:
         raise ValueError(_open(system, period, np.asarray(distance), np.asarray(far)))
-    return Floquet(monodromy, state_labels(system, names, own), own.coordinates, own.basis, period)
+    return Floquet(monodromy, state_labels(system, names, perturbed), perturbed.coordinates, perturbed.basis, period)
 
 
 def _indices(system, name):
@@ -173,8 +175,8 @@ def _flow(system, state, basis, t, period, rtol, solver):
 
 
 def _return(system, state, end, pushed, free):
-    """The distance of the end of a motion from its start, and the derivatives there; whole turns of bodies and the
-    sign of their Euler parameters do not count.
+    """The difference between the end of a motion and its start, and its derivatives; whole turns of bodies and the sign
+    of their Euler parameters do not count.
     """
     q, nq = end[: system.nq], system.nq
     names = system.coordinate_names()
@@ -202,5 +204,5 @@ def _open(system, period, distance, far):
     listed = ", ".join(f"{name(k)} ({distance[k]:.3g})" for k in worst)
     return (
         f"The motion does not return after {float(period):.6g} s: it differs in {listed}. Give its period and a state "
-        "on it; coordinates on which nothing depends may be named as ignorable."
+        "on it; cyclic coordinates may be named as ignorable."
     )

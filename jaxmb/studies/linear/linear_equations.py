@@ -1,12 +1,12 @@
 """The linear equations about a state: derivatives of the equations of motion along its independent perturbations.
 
-Small perturbations of a motion `ẋ = X(x)` on the constraints are tangent to them, and to first order `δẋ = DX δx`
-depends on no extension of X off the constraints. So A follows from derivatives of the full equations along a basis of
-the tangent space, without multipliers among the unknowns. Forces on dependent coordinates count to second order, since
-the accelerations are those of the constrained system.
+Small perturbations of a motion `ẋ = X(x)` on the constraints are tangent to them, and to first order `δẋ = DX δx` does
+not depend on values of X off the constraints. So A follows from derivatives of the full equations along a basis of the
+tangent space, without multipliers among the unknowns. Forces on dependent coordinates count to second order, since the
+accelerations belong to the constrained system.
 
-About a steady motion perturbations are seen from a frame that is carried along (`comoving`), in which the equations are
-constant. That they are is found out by comparing them with those a little later.
+About a steady motion, perturbations are seen from a co-moving frame (`comoving`), in which the equations are constant.
+A comparison with the equations a little later verifies this.
 """
 
 import dataclasses
@@ -28,18 +28,18 @@ from .comoving import carriers
 from .perturbations import Perturbations, StateNames, joined, parted, perturbations
 from .quantities import measured
 
-# Accelerations that remain may be this fraction of those that the applied forces alone would cause, and this fraction
-# of what displacements by the system's size would cause: assembled states are this exact.
+# Largest remaining accelerations, as a fraction of accelerations by the applied forces alone, and of accelerations by
+# displacements of the system's size: the accuracy of assembled states.
 _UNBALANCED, _ROUNDING = 1e-6, 1e-9
-# Relative change of the equations along a steady motion that counts as none.
+# Negligible relative change of the equations along a steady motion.
 _SAME = 1e-6
 
 
 def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State, Array]:
     """q̇, u̇ and ż of a state, and the multipliers.
 
-    In independent accelerations: with multipliers, derivatives along the motion of light and heavy bodies together lose
-    as many digits as their masses differ by.
+    In independent accelerations: with multipliers, derivatives for light and heavy bodies together lose as many digits
+    as the ratio of their masses has.
     """
     at = Instant.of(system, t, state)
     udot, multipliers = accelerations_at(at, Partitioned())
@@ -47,11 +47,11 @@ def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State
 
 
 class LinearEquations(NamedTuple):
-    """The linear equations and what was found out about them.
+    """The linear equations and their tests.
 
-    `residual`: what remains of X − S at the state, (n,), `steady` whether it vanishes; `moving`, whether anything
-    moves; `constant`: whether A, B of every input and C, D of every output are the same a little later, (1 + inputs +
-    outputs,); `bound`: which inputs move constraints.
+    `residual`: X − S at the state, (n,); `steady`: whether it vanishes; `moving`: whether the state has velocities;
+    `constant`: whether A, B of every input and C, D of every output are the same a little later, (1 + inputs +
+    outputs,); `bound`: the mask of inputs that move constraints.
     """
 
     A: Float[Array, "k k"]
@@ -87,31 +87,31 @@ def linear_equations(
     inputs: tuple[tuple[str, int], ...],
     outputs: tuple[tuple[str, int], ...],
 ) -> LinearEquations:
-    own = perturbations(system, t, state, names)
+    directions = perturbations(system, t, state, names)
     field, _ = vector_field(system, t, state)
     rate = fastest(system, state, field)
     moving = rate > 0
     later = jnp.where(moving, 0.4 / jnp.where(moving, rate, 1.0), 1.0)
 
-    # The state itself, and where each displacement carries it, with the same perturbations.
+    # The state, and the state after each displacement, with the same perturbations.
     moves = jax.vmap(lambda carrier: carrier.displacement(state, later))(carriers(system, state, field, system.length))
     at = joined(state)
     points = jnp.concatenate([at[None], jax.vmap(lambda move: move.turn @ at + move.shift)(moves)])
-    bases = jnp.concatenate([own.basis[None], jax.vmap(lambda move: move.turn @ own.basis)(moves)])
+    bases = jnp.concatenate([directions.basis[None], jax.vmap(lambda move: move.turn @ directions.basis)(moves)])
     times = jnp.concatenate([t[None], jnp.broadcast_to(t + later, (len(points) - 1,))])
     local = jax.vmap(lambda t, x, basis: _local(system, t, x, basis, inputs, outputs))
-    found = local(times, points, bases)
-    here = jax.tree.map(lambda x: x[0], found)
+    values = local(times, points, bases)
+    here = jax.tree.map(lambda x: x[0], values)
 
-    # What is left in the frame of each displacement, in units of the states' sizes and the fastest rate.
+    # The residuals in the frame of each displacement, in units of the states' sizes and the fastest rate.
     scales = State(system.coordinate_scale(), system.velocity_scale(), system.state_scale() if system.nz else None)
-    sizes, kq, last = joined(scales), own.coordinates, own.basis.shape[1] - system.nz
-    widths = jnp.max(jnp.abs(own.basis) / sizes[:, None], axis=0)
+    sizes, kq, last = joined(scales), directions.coordinates, directions.basis.shape[1] - system.nz
+    widths = jnp.max(jnp.abs(directions.basis) / sizes[:, None], axis=0)
     entries = jnp.abs(parted(system, here.by_states).u) / (scales.u[:, None] * widths[None, :])
     omega = rate + jnp.max(entries[:, kq:last], initial=0.0) + jnp.sqrt(jnp.max(entries[:, :kq], initial=0.0))
     omega = jnp.where(omega > 0, omega, 1.0)
     units = joined(dataclasses.replace(scales, u=omega * scales.u))
-    widths = jnp.max(jnp.abs(own.basis) / units[:, None], axis=0)
+    widths = jnp.max(jnp.abs(directions.basis) / units[:, None], axis=0)
     single = jnp.finfo(at.dtype).eps > 1e-10
     unbalanced, rounding, same = (3e-4, 1e-5, 1e-3) if single else (_UNBALANCED, _ROUNDING, _SAME)
     allowed = unbalanced * (_applied(system, t, state) + rate**2) / omega**2 + rounding
@@ -131,19 +131,19 @@ def linear_equations(
         constant = jnp.concatenate([jnp.all(states)[None], inputs, outputs & through])
         return residual, largest, largest <= allowed, constant
 
-    residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], found))
-    # The first displacement that carries the motion along and leaves its equations as they are; else the nearest one.
+    residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], values))
+    # The first displacement with the motion's field that leaves the equations unchanged; otherwise the nearest.
     good = steady & constant[:, 0]
     nearest = jnp.where(jnp.any(steady), jnp.argmax(steady), jnp.argmin(largest))
     best = jnp.where(jnp.any(good), jnp.argmax(good), nearest)
     bound = jnp.max(jnp.abs(here.rows_by_inputs), axis=0, initial=0.0) > 0
-    ok = jnp.all(own.regular) & steady[best] & jnp.all(constant[best]) & ~jnp.any(bound)
+    ok = jnp.all(directions.regular) & steady[best] & jnp.all(constant[best]) & ~jnp.any(bound)
     return LinearEquations(
-        own.reading @ (here.by_states - moves.rate[best] @ own.basis),
-        own.reading @ here.by_inputs,
+        directions.reading @ (here.by_states - moves.rate[best] @ directions.basis),
+        directions.reading @ here.by_inputs,
         here.outputs_by_states,
         here.outputs_by_inputs,
-        own,
+        directions,
         residuals[best],
         steady[best],
         moving,
@@ -157,10 +157,10 @@ def _local(system, t, x, basis, inputs, outputs):
     """Values and derivatives at a state, by one forward derivative."""
     k = basis.shape[1]
     names = tuple(dict.fromkeys(name for name, _ in inputs))
-    known = parameters(system) if names else {}
+    numbers = parameters(system) if names else {}
 
     def evaluate(changes):
-        values = {name: known[name] for name in names}
+        values = {name: numbers[name] for name in names}
         for (name, place), change in zip(inputs, changes[k:], strict=True):
             value = values[name]
             values[name] = jnp.ravel(value).at[place].add(change.astype(value.dtype)).reshape(value.shape)
@@ -180,7 +180,7 @@ def _local(system, t, x, basis, inputs, outputs):
 
 
 def _unchanged(after, before, same):
-    """Which rows of a matrix are the same."""
+    """Whether each row of a matrix is unchanged."""
     size = jnp.max(jnp.abs(before), axis=1, initial=0.0)
     rounding = 1e-6 * same * jnp.max(size, initial=0.0)
     return jnp.max(jnp.abs(after - before), axis=1, initial=0.0) <= same * size + rounding
@@ -193,7 +193,7 @@ def fastest(system, state, field):
 
 
 def _applied(system, t, state):
-    """The largest acceleration that applied forces would cause without constraints, in the same units."""
+    """The largest acceleration by applied forces without constraints, in the same units."""
     if not system.positive_definite_mass:
         return jnp.zeros((), state.q.dtype)
     at = Instant.of(system, t, state)

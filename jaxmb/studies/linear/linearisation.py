@@ -17,9 +17,9 @@ from ...manifold.orthogonal_projection import project_normalized
 from ...system import AbstractSystem
 from .eigen import eigen
 
-# A column of A below this fraction of the largest, in units of the states' sizes, has no effect.
+# A column of A below this fraction of the largest, in units of the states' sizes, counts as zero.
 _NO_EFFECT = 1e-10
-# This many units of rounding of A are no part of an eigenvalue that is printed.
+# Units of rounding of A that printed eigenvalues suppress.
 _ROUNDING = 10
 
 
@@ -27,8 +27,8 @@ class Mode(eqx.Module):
     """A mode of a linearised motion: `x(t) = x₀ + Re(amplitude e^{λ t} shape)`.
 
     **Fields:** `eigenvalue` λ [1/s]; `q`, `u` and `z`, the shape in all coordinates, velocities and internal states,
-    complex, (nq,), (nu,) and (nz,); the displacement that is largest in units of the system's size is one; `system`,
-    `state`, `t`.
+    complex, (nq,), (nu,) and (nz,), with largest displacement one in units of the system's size; `system`, `state`,
+    `t`.
     """
 
     eigenvalue: Complex[Array, ""]
@@ -40,7 +40,7 @@ class Mode(eqx.Module):
     t: Array
 
     def at(self, phase: Scalar, amplitude: Scalar) -> State:
-        """The state nearest to the mode at a phase [rad], on the constraints; for pictures, and to start a simulation.
+        """The state on the constraints nearest to the mode at a phase [rad], for pictures and simulations.
 
         **Arguments:** `amplitude`: of the largest displacement, in units of the system's size, or in radians.
         """
@@ -48,17 +48,17 @@ class Mode(eqx.Module):
         phase, amplitude = (jnp.asarray(real_array(f"Mode.at: {name}", x, dtype)) for name, x in given)
         shown = lambda shape: amplitude * (jnp.cos(phase) * shape.real - jnp.sin(phase) * shape.imag)
         z = None if self.state.z is None else self.state.z + shown(self.z)
-        moved = State(self.state.q + shown(self.q), self.state.u + shown(self.u), z)
-        return project_normalized(self.system, self.t, moved)
+        displaced = State(self.state.q + shown(self.q), self.state.u + shown(self.u), z)
+        return project_normalized(self.system, self.t, displaced)
 
 
 class Linearisation(eqx.Module):
     """`ż = A z + B w`, `y = C z + D w`: small changes of states z, inputs w and outputs y. `print` shows its modes.
 
-    It shows the real or imaginary part of an eigenvalue as 0 where rounding explains it: ten units of rounding of A,
-    in units of the states' sizes, times the eigenvalue's condition. The condition is large for a coordinate that
-    nothing restores, whose two eigenvalues of zero are computed as about 1e-8 of the largest; more than ten times
-    that is never shown as 0. `eigenvalues` are as they are computed.
+    It shows the real or imaginary part of an eigenvalue as 0 if rounding explains it: ten units of rounding of A, in
+    units of the states' sizes, times the eigenvalue's condition. The condition is large for a coordinate without
+    restoring force, whose two zero eigenvalues are computed as about 1e-8 of the largest; more than ten times that is
+    never shown as 0. `eigenvalues` are the computed values.
 
     ```python
     about_rest = jaxmb.linearise(system, jaxmb.equilibrium(system), outputs=["bar.angle"])
@@ -69,7 +69,7 @@ class Linearisation(eqx.Module):
     **Fields:**
 
     - `A` (k, k), `B` (k, inputs), `C` (outputs, k), `D` (outputs, inputs), in SI units.
-    - `states`, `inputs`, `outputs`: their names. The first `coordinates` states are coordinates, then come rates, and
+    - `states`, `inputs`, `outputs`: their names. The states are first `coordinates` coordinates, then rates, then
         internal states.
     - `basis` (nq + nu + nz, k): the changes of all coordinates, velocities and internal states with the states;
         `system`, `state`, `t`.
@@ -90,8 +90,8 @@ class Linearisation(eqx.Module):
 
     @property
     def eigenvalues(self) -> Complex[Array, "k"]:
-        """Eigenvalues of A [1/s] in order of their sizes. Simple ones are differentiable; derivatives of others are
-        not finite.
+        """Eigenvalues of A [1/s] in order of their sizes. Simple eigenvalues are differentiable; derivatives of others
+        are not finite.
         """
         return _spectrum(self)[0]
 
@@ -107,20 +107,20 @@ class Linearisation(eqx.Module):
 
     @property
     def damping_ratios(self) -> Float[Array, "k"]:
-        """`−Re λ / |λ|` of every eigenvalue; zero where the eigenvalue is."""
+        """`−Re λ / |λ|` of every eigenvalue; zero for a zero eigenvalue."""
         values = self.eigenvalues
         size = _size(values)
         return jnp.where(size > 0, -values.real / jnp.where(size > 0, size, 1.0), 0.0)
 
     @property
     def ignorable(self) -> Bool[Array, "k"]:
-        """States that have no effect on others, or only on such states. Their eigenvalues are zero."""
+        """Ignorable states, which have no effect except on other ignorable states. Their eigenvalues are zero."""
         return ~_effective(self)
 
     def mode(self, k: int) -> Mode:
         """The mode of the k-th eigenvalue.
 
-        **Raises:** `ValueError` for a number that no eigenvalue has.
+        **Raises:** `ValueError` for a number out of range.
         """
         count = len(self.states)
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or not -count <= k < count:
@@ -133,7 +133,7 @@ class Linearisation(eqx.Module):
     def frequency_response(self, omega: ArrayLike) -> Complex[Array, "frequencies o i"]:
         """`C (iω − A)⁻¹ B + D` at angular frequencies [rad/s], shape (frequencies, outputs, inputs).
 
-        **Raises:** `ValueError` for frequencies that are no vector of real numbers, and without inputs or outputs.
+        **Raises:** `ValueError` for frequencies that are not a vector of real numbers, and without inputs or outputs.
         """
         if not self.inputs or not self.outputs:
             raise ValueError("A frequency response needs inputs and outputs: linearise(..., inputs=, outputs=).")
@@ -143,7 +143,7 @@ class Linearisation(eqx.Module):
         return _response(self, omega)
 
     def response(self, z0: ArrayLike, ts: VectorLike) -> Float[Array, "times k"]:
-        """The states at times [s] after small changes z0 (k,) of them, `exp(A t) z0`, without inputs.
+        """The states at times [s] after initial changes z0 (k,), `exp(A t) z0`, without inputs.
 
         **Raises:** `ValueError` for arguments of another shape.
         """
@@ -168,7 +168,7 @@ class Linearisation(eqx.Module):
         return StateSpace(*map(np.asarray, (self.A, self.B, self.C, self.D)))
 
     def to_control(self) -> Any:
-        """The same as a `control.StateSpace` of python-control, with all names, whose points become underscores:
+        """The same as a `control.StateSpace` of python-control, with all names, with underscores for dots:
         `motor_torque`.
 
         **Raises:** `ImportError` without python-control.
@@ -177,8 +177,8 @@ class Linearisation(eqx.Module):
             from control import ss
         except ImportError as error:
             raise ImportError("to_control needs python-control; install it with: pip install control") from error
-        own = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
-        names = {kind: [name.replace(".", "_") for name in of_kind] for kind, of_kind in own.items()}
+        names_by_kind = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        names = {kind: [name.replace(".", "_") for name in of_kind] for kind, of_kind in names_by_kind.items()}
         return ss(*map(np.asarray, (self.A, self.B, self.C, self.D)), **names)
 
     def __repr__(self) -> str:
@@ -198,19 +198,19 @@ class Linearisation(eqx.Module):
             if value.imag < 0:
                 continue
             size = abs(value)
-            # From zero, so that no damping has no sign.
+            # Subtracted from zero, so that zero damping has no sign.
             ratio = (0.0 - value.real) / size if size > 0 else 0.0
             text = f"{value.real:.5g}" + (f" ± {value.imag:.5g}i" if value.imag > 0 else "")
-            # A change of speed alone, which nothing depends on, displaces nothing at first.
+            # A change of speed alone displaces nothing at first.
             displaced = np.any(shares[: self.coordinates, k])
-            own = shares[: self.coordinates, k] if displaced else shares[:, k]
-            largest = [self.states[j] for j in np.argsort(-own)[:3] if own[j] > 0.05 * own.max()]
+            weights = shares[: self.coordinates, k] if displaced else shares[:, k]
+            largest = [self.states[j] for j in np.argsort(-weights)[:3] if weights[j] > 0.05 * weights.max()]
             lines.append(f"{k:>4}  {text:>24}  {size:>9.5g}  {ratio:>8.4f}  {', '.join(largest)}")
         return "\n".join(lines)
 
 
 def _without_rounding(linear):
-    """Eigenvalues with zero for what rounding explains, and their vectors in units of the states' sizes."""
+    """Eigenvalues with zero for values that rounding explains, and their vectors in units of the states' sizes."""
     (values, vectors), widths = _spectrum(linear), np.asarray(_widths(linear))
     shapes = np.asarray(vectors) * widths[:, None]
     if not np.all(np.isfinite(shapes)):
@@ -239,7 +239,7 @@ def _widths(linear):
 
 
 def _effective(linear):
-    """Which states have an effect on others that have one, or on themselves."""
+    """Whether each state affects itself or another effective state."""
     widths = _widths(linear)
     effects = jnp.abs(linear.A) * widths[:, None] / widths[None, :]
     least = _NO_EFFECT * jnp.max(effects, initial=0.0)
@@ -254,10 +254,10 @@ def _effective(linear):
 def _spectrum(linear):
     """Eigenvalues, and eigenvectors in all states."""
     kept = lax.stop_gradient(_effective(linear))
-    values, vectors, own = eigen(linear.A, kept)
+    values, vectors, of_block = eigen(linear.A, kept)
     A, unit = linear.A.astype(values.dtype), jnp.eye(len(linear.states), dtype=values.dtype)
     size = lax.stop_gradient(jnp.abs(values))
-    quick = own & (size > _NO_EFFECT * jnp.max(size, initial=0.0))
+    quick = of_block & (size > _NO_EFFECT * jnp.max(size, initial=0.0))
 
     def complete(value, vector, quick):
         # States without effect on others follow the others: (λ − A_ii) v_i = A_ik v_k.

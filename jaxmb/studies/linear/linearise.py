@@ -44,14 +44,13 @@ def linearise(
     about_rest.eigenvalues, about_rest.states
     ```
 
-    `ż = A z + B w` and `y = C z + D w` for small changes z of the states, w of the inputs and y of the outputs. There
-    are as many states as independent coordinates and velocities, fewer velocities than coordinates with rolling, and
-    internal states, so no eigenvalue is spurious. Eigenvalues of zero belong to states that nothing depends on, such as
-    the place of a vehicle on level ground.
+    `ż = A z + B w` and `y = C z + D w` for small changes z of the states, w of the inputs and y of the outputs. The
+    states are independent coordinates and velocities (with rolling, fewer velocities than coordinates) and internal
+    states, so no eigenvalue is spurious. Eigenvalues of zero belong to ignorable states, such as the place of a vehicle
+    on level ground.
 
-    In a steady motion bodies travel and turn together, uniformly, and wheels may spin in addition. States are then
-    seen from a frame that is carried along with each body, so that A is constant; that it is, is verified a little
-    later along the motion.
+    In a steady motion bodies travel and turn together, uniformly, and wheels may spin in addition. States are then seen
+    from a frame that moves with each body, in which A is constant; this is verified a little later along the motion.
 
     **Arguments:**
 
@@ -59,20 +58,20 @@ def linearise(
         `steady_motion` or `assemble`.
     - `t`: the time, for drivers [s].
     - `inputs`: names of parameters, `"motor.torque"`, or of their components, `"push.force[0]"`.
-    - `outputs`: names of quantities that `Trajectory.quantity` takes, `"rod.position"`, `"A.force"`, or components.
-    - `coordinates`: names of coordinates that should be states: entries of q, `"crank.angle"`; displacements and small
-        turns of spatial bodies about their own axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a
-        smooth function of q. They may be fewer than the independent ones; the others are chosen, by pivoting.
-    - `rates`: likewise names of rates, `"crank.angle_rate"`, `"hip.angle_rate"`, `"frame.wx"`, or of coordinates, whose
-        rates they stand for; default the rates of the coordinates, as far as they are independent.
+    - `outputs`: names of quantities of `Trajectory.quantity`, `"rod.position"`, `"A.force"`, or components.
+    - `coordinates`: names of coordinates as states: entries of q, `"crank.angle"`; displacements of spatial bodies and
+        small turns about body axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a smooth function of
+        q. Pivoting chooses further states if they are too few.
+    - `rates`: likewise names of rates, `"crank.angle_rate"`, `"hip.angle_rate"`, `"frame.wx"`, or of coordinates, for
+        their rates; default the rates of the coordinates, as far as they are independent.
 
-    **Returns:** a `Linearisation`. Under `jit` and `vmap` chosen states have no names but numbers, since numbers decide
-    on the choice; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to parameters
-    and the state are exact, those of A at fixed states.
+    **Returns:** a `Linearisation`. Under `jit` and `vmap` chosen states have numbers instead of names, since the choice
+    depends on values; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to
+    parameters and the state are exact; derivatives of A hold the choice of states fixed.
 
     **Raises:** `ValueError` for unknown names, too many of them and dependent ones; for a state that violates the
-    constraints, is singular, is no equilibrium or steady motion, with the accelerations that remain; for a motion whose
-    linear equations change with time; for contacts that are closed, and dry friction; and for inputs that move joints.
+    constraints, is singular, or is not an equilibrium or steady motion, with the remaining accelerations; for a motion
+    whose linear equations change with time; for closed contacts and dry friction; and for inputs that move joints.
     Under a trace the result is NaN instead.
     """
     check_system("linearise", system)
@@ -93,35 +92,37 @@ def linearise(
             f"linearise: {', '.join(closed)} may open, which no linear equation describes. Replace closed contacts by "
             "joints."
         )
-    found = linear_equations(system, t, state, names, chosen, observed)
+    equations = linear_equations(system, t, state, names, chosen, observed)
     labels = tuple(_label(item, shapes) for item in chosen), tuple(_label(item, seen) for item in observed)
-    matrices = found.A, found.B, found.C, found.D
-    if is_traced((matrices, found.ok)):
-        matrices = nan_where(~(found.ok & jnp.all(opens)), matrices, (system, state, t))
-    elif not found.ok:
-        raise ValueError(_refusal(system, t, state, names, found, labels))
+    matrices = equations.A, equations.B, equations.C, equations.D
+    if is_traced((matrices, equations.ok)):
+        matrices = nan_where(~(equations.ok & jnp.all(opens)), matrices, (system, state, t))
+    elif not equations.ok:
+        raise ValueError(_refusal(system, t, state, names, equations, labels))
     return Linearisation(
         *matrices,
-        states=state_labels(system, names, found.perturbations),
+        states=state_labels(system, names, equations.perturbations),
         inputs=labels[0],
         outputs=labels[1],
-        coordinates=found.perturbations.coordinates,
-        basis=found.perturbations.basis,
+        coordinates=equations.perturbations.coordinates,
+        basis=equations.perturbations.basis,
         system=system,
         state=state,
         t=t,
     )
 
 
-def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations) -> tuple[str, ...]:
-    """The names of the states; of chosen ones under a trace, where the choice is not known, numbers."""
-    coordinates, rates = found.picked
-    own = [_rate_label(system, name) for name in names.rates or ()]
-    if is_traced(found.picked):
+def state_labels(system: AbstractSystem, names: StateNames, perturbed: Perturbations) -> tuple[str, ...]:
+    """The names of the states; numbers for chosen states under a trace, where the choice is unknown."""
+    coordinates, rates = perturbed.picked
+    named_rates = [_rate_label(system, name) for name in names.rates or ()]
+    if is_traced(perturbed.picked):
         chosen = [f"coordinate {k}" for k in range(coordinates.size)], [f"rate {k}" for k in range(rates.size)]
     else:
         lists = displacement_names(system), rate_candidates(system, names)
-        chosen = tuple([known[int(k)] for k in picked] for known, picked in zip(lists, found.picked, strict=True))
+        chosen = tuple(
+            [candidates[int(k)] for k in picked] for candidates, picked in zip(lists, perturbed.picked, strict=True)
+        )
     internal = {k: name for name, index in system.state_names().items() for k in index if len(index) == 1}
     internal |= {
         k: f"{name}[{place}]"
@@ -129,11 +130,11 @@ def state_labels(system: AbstractSystem, names: StateNames, found: Perturbations
         for place, k in enumerate(index)
         if len(index) > 1
     }
-    return (*names.coordinates, *chosen[0], *own, *chosen[1], *(internal[k] for k in range(system.nz)))
+    return (*names.coordinates, *chosen[0], *named_rates, *chosen[1], *(internal[k] for k in range(system.nz)))
 
 
 def _rate_label(system, name):
-    """The name of a rate as a state, which differs from that of its coordinate."""
+    """The name of a rate as a state, different from its coordinate's."""
     return f"{name}_rate" if name in {**system.coordinate_names(), **system.joint_coordinates()} else name
 
 
@@ -142,24 +143,21 @@ def _label(item, shapes):
     return component_names(name, shapes[name])[place]
 
 
-def _refusal(system, t, state, names, found: LinearEquations, labels):
-    """Why there are no linear equations."""
-    full, coordinates, rates = map(bool, found.perturbations.regular)
+def _refusal(system, t, state, names, equations: LinearEquations, labels):
+    """The reason why there are no linear equations."""
+    full, coordinates, rates = map(bool, equations.perturbations.regular)
     if not full:
-        return "The state is singular: fewer constraint rows are independent than elsewhere. Linearise at another one."
+        return "The state is singular: fewer constraint rows are independent than elsewhere. Choose another state."
     for kind, good, given in (("coordinates", coordinates, names.coordinates), ("rates", rates, names.rates or ())):
         if not good:
-            return (
-                f"The {kind} {', '.join(given)} are not independent of each other in this state. Name fewer of them, "
-                "or others."
-            )
-    if not found.steady:
-        return _not_steady(system, found)
-    constant = np.asarray(found.constant)
+            return f"The {kind} {', '.join(given)} are not independent in this state. Name fewer of them, or others."
+    if not equations.steady:
+        return _not_steady(system, equations)
+    constant = np.asarray(equations.constant)
     if not constant[0]:
         return (
-            "The linear equations change along this motion, or with time: it is no steady motion, since bodies that "
-            f"move ({', '.join(_moving(system, t, state))}) do not carry their surroundings along. For a periodic "
+            "The linear equations change along this motion, or with time: it is not a steady motion, since moving "
+            f"bodies ({', '.join(_moving(system, t, state))}) do not carry their surroundings along. For a periodic "
             "motion use jaxmb.floquet."
         )
     changing = [name for name, same in zip([*labels[0], *labels[1]], constant[1:], strict=True) if not same]
@@ -168,15 +166,15 @@ def _refusal(system, t, state, names, found: LinearEquations, labels):
             f"The effects of {', '.join(changing)} change along this motion, since their directions do not turn with "
             "it. Choose quantities or forces whose directions are fixed in a body that is carried along."
         )
-    moves = [name for name, own in zip(labels[0], np.asarray(found.bound), strict=True) if own]
+    moves = [name for name, is_bound in zip(labels[0], np.asarray(equations.bound), strict=True) if is_bound]
     return (
-        f"{', '.join(moves)} cannot be an input: it moves the constraints, and the state would have to follow. Use "
-        "a force, a torque, or a parameter of one."
+        f"{', '.join(moves)} cannot be an input: it moves the constraints, and the state would have to follow. Use a "
+        "force, a torque, or a parameter of either."
     )
 
 
 def remaining(system: AbstractSystem, residual) -> str:
-    """The accelerations that remain where there should be none, for messages."""
+    """The remaining accelerations that should be zero, for messages."""
     left = np.asarray(residual)
     rates, accelerations, of_states = np.split(left, [system.nq, system.nq + system.nu])
     labels = directions(system.rate_names())
@@ -190,17 +188,17 @@ def remaining(system: AbstractSystem, residual) -> str:
         )
     if listed:
         return f"accelerations remain along {listed}, in m/s² and rad/s²"
-    return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from those of a uniform motion"
+    return f"rates differ by {np.abs(rates).max():.3g}, in m/s or 1/s, from the rates of a uniform motion"
 
 
-def _not_steady(system, found):
-    left = remaining(system, found.residual)
-    if found.moving:
+def _not_steady(system, equations):
+    left = remaining(system, equations.residual)
+    if equations.moving:
         return (
-            f"The state is no steady motion: {left}, which no uniform motion of all bodies has. jaxmb.steady_motion "
-            "finds one near it; about a periodic motion use jaxmb.floquet."
+            f"The state is not a steady motion: {left}, unlike in any uniform motion of all bodies. "
+            "jaxmb.steady_motion finds a steady motion near it; about a periodic motion use jaxmb.floquet."
         )
-    return f"The state is no equilibrium: {left}. jaxmb.equilibrium(system, state) finds one near it."
+    return f"The state is not an equilibrium: {left}. jaxmb.equilibrium(system, state) finds an equilibrium near it."
 
 
 def _moving(system, t, state):
@@ -209,5 +207,5 @@ def _moving(system, t, state):
     names = system.coordinate_names()
     index = {name: names.get(f"{name}.position", names.get(name, [])) for name in system.catalogue.motion_names()}
     turning = lambda name: names.get(f"{name}.orientation", names.get(f"{name}.angle", []))
-    index = {name: [*own, *turning(name)] for name, own in index.items()}
-    return [name for name, own in index.items() if np.any(speeds[own] > 0)] or ["none"]
+    index = {name: [*indices, *turning(name)] for name, indices in index.items()}
+    return [name for name, indices in index.items() if np.any(speeds[indices] > 0)] or ["none"]

@@ -24,13 +24,13 @@ from ...system import AbstractSystem
 from ...system.quantities import directions, rates_of
 from .quantities import checked_names, components, measured
 
-# How much rather a state is chosen than another that serves as well: turns than displacements, the rates of coordinates
-# that were chosen than other rates, and those of coordinates that the user named than any.
+# Weights of preference between equally suitable states: turns before displacements, rates of chosen coordinates before
+# other rates, and rates of coordinates that the user named before all.
 _TURN, _CHOSEN, _NAMED = 4.0, 4.0, 64.0
 
 
 class StateNames(NamedTuple):
-    """The states that the user names; static. `rates` None: those of the named coordinates, as far as they are
+    """The states that the user names; static. `rates` None: the rates of the named coordinates, as far as they are
     independent.
     """
 
@@ -42,8 +42,8 @@ class Perturbations(eqx.Module):
     """Independent perturbations z of a state.
 
     **Fields:** `basis` (n × k): `δx = basis z` of x = (q, u) and internal states; `reading` (k × n): `z = reading δx`;
-    `coordinates`, the number of states that are coordinates, which come first; internal states come last; `picked`: of
-    the states that the user did not name, the coordinates as indices in `displacement_names`, the rates as indices in
+    `coordinates`, the number of coordinates among the states, which come first; internal states come last; `picked`:
+    the states that the user did not name, as indices of coordinates in `displacement_names` and of rates in
     `rate_candidates`; `regular`: whether the constraints have their ranks, and the named coordinates and rates are
     independent.
     """
@@ -61,7 +61,7 @@ def joined(state: State) -> Float[Array, "n"]:
 
 
 def parted(system: AbstractSystem, x: Array) -> State:
-    """The state of a vector, or of a matrix with one column for each of several."""
+    """The state of a vector, or of a matrix with a column for each of several vectors."""
     q, u, z = jnp.split(x, [system.nq, system.nq + system.nu])
     return State(q, u, z if system.nz else None)
 
@@ -72,8 +72,8 @@ def counts(system: AbstractSystem) -> tuple[int, int]:
 
 
 def displacement_names(system: AbstractSystem) -> list[str]:
-    """Names of the displacements that coordinates are chosen from: the coordinates; or, where these have invariants of
-    their own, translations and small turns about the body's axes, `"rod.x"` and `"rod.rotation_x"`.
+    """Names of the displacements among which coordinates are chosen: the coordinates, or for coordinates with
+    invariants translations and small turns about the body's axes, `"rod.x"` and `"rod.rotation_x"`.
     """
     if not _has_invariants(system):
         return _singles(system.coordinate_names(), system.nq)
@@ -83,15 +83,15 @@ def displacement_names(system: AbstractSystem) -> list[str]:
 
 
 def rate_candidates(system: AbstractSystem, names: StateNames) -> list[str]:
-    """Names of the rates that velocities are chosen from: those of named coordinates, and all velocities."""
+    """Names of the rates among which velocities are chosen: rates of named coordinates, and all velocities."""
     named = [f"{name}_rate" for name in names.coordinates] if names.rates is None else []
     return named + _singles(system.rate_names(), system.nu)
 
 
 def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinates, rates) -> StateNames:
-    """The names that a user gives to states.
+    """The states that a user names.
 
-    **Raises:** `ValueError` for unknown names, more than there are independent ones, and quantities that are no
+    **Raises:** `ValueError` for unknown names, more names than independent states, and quantities that are not
     coordinates.
     """
     names = StateNames(
@@ -108,43 +108,43 @@ def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinat
     for name in names.coordinates:
         function = coordinate_function(system, t, state, name)
         if _depends_on_velocities(function, state):
-            raise ValueError(f"{name!r} depends on velocities and is no coordinate; name it in rates.")
+            raise ValueError(f"{name!r} depends on velocities and is not a coordinate; name it in rates.")
     for name in names.rates or ():
         rate_function(system, t, state, name)
     return names
 
 
 def coordinate_function(system: AbstractSystem, t: Scalar, at: State | None, name: str) -> Callable[[State], Array]:
-    """A coordinate as a function of the state: an entry of q, a displacement from the state `at` if that is given, or a
+    """A coordinate as a function of the state: an entry of q, a displacement from the state `at` if given, or a
     quantity.
     """
-    known = system.coordinate_names()
-    if name in known and len(known[name]) == 1:
-        return lambda state: state.q[known[name][0]]
+    entries = system.coordinate_names()
+    if name in entries and len(entries[name]) == 1:
+        return lambda state: state.q[entries[name][0]]
     displacements = [] if at is None else displacement_names(system)
     if at is not None and name in displacements:
         place = displacements.index(name)
         return lambda state: _displacements(system, t, at)[place] @ (state.q - at.q)
-    return _quantity(system, t, name, "coordinate", [*(k for k, v in known.items() if len(v) == 1), *displacements])
+    return _quantity(system, t, name, "coordinate", [*(k for k, v in entries.items() if len(v) == 1), *displacements])
 
 
 def rate_function(system: AbstractSystem, t: Scalar, at: State, name: str) -> Callable[[State], Array]:
     """A rate as a function of the state: an entry of u, the rate of a coordinate, or a quantity."""
-    known = {name: index for name, index in rates_of(system.rate_names()).items() if len(index) == 1}
-    if name in known:
-        return lambda state: state.u[known[name][0]]
+    entries = {name: index for name, index in rates_of(system.rate_names()).items() if len(index) == 1}
+    if name in entries:
+        return lambda state: state.u[entries[name][0]]
     base = name.removesuffix("_rate")
     coordinates = {*system.coordinate_names(), *displacement_names(system), *system.quantities()}
     if name in system.joint_coordinates() or (base != name and base.split("[")[0] in coordinates):
         function = coordinate_function(system, t, at, base)
         if not _depends_on_velocities(function, at):
             return lambda state: _rate(system, t, function, state)
-    return _quantity(system, t, name, "rate", known)
+    return _quantity(system, t, name, "rate", entries)
 
 
 def tangent_basis(system: AbstractSystem, t: Scalar, state: State) -> tuple[Array, Array, Array, Bool[Array, ""]]:
-    """The directions in which a state moves on its constraints: those of coordinates (nq × kq), the velocities that
-    follow them (nu × kq), those of velocities alone (nu × ku); and whether the constraints have their ranks.
+    """The directions of a state on its constraints: of coordinates (nq × kq), with their changes of velocities (nu ×
+    kq), and of velocities alone (nu × ku); and whether the constraints have their ranks.
     """
     q, u = state.q, state.u
     if _has_invariants(system):
@@ -166,7 +166,7 @@ def tangent_basis(system: AbstractSystem, t: Scalar, state: State) -> tuple[Arra
 
 
 def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateNames) -> Perturbations:
-    """The named states and, of the others, those that serve best, by pivoting."""
+    """The named states and the most suitable others, by pivoting."""
     along, following, alone, regular = tangent_basis(system, t, state)
     nq, kq, ku = system.nq, along.shape[1], alone.shape[1]
     displacements = _displacements(system, t, state)
@@ -179,8 +179,8 @@ def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateN
 
     if names.rates is None:
         given = jnp.zeros((0, nq + system.nu), state.q.dtype)
-        own = [coordinate_function(system, t, state, name) for name in names.coordinates]
-        preferred = _gradients([lambda x, f=f: _rate(system, t, f, x) for f in own], state)
+        functions = [coordinate_function(system, t, state, name) for name in names.coordinates]
+        preferred = _gradients([lambda x, f=f: _rate(system, t, f, x) for f in functions], state)
     else:
         given = _gradients([rate_function(system, t, state, name) for name in names.rates], state)
         preferred = given[:0]
@@ -201,13 +201,13 @@ def perturbations(system: AbstractSystem, t: Scalar, state: State, names: StateN
     reading = jnp.concatenate([rows_q, rows_u])
     basis = tangent @ jnp.linalg.inv(reading @ tangent)
     if system.nz:
-        own = jnp.eye(system.nz, dtype=basis.dtype)
-        basis, reading = block_diag(basis, own), block_diag(reading, own)
+        identity = jnp.eye(system.nz, dtype=basis.dtype)
+        basis, reading = block_diag(basis, identity), block_diag(reading, identity)
     return Perturbations(basis, reading, kq, (picked, picked_rates), jnp.stack([regular, coordinates_ok, rates_ok]))
 
 
 def _remaining(rows: Float[Array, "m k"]) -> tuple[Float[Array, "k f"], Bool[Array, ""]]:
-    """A basis of what named states leave free, and whether they are independent."""
+    """A basis of the directions that named states leave free, and whether the states are independent."""
     m, k = rows.shape
     if m == 0:
         return jnp.eye(k, dtype=rows.dtype), jnp.array(True)
@@ -216,7 +216,7 @@ def _remaining(rows: Float[Array, "m k"]) -> tuple[Float[Array, "k f"], Bool[Arr
 
 
 def _picked(rows: Float[Array, "c f"], weight: Float[Array, "c"]) -> Int[Array, "f"]:
-    """The rows that determine all free directions best, by full pivoting, in their own order."""
+    """The rows that determine all free directions best, by full pivoting, in ascending order."""
     pivots: PivotSearch = full_pivot(rows.T, scale=weight)
     return jnp.sort(pivots.order.columns[: rows.shape[1]])
 
@@ -268,13 +268,13 @@ def _sizes(system):
 
 
 def _turns(system, rates=False):
-    """Which displacements, or rates, are turns of bodies."""
-    own = system.rate_names() if rates or _has_invariants(system) else system.coordinate_names()
+    """Whether each displacement, or rate, is a turn of a body."""
+    entries = system.rate_names() if rates or _has_invariants(system) else system.coordinate_names()
     count = system.nu if rates or _has_invariants(system) else system.nq
     turns = np.zeros(count, bool)
     for body in system.body_names:
         for name in (f"{body}.angle", f"{body}.angle_rate", f"{body}.angular_velocity"):
-            turns[own.get(name, [])] = True
+            turns[entries.get(name, [])] = True
     return turns
 
 

@@ -1,4 +1,4 @@
-"""Least-squares solutions of rows that may depend on each other, differentiable while their rank stays the same."""
+"""Least-squares solutions of rows that may be dependent, differentiable at constant rank."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ _NEGLIGIBLE = 1e-7
 
 @jax.custom_jvp
 def pseudoinverse(E: Float[Array, "m n"]) -> Float[Array, "n m"]:
-    """`E⁺`, of small singular values as of zeros; its derivatives of every order are those at constant rank.
+    """`E⁺`, with small singular values taken as zeros; its derivatives of every order are at constant rank.
 
     Source: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10(2), 1973.
     """

@@ -14,10 +14,10 @@ from ...system.quantities import Solved, component_names
 
 
 def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
-    """The components that names denote, each as the name of its array and its place in it; an array's name denotes all
-    of its components.
+    """The components with these names, each as the name of its array and its place in it; an array's name means all its
+    components.
 
-    **Raises:** `ValueError` for names that are unknown or occur twice, and for a single text instead of a sequence.
+    **Raises:** `ValueError` for unknown or repeated names, and for a single text instead of a sequence.
     """
     out = []
     for name in checked_names(kind, names):
@@ -25,10 +25,10 @@ def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...
             out += [(name, k) for k in range(int(np.prod(shapes[name], dtype=int)))]
             continue
         base = name.split("[")[0]
-        own = component_names(base, shapes[base]) if base in shapes else []
-        if name not in own:
-            raise unknown(kind, name, own or shapes)
-        out.append((base, own.index(name)))
+        names_of_array = component_names(base, shapes[base]) if base in shapes else []
+        if name not in names_of_array:
+            raise unknown(kind, name, names_of_array or shapes)
+        out.append((base, names_of_array.index(name)))
     if len(set(out)) < len(out):
         raise ValueError(f"Every {kind} is named once, got {', '.join(names)}.")
     return tuple(out)
@@ -37,7 +37,7 @@ def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...
 def checked_names(kind: str, names: Iterable[str]) -> tuple[str, ...]:
     """Names as a tuple.
 
-    **Raises:** `ValueError` for a single text, anything but text, and names that occur twice.
+    **Raises:** `ValueError` for a single text, for names that are not text, and for repeated names.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ValueError(f"Names are given in a sequence, ({names!r},), also a single {kind}.")
@@ -53,9 +53,11 @@ def checked_names(kind: str, names: Iterable[str]) -> tuple[str, ...]:
 def measured(
     system: AbstractSystem, chosen: Sequence[tuple[str, int]], t: Scalar, state: State, solved: Solved | None
 ) -> Float[Array, "k"]:
-    """Components of quantities at one state; `solved`, what the equations give there, where some are of forces."""
-    known = system.quantities()
+    """Components of quantities at one state; `solved`: the solution of the equations there, for forces."""
+    quantities = system.quantities()
     along = jnp.asarray(t, state.q.dtype)[None], jax.tree.map(lambda x: x[None], state)
     forces = jax.tree.map(lambda x: x[None], solved)
-    values = {name: jnp.ravel(known[name].value(*along, forces)[0]) for name in dict.fromkeys(n for n, _ in chosen)}
+    values = {
+        name: jnp.ravel(quantities[name].value(*along, forces)[0]) for name in dict.fromkeys(n for n, _ in chosen)
+    }
     return jnp.stack([values[name][k] for name, k in chosen]) if chosen else jnp.zeros(0, state.q.dtype)

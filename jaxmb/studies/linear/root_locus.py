@@ -1,4 +1,4 @@
-"""Eigenvalues along a parameter, with modes followed."""
+"""Eigenvalues along a parameter, with tracked modes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -24,7 +24,7 @@ class RootLocus(eqx.Module):
     ```
 
     **Fields:** `name` and `values` of the parameter, (values,); `eigenvalues` [1/s], (values, k): column j is one mode,
-    followed; `shapes`, (values, nq + nu, k), of the modes in all coordinates and velocities, each of norm one in units
+    tracked; `shapes`, (values, nq + nu, k), of the modes in all coordinates and velocities, each of norm one in units
     of the system's size; `states`, names of the states.
     """
 
@@ -35,13 +35,13 @@ class RootLocus(eqx.Module):
     states: tuple[str, ...] = eqx.field(static=True)
 
     def stable(self, least: float = 1e-6) -> np.ndarray:
-        """Whether no eigenvalue at a value has a positive real part, above this fraction of the largest one."""
+        """Whether no eigenvalue at a value has a positive real part, above this fraction of the largest eigenvalue."""
         sizes = np.max(np.abs(self.eigenvalues), axis=1)
         return np.all(np.real(self.eigenvalues) <= least * sizes[:, None], axis=1)
 
     def boundaries(self, least: float = 1e-6) -> np.ndarray:
-        """The values at which the system becomes stable or ceases to be, between those of `values` by a straight line
-        through the largest real parts; `least` as in `stable`.
+        """The values at which stability changes, by linear interpolation of the largest real parts between `values`;
+        `least` as in `stable`.
         """
         sizes = np.max(np.abs(self.eigenvalues), axis=1)
         # Modes that stay at zero neither grow nor decay.
@@ -68,14 +68,14 @@ def root_locus(
     locus = jaxmb.root_locus(system, "bar.mass", [0.5, 1.0, 2.0], state=jaxmb.equilibrium)
     ```
 
-    Modes at neighbouring values are matched by the overlap of their shapes and the nearness of their eigenvalues, all
-    at once, so that they keep their places where eigenvalues cross.
+    Modes at neighbouring values are matched, all at once, by the overlap of their shapes and the distance of their
+    eigenvalues, so that they keep their columns if eigenvalues cross.
 
     **Arguments:**
 
     - `system`: a compiled scene, or another system, whose parameter `name` takes the values; or a function that returns
         a system and a state for each value, such as a speed.
-    - `name`: of the parameter, or what the values mean.
+    - `name` of the parameter, or the meaning of the values.
     - `values`: numbers in order, close enough to follow the modes.
     - `state(system)`: the equilibrium or steady motion of each system, such as `mb.equilibrium`; not with a function.
     - `t`, `coordinates`, `rates`: as in `linearise`.
@@ -84,15 +84,14 @@ def root_locus(
 
     **Returns:** a `RootLocus`, with NumPy arrays.
 
-    **Raises:** `ValueError` for an unknown parameter or one that is no number, fewer than two values, a `state` that is
-    missing or too much, for what `linearise` refuses at the first value, and for values without an equilibrium or
-    steady motion.
+    **Raises:** `ValueError` for an unknown or non-scalar parameter, fewer than two values, a missing or superfluous
+    `state`, refusals of `linearise` at the first value, and values without an equilibrium or steady motion.
     """
     case = _case(system, name, state)
     given = np.asarray(real_array("root_locus: values", values, np.result_type(float), None))
     if given.ndim != 1 or given.size < 2 or not np.all(np.isfinite(given)):
         raise ValueError(f"root_locus: values must be a vector of at least two finite numbers, got {values!r}.")
-    # The first one names the states, and says what is wrong.
+    # The first value names the states, and raises errors.
     first = linearise(*case(given[0]), t=t, coordinates=coordinates, rates=rates)
     chosen = first.states[: first.coordinates], first.states[first.coordinates :]
 
@@ -100,11 +99,11 @@ def root_locus(
         linear = linearise(*case(value), t=t, coordinates=chosen[0], rates=chosen[1])
         return linear.eigenvalues, linear.basis.astype(linear.vectors.dtype) @ linear.vectors
 
-    # A loop: in a batch two LAPACK routines at once may wait for each other's threads for ever, on two cores.
+    # A loop: in a batch, two LAPACK routines at once may wait for each other's threads for ever, on two cores.
     of_all = eqx.filter_jit(lambda values: jax.lax.map(of_one, values))
 
-    found, shapes = map(np.asarray, of_all(given.astype(first.A.dtype)))
-    bad = ~np.all(np.isfinite(found), axis=1)
+    eigenvalues, shapes = map(np.asarray, of_all(given.astype(first.A.dtype)))
+    bad = ~np.all(np.isfinite(eigenvalues), axis=1)
     if np.any(bad):
         listed = ", ".join(f"{value:.6g}" for value in given[bad][:8])
         raise ValueError(
@@ -114,7 +113,7 @@ def root_locus(
     sizes = np.concatenate([np.asarray(first.system.coordinate_scale()), np.asarray(first.system.velocity_scale())])
     shapes = shapes / sizes[None, :, None]
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
-    return RootLocus(name, given, *_followed(found, shapes), first.states)
+    return RootLocus(name, given, *_followed(eigenvalues, shapes), first.states)
 
 
 def _case(system: Any, name: str, state: Any) -> Any:
@@ -127,11 +126,11 @@ def _case(system: Any, name: str, state: Any) -> Any:
         if state is not None:
             raise ValueError("root_locus: the function returns a system and its state, so `state` is not needed.")
         return system
-    known = parameters(system)
-    if name not in known:
-        raise unknown("parameter", name, known)
-    if known[name].shape != ():
-        shape = known[name].shape
+    values = parameters(system)
+    if name not in values:
+        raise unknown("parameter", name, values)
+    if values[name].shape != ():
+        shape = values[name].shape
         raise ValueError(f"root_locus: {name!r} has shape {shape}, and values are numbers; give a function.")
     if state is None:
         raise ValueError("root_locus needs the state of each system: state=jaxmb.equilibrium, or another function.")

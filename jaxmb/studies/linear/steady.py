@@ -1,4 +1,4 @@
-"""Steady motions: states that keep their velocities while everything travels, turns and spins uniformly."""
+"""Steady motions: states that keep their velocities while all bodies travel, turn and spin uniformly."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -54,59 +54,58 @@ def steady_motion(
     circling = jaxmb.steady_motion(conical, fix={"bob.z": -0.8})  # Its speed is √(9.81 / 0.8) · 0.6.
     ```
 
-    All bodies travel and turn together, uniformly, and may spin about axes of their own in addition: a vehicle that
-    runs straight or in a circle, a governor, a top that precesses. With `ignorable` only these coordinates change,
-    uniformly, and all velocities are constant. Steady motions form families; the nearest one in the scales of
-    coordinates and velocities is found, and `fix` and `rates` select another.
+    All bodies travel and turn together, uniformly, and may spin about separate axes in addition: a vehicle that runs
+    straight or in a circle, a governor, a top that precesses. With `ignorable` only these coordinates change,
+    uniformly, and all velocities are constant. Steady motions form families; the result is the nearest in the scales of
+    coordinates and velocities, and `fix` and `rates` select another.
 
     **Arguments:**
 
     - `system`: a compiled scene, or another system.
-    - `guess`: where to start, default the poses and velocities given with the bodies. It should move: the rates of a
-        turn are found from the velocities of the guess.
-    - `fix`: coordinates that must have these values, by name: entries of q, or scalar quantities that depend on q.
+    - `guess`: start of the search, default the poses and velocities given with the bodies. It should move: its
+        velocities determine the first rates of a turn.
+    - `fix`: prescribed values of coordinates by name: entries of q, or scalar quantities that depend on q.
     - `rates`: likewise velocities, `{"wheel.wy": 5.0}`, `{"frame.velocity[0]": 3.0}`.
-    - `ignorable`: names of coordinates that advance uniformly; needed for a system without bodies, unless nothing
-        moves in its coordinates.
-    - `t`: the time, for drivers that depend on it [s].
+    - `ignorable`: names of coordinates that advance uniformly; needed for a system without bodies, unless its
+        coordinates are constant.
+    - `t`: the time [s] for drivers.
     - `throw`: whether a failed search is an error. With `False` the state is NaN instead.
 
-    Contacts stay as they are in the guess, open or closed, as in `equilibrium`.
+    Contacts stay open or closed as in the guess, as in `equilibrium`.
 
     **Returns:** a `State` on the constraints, differentiable with respect to parameters and prescribed values.
 
-    **Raises:** `ValueError` for unknown names, for a system with dry friction that may stick, and if there is no such
-    motion, with the accelerations that remain, or only one in which an open contact is overlapped or a closed one would
-    have to pull. Under `jit` the result is NaN instead where the motion is not found.
+    **Raises:** `ValueError` for unknown names; for a system with dry friction that may stick; if there is no such
+    motion, with the remaining accelerations; and if an open contact would overlap or a closed contact would have to
+    pull. Under `jit` the result is NaN instead.
     """
     check_system("steady_motion", system)
     check_no_states("steady_motion", system)
     if system.contacts.m:
         names = ", ".join(system.contacts.friction_names)
         raise ValueError(
-            f"steady_motion: {names} may stick or slip, and the search knows neither. Remove it, or use smooth "
+            f"steady_motion: {names} may stick or slip, which the search does not support. Remove it, or use smooth "
             "`Friction`."
         )
     guess = checked_guess("steady_motion", system, guess)
     t = jnp.asarray(checked_time("steady_motion", t, guess.q.dtype))
     chosen, values = _conditions(system, t, guess, {} if fix is None else fix, {} if rates is None else rates)
     advancing = _indices(system, ignorable)
-    found = _search(system, t, State(system.normalize(guess.q), guess.u), chosen, values, advancing)
-    holds = True if found.against is None else ~jnp.any(found.against[0] | found.against[1])
-    if is_traced(found) or not throw:
-        return nan_where(~(found.ok & holds), found.state, (system, guess, values, t))
-    if not found.ok:
-        raise ValueError(_not_found(system, found, [*chosen[0], *chosen[1]]))
-    if found.against is not None and not holds:
-        against, change = about_contacts("The motion is steady", system, *found.against)
+    solution = _search(system, t, State(system.normalize(guess.q), guess.u), chosen, values, advancing)
+    holds = True if solution.against is None else ~jnp.any(solution.against[0] | solution.against[1])
+    if is_traced(solution) or not throw:
+        return nan_where(~(solution.ok & holds), solution.state, (system, guess, values, t))
+    if not solution.ok:
+        raise ValueError(_not_found(system, solution, [*chosen[0], *chosen[1]]))
+    if solution.against is not None and not holds:
+        against, change = about_contacts("The motion is steady", system, *solution.against)
         raise ValueError(f"{against}For example jaxmb.steady_motion(system, jaxmb.assemble(system, guess, {change})).")
-    return found.state
+    return solution.state
 
 
 class _Found(NamedTuple):
-    """A state, the rates that remain at it (n,), the residuals of all equations, with those of the conditions last, and
-    whether all vanish there and a little later; which contacts are overlapped and which ones pull there, None without
-    any.
+    """A state, its remaining rates (n,), the residuals of all equations, with the conditions last, whether all vanish
+    there, and also a little later; masks of overlapped and of pulling contacts, None without contacts.
     """
 
     state: State
@@ -154,7 +153,7 @@ def _search(
     frozen = lax.stop_gradient((system, t, guess, values))
     start, unknowns = ravel_pytree(_start(*frozen[:3], advancing))
     rate = fastest(frozen[0], frozen[2], vector_field(*frozen[:3])[0])
-    # Where the guess does not move, the prescribed rates are all that is known of the motion.
+    # For a guess at rest, only the prescribed rates tell of the motion.
     rate = jnp.where(rate > 0, rate, 1.0)
     later = 0.4 / rate
     length, units = frozen[0].length, (frozen[0].coordinate_scale(), rate * frozen[0].velocity_scale())
@@ -184,7 +183,8 @@ def _search(
     tol = max(_SOLVED, float(jnp.finfo(start.dtype).eps) ** 0.5)
     solved = jnp.max(jnp.abs(left)) <= tol
 
-    # The equations of the nearest solution, for its derivatives: what the residuals leave free stays as it is.
+    # The equations of the nearest solution, for its derivatives: directions that the residuals leave free do not
+    # change.
     inverse = pseudoinverse(jax.jacfwd(lambda z: residual(now, z))(z))
     free = jnp.eye(z.size, dtype=z.dtype) - inverse @ jax.jacfwd(lambda z: residual(now, z))(z)
     good = solved & jnp.all(jnp.isfinite(inverse))
@@ -192,7 +192,7 @@ def _search(
     solution = unknowns(scale * root(equations, z, lambda _, x: x))
     state = State(system.normalize(solution.state.q), solution.state.u)
 
-    # The same at another time, and what remains now.
+    # The residuals at another time, and the remaining rates now.
     check = _residual(system, t, values, chosen, advancing, solution, (*units, rate), 0.7 * later)
     same = jnp.max(jnp.abs(check)) <= 1e3 * tol
     carrier = _carrier(system, solution, system.rates(t, state.q, state.u), advancing)
@@ -207,7 +207,7 @@ def _search(
 
 
 def _start(system, t, guess, advancing):
-    """The guess with the turning and travel that carry it along best."""
+    """The guess with the best-fitting turning and travel."""
     none = jnp.zeros(3, guess.q.dtype)
     if advancing or not system.body_names:
         return _Unknowns(guess, none, none)
@@ -216,7 +216,7 @@ def _start(system, t, guess, advancing):
 
 
 def _carrier(system, unknowns, rates, advancing) -> AbstractCarrier:
-    """What carries a motion along: all bodies together, or only the coordinates that advance."""
+    """The displacement of a motion: all bodies together, or only the coordinates that advance."""
     if advancing or not system.body_names:
         moves = np.isin(np.arange(system.nq), advancing)
         return Advance(jnp.where(moves, rates, 0.0))
@@ -224,12 +224,12 @@ def _carrier(system, unknowns, rates, advancing) -> AbstractCarrier:
 
 
 def _bodies(system, unknowns, rates):
-    """Bodies that turn and travel together; their spins are what is left of their angular velocities."""
+    """Bodies that turn and travel together; their spins are the remainders of their angular velocities."""
     index = body_index(system)
     travel = jnp.broadcast_to(unknowns.travel[None, :], (len(index.rotates), 3))
-    still = jnp.zeros((len(index.spin), 3), travel.dtype)
+    no_spin = jnp.zeros((len(index.spin), 3), travel.dtype)
     advance = rates[np.array(index.scalars, int)]
-    without = Bodies(unknowns.turning, travel, still, advance, index)
+    without = Bodies(unknowns.turning, travel, no_spin, advance, index)
     if not index.spin:
         return without
     spins = unknowns.state.u[np.array(index.spin)]
@@ -237,13 +237,13 @@ def _bodies(system, unknowns, rates):
         spins = jnp.pad(spins - unknowns.turning[2], ((0, 0), (2, 0)))
         return Bodies(unknowns.turning, travel, spins, advance, index)
     attitude = unknowns.state.q[np.array(index.attitude)]
-    own = jax.vmap(lambda p: unrotate(p, unknowns.turning))(attitude)
-    return Bodies(unknowns.turning, travel, spins - own, advance, index)
+    turning_in_body = jax.vmap(lambda p: unrotate(p, unknowns.turning))(attitude)
+    return Bodies(unknowns.turning, travel, spins - turning_in_body, advance, index)
 
 
 def _residual(system, t, values, chosen, advancing, unknowns, units, later):
-    """All equations of a steady motion, in units of the system's size and of the fastest rate: at the state, and where
-    it is carried to in a while. Balance at one time does not last where the surroundings change.
+    """All equations of a steady motion, in units of the system's size and of the fastest rate: at the state, and at the
+    displaced state later. Balance at one time does not last if the surroundings change.
     """
     state = unknowns.state
     carrier = _carrier(system, unknowns, system.rates(t, state.q, state.u), advancing)
@@ -269,11 +269,11 @@ def _not_found(system, found, names):
     held = f" with {', '.join(names)} prescribed" if names else ""
     if found.met:
         return (
-            f"No steady motion was found{held}: the nearest state is in balance at one time only, since what it moves "
-            "in changes along the motion. Prescribe other values, or give another guess."
+            f"No steady motion was found{held}: the nearest state is in balance at one time only, since its "
+            "surroundings change along the motion. Prescribe other values, or give another guess."
         )
     cause = f"{', '.join(unmet)} cannot be reached. " if unmet else ""
     return (
-        f"No steady motion was found{held}: {cause}{remaining(system, found.remaining)}. Prescribe "
-        "fewer values, or others, or give a guess nearer to the motion."
+        f"No steady motion was found{held}: {cause}{remaining(system, found.remaining)}. Prescribe fewer or other "
+        "values, or give a guess nearer to the motion."
     )

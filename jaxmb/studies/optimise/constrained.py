@@ -1,7 +1,7 @@
 """Optimisation with constraints by SciPy's SLSQP, on trials that may fail.
 
-Where a trial fails, the objective is far above all others and everything else is as at the last good trial, so that the
-line search shortens the step.
+A failed trial gets an objective far above all others, and the other values of the last good trial, so that the line
+search shortens the step.
 """
 
 import dataclasses
@@ -13,28 +13,29 @@ from scipy import linalg, optimize
 
 from .trials import HOLDS, Trial, Trials, nearer
 
-# The objective of a trial that failed, in units of the size of the objective.
+# The objective of a failed trial, in units of the size of the objective.
 _FAILED = 1e10
 
 # Largest number of runs, each with an objective of unit size and a fresh Hessian.
 _RUNS = 10
 
-# How far from its last point a method that cannot go on starts anew, in units of the scales of parameters.
+# The distance from the last point at which a stalled method restarts, in units of the scales of parameters.
 _ASIDE = (0.0, 0.1)
 
-# A gain is what leaves no more than this of the violation of constraints; less may be errors of simulations.
+# A gain reduces the violation of constraints at least to this fraction; a smaller reduction may be errors of
+# simulations.
 _LESS = 0.9
 
-# A gradient of unit length is a combination of others where no more than this is left of it.
+# A gradient of unit length depends on others if its remainder is no longer than this.
 _DEPENDENT = 1e-8
 
 
 def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, str]:
-    """Sequential least squares programming, again and again from its own result, with the objective in units of what is
-    left of it and of its gradient, until a run gains no more than the tolerance: SciPy's tolerances are absolute, and
-    its Hessians may mislead it.
+    """Sequential least squares programming, restarted from its result until a run gains no more than the tolerance. The
+    objective is scaled by its present size and gradient, since SciPy's tolerances are absolute and its Hessians may
+    mislead it.
 
-    Where it cannot go on it starts anew at a point where constraints hold better, or a little aside.
+    A stalled run restarts at a more feasible point, or slightly aside.
     """
     here, left, ended, message = start, limit, False, ""
     aside = list(_ASIDE)
@@ -46,9 +47,9 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
         gained = _nearer(trials, new, here) or (
             trials.merit(here)[0] >= trials.merit(new)[0] and here.rows[0] - new.rows[0] > tol * size
         )
-        # A run that gains nothing confirms the one before, however it ends.
+        # A run without a gain confirms the previous run, however it ends.
         if gained or not ended:
-            message = "no step leads on from here" + f" (SciPy: {how.strip()!r})" * (not well)
+            message = "no step makes progress from here" + f" (SciPy: {how.strip()!r})" * (not well)
             ended = (well and trials.violation(new) <= HOLDS) or _balanced(trials, new, tol)
         here = new
         if not gained and (ended or not aside):
@@ -66,17 +67,19 @@ def slsqp(trials: Trials, start: Trial, tol: float, limit: int) -> tuple[bool, s
 
 
 def _run(trials: Trials, here: Trial, size: float, tol: float, left: int) -> tuple[int, bool, str]:
-    """One run, the objective in units of a size: the number of iterations, whether it converged, and SciPy's words."""
+    """One run, with the objective in units of a size: the number of iterations, whether it converged, and SciPy's
+    message.
+    """
     unit = _unit(trials, here, size, tol)
     values, slopes, equal = _one_sided(trials, unit)
     kept = _independent(slopes(here.z / unit), equal)
     constraints = [
-        {"type": kind, "fun": lambda y, own=own: values(y)[own], "jac": lambda y, own=own: slopes(y)[own]}
-        for kind, own in (("eq", kept & equal), ("ineq", kept & ~equal))
-        if own.any()
+        {"type": kind, "fun": lambda y, mask=mask: values(y)[mask], "jac": lambda y, mask=mask: slopes(y)[mask]}
+        for kind, mask in (("eq", kept & equal), ("ineq", kept & ~equal))
+        if mask.any()
     ]
     with warnings.catch_warnings():
-        # SciPy warns of functions that are linear, and of steps to a bound; the result says how it ended.
+        # SciPy warns of linear functions and of steps to a bound; the result has the status.
         warnings.simplefilter("ignore")
         result: Any = optimize.minimize(
             lambda y: _value(trials, y * unit, size),
@@ -94,7 +97,7 @@ def _run(trials: Trials, here: Trial, size: float, tol: float, left: int) -> tup
 
 
 def _nearer(trials: Trials, trial: Trial, other: Trial) -> bool:
-    """Whether constraints that do not hold at another trial are violated far less."""
+    """Whether the constraints violated at another trial are violated far less."""
     return trials.merit(trial)[0] < _LESS * trials.merit(other)[0]
 
 
@@ -106,10 +109,10 @@ def _balanced(trials: Trials, trial: Trial, tol: float) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Balance:
-    """How constraints and the bounds of parameters balance the gradient of the objective.
+    """The balance of the objective's gradient by constraints and bounds of parameters.
 
-    **Fields:** `pull`: the objective's gain of one unit more of each constraint's output, shape (constraints,);
-    `active` constraints; `push` of bounds and `rest`, the part of the gradient that is not balanced, shape (n,).
+    **Fields:** `pull`: the change of the objective per unit of each constraint's output, shape (constraints,); `active`
+    constraints; `push` of bounds and `rest`, the unbalanced part of the gradient, shape (n,).
     """
 
     pull: np.ndarray
@@ -119,8 +122,8 @@ class Balance:
 
 
 def balance_at(trials: Trials, trial: Trial) -> Balance:
-    """The multipliers that come closest, in least squares, to balancing the gradient of the objective by those of
-    active constraints and bounds, each of which only pushes inwards.
+    """The multipliers that best balance, in least squares, the gradient of the objective by gradients of active
+    constraints and bounds, which only push inwards.
     """
     low, high, values = trials.limits.low, trials.limits.high, trial.rows[1:]
     near = 10 * HOLDS
@@ -128,22 +131,22 @@ def balance_at(trials: Trials, trial: Trial) -> Balance:
     at_low, at_high = trial.z <= trials.box[0] + near, trial.z >= trials.box[1] - near
     gradient, slopes, axes = trial.jacobian[0], trial.jacobian[1:], np.eye(trial.z.size)
     inwards = np.vstack([slopes[below], -slopes[above], axes[at_low], -axes[at_high]])
-    # The solver's tolerance is absolute: all are made of length one. A constraint without a gradient, such as a gap
-    # that is closed, balances nothing.
+    # The solver's tolerance is absolute: all gradients are normalised. A constraint without a gradient, such as a
+    # closed gap, balances nothing.
     length, lengths = (x + (x == 0) for x in (np.linalg.norm(gradient), np.linalg.norm(inwards, axis=1)))
-    found = np.zeros(0)
+    multipliers = np.zeros(0)
     # SciPy's solver crashes without unknowns.
     if inwards.size:
-        found = optimize.nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
+        multipliers = optimize.nnls((inwards / lengths[:, None]).T, gradient / length)[0] * length / lengths
     sides, bounds = np.zeros((2, low.size)), np.zeros((2, trial.z.size))
     ends = np.cumsum([below.sum(), above.sum(), at_low.sum()])
-    sides[0, below], sides[1, above], bounds[0, at_low], bounds[1, at_high] = np.split(found, ends)
-    return Balance(sides[0] - sides[1], below | above, bounds[0] - bounds[1], gradient - inwards.T @ found)
+    sides[0, below], sides[1, above], bounds[0, at_low], bounds[1, at_high] = np.split(multipliers, ends)
+    return Balance(sides[0] - sides[1], below | above, bounds[0] - bounds[1], gradient - inwards.T @ multipliers)
 
 
 def _one_sided(trials: Trials, unit: float):
-    """The constraints as SciPy wants them, relative to the sizes of their sides: functions of z in a unit, which are
-    not negative, or zero for equations; their derivatives; and which of them are equations.
+    """The constraints for SciPy, relative to the sizes of their sides: functions of z in a unit, non-negative, or zero
+    for equations; their derivatives; and a mask of the equations.
     """
     limits = trials.limits
     equal = limits.low == limits.high
@@ -157,8 +160,8 @@ def _one_sided(trials: Trials, unit: float):
 
 
 def _independent(slopes: np.ndarray, equal: np.ndarray) -> np.ndarray:
-    """Constraints for SciPy's method, which takes any point for an optimum where gradients of equations are linearly
-    dependent, or where an inequality's gradient is a combination of them.
+    """The mask of independent constraints. SciPy's method takes any point for an optimum if gradients of equations are
+    linearly dependent, or if an inequality's gradient is a combination of them.
     """
     lengths = np.linalg.norm(slopes, axis=1)
     units = slopes / np.where(lengths > 0, lengths, 1.0)[:, None]
@@ -175,20 +178,20 @@ def _independent(slopes: np.ndarray, equal: np.ndarray) -> np.ndarray:
 
 
 def objective_size(trial: Trial) -> float:
-    """The size of the objective, or of its change where parameters change by their scales, if that is larger."""
+    """The size of the objective, or if larger of its change when a parameter changes by its scale."""
     size = max(abs(float(trial.rows[0])), float(np.max(np.abs(trial.jacobian[0]), initial=0.0)))
     return size if size > 0 else 1.0
 
 
 def _unit(trials: Trials, here: Trial, size: float, tol: float) -> float:
-    """The unit of parameters' changes for SLSQP, which takes a Hessian of one at first, and ends where the step that
-    follows from it promises less than the tolerance, as where the objective has a large constant part. There the unit
-    is such that the first step promises ten times the tolerance, unless it is then longer than one: what is left shows.
+    """The unit of parameters' changes for SLSQP, whose first Hessian is one. SLSQP ends if its first step promises less
+    than the tolerance, for example with a large constant part of the objective. The unit then makes the first step
+    promise ten times the tolerance, but not longer than one.
 
-    A power of two, so that nothing is rounded.
+    A power of two, without rounding.
     """
     slope = float(np.linalg.norm(balance_at(trials, here).rest)) / size
-    # Where constraints are violated, they make the step; a smaller slope is that of an optimum, and may be rounding.
+    # Violated constraints determine the step; a smaller slope belongs to an optimum, and may be rounding.
     if slope <= tol or slope**2 >= tol or trials.violation(here) > HOLDS:
         return 1.0
     return 2.0 ** np.round(-0.5 * np.log2(max(slope, slope**2 / (10 * tol))))

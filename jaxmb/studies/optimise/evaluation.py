@@ -18,8 +18,8 @@ from ...system.quantities import component_names
 from ..batch import batch
 from .space import Space
 
-# Reverse mode costs about as much as this many tangents in forward mode, for every row: a gradient some three to five
-# runs, and a Jacobian in forward mode some more at once, and little for each further tangent.
+# A row in reverse mode costs about as much as this number of tangents in forward mode: a gradient takes three to five
+# runs; forward mode has a fixed cost and little for each further tangent.
 _TANGENTS_A_ROW = 2
 
 # The name of the output of a function that returns a number.
@@ -27,10 +27,10 @@ OBJECTIVE = "objective"
 
 
 class Program(eqx.Module):
-    """Some outputs of a function of named parameters, as rows of one vector of the components of the parameters.
+    """Outputs of a function of named parameters, as rows that depend on the vector of the parameters' components.
 
     **Fields:** `function(values)`; `space`: named values of a vector; `names` of the outputs that are rows; `forward`:
-    in which mode to differentiate.
+    the mode of differentiation.
     """
 
     function: Callable[..., Any]
@@ -78,7 +78,7 @@ def rows_of_batch(program: Program, z: Float[Array, "starts n"]) -> Float[Array,
 
 @dataclasses.dataclass(frozen=True)
 class Told:
-    """A function that is equal to others whose programs are the same: what it reads may change between two calls."""
+    """A function that equals others with the same program: the values that it reads may change between two calls."""
 
     function: Callable[..., Any] = dataclasses.field(compare=False)
     digest: Digest
@@ -88,7 +88,7 @@ class Told:
 
 
 def told_apart(function: Callable[..., Any], space: Space) -> Told:
-    """A function of named parameters as one that is told apart by what it computes now."""
+    """A function of named parameters, compared by its present program."""
     traced = jax.make_jaxpr(lambda z: function(space(z)))(jnp.zeros(space.size))
     return Told(function, digest_of(traced, rules=False))
 
@@ -107,7 +107,7 @@ class Limits:
     high: np.ndarray
 
     def worst(self, values: np.ndarray, scales: np.ndarray) -> str:
-        """The component that is farthest out of its bounds, relative to its size, in words."""
+        """The component farthest out of its bounds, relative to its size, in words."""
         k = int(np.argmax(self.excess(values, scales)))
         low, high = self.low[k], self.high[k]
         if low == high:
@@ -116,7 +116,7 @@ class Limits:
         return f"{self.components[k]!r} is {values[k]:.6g}, {side}"
 
     def excess(self, values: np.ndarray, scales: np.ndarray) -> np.ndarray:
-        """How far components are out of their bounds, relative to the sizes of both sides; zero within."""
+        """The violation of bounds by components, relative to the sizes of both sides; zero within."""
         low, high = scales
         return np.maximum(np.maximum((self.low - values) / low, (values - self.high) / high), 0.0)
 
@@ -124,25 +124,25 @@ class Limits:
 def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
     """The shapes of all outputs.
 
-    **Raises:** `ValueError` for outputs that are no real numbers.
+    **Raises:** `ValueError` for outputs that are not real numbers.
     """
     with traced_by_jax("the function of optimise", "a parameter"):
-        found = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
-    found = found if isinstance(found, Mapping) else {OBJECTIVE: found}
+        outputs = eqx.filter_eval_shape(lambda z: program.function(program.space(z)), jnp.zeros(program.space.size))
+    outputs = outputs if isinstance(outputs, Mapping) else {OBJECTIVE: outputs}
     shapes = {}
-    for name, own in found.items():
-        if not isinstance(name, str) or not hasattr(own, "shape") or not jnp.issubdtype(own.dtype, jnp.number):
+    for name, output in outputs.items():
+        if not isinstance(name, str) or not hasattr(output, "shape") or not jnp.issubdtype(output.dtype, jnp.number):
             raise ValueError(
-                f"The function must return a number, or numbers and arrays by name; got {own!r} under {name!r}."
+                f"The function must return a number, or numbers and arrays by name; got {output!r} under {name!r}."
             )
-        shapes[name] = own.shape
+        shapes[name] = output.shape
     return shapes
 
 
 def chosen_objective(objective: str | None, shapes: Mapping[str, tuple[int, ...]], constraints: Any) -> str:
     """The name of the objective among the outputs.
 
-    **Raises:** `ValueError` for an unknown output, for one that is NaN, and where none is named.
+    **Raises:** `ValueError` for an unknown output, a NaN, and a missing name.
     """
     if objective is None:
         left = [name for name in shapes if name not in (constraints or {})]
@@ -157,7 +157,7 @@ def chosen_objective(objective: str | None, shapes: Mapping[str, tuple[int, ...]
 
 
 def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int, ...]]) -> Limits:
-    """Bounds of outputs from `(low, high)`, or from the number that they equal, by name.
+    """Bounds of outputs by name, from `(low, high)`, or from a number for an equation.
 
     **Raises:** `ValueError` for unknown outputs and for bounds that are reversed, absent, or of another shape.
     """
@@ -165,7 +165,7 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
     for name, given in (constraints or {}).items():
         if name not in shapes:
             raise unknown("output", name, shapes)
-        # A list is an array that the output equals, but for a number, which has two bounds.
+        # A list is an array that the output equals; for a number it is two bounds.
         pair = isinstance(given, tuple) or (isinstance(given, list) and shapes[name] == ())
         sides = given if pair else (given, given)
         if all(side is None for side in sides):
@@ -182,9 +182,9 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
 
 
 def with_derivatives(program: Program, rows: int) -> Program:
-    """The program in the mode of derivatives that is cheaper, of those that the function allows.
+    """The program in the cheaper mode of derivatives that the function allows.
 
-    **Raises:** `ValueError` where the function has no derivatives.
+    **Raises:** `ValueError` for a function without derivatives.
     """
     cheaper = program.space.size <= _TANGENTS_A_ROW * rows
     first: Exception | None = None
@@ -197,6 +197,6 @@ def with_derivatives(program: Program, rows: int) -> Program:
             continue
         return trial
     raise ValueError(
-        "The function has no derivatives in either mode. One with a jax.custom_vjp has none in forward mode, one with "
-        "a loop such as jax.lax.while_loop none in reverse mode, and a simulation with an adjoint the mode of that."
+        "The function has no derivatives in either mode. A jax.custom_vjp rules out forward mode, a loop such as "
+        "jax.lax.while_loop reverse mode; a simulation has the mode of its adjoint."
     ) from first

@@ -25,18 +25,20 @@ from .trials import HOLDS, Iteration, Trial, Trials, evaluate
 from .unconstrained import first_order
 from .verdict import objection
 
-# Gradients below this, relative to that at the start, are those of an optimum.
+# Gradients below this, relative to the start's, belong to an optimum.
 _BALANCED = 1e-3
 
-# Lines of the log that are printed.
+# The printed first and last lines of the log.
 _FIRST, _LAST = 3, 9
 
 
 @dataclasses.dataclass(frozen=True)
 class ConstrainedOutput:
-    """A component of a constrained output at the optimum: its bounds, the values before and after, whether a bound is
-    active, its multiplier, what one unit more of that bound would gain of the objective, and the `tolerance` by which
-    the value may be out of bounds, in the output's unit.
+    """A component of a constrained output at the optimum.
+
+    **Fields:** its bounds `low` and `high`; the values `before` and `after`; whether a bound is `active`; `multiplier`
+    ≥ 0, the gain in the objective per unit by which the active bound is relaxed; `tolerance`, by which the value may be
+    out of bounds, in the output's unit.
     """
 
     name: str
@@ -52,7 +54,7 @@ class ConstrainedOutput:
 @dataclasses.dataclass(frozen=True)
 class Attempt:
     """One local optimisation: start and result, the objectives there, the largest violation of a constraint relative to
-    its size, and how it ended.
+    its size, and its status.
     """
 
     start: dict[str, np.ndarray]
@@ -75,17 +77,17 @@ class Optimum(Printed):
 
     **Fields:**
 
-    - `parameters`: the best values by name; `start`: those it started from.
-    - `objective`: its value; `outputs`: all outputs by name; `before`: the outputs at the start, not finite where they
-        could not be computed there.
+    - `parameters`: the best values by name; `start`: the starting values.
+    - `objective`: its value; `outputs`: all outputs by name; `before`: the outputs at the start, not finite if they
+        could not be computed.
     - `constraints`: for every component of a constrained output, its bounds, values, whether it is active, and its
         multiplier.
-    - `iterations`: the log of the local optimisation that gave the result; `trials`: how often the function was
-        differentiated for it, of which `failed` trials were rejected.
+    - `iterations`: the log of the local optimisation that gave the result; `trials`: the number of its trials with
+        derivatives; `failed`: the number of rejected trials.
     - `attempts`: all local optimisations, the best first, if there were several.
-    - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. An edge
-        beyond which trials fail or the objective leaps up is no minimum, nor is a maximum, a saddle, or a point where
-        the objective changes in steps; `message`: how it ended.
+    - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. A maximum,
+        a saddle and steps of the objective are not minima, nor an edge beyond which trials fail or the objective leaps
+        up; `message`: the reason of the end.
     - `derivatives`: the mode, `"forward"` or `"reverse"`.
     """
 
@@ -111,7 +113,7 @@ class Optimum(Printed):
         rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
         for name, value in self.parameters.items():
             each = zip(component_names(name, value.shape), self.start[name].flat, value.flat, strict=True)
-            rows += [(own, *numbers(a, b)) for own, a, b in each]
+            rows += [(word, *numbers(a, b)) for word, a, b in each]
         rows += [(), ("output", "before", "after")]
         rows += [(name, *numbers(self.before[name], x)) for name, x in self.outputs.items() if x.ndim == 0]
         if self.constraints:
@@ -122,7 +124,9 @@ class Optimum(Printed):
         if len(self.attempts) > 1:
             rows += [(), ("attempt", "before", "after", "violation")]
             each = enumerate(self.attempts, 1)
-            rows += [(str(k), *numbers(own.before, own.after), f"{own.violation:.1e}") for k, own in each]
+            rows += [
+                (str(k), *numbers(attempt.before, attempt.after), f"{attempt.violation:.1e}") for k, attempt in each
+            ]
         rows += [(), ("iteration", "objective", "violation", "step", "trials", "failed")]
         log = [
             (str(i.number), f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}", str(i.trials), str(i.failed))
@@ -157,7 +161,7 @@ def optimise(
     max_iterations: int = 200,
     tol: float = 1e-8,
 ) -> Optimum:
-    """Find the values of named parameters that make an objective smallest, with constraints on named outputs.
+    """Find the values of named parameters that minimise an objective, with constraints on named outputs.
 
     ```python
     def fall(values):
@@ -171,47 +175,46 @@ def optimise(
 
     **Arguments:**
 
-    - `function(values)`: outputs by name, numbers or arrays, from parameters by name; or a number, which is the
-        objective. It is made of JAX functions and compiled once. A trial whose `simulate` or `assemble` fails is NaN,
-        and steps are shorter.
+    - `function(values)`: outputs by name, numbers or arrays, from parameters by name; or a number, the objective. It
+        consists of JAX functions and is compiled once. A trial whose `simulate` or `assemble` fails is NaN and shortens
+        the step.
     - `start`: starting values by name, or names alone of parameters of `system`.
-    - `objective`: the output to make small, a number; may be left out if there is but one without a constraint.
-    - `constraints`: outputs by name with their bounds `(low, high)`, either of them None, or with the number that they
-        equal. Those of an array hold for all its components; bounds may be arrays of its shape.
+    - `objective`: the output to minimise, a number; may be left out if only one output has no constraint.
+    - `constraints`: bounds `(low, high)` of outputs by name, either of them None, or the number that the output equals.
+        They hold for all components of an array; bounds may be arrays of its shape.
     - `bounds`: of parameters, `(low, high)` by name, either of them None; numbers, or arrays of the parameter's shape.
     - `system`: a system with design variables, whose bounds and scales are the default, by name. Without a scale a
         parameter is scaled by the distance of its bounds, or its start.
 
     **The method:**
 
-    - `method`: `"slsqp"` of SciPy, with bounds and constraints, which without them is a BFGS method; or an optax
-        optimiser such as `optax.adam(0.02)`, without constraints, which keeps bounds by a change of variables.
-    - `starts`: a number of starts: the given one, and others that fill the bounds evenly (a Sobol sequence by `seed`).
-        All are evaluated in one batch, and the best four of them are optimised.
+    - `method`: `"slsqp"` of SciPy, with bounds and constraints (a BFGS method without them); or an optax optimiser such
+        as `optax.adam(0.02)`, without constraints, which keeps bounds by a change of variables.
+    - `starts`: the number of starts: the given start, and others that fill the bounds evenly (a Sobol sequence by
+        `seed`). All are evaluated in one batch, and the best four are optimised.
     - `max_iterations`, of each local optimisation; `tol`: the method's tolerance, of the objective relative to its size
         (SLSQP), or of a step (optax).
 
-    Values and derivatives of all that is needed come from one program, in forward mode, which is cheaper for few
-    parameters, or in reverse mode, for many parameters and few outputs.
+    One program computes all values and derivatives, in forward mode, cheaper for few parameters, or in reverse mode,
+    for many parameters and few outputs.
 
-    **Trials that fail**, where the mechanism cannot be assembled, the simulation fails or an output is NaN,
-    are rejected: the step is shortened. **A start that fails** needs an output that tells how far it is from one that
-    does not, such as `"gap": jaxmb.assembly_gap(…)`, with a constraint, `{"gap": (None, 0)}`: violations of constraints
-    that have a value are made small first, until all outputs have one. A gap is zero up to the edge of what can be
-    assembled and gives no warning of it: where the best designs lie there, constrain a margin as well, such as the sine
-    of the transmission angle.
+    **A trial fails** if the mechanism cannot be assembled, the simulation fails or an output is NaN; it is rejected,
+    and the step shortened. **A start that fails** needs an output that measures its distance from a feasible start,
+    such as `"gap": jaxmb.assembly_gap(…)`, with a constraint, `{"gap": (None, 0)}`. Violations of finite constraints
+    are reduced first, until all outputs are finite. A gap is zero up to the edge of feasible designs, without a
+    warning: if the best designs lie there, constrain a margin as well, such as the sine of the transmission angle.
 
-    **Constraints hold** to a millionth of their bound, or of the distance of both bounds where that is smaller. A bound
-    of zero has no size: there it is a millionth of the output at the start, or of its change where a parameter changes
-    by its scale, whichever is larger. `Optimum.constraints` has the tolerances.
+    **Constraints hold** to a millionth of their bound, or of the distance of both bounds if smaller. For a bound of
+    zero it is a millionth of the output at the start, or if larger of its change when a parameter changes by its scale.
+    `Optimum.constraints` has the tolerances.
 
-    **A minimum** is told from a maximum, a saddle and a flat objective by some trials beside the result, which `trials`
-    does not count.
+    **A minimum** is distinguished from a maximum, a saddle and a flat objective by some trials beside the result, which
+    `trials` does not count.
 
-    **Returns:** an `Optimum`, the best of all trials whose constraints hold; of `"slsqp"`, where it converged, the last
-    one, unless a better one breaks them by no more.
+    **Returns:** an `Optimum`: the feasible trial (violation ≤ 1e-6 of the bound) with the smallest objective. If SLSQP
+    converged, it is its final point, unless another trial is better and no less feasible.
 
-    **Raises:** `ValueError` for unknown names, bounds that are reversed, a start out of bounds, an objective that is no
+    **Raises:** `ValueError` for unknown names, reversed bounds, a start out of bounds, an objective that is not a
     number, a function without derivatives, and a start that fails if no constraint leads away from it.
     """
     where = space(start, bounds, system)
@@ -229,7 +232,7 @@ def optimise(
 
 
 class _Run(NamedTuple):
-    """A local optimisation: its trials, whether the method converged, and how it ended."""
+    """A local optimisation: its trials, whether the method converged, and its message."""
 
     trials: Trials
     ok: bool
@@ -258,8 +261,8 @@ def _check(method: Any, limited: Limits, starts: Any, max_iterations: Any, tol: 
 
 
 def _optimum(first: Trial, shapes: Mapping[str, tuple[int, ...]], runs: list[_Run], spent: int) -> Optimum:
-    """The result, from the trial at the start, the shapes of outputs, all runs, the best first, and how many trials led
-    from a start that failed.
+    """The result, from the trial at the start, the shapes of outputs, all runs, the best first, and the number of
+    trials that led from a failed start.
     """
     trials, ok, message = runs[0]
     best, program = trials.best, trials.program
@@ -268,7 +271,7 @@ def _optimum(first: Trial, shapes: Mapping[str, tuple[int, ...]], runs: list[_Ru
     if against:
         message = against if ok else f"{message}; {against}"
     if spent:
-        message = f"{message}; {spent} trials led from the start, which failed, to one that does not"
+        message = f"{message}; {spent} trials led from the failed start to a valid start"
     holds = trials.violation(best) <= HOLDS
     if not holds:
         message += f"; constraints are violated, most of all {trials.limits.worst(best.rows[1:], trials.scales)}"
@@ -292,7 +295,7 @@ def _optimum(first: Trial, shapes: Mapping[str, tuple[int, ...]], runs: list[_Ru
 
 
 def _against(trials: Trials, ok: bool, balance: Balance) -> str | None:
-    """What speaks against the best trial, or None."""
+    """The objection to the best trial, or None."""
     slope = np.max(np.abs(trials.start.jacobian[0]), initial=0.0)
     if trials.failed > 0 and np.max(np.abs(balance.rest), initial=0.0) > _BALANCED * slope:
         return "trials fail where the objective decreases: constrain a margin from there"
@@ -319,7 +322,7 @@ def _attempt(run: _Run) -> Attempt:
 
 
 def _constraints(trials: Trials, balance: Balance, first: Trial) -> tuple[ConstrainedOutput, ...]:
-    """The components of constrained outputs at the best trial, and at the first one."""
+    """The components of constrained outputs at the best trial, and at the first trial."""
     limited, before = trials.limits, first.rows
     if first.outputs:
         before = np.concatenate([np.ravel(first.outputs[name]) for name in trials.program.names])
@@ -329,6 +332,6 @@ def _constraints(trials: Trials, balance: Balance, first: Trial) -> tuple[Constr
         *(balance.active, np.abs(balance.pull), HOLDS * np.min(trials.scales, axis=0)),
     )
     return tuple(
-        ConstrainedOutput(own, float(low), float(high), float(a), float(b), bool(on), float(pull), float(within))
-        for own, low, high, a, b, on, pull, within in zip(*columns, strict=True)
+        ConstrainedOutput(component, float(low), float(high), float(a), float(b), bool(on), float(pull), float(within))
+        for component, low, high, a, b, on, pull, within in zip(*columns, strict=True)
     )

@@ -1,4 +1,4 @@
-"""Where an optimisation starts: the best of several points, or one that leads away from a start that fails."""
+"""Starts of an optimisation: the best of several points, or a feasible point near a start that fails."""
 
 from collections.abc import Callable, Mapping
 
@@ -8,7 +8,7 @@ import numpy as np
 from .evaluation import Limits, Program, rows_of_batch
 from .trials import HOLDS, Trial, constraint_scales, evaluate
 
-# Local optimisations from the best of several starts.
+# Number of local optimisations, from the best of several starts.
 _LOCAL = 4
 
 
@@ -21,7 +21,7 @@ def starting_points(
     seed: int,
     most: int,
 ) -> tuple[list[np.ndarray], int]:
-    """The vectors to start from, and the number of trials that led to the one where every start failed.
+    """The vectors to start from, and the number of trials that led to a feasible start if every start failed.
 
     **Arguments:** `first`: the trial at the given start; `shapes` of outputs; `starts`: their number; `most`: largest
     number of trials.
@@ -33,12 +33,12 @@ def starting_points(
         chosen = _best(program, limits, starts, seed)
     if chosen:
         return chosen, 0
-    found, spent = _from_nowhere(program, limits, shapes, first, most)
-    return [found.z], spent
+    trial, spent = _feasible_start(program, limits, shapes, first, most)
+    return [trial.z], spent
 
 
 def _best(program: Program, limits: Limits, starts: int, seed: int) -> list[np.ndarray]:
-    """The best of several starts, evaluated at once; none where all fail."""
+    """The best of several starts, evaluated at once; none if all fail."""
     others = program.space.sample(starts - 1, seed)
     z = jnp.concatenate([jnp.zeros((1, program.space.size), others.dtype), others])
     rows = np.asarray(rows_of_batch(program, z))
@@ -52,30 +52,30 @@ def _best(program: Program, limits: Limits, starts: int, seed: int) -> list[np.n
     return [np.asarray(z[k], float) for k in order[:_LOCAL] if good[k]]
 
 
-def _from_nowhere(program: Program, limits: Limits, shapes, first: Trial, most: int) -> tuple[Trial, int]:
-    """From a start that fails to one that does not, by the constraints that have a value there."""
+def _feasible_start(program: Program, limits: Limits, shapes, first: Trial, most: int) -> tuple[Trial, int]:
+    """A feasible trial from a start that fails, by the constraints that are finite there."""
     finite = [name for name in limits.names if name in first.outputs and np.all(np.isfinite(first.outputs[name]))]
     lost = [name for name in program.names if name not in finite]
     named = f"{', '.join(map(repr, lost))} {'is' if len(lost) == 1 else 'are'}" if lost else "derivatives are"
     what = f"At the start {named} not finite"
     cure = (
-        "Start elsewhere, or return an output that tells how far the start is from a feasible one, such as "
+        "Start elsewhere, or return an output that measures the distance from a feasible start, such as "
         "jaxmb.assembly_gap(...), with a constraint: constraints={'gap': (None, 0)}."
     )
     if not finite:
         raise ValueError(f"{what}. {cure}")
-    own = np.concatenate([np.full(int(np.prod(shapes[name])), name in finite) for name in limits.names])
-    components = tuple(c for c, k in zip(limits.components, own, strict=True) if k)
-    kept = Limits(tuple(finite), components, limits.low[own], limits.high[own])
-    # In forward mode, since a reverse pass through anything that is NaN is NaN, whatever its weight.
+    mask = np.concatenate([np.full(int(np.prod(shapes[name])), name in finite) for name in limits.names])
+    components = tuple(c for c, k in zip(limits.components, mask, strict=True) if k)
+    kept = Limits(tuple(finite), components, limits.low[mask], limits.high[mask])
+    # In forward mode, since a reverse pass through a NaN is NaN, whatever its weight.
     part = Program(program.function, program.space, tuple(finite), True)
     start = evaluate(part, first.z)
     if not start.good or not kept.excess(start.rows, np.ones((2, start.rows.size))).any():
-        raise ValueError(f"{what}, and no constraint that is violated leads away from it. {cure}")
+        raise ValueError(f"{what}, and no violated constraint leads away from it. {cure}")
     found, spent = _first_feasible(part, lambda z: evaluate(program, z), kept, start, most)
     if found is None:
         raise ValueError(
-            f"{what}, and {spent} trials that made {', '.join(finite)} small found no start that is. {cure}"
+            f"{what}, and {spent} trials that made {', '.join(finite)} small found no finite start. {cure}"
         )
     return found, spent
 
@@ -87,13 +87,13 @@ def _first_feasible(
     here: Trial,
     most: int,
 ) -> tuple[Trial | None, int]:
-    """From a trial where the objective is NaN to one where everything is finite.
+    """A trial with finite values, from a trial whose objective is NaN.
 
-    Gauss–Newton steps make the excess of those constraints small that have a value, such as a gap of assembly, and go
-    beyond their bounds by a part of the way, since at the bounds themselves a mechanism is singular.
+    Gauss–Newton steps reduce the violation of finite constraints, such as a gap of assembly. They then go beyond the
+    bounds by a fraction of the way, since a mechanism is singular at the bounds themselves.
 
-    **Arguments:** `program`: of the constraints that have a value at the start; `whole(z)`: a trial of everything;
-    `limits` of these constraints; `here`: the trial of these; `most`: largest number of trials.
+    **Arguments:** `program` of the constraints that are finite at the start, with their `limits` and their trial
+    `here`; `whole(z)`: a trial of all outputs; `most`: largest number of trials.
 
     **Returns:** the trial, or None; and the number of trials.
     """
@@ -111,19 +111,19 @@ def _first_feasible(
         step = -np.linalg.lstsq(slope[violated], excess[violated], rcond=1e-8)[0]
         # No step is longer than half the scale of a parameter.
         step *= min(1.0, 0.5 / max(np.max(np.abs(step)), 1e-300))
-        length, moved = 1.0, None
+        length, better = 1.0, None
         while length > 1e-3 and count < most:
             trial = evaluate(program, np.clip(here.z + length * step, low, high))
             count += 1
             smaller = np.linalg.norm(limits.excess(trial.rows, scales)) < (1 - 1e-3 * length) * np.linalg.norm(excess)
             if trial.good and smaller:
-                moved = trial
+                better = trial
                 break
             length *= 0.5
-        if moved is None:
+        if better is None:
             break
-        beyond = moved.z - here.z
-        here = moved
+        beyond = better.z - here.z
+        here = better
         if np.max(limits.excess(here.rows, scales)) < 1e-2:
             break
     # The last steps, lengthened until the objective has a value.

@@ -1,4 +1,4 @@
-"""The trials of an optimisation: each is evaluated once, and those that fail are told apart."""
+"""The trials of an optimisation: each is evaluated once, and failed trials are marked."""
 
 import dataclasses
 from typing import Any
@@ -10,13 +10,13 @@ from scipy import optimize
 
 from .evaluation import Limits, Program, linearised
 
-# Constraints that are violated by no more than this, relative to their size, hold.
+# Largest violation of a satisfied constraint, relative to its size.
 HOLDS = 1e-6
 
-# Trials that are kept, in case they are asked for again.
+# Number of trials in the cache.
 _KEPT = 32
 
-# Violations that decrease by less than this part are as small as they become.
+# Least relative decrease of violations at which their reduction continues.
 _STALLED = 1e-3
 
 # The smallest size of a constraint's side, relative to its output.
@@ -26,8 +26,8 @@ _ROUNDED = 1e-7
 @dataclasses.dataclass(frozen=True)
 class Iteration:
     """One line of the log: the number of the iteration, the objective, the largest violation of a constraint relative
-    to its size, the largest change of a parameter relative to its scale, and the numbers of trials and of those among
-    them that failed, so far.
+    to its size, the largest change of a parameter relative to its scale, and the numbers of trials and of failed trials
+    so far.
     """
 
     number: int
@@ -40,7 +40,7 @@ class Iteration:
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """Values and derivatives at a vector z; not finite where the trial failed.
+    """Values and derivatives at a vector z; not finite if the trial failed.
 
     **Fields:** `rows`, shape (1 + constraints,), the objective first; `jacobian`; `outputs` by name.
     """
@@ -56,7 +56,7 @@ class Trial:
 
 
 class Trials:
-    """Evaluates a program at vectors within the box of its space, and keeps what it found."""
+    """Evaluates a program at vectors within the box of its space, with a cache."""
 
     def __init__(self, program: Program, limits: Limits, start: Trial):
         self.program, self.limits, self.box = program, limits, program.space.box
@@ -71,7 +71,7 @@ class Trials:
     def __call__(self, z: np.ndarray) -> Trial:
         z = np.clip(np.asarray(z, float), *self.box)
         trial = self._kept.get(z.tobytes())
-        # A line search that found nothing begins again with the same points.
+        # A failed line search begins again with the same points.
         if trial is None:
             trial = evaluate(self.program, z)
             self.count += 1
@@ -85,9 +85,9 @@ class Trials:
         return trial
 
     def ended(self, z: np.ndarray) -> None:
-        """Take the end of a run that converged as the best trial where that one breaks constraints by more.
+        """Take the end of a converged run as the best trial, if the present best violates constraints more.
 
-        A trial may be better for no other reason, by no more than `HOLDS`.
+        The present best may owe its objective to a violation within `HOLDS`.
         """
         end = self(z)
         if end.good and self.violation(end) < self.violation(self.best):
@@ -98,7 +98,7 @@ class Trials:
         return float(np.max(self.limits.excess(trial.rows[1:], self.scales), initial=0.0))
 
     def merit(self, trial: Trial) -> tuple[float, float]:
-        """What makes one trial better than another: first constraints that hold, then a small objective."""
+        """The order of trials: first feasibility, then the objective."""
         violation = self.violation(trial)
         return (violation if violation > HOLDS else 0.0), float(trial.rows[0])
 
@@ -113,8 +113,8 @@ class Trials:
 
 
 def evaluate(program: Program, z: np.ndarray) -> Trial:
-    """One trial. An error of the program, such as that of a simulation that throws, is a trial that failed; one of the
-    machine, or of a function of the user that the program calls, is not.
+    """One trial. An error raised by the program, such as by a simulation that throws, makes it a failed trial. Errors
+    of the machine, or of a user's function that the program calls, are raised.
     """
     try:
         rows, jacobian, outputs = linearised(program, jnp.asarray(z, jnp.result_type(float)))
@@ -125,26 +125,27 @@ def evaluate(program: Program, z: np.ndarray) -> Trial:
 
 
 def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
-    """Sizes of the lower and the upper side of constraints: their bounds, each its own, so that a far one does not
-    loosen the other, or the distance of both if that is smaller.
+    """Sizes of the lower and the upper side of constraints: each side's bound, so that a far bound does not loosen the
+    other, or the distance of both if smaller.
 
-    Where the bound is zero, the first value, or its change where a parameter changes by its scale if that is larger,
-    but no more than the other bound. A bound that is almost zero has a size far above rounding errors of these.
+    For a bound of zero, the first value, or if larger its change when a parameter changes by its scale, but at most the
+    other bound. A bound of almost zero has a size far above rounding errors of these.
     """
-    known = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
-    own = known(np.abs([limits.low, limits.high]))
-    first = known(np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0)))
-    size = np.where(np.isfinite(own), own, np.minimum(own[::-1], first))
-    size = np.minimum(size, known(limits.high - limits.low))
+    or_infinite = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
+    of_bounds = or_infinite(np.abs([limits.low, limits.high]))
+    first = or_infinite(np.maximum(np.abs(start.rows[1:]), np.max(np.abs(start.jacobian[1:]), axis=1, initial=0.0)))
+    size = np.where(np.isfinite(of_bounds), of_bounds, np.minimum(of_bounds[::-1], first))
+    size = np.minimum(size, or_infinite(limits.high - limits.low))
     size = np.maximum(size, np.where(np.isfinite(first), _ROUNDED * first, 0.0))
     return np.where(np.isfinite(size), size, 1.0)
 
 
 def nearer(trials: Trials, here: Trial, aside: float, most: int) -> Trial:
-    """A trial whose constraints hold better, by least squares of their violations within the box; linearised
-    constraints that contradict each other do not stop it, nor, with `aside`, a slope of zero.
+    """A more feasible trial, by least squares of violations within the box. Contradictory linearised constraints do not
+    stop it, nor, with `aside`, a slope of zero.
 
-    **Arguments:** `aside`: how far from `here` to begin, in a random direction; `most`: largest number of trials.
+    **Arguments:** `aside`: the distance of the start from `here`, in a random direction; `most`: largest number of
+    trials.
     """
     limits = trials.limits
     step = aside * np.random.default_rng(0).uniform(-1.0, 1.0, here.z.size)
@@ -162,6 +163,6 @@ def nearer(trials: Trials, here: Trial, aside: float, most: int) -> Trial:
     excess = lambda z: limits.excess(trials(z).rows[1:], trials.scales)
     if excess(start.z).any():
         options: dict[str, Any] = {"jac": slopes, "bounds": trials.box, "ftol": _STALLED, "max_nfev": most}
-        found = optimize.least_squares(excess, start.z, **options)
-        start = trials(found.x)
+        result = optimize.least_squares(excess, start.z, **options)
+        start = trials(result.x)
     return start

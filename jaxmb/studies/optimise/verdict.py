@@ -1,4 +1,4 @@
-"""Whether the result of an optimisation is a minimum: what lies beside it speaks for or against it."""
+"""Tests by trials beside the result of an optimisation, whether it is a minimum."""
 
 from collections.abc import Callable, Iterator
 
@@ -7,36 +7,37 @@ import numpy as np
 from .constrained import Balance, objective_size
 from .trials import HOLDS, Trial, Trials
 
-# Gradients below this, relative to the objective, are those of an optimum.
+# Gradients below this, relative to the objective, belong to an optimum.
 _BALANCED = 1e-3
 
-# How far beside the result a leap of the objective is looked for, in units of the scales of parameters.
+# Distance beside the result of the test for a leap of the objective, in units of the scales of parameters.
 _BESIDE = 1e-5
 
-# How far beside the result the objective must increase, in the same units.
+# Distances beside the result at which the objective must increase, in the same units.
 _NEAR, _FAR = 1e-3, 1e-2
 
-# Directions in which the curvature is measured, at most.
+# Largest number of directions in which the curvature is measured.
 _DIRECTIONS = 8
 
-# From the near to the far point a decrease becomes so much steeper: a slope that is left of the iteration does not.
+# Least ratio of the slopes at the far and the near point for a true decrease: a remaining slope of the iteration is
+# constant.
 _STEEPER = 3.0
 
-# A decrease on both sides, and on one side, which is more than an error, relative to the objective.
+# Least significant decrease on both sides, and on one side, relative to the objective.
 _BOTH, _ONE = 1e-11, 1e-7
 
-# Constraints and bounds of less than this part of the gradient do not hold the result where it is.
+# Constraints and bounds with less than this fraction of the gradient do not hold the result.
 _WEAK = 1e-6
 
 
 def objection(at: Callable[[np.ndarray], Trial], trials: Trials, balance: Balance, components: list[str]) -> str | None:
-    """What speaks against a result that a method converged to, or None.
+    """The objection to a converged result, or None.
 
-    **Arguments:** `at(z)`: a trial; `components`: the names of those of z.
+    **Arguments:** `at(z)`: a trial; `components`: the names of z's components.
     """
     best = trials.best
-    if (found := _steep(at, trials, balance)) is not None:
-        return found
+    if (reason := _steep(at, trials, balance)) is not None:
+        return reason
     if not best.jacobian[0].any() and not trials.start.jacobian[0].any():
         others = [at(z) for z in _around(trials)]
         if not any(other.jacobian[0].any() for other in others):
@@ -45,8 +46,8 @@ def objection(at: Callable[[np.ndarray], Trial], trials: Trials, balance: Balanc
 
 
 def _steep(at, trials: Trials, balance: Balance) -> str | None:
-    """A gradient that nothing balances, as where a mechanism is assembled on another branch, or where a method ended
-    too early. A kink of the objective is a minimum.
+    """An unbalanced gradient, as beside another branch of assembly, or from a method that ended too early. A kink of
+    the objective is a minimum.
     """
     best, rest = trials.best, balance.rest
     length = float(np.linalg.norm(rest))
@@ -59,8 +60,8 @@ def _steep(at, trials: Trials, balance: Balance) -> str | None:
     slope = max(np.linalg.norm(trial.jacobian[0]) for trial in (best, beside))
     if gained < -10 * slope * _BESIDE:
         return (
-            f"beside the result the objective leaps to {beside.rows[0]:.6g}, where its gradient promises less: "
-            "constrain a margin from there, or, where a mechanism is assembled, give a guess closer to the branch"
+            f"beside the result the objective leaps to {beside.rows[0]:.6g}, though its gradient promises a decrease: "
+            "constrain a margin from there, or give the assembly a guess closer to the branch"
         )
     if gained > 0.5 * length * _BESIDE:
         return "the objective still decreases along the constraints: start elsewhere, or use another method"
@@ -68,17 +69,17 @@ def _steep(at, trials: Trials, balance: Balance) -> str | None:
 
 
 def _around(trials: Trials) -> Iterator[np.ndarray]:
-    """Points about the best one, at half the scale of parameters."""
+    """Points about the best trial, within half the scale of parameters."""
     step = np.random.default_rng(0).uniform(-0.5, 0.5, (4, trials.best.z.size))
-    return (np.clip(trials.best.z + own, *trials.box) for own in step)
+    return (np.clip(trials.best.z + offset, *trials.box) for offset in step)
 
 
 def _flat(best: Trial, others: list[float]) -> str | None:
-    """Words for an objective without a gradient. A constant one has its minimum wherever constraints hold."""
+    """Words for an objective without a gradient. A constant objective is minimal wherever constraints hold."""
     if any(value != best.rows[0] for value in others):
         return (
             "the derivative of the objective is exactly zero, though its value changes: it changes in steps, as by "
-            "rounding, counting or comparing, which gradients do not see"
+            "rounding, counting or comparing, which have no gradient"
         )
     if best.rows.size > 1:
         return None
@@ -114,21 +115,21 @@ class _Lagrangian:
         self.gradient = self.weights @ self.here.jacobian
 
     def beside(self, step: np.ndarray) -> Trial | None:
-        """A trial beside, unless it fails or is not within bounds."""
+        """A trial beside the result, unless it fails or is out of bounds."""
         z = self.here.z + step
         low, high = self.trials.box
         trial = self.at(np.clip(z, low, high)) if np.all((z >= low - HOLDS) & (z <= high + HOLDS)) else None
         return trial if trial is not None and trial.good else None
 
     def decrease(self, direction: np.ndarray) -> float:
-        """How much it decreases on the way there; zero where it does not, or where a constraint is in the way."""
+        """The decrease along a direction; zero without one, or if a constraint blocks the way."""
         near, far = (self.beside(length * direction) for length in (_NEAR, _FAR))
         if near is None or far is None:
             return 0.0
         first, second = (self.weights @ trial.jacobian @ direction for trial in (near, far))
         if first >= 0 or second > _STEEPER * first:
             return 0.0
-        # Constraints with multipliers hold to first order; others must not be in the way.
+        # Constraints with multipliers hold to first order; others must not block the way.
         free = self.weights[1:] == 0
         excess = self.trials.limits.excess(far.rows[1:], self.trials.scales)
         if np.max(excess[free], initial=0.0) > HOLDS:
@@ -137,7 +138,9 @@ class _Lagrangian:
 
 
 def _tangents(trials: Trials, balance: Balance) -> np.ndarray:
-    """An orthonormal basis of the changes that keep to first order what holds the result, shape (n, free)."""
+    """An orthonormal basis of the changes that keep, to first order, the constraints that hold the result, shape (n,
+    free).
+    """
     best, size = trials.best, np.linalg.norm(trials.best.jacobian[0])
     slopes, equal = best.jacobian[1:], trials.limits.low == trials.limits.high
     lengths = np.linalg.norm(slopes, axis=1)

@@ -263,11 +263,13 @@ def test_forces_at_corners_follow_from_the_energy_and_balance():
 
 
 def test_what_is_no_chain_is_refused():
-    with pytest.raises(ValueError, match="closed chain has three plates at least, got 1"):
+    with pytest.raises(ValueError, match="closed chain has at least three plates, got 1"):
         collision(plate(chain=True, **LAWS), (0.0, 0.25))
     corners = {"start": ROOF, "end": np.roll(ROOF, 1, axis=0)}
     backwards = planar.PlateContact("touch", ("disc", "a", "b", "c"), radius=0.2, chain=True, **corners, **SHARP)
-    with pytest.raises(ValueError, match=r"'touch': .* that of 'c' begins 2 m from the end of that of 'b'; join them"):
+    with pytest.raises(
+        ValueError, match=r"'touch': .* the plate of 'c' begins 2 m from the end of the plate of 'b'; join them"
+    ):
         backwards.resolve(PLANE, jnp.zeros((4, 3)))
 
 

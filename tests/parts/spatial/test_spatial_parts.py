@@ -752,8 +752,11 @@ TWO = ("J", "a", "b")
             spatial.Composite(*TWO, point=O, sequence=["hinge", "slide", "hinge"], axes=[Z, (1.0, 0.0, 0.0), Z]),
             "hinge 1, hinge 3 are parallel hinges",
         ),
-        (spatial.Composite(*TWO, point=O, sequence=["slide"] * 2, axes=[Z, Z]), "slide 1, slide 2 slide in directions"),
-        (spatial.Composite(*TWO, point=O, sequence=["ball", "hinge"], axes=[Z, Z]), "turn in more ways than"),
+        (
+            spatial.Composite(*TWO, point=O, sequence=["slide"] * 2, axes=[Z, Z]),
+            "slide 2 slide in linearly dependent directions",
+        ),
+        (spatial.Composite(*TWO, point=O, sequence=["ball", "hinge"], axes=[Z, Z]), "have more than three rotations"),
         (spatial.Composite(*TWO, point=O, sequence=["hinge"], axes=[Z], points=[Z, Z]), "points must have 1 rows"),
         (spatial.Composite(*TWO, point=O, sequence=["hinge"], axes=[Z], middle=1.0), "leave it out"),
         (spatial.Composite(*TWO, point=O, sequence=["hinge"] * 3, axes=[Z, (1.0, 0.0, 0.0), Z]), "give another middle"),

@@ -603,7 +603,7 @@ def test_measurements_from_files_and_tables(tmp_path):
         ("t,phi\n0,1\n0,2\n", None, "must increase, but 0 in row 2 follows 0"),
         ("t,phi\n0,1\n,2\n", None, "no number in row 2"),
         ("t,phi\n0,1\n", None, "too few data"),
-        ("t\n0\n1\n", None, "no column but that of time"),
+        ("t\n0\n1\n", None, "no column except time"),
         ("\n", None, "is empty"),
     ],
 )
