@@ -57,13 +57,14 @@ def first_failure(file: str, code: str, wrong: str) -> str | None:
         if text.count(code) != 1:
             raise ValueError(f"{file} has {code!r} {text.count(code)} times, not once.")
         path.write_text(text.replace(code, wrong))
-        folder = f"tests/{file.split('/')[0]}"
-        command = [sys.executable, "-m", "pytest", "-x", "-q", folder, "tests", f"--ignore={place}/tests/package"]
-        out = subprocess.run(
-            command, cwd=place, env=os.environ | {"PYTHONPATH": place}, capture_output=True, text=True
-        ).stdout
-        failed = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - |$)", out, re.MULTILINE)
-        return failed.group(1) if failed else None
+        for tests in (f"tests/{file.split('/')[0]}", "tests"):
+            command = [sys.executable, "-m", "pytest", "-x", "-q", tests, f"--ignore={place}/tests/package"]
+            environment = os.environ | {"PYTHONPATH": place}
+            out = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True).stdout
+            failed = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - |$)", out, re.MULTILINE)
+            if failed:
+                return failed.group(1)
+        return None
 
 
 def main(words: list[str]) -> int:
