@@ -643,7 +643,7 @@ ANGLE = {"rod.angle": np.linspace(0.0, 1.0, 30)}
             "bounds",
         ),
         (ANGLE, {"ts": TS, "free": {"rod.angle.delay": 0.1}}, "smaller than 0.0333333 s"),
-        (ANGLE, {"ts": TS, "sensors": [mb.Sensor("rod.angle", delay=0.1)]}, "reads at 0.0333333 s .* before 0.1 s"),
+        (ANGLE, {"ts": TS, "sensors": [mb.Sensor("rod.angle", delay=0.1)]}, "reading at 0.0333333 s .* before 0.1 s"),
         (ANGLE, {"ts": TS, "prior": {"rod.mass": (1.0, 0.1)}}, "noise of a known size"),
         (ANGLE, {"ts": TS, "prior": {"rod.mass": (1.0, 0.0)}, "sigma": {"rod.angle": 1.0}}, "positive deviation"),
         (ANGLE, {"ts": TS, "prior": {"rod.mass": 1.0}, "sigma": {"rod.angle": 1.0}}, r"must be \(mean, deviation\)"),
