@@ -4,7 +4,7 @@
 omissions, and `coordinates`, `controls` and `states` by the names of the file. MuJoCo reads MJCF, with its includes,
 defaults and units (`pip install "jaxmb[import]"`). URDF may have `mimic` joints; in SDF, of any version, links with two
 parents close loops. Bodies and joints keep their names, and bodies their frames; links fixed to other links, and sites,
-become frames. Angles are the file's. `viz.show(trajectory, shapes=model.shapes)` shows the links;
+become frames. Angles have the file's values. `viz.show(trajectory, shapes=model.shapes)` shows the links;
 `model.collision_shapes` are shapes for contacts. `to_mjcf` writes a scene as MJCF for a check in MuJoCo, which holds
 loops and couplings softly.
 
