@@ -33,8 +33,8 @@ motion = jaxmb.simulate(system, state, t1=1.0, inputs={"motor.control": lambda t
 
 **Approximate, with a note:**
 
-- moments of inertia that violate the triangle inequality by up to 5 % are lowered to it; massless links at the ends are
-  left out;
+- moments of inertia that violate the triangle inequality by up to 5 % are lowered to the bound; massless links at the
+    ends are left out;
 - limits are compliant stops for the inertia that moves with the joint, with the time of MuJoCo's `solref`, 0.02 s by
   default; dry friction is `tanh(rate / transition_speed)`;
 - `solref` and `solimp` have no effect on loops: constraints are hard; couplings see angles up to half a turn from zero,

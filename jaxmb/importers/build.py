@@ -254,7 +254,7 @@ class _Builder:
             )
         )
         self.notes.say(
-            "Limits are compliant stops, of the moved inertia over the square of a time, by default "
+            "Limits are compliant stops with the stiffness moved inertia / time², by default with time = "
             f"{STOP_TIME} s: {{}}.",
             name,
         )

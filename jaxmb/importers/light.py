@@ -111,7 +111,7 @@ def rigid(link: Link, notes: Notes) -> np.ndarray:
     if moments[0] <= 0 or not most < moments[2] <= most * (1 + _ROUNDED):
         return inertia
     notes.say(
-        "Moments of inertia that exceed the sum of the other two by rounding, up to 5 %, are lowered to it: {}.",
+        "Moments of inertia that exceed the sum of the other two by rounding, up to 5 %, are lowered to this sum: {}.",
         link.name,
     )
     return axes @ np.diag([*moments[:2], most]) @ axes.T

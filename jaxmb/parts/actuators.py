@@ -52,7 +52,7 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
             raise ValueError(f"{self.label}: gain and damping belong to the modes 'speed' and 'position'.")
         if self.mode != "force" and self.gain is None:
             raise ValueError(
-                f"{self.label}: without a gain its command does nothing in the mode {self.mode!r}; give gain."
+                f"{self.label}: without a gain the command does nothing in the mode {self.mode!r}; give gain."
             )
         if self.mode == "speed" and np.any(self.damping):
             raise ValueError(f"{self.label}: damping belongs to the mode 'position'; with 'speed' use gain.")

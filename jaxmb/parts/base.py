@@ -283,7 +283,7 @@ class AbstractActor(AbstractPart):
         return self._on_frames(lambda frame, x, w: frame.wrench(space, x, w), poses, wrenches)
 
     def _on_frames(self, of_frame: Callable[..., Any], *rows: Any) -> Any:
-        """The last array; a row of a body with a frame is replaced by `of_frame(frame, …)` of its rows in all arrays."""
+        """The last array; `of_frame(frame, …)` of its rows in all arrays replaces a row of a body with a frame."""
         frames = self.body_frames
         if not frames:
             return rows[-1]

@@ -39,7 +39,7 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
 
     Contacts in space, and joints whose bodies slide over each other in two directions, add two of each. The modes
     `"rub.mode_1"` and `"rub.mode_2"` are both 2 in stick. In slip they are the components of a vector near the
-    direction of slip: of length one, or one half if slip has just begun from rest and is not visible yet.
+    direction of slip: of length one, or one half if slip has just begun from rest and is still below its tolerance.
 
     **Fields:** `joint`, its name, or `"joint.coordinate"`; `coefficient` μ ≥ 0 in slip; `static_coefficient` ≥ μ in
     stick, default μ.

@@ -51,11 +51,11 @@ class Declaration:
 
     **Fields:**
 
-    - `kind`: `"identity"` for a name that distinguishes stacked parts (`"identities"` for several), `"body"` for the
-        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of numbers and modules,
-        `"module"` for a module whose weights are one number, `"law"` for a module with parameters, `"part"` for another
-        part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
-        `"internal"` for an internal state (`"internals"` for a dictionary of them); states are not parameters.
+    - `kind`: `"identity"`: a name that distinguishes stacked parts; `"body"`: the name of a body; `"number"`;
+        `"module"`: a module whose weights are one parameter; `"law"`: a module with parameters; `"part"`: another part
+        of the scene; `"state"`: a number of the initial guess; `"internal"`: an internal state. Plurals are tuples of
+        names (`"identities"`, `"bodies"`) and dictionaries (`"numbers"`, also of modules; `"parts"`; `"internals"`).
+        States are not parameters.
     - `shape` of a number, None for any shape, with entries None for any size; `sign`; `unit`, `"1"` for a number
         without unit, None if unknown, or two units, with an angle and with a length, `("N m", "N")`.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.

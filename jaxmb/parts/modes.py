@@ -4,7 +4,7 @@ A contact is open (0), closed (1), or closed but implied by other closed contact
 friction in one direction is inactive (0), slips forwards or backwards (1, -1), sticks (2), or sticks but is implied by
 other friction, which takes the force (3). Friction in two directions has two modes. Both have the same number if it is
 inactive or sticks. In slip they are the components of a vector near the direction of slip: of length one, or one half
-if slip has just begun from rest and is not visible yet.
+if slip has just begun from rest and is still below its tolerance.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,8 @@ from ..linalg.sums import with_entries
 
 OPEN, CLOSED, IMPLIED = 0, 1, 2
 FREE, FORWARD, STICK, IMPLIED_STICK = 0, 1, 2, 3
-# The length of the modes when slip in two directions has just begun, and the lengths between which slip is visible.
+# The length of the modes when slip in two directions has just begun, and the lengths between which slip is above its
+# tolerance.
 BEGUN, _SEEN, _HELD = 0.5, 0.75, 1.5
 
 
@@ -58,12 +59,12 @@ class SlipInPlane(NamedTuple):
 
     @property
     def begun(self) -> Bool[Array, "pairs"]:
-        """Friction whose slip has begun and is not visible yet."""
+        """Friction whose slip has begun and is still below its tolerance."""
         return (self.size > 0) & (self.size < _SEEN)
 
     @property
     def slides(self) -> Bool[Array, "pairs"]:
-        """Friction whose slip is visible."""
+        """Friction whose slip is above its tolerance."""
         return (self.size > _SEEN) & (self.size < _HELD)
 
 
