@@ -88,7 +88,7 @@ class Joint:
 
 @dataclasses.dataclass
 class Loop:
-    """Two links whose points [m], in the links' axes, coincide; with a `rotation`, B's in A, they are welded."""
+    """Two links whose points [m], in the links' axes, coincide; with a `rotation`, of B in A, the links are welded."""
 
     name: str
     link_a: LinkKey

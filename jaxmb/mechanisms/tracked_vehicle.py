@@ -21,7 +21,7 @@ from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
 
-# Arm pivots of five wheels, in the hull [m]; other numbers of pivots lie evenly between the outer two.
+# Arm pivots of five wheels, in the hull [m]; for other numbers of wheels the pivots lie evenly between the outer two.
 _PIVOTS = np.array([(1.639, -0.487), (0.972, -0.487), (0.305, -0.487), (-0.362, -0.487), (-1.028, -0.487)])
 
 

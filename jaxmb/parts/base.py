@@ -200,7 +200,9 @@ class AbstractBody(AbstractPart):
 
     @abc.abstractmethod
     def velocities(self) -> Any:
-        """The initial guess of the velocity at the mass centre, likewise."""
+        """The initial guess of the velocity at the mass centre; only the linear velocity for a body that does not
+        rotate.
+        """
 
 
 class _Bodies:

@@ -1,8 +1,8 @@
 """Unilateral constraints: gaps that close at an instant, with an impact, and open again.
 
 A gap is a function of the poses of bodies that stays non-negative. An open gap has no effect; a closed gap is a
-constraint `gap = 0`, as in a joint, whose force pushes and never pulls. `simulate` finds the times of impacts and of
-loss of contact within its steps. Every pair that may touch must be named; no others are searched for.
+constraint `gap = 0`, whose force pushes and never pulls. `simulate` finds the times of impacts and of loss of contact
+within its steps. Every pair that may touch must be named; no others are searched for.
 """
 
 import abc
@@ -33,7 +33,7 @@ from .terrain import AbstractTerrain, distance
 
 
 class AbstractUnilateralConstraint(AbstractInertialConstraint):
-    """A gap between bodies, which stays non-negative.
+    """A gap between bodies; the gap stays non-negative.
 
     Subclasses define the `gap` and list the bodies. The part adds one coordinate, one velocity and one row to the
     scene. The coordinate is its mode: 0 open, 1 closed, 2 closed but implied by other contacts. Its name is

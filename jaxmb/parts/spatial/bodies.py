@@ -101,7 +101,7 @@ def _check_inertia(body: AbstractRigidBody) -> None:
     if not np.allclose(inertia, inertia.T, rtol=0.0, atol=1e-9 * np.max(np.abs(inertia))):
         raise ValueError(f"{body.label}: inertia must be symmetric, got {inertia.tolist()}; use (J + J.T) / 2.")
     moments = np.linalg.eigvalsh(inertia)
-    # Moments that are smaller relative to the largest are rounding errors, not those of a thin body.
+    # Moments this far below the largest come from rounding errors, not from a thin body.
     if moments[0] <= 1e-14 * np.max(np.abs(moments)):
         raise ValueError(
             f"{body.label}: inertia must be positive definite, got principal moments {moments.tolist()} kg m²; a "
