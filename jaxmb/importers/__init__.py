@@ -4,7 +4,7 @@
 omissions, and `coordinates`, `controls` and `states` by the names of the file. MuJoCo reads MJCF, with its includes,
 defaults and units (`pip install "jaxmb[import]"`). URDF may have `mimic` joints; in SDF, of any version, links with two
 parents close loops. Bodies and joints keep their names, and bodies their frames; links fixed to other links, and sites,
-become frames. Angles are the file's. `viz.show(trajectory, shapes=model.shapes)` shows the links;
+become frames. Angles have the file's values. `viz.show(trajectory, shapes=model.shapes)` shows the links;
 `model.collision_shapes` are shapes for contacts. `to_mjcf` writes a scene as MJCF for a check in MuJoCo, which holds
 loops and couplings softly.
 
@@ -33,8 +33,8 @@ motion = jaxmb.simulate(system, state, t1=1.0, inputs={"motor.control": lambda t
 
 **Approximate, with a note:**
 
-- moments of inertia that violate the triangle inequality by up to 5 % are lowered to it; massless links at the ends are
-  left out;
+- moments of inertia that violate the triangle inequality by up to 5 % are lowered to the bound; massless links at the
+    ends are left out;
 - limits are compliant stops for the inertia that moves with the joint, with the time of MuJoCo's `solref`, 0.02 s by
   default; dry friction is `tanh(rate / transition_speed)`;
 - `solref` and `solimp` have no effect on loops: constraints are hard; couplings see angles up to half a turn from zero,

@@ -45,9 +45,9 @@ class Scalar(NamedTuple):
 class Built:
     """A scene, with the coordinates and the bodies of the file's joints and links.
 
-    **Fields:** `coordinates`: for each joint the name of its coordinate, with the file's values, or None; `controls`:
-    for each actuator the name of its control; `fused`: the links as bodies; `scalars`: the scalar coordinates of the
-    scene in order; `shapes` and `collision_shapes` of bodies by name.
+    **Fields:** `coordinates`: for each joint the name of its coordinate, which has the file's values, or None;
+    `controls`: for each actuator the name of its control; `fused`: the links as bodies; `scalars`: the scalar
+    coordinates of the scene in order; `shapes` and `collision_shapes` of bodies by name.
     """
 
     scene: Scene
@@ -60,7 +60,7 @@ class Built:
 
 
 def build_scene(machine: Machine, notes: Notes) -> Built:
-    """The scene of a machine; `notes`, which the caller finishes, refuse unsupported elements."""
+    """The scene of a machine. Unsupported elements are refused in `notes`, which the caller finishes."""
     left_out = without_ends(machine, notes)
     with_rotors(machine, notes)
     return _Builder(machine, notes, left_out).build()
@@ -202,7 +202,7 @@ class _Builder:
 
     def _counted(self, name, coordinate):
         """The coordinate of a joint for springs and servos: for a hinge without limits the length of a cord that it
-        winds up, which counts on through full turns.
+        winds up, which counts full turns.
         """
         joint = self.of_name[name]
         if joint.kind != "hinge" or _range(joint) is not None:
@@ -254,7 +254,7 @@ class _Builder:
             )
         )
         self.notes.say(
-            "Limits are compliant stops, of the moved inertia over the square of a time, by default "
+            "Limits are compliant stops with the stiffness moved inertia / time², by default with time = "
             f"{STOP_TIME} s: {{}}.",
             name,
         )
@@ -328,7 +328,7 @@ class _Builder:
                     self._seen_up_to_half_a_turn(other, coupling.name, zero)
 
     def _turns_without_end(self, joint, powers):
-        """Whether full turns of another hinge are full turns of this one."""
+        """Whether full turns of another hinge give full turns of a joint."""
         return self.of_name[joint].kind == "hinge" and not np.any(powers[1:]) and float(powers[0]).is_integer()
 
     def _coordinate(self, what, kind, of, table=None):
@@ -414,9 +414,7 @@ class _Builder:
         return 0.0 if limits is None or joint.kind != "hinge" else 0.5 * (limits[0] + limits[1])
 
     def _seen_up_to_half_a_turn(self, name, of, zero=0.0):
-        """Note that a coupling sees a joint's angle up to half a turn from its zero, if the angle may leave this
-        range.
-        """
+        """Add a note if a coupled joint's angle may go beyond half a turn from its zero, which couplings do not see."""
         joint = self.of_name[name]
         if joint.kind == "hinge" and (_range(joint) is None or not _near(joint, zero)):
             self.notes.say("Couplings see angles of hinges only up to half a turn from their zeros: {}.", of)
@@ -474,6 +472,6 @@ def _range(joint: Joint):
 
 
 def _near(joint: Joint, zero: Any):
-    """Whether the limits of a hinge, if any, keep it within half a turn of a zero."""
+    """Whether no limits of a hinge let it go beyond half a turn from a zero."""
     limits = _range(joint)
     return joint.kind != "hinge" or limits is None or max(abs(limit - zero) for limit in limits) <= np.pi

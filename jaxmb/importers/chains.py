@@ -122,7 +122,7 @@ def _meeting(points, axes):
     """The common point of lines; None without one."""
     rows = np.concatenate([np.eye(3) - np.outer(axis, axis) for axis in axes])
     target = np.concatenate([rows[3 * k : 3 * k + 3] @ point for k, point in enumerate(points)])
-    # Near the first point, so that a common point stays unchanged.
+    # Relative to the first point, so that a common point stays unchanged.
     step = np.linalg.lstsq(rows, target - rows @ points[0], rcond=None)[0]
     point = points[0] + step
     return point if np.max(np.abs(rows @ point - target)) <= _CLOSE else None

@@ -88,7 +88,7 @@ class Joint:
 
 @dataclasses.dataclass
 class Loop:
-    """Two links whose points [m], in the links' axes, coincide; with a `rotation`, B's in A, they are welded."""
+    """Two links whose points [m], in the links' axes, coincide; with a `rotation`, of B in A, the links are welded."""
 
     name: str
     link_a: LinkKey
@@ -103,7 +103,7 @@ class Coupling:
     """A joint's coordinate as a constant plus polynomials of other joints' coordinates, `x − zero = constant + Σᵢ Σₖ
     powersᵢ[k − 1] (yᵢ − zeroᵢ)ᵏ`; without others it is constant.
 
-    `others`: names, powers and zeros; `of_tendons`: the coordinates are lengths of tendons.
+    `others`: names, powers and zeros; `of_tendons`: all coordinates, its own included, are tendon lengths.
     """
 
     name: str

@@ -36,9 +36,9 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     ```
 
     Joints in a spanning tree become joints of MuJoCo, with the names and values of the coordinates here. Joints that
-    close loops become equality constraints, which MuJoCo holds softly. Angles are in (−π, π] at the given pose, from
-    which MuJoCo counts on; the numbers of springs, stops and actuators are shifted by full turns accordingly. Several
-    springs, dampers, frictions or stops of a joint are merged. Frames of bodies are at their mass centres.
+    close loops become equality constraints, which MuJoCo holds softly. Angles are in (−π, π] at the given pose; from
+    there MuJoCo counts full turns, by which the numbers of springs, stops and actuators are shifted accordingly.
+    Several springs, dampers, frictions or stops of a joint are merged. Frames of bodies are at their mass centres.
 
     **Arguments:** `system`: a compiled scene; `state` of the machine, default the poses given with the bodies, which
     must satisfy the constraints; `ignore`: names of parts to leave out.

@@ -127,7 +127,7 @@ def parts_of(system: RigidBodySystem, groups: Any, tree: Tree) -> list[PlacedPar
 
 
 def _acts_on(group, part, k):
-    """The coordinates that a part acts on: stacked parts know their joints by number only."""
+    """The coordinates that a part acts on: stacked parts know their joints by index only."""
     names = [joints[k] for keys, joints in group.inner if len(keys) == 2 and keys[0] == "joints"]
     return tuple(f"{name}.{coordinate}" for name, coordinate in zip(names, getattr(part, "within", ()), strict=False))
 
@@ -218,7 +218,7 @@ def _oriented(part, tree, child):
 
 
 def _ends(part, tree):
-    """Attributes that name the bodies, a moving body first, and its number."""
+    """Attributes that name the bodies, a moving body first, and the index of this body."""
     k = 0 if part.bodies[0] != GROUND else 1
     other = part.bodies[1 - k]
     return {"body1": tree.bodies[part.bodies[k]]} | ({} if other == GROUND else {"body2": tree.bodies[other]}), k

@@ -57,7 +57,7 @@ class Fused:
         return body.rotation.T @ self.links[link].rotation
 
     def frames(self) -> dict[str, tuple[str, np.ndarray, np.ndarray]]:
-        """For each link that is fixed to another link its body, and position and rotation in it."""
+        """For each link that is fixed to another link: its body, and its position and rotation in the body."""
         out = {}
         for name, carrier in self.of.items():
             if name is not WORLD and carrier != name and (carrier is WORLD or carrier in self.carriers):

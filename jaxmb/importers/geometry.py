@@ -32,8 +32,8 @@ def read_shapes(
 ) -> None:
     """Read the `<visual>`s and `<collision>`s of a link.
 
-    Elements with wrong numbers are refused, unless their kind is left out and has no effect. `place`: position,
-    orientation and color of an element; a color of None is invisible.
+    Elements with wrong numbers are refused, unless their kind is left out. `place`: position, orientation and color of
+    an element; a color of None is invisible.
     """
     for tag, word in _WORDS.items():
         for element in link.all(tag):

@@ -78,8 +78,9 @@ def _take_out(machine, links, joints, notes):
 def with_rotors(machine: Machine, notes: Notes) -> None:
     """Make the armature of free joints, and of ball joints on the ground, a separate link, fixed to the joint's link.
 
-    The velocities of these joints are the link's. The armature is therefore a weightless point mass in the origin of
-    the link's frame, and the inertia of a ball about it. No link moves like a ball joint between two moving links.
+    The velocities of these joints are the link's. The armature is therefore a weightless point mass at the origin of
+    the link's frame, and the inertia of a ball about this point. No link moves like a ball joint between two moving
+    links.
     """
     of = bodies_of(machine)
     heavy = {of[name] for name, link in machine.links.items() if link.mass}
@@ -102,7 +103,7 @@ def with_rotors(machine: Machine, notes: Notes) -> None:
 
 def rigid(link: Link, notes: Notes) -> np.ndarray:
     """The inertia of a link, shape (3, 3), symmetric; a largest principal moment that exceeds the sum of the others by
-    rounding is lowered to it.
+    rounding is lowered to this sum.
     """
     inertia = 0.5 * (link.inertia + link.inertia.T)
     moments, axes = np.linalg.eigh(inertia)
@@ -110,7 +111,7 @@ def rigid(link: Link, notes: Notes) -> np.ndarray:
     if moments[0] <= 0 or not most < moments[2] <= most * (1 + _ROUNDED):
         return inertia
     notes.say(
-        "Moments of inertia that exceed the sum of the other two by rounding, up to 5 %, are lowered to it: {}.",
+        "Moments of inertia that exceed the sum of the other two by rounding, up to 5 %, are lowered to this sum: {}.",
         link.name,
     )
     return axes @ np.diag([*moments[:2], most]) @ axes.T

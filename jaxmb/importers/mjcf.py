@@ -190,8 +190,9 @@ def _read_equalities(mujoco, model, names, machine, notes):
 
 
 def _tendon_coupling(mujoco, model, names, name, one, two, data):
-    """A tendon's length as a polynomial of another's, both from their lengths at the reference pose. If it is a sum of
-    polynomials of joint coordinates, the coupling is between the joints, which may then turn without end.
+    """A tendon's length as a polynomial of another tendon's, both less their lengths at the reference pose. If this
+    relation is a sum of polynomials of joint coordinates, the coupling is between the joints, which may then turn
+    without end.
     """
     on_joints = lambda k: model.wrap_type[model.tendon_adr[k]] == mujoco.mjtWrap.mjWRAP_JOINT
     tendons = [one] if two < 0 else [one, two]

@@ -95,7 +95,7 @@ def _read(mujoco, model, names, notes, k, name):
 
 
 def _acting_on(mujoco, model, joint):
-    """Numbers of the actuators that may act on a joint, directly or through a tendon."""
+    """Indices of the actuators that may act on a joint, directly or through a tendon."""
     kinds, numbers = mujoco.mjtTrn, []
     for k, (number, (target, _)) in enumerate(zip(model.actuator_trntype, model.actuator_trnid, strict=True)):
         kind = kinds(int(number))

@@ -47,7 +47,7 @@ def _specification(mujoco, source):
 
 
 def _compiled(spec, notes):
-    """The model; wrong numbers of shapes do not matter if shapes are left out."""
+    """The model; shapes with wrong numbers do not matter if shapes are left out."""
     try:
         return spec.compile()
     except ValueError as error:

@@ -6,7 +6,7 @@ import numpy as np
 
 from .notes import Notes
 
-# Numbers that must vanish: the fields of the model, a description, and the kind to leave out.
+# Numbers that must vanish, by their field of the model: the kind of element, a description, and the word of `ignore`.
 _MUST_VANISH = {
     "jnt_stiffnesspoly": ("joint", "nonlinear stiffness", "springs"),
     "jnt_springyield": ("joint", "plastic springs", "springs"),
@@ -68,7 +68,7 @@ def refuse_unknown(mujoco: Any, model: Any, notes: Notes) -> None:
 
 
 def _set(values):
-    """Numbers of the elements with a nonzero entry."""
+    """Indices of the elements with a nonzero entry."""
     values = np.asarray(values)
     return np.flatnonzero(np.any(values.reshape(len(values), -1) != 0, axis=1)) if values.size else ()
 
@@ -85,7 +85,7 @@ def _check_tendon(mujoco, model, notes, k, name):
 
 
 def _colliding(mujoco, model):
-    """Numbers of moving bodies whose shapes may collide with another body."""
+    """Indices of moving bodies whose shapes may collide with another body."""
     types: dict[tuple[int, int, int], set[int]] = {}
     for g in range(model.ngeom):
         mask = int(model.geom_contype[g]), int(model.geom_conaffinity[g])

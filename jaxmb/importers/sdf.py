@@ -44,7 +44,7 @@ def sdf(
     ignore: str | Collection[str] = (),
     package_dirs: str | os.PathLike[str] | Collection[str | os.PathLike[str]] = (),
 ) -> ImportedModel:
-    """A machine from SDF, of one model or all that stand side by side in the file.
+    """A machine from SDF: the model of the file, or several models side by side.
 
     ```python
     model = jaxmb.importers.sdf("arm.sdf", gravity=(0.0, 0.0, -9.81))

@@ -23,7 +23,7 @@ _KINDS: dict[str, Kind] = {
     "prismatic": "slide",
     "fixed": "fixed",
     "floating": "free",
-    # Elements of Bullet and MuJoCo, not of the format.
+    # A kind of joint of Bullet and MuJoCo, not of the format.
     "spherical": "ball",
 }
 # Elements without effect on the motion.

@@ -135,7 +135,8 @@ class Connection(AbstractKinematics):
     def count(self, nq):
         if sorted((*self.base, *self.fibre)) != list(range(nq)):
             raise ValueError(
-                f"A connection's base {self.base} and fibre {self.fibre} are the {nq} coordinates, each of them once."
+                f"A connection's base {self.base} and fibre {self.fibre} must hold the {nq} coordinates, each of them "
+                "once."
             )
         return len(self.base)
 

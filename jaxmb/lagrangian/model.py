@@ -109,7 +109,7 @@ class AbstractLagrangian(AbstractSystem):
 
     @property
     def rows(self) -> tuple[tuple[str, int], ...]:
-        """Name of the constraint, and number within it, of every row of A."""
+        """For every row of A, the name of its constraint and its index within the constraint."""
         return tuple((c.name, k) for c, n in zip(self.constraints, self.sizes, strict=True) for k in range(n))
 
     def coordinate_names(self):
@@ -185,7 +185,7 @@ class AbstractLagrangian(AbstractSystem):
         return pull(total)[0]
 
     def _on_coordinates(self, t, q, v, multipliers):
-        """The generalized force on the coordinates of these multipliers."""
+        """The generalized force of these multipliers on the coordinates."""
 
         def residual(a):
             return self._join(

@@ -102,7 +102,7 @@ def _inverse(omega, t, q, target, parameters, near):
 
     far = lambda v, size: size > 8 * jnp.finfo(v.dtype).eps * (1.0 + jnp.max(jnp.abs(v)))
     v, size = newton(correct, far, near, most=_ITERATIONS, dtype=q.dtype)
-    # The inverse is accepted also if rounding keeps corrections slightly larger.
+    # The inverse is accepted also if rounding keeps corrections slightly larger than demanded.
     converged = size <= jnp.sqrt(jnp.finfo(q.dtype).eps) * (1.0 + jnp.max(jnp.abs(v)))
     return jnp.where(converged, v, jnp.nan)
 

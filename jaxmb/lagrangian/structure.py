@@ -128,8 +128,8 @@ class Structure(NamedTuple):
 def find_structure(system: AbstractLagrangian) -> Structure:
     """Evaluate a system's functions at its guess, and eliminate.
 
-    **Raises:** `ValueError` for an L without second derivatives in the rates, constraints that cannot be satisfied near
-    the guess, and laws of missing constraints, or of constraints whose force is not determined.
+    **Raises:** `ValueError` for an L without second derivatives in the rates, for constraints that cannot be satisfied
+    near the guess, and for laws of constraints that are missing or whose force is not determined.
     """
     q: Any = np.asarray(system.guess.q)
     u, p = np.asarray(system.guess.u), system.parameters
@@ -212,8 +212,8 @@ def _met_by_jax(system):
 
 @on_host
 def _evaluate(system, constant):
-    """The rates, their derivatives with respect to the velocities, and second derivatives of L, also with other
-    parameters if these are `constant`.
+    """The rates, their derivatives with respect to the velocities, and second derivatives of L, if they are `constant`
+    also with other parameters.
     """
     q, u, p = system.guess.q, system.guess.u, system.parameters
     t = jnp.zeros((), q.dtype)

@@ -61,13 +61,13 @@ class LagrangianSystem(AbstractLagrangian):
         imply others.
     - `nonideal`: constraint forces that do virtual work: `CoulombFriction`, `Viscous`, `NonIdealForce`.
     - `kinematics`: the meaning of u; default `Rates()`, u = q̇.
-    - `equations`: their form; default `Projected()`, as above, or `Hamel()`, `Voronets()`.
+    - `equations`: the form of the equations; default `Projected()`, as above, or `Hamel()`, `Voronets()`.
     - `q`, `u`: a state near the constraints, the guess for `assemble`; ranks are found there. Default u is zero.
     - `parameters`: numbers by name. An equinox module, such as a network, is called in the functions,
         `parameters["net"](v)`; its weights are one parameter, a vector, as in `Force`.
-    - `coordinates`: their names, default `q0`, `q1`, …. A saved motion uses them: not `t`, `q`, `u`, `energy` or
-        `file`, and without slashes.
-    - `length`: the size that residuals of positions are relative to.
+    - `coordinates`: their names, default `q0`, `q1`, …. A saved motion uses these names: not `t`, `q`, `u`, `energy` or
+        `file`, and without slashes, colons or a leading dot.
+    - `length`: the scale of the residuals of position constraints.
 
     Functions keep the values that they read now: after a change of a global variable, make a new system.
 

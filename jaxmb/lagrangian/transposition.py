@@ -33,7 +33,7 @@ def check_shape(transposition: Callable[..., Array], q: Array, parameters: Param
 
 
 def share_of_suslov(transposition: Transposition) -> float | None:
-    """The number of a transposition, None for a function.
+    """The share of Suslov's choice in a transposition, None for a function.
 
     **Raises:** `ValueError` for other words.
     """

@@ -1,12 +1,12 @@
 """A train on a straight track in relative coordinates, after V. A. Lazaryan and others.
 
 Coordinates are the position of the leading vehicle and the extensions of the couplers, `q = (x₁, y₁, …, yₙ₋₁)`, and
-velocities are their rates: a slack of a centimetre is not the difference of positions ten kilometres along the track.
-With the forces F_j on the vehicles and the tensions S_j of the couplers
+velocities are their rates. A slack of a centimetre is then not computed as the difference of positions ten kilometres
+along the track. With the forces F_j on the vehicles and the tensions S_j of the couplers
 
     ÿ_j = −S_j (1/m_j + 1/m_{j+1}) + S_{j−1}/m_j + S_{j+1}/m_{j+1} + F_j/m_j − F_{j+1}/m_{j+1}
 
-so the mass matrix is full, but its inverse tridiagonal.
+so the mass matrix is full, but its inverse is tridiagonal.
 """
 
 from collections.abc import Callable
@@ -138,7 +138,7 @@ class RelativeTrain(AbstractSystem):
         return 0.5 * jnp.sum(self.mass * velocities(u) ** 2)
 
     def potential_energy(self, t, q):
-        # Positions along the track up to the constant part, of couplers without extension.
+        # Positions along the track up to constants, the lengths of couplers without extension.
         return jnp.sum(self.couplers.stored(q[1:])) + self.slope * jnp.sum(self.mass * velocities(q))
 
     def coordinate_scale(self):

@@ -73,7 +73,7 @@ def shoe_track(
 
     **Arguments:** `place`, of the hull; `sprocket`, `idler` [m] in the hull; `wheels` [m], centres in the world, front
     wheel first, of `radius` [m]; `stiffness` [N/m] and `pretension` [N] along the loop, both by the tensioner;
-    `friction` with its transition `speed`, and `damping`, of wheels and idler on shoes.
+    `friction`, the coefficient of wheels and idler on shoes; its transition `speed` and the `damping` of all discs.
     """
     p, hull = prefix, f"{prefix}hull"
     offset, pins = laid(shoes, place + sprocket, place + idler, wheels, radius)
@@ -140,8 +140,8 @@ def running(system, guess, speed):
     """The state of a vehicle on tracks of shoes, from near rest, that moves forward with rolling wheels and shoes that
     lie on the ground.
 
-    Without drive, shoes hang down, and vehicle and tracks lose their motion in a second. They go on to creep, since dry
-    friction is regularised: there are many equilibria in which friction holds the shoes.
+    Without drive, shoes hang down, and vehicle and tracks lose their motion in a second. They continue to creep, since
+    dry friction is regularised: there are many equilibria in which friction holds the shoes.
     """
     names, values = system.body_names, parameters(system)
     undriven_system = undriven(system)
@@ -174,8 +174,8 @@ def undriven(system):
 
 
 def _circulation(poses, speed, pitch):
-    """Velocities of shoes that run through the shape of their track at a speed [m/s], backwards along the ground; from
-    their poses, both of shape (shoes, 3), and their pitch [m].
+    """Velocities of shoes that run through the shape of their track at a speed [m/s], backwards along the ground.
+    Velocities and `poses` have shape (shoes, 3); `pitch` [m].
     """
     turn = lambda v: jnp.stack([-v[:, 1], v[:, 0]], axis=1)
     along = jnp.stack([jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])], axis=1)

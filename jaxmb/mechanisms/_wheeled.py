@@ -2,9 +2,9 @@
 Lagrangian, or as rigid bodies.
 
 Coordinates: x, y of the middle of the rear axle, its heading θ, and the angle φ of the front platform against it.
-Parameters: `mass`, `inertia` and `ahead` of the rear platform, its mass centre ahead of its axle; `front_mass`,
-`front_inertia` and `front_ahead` of the front platform; `pivot`, of the pin ahead of the rear axle, and `handle`, of
-the front axle ahead of the pin.
+Parameters: `mass`, `inertia` and `ahead`, the distance of the mass centre ahead of the axle, of the rear platform;
+`front_mass`, `front_inertia` and `front_ahead` of the front platform; `pivot`, the distance of the pin ahead of the
+rear axle; `handle`, the distance of the front axle ahead of the pin.
 """
 
 from collections.abc import Callable

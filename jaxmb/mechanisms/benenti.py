@@ -22,7 +22,7 @@ def benenti(
     gravity: float = 9.81,
     model: Model = "lagrangian",
 ) -> Mechanism:
-    """Two particles in the vertical plane, with a spring between them, whose velocities are held parallel.
+    """Two particles in the vertical plane with a spring between them; their velocities are held parallel.
 
     Coordinates: x1, y1, x2, y2 [m], y up. The constraint ẋ1 ẏ2 − ẋ2 ẏ1 = 0 is quadratic and homogeneous in velocities,
     so energy is conserved.

@@ -29,8 +29,8 @@ def cable(
     sides and equal angles, in a plane at 0.5 rad from the vertical: swung to the side of positive y. Every rod is free
     to turn about its axis, but nothing turns it. Of the `6 n` velocities `3 n - 3` are free.
 
-    With the turn α from one rod to the next, a polygon of n sides l spans `l Σ cos((k - (n + 1) / 2) α)`, k = 1 … n,
-    which falls from `n l` to zero while α grows from zero to `2 π / n`; α is found by bisection. The tests check the
+    With the turn α from one rod to the next, a polygon of n sides l spans `l Σ cos((k - (n + 1) / 2) α)`, k = 1 … n.
+    The span falls from `n l` to zero while α grows from zero to `2 π / n`; α is found by bisection. The tests check the
     motion by independent equations in the directions of the rods.
 
     **Arguments:** `n` ≥ 2, the number of rods; `length` [m] and `mass` [kg] of the whole cable; `span` [m], the

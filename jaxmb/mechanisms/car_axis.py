@@ -31,8 +31,8 @@ def car_axis(
     Source: S. Schneider, "Intégration de systèmes d'équations différentielles raides et différentielles-algébriques par
     des méthodes de collocations et méthodes générales linéaires", thesis, Genève 1994, as in F. Mazzia and C.
     Magherini, "Test Set for Initial Value Problem Solvers", 2008; all quantities without units. The reference values
-    were recomputed in extended precision, with multipliers and in two minimal coordinates; the test set's agree to 12
-    digits in positions and to 9 in velocities.
+    were recomputed in extended precision, with multipliers and in two minimal coordinates; the test set's values agree
+    to 12 digits in positions and to 9 in velocities.
 
     **Arguments:** as in the source, `mass` M, `epsilon` ε, `length` L of the axle and `free_length` L₀ of the springs,
     `amplitude` r and `frequency` ω of the road, `gravity` g.

@@ -39,9 +39,9 @@ def longitudinal_train(
     """An emergency stop of a train of n vehicles on a straight track, in relative coordinates.
 
     Coordinates are the position `x1` of the leading vehicle and the extensions `y1`, `y2`, … of the couplers. Slack
-    thus loses no digits in a long train, and tolerances are relative to it. A stop of 300 vehicles with a mean error of
-    500 N in the coupler forces takes rtol 1e-4 and 14000 steps. In positions along the track, 4 km long, it takes rtol
-    1e-7 and about as many steps; rtol 1e-6 leaves 5000 N. Otherwise as `train`, without pitch.
+    thus loses no digits in a long train, and tolerances are relative to the slack. A stop of 300 vehicles with a mean
+    error of 500 N in the coupler forces takes rtol 1e-4 and 14000 steps. In positions along the track, 4 km long, it
+    takes rtol 1e-7 and about as many steps; rtol 1e-6 leaves 5000 N. Otherwise as `train`, without pitch.
 
     Source: V. A. Lazaryan, L. A. Manashkin and A. V. Yurchenko, Soviet Applied Mechanics 10(6), 1974.
 

@@ -20,7 +20,7 @@ def net(*, n: int = 4, m: int = 4, spacing: float = 1.0, mass: float = 1.0, grav
     one plane, and leave `n m + n + m - 2` of the `3 n m` velocities free. The motion is symmetric about the plane `x =
     (n - 1) spacing / 2`.
 
-    The tests check it by independent equations for the forces in the rods.
+    The tests check the motion by independent equations for the forces in the rods.
 
     **Arguments:** `n`, `m` ≥ 2, the numbers of knots along x and y; `spacing` [m] of the knots; `mass` [kg] of one
     knot; `gravity` [m/s²].

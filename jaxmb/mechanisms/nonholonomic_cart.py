@@ -32,11 +32,13 @@ def nonholonomic_cart(
     Source: A. M. Bloch, Nonholonomic Mechanics and Control, Springer, 2015, on such systems; data of this package.
     Reference values from DOP853 on Hamel's equations.
 
-    **Arguments:** `mass` [kg], `inertia` [kg m²] and `ahead` [m], the mass centre ahead of the axle, of the rear
-    platform, and the same for the front platform; `pivot` [m], of the pin ahead of the rear axle; `handle` [m], of the
-    front axle ahead of the pin; `angle` φ [rad], `speed` along the heading [m/s] and turning `rate` [rad/s] at the
-    start; `form` and `equations` as in `roller_racer`; `model`: from its Lagrangian, or as rigid bodies `rear` and
-    `front`.
+    **Arguments:**
+
+    - `mass` [kg], `inertia` [kg m²] and `ahead` [m], the distance of the mass centre ahead of the axle, of the rear
+        platform; `front_mass`, `front_inertia` and `front_ahead` of the front platform.
+    - `pivot` [m], the distance of the pin ahead of the rear axle; `handle` [m], of the front axle ahead of the pin.
+    - `angle` φ [rad], `speed` along the heading [m/s] and turning `rate` [rad/s] at the start.
+    - `form` and `equations` as in `roller_racer`; `model`: from its Lagrangian, or as rigid bodies `rear` and `front`.
 
     **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
     """

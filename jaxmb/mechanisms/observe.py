@@ -67,7 +67,9 @@ def lagrangian_coordinates(trajectory: Trajectory) -> Observation:
 
 
 def point_coordinates(trajectory: Trajectory, labels: Iterable[str]) -> Observation:
-    """The same of point masses: their positions, one after the other, by label, and their velocities."""
+    """As `lagrangian_coordinates`, of point masses: their positions, one after the other, by label, and their
+    velocities.
+    """
     points = [trajectory[name] for name in trajectory.system.body_names]
     positions, velocities = jnp.hstack([p.position for p in points]), jnp.hstack([p.velocity for p in points])
     return columns(labels, positions) | _numbered(velocities)

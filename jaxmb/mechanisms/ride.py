@@ -41,7 +41,7 @@ def vertical_rms(trajectory: Trajectory, seat: VectorLike = (0.5, 0.4), *, unit:
 
 
 def arm_travel(trajectory: Trajectory, *, unit: int = 1) -> Float[Array, "times wheels"]:
-    """Angles [rad] of the road arms in the hull from the middle between their stops; wheels upwards are negative."""
+    """Angles [rad] of the road arms in the hull from the middle between their stops; negative if wheels are higher."""
     p, values = PREFIXES[unit - 1], parameters(trajectory.system)
     hull = trajectory[f"{p}hull"].angle
     arms = [name for name in trajectory.system.body_names if name.startswith(f"{p}arm")]

@@ -24,19 +24,23 @@ def roller_racer(
 ) -> Mechanism:
     """A racer of two platforms with a pin between them, each on an axle whose wheels do not slip sideways, coasting.
 
-    The rear platform is balanced: its mass centre is on its axle. The mass of the front platform counts in rotation
-    only. Coordinates: x, y [m] of the middle of the rear axle, its heading θ and the angle φ of the handlebar [rad].
+    The rear platform is balanced: its mass centre is on its axle. The front platform has inertia in rotation only.
+    Coordinates: x, y [m] of the middle of the rear axle, its heading θ and the angle φ of the handlebar [rad].
 
     Source: P. S. Krishnaprasad and D. P. Tsakiris, Oscillations, SE(2)-snakes and motion control: a study of the roller
     racer, Dynamical Systems 16(4), 2001. Reference values from DOP853 on Hamel's equations.
 
-    **Arguments:** `mass` [kg] and `inertia` [kg m²] of the rear platform, `front_inertia` [kg m²]; `pivot` [m], of the
-    pin ahead of the rear axle; `handle` [m], of the front axle ahead of the pin; `angle` φ [rad], `speed` along the
-    heading [m/s] and turning `rate` [rad/s] at the start; `form`: the velocities are speed and turning rate, in a frame
-    that satisfies the constraints; or the coordinates' rates, with the constraints; or the rates of θ and φ, with a
-    connection that is singular where the platforms are in line; `equations`: their form, default `Projected()`;
-    `model`: from its Lagrangian, or as rigid bodies `rear` and `front`, with part of the mass moved to the front body,
-    at the pin, which moves with both.
+    **Arguments:**
+
+    - `mass` [kg] and `inertia` [kg m²] of the rear platform; `front_inertia` [kg m²].
+    - `pivot` [m], the distance of the pin ahead of the rear axle; `handle` [m], of the front axle ahead of the pin.
+    - `angle` φ [rad], `speed` along the heading [m/s] and turning `rate` [rad/s] at the start.
+    - `form`: the velocities. `"frame"`: speed and turning rate, in a frame that satisfies the constraints;
+        `"constraints"`: the coordinates' rates, with the constraints; `"connection"`: the rates of θ and φ, with a
+        connection that is singular where the platforms are in line.
+    - `equations`: the form of the equations, default `Projected()`.
+    - `model`: from its Lagrangian, or as rigid bodies `rear` and `front`; part of the mass is then at the pin, on the
+        front body.
 
     **Labels:** `x`, `y` [m], `theta`, `phi` [rad], and the velocities `u0`, `u1`, …: speed [m/s] and rate [rad/s].
     """

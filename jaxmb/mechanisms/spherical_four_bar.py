@@ -34,9 +34,9 @@ def spherical_four_bar(
 ) -> Mechanism:
     """Four links turn about axes through the centre of a sphere; a constant torque drives the input.
 
-    Coordinates: the input angle θ, the output angle ψ [rad], and the coupler's Euler parameters. The input turns
-    about z; the output about z turned by the ground arc about x. The coupler's frame has z along its joint with the
-    input. Two rows for each of the dyads, input and output, and the Euler parameters' normalisation: one degree of
+    Coordinates: the input angle θ, the output angle ψ [rad], and the coupler's Euler parameters. The input turns about
+    z; the output about z turned by the ground arc about x. The coupler's frame has z along its joint with the input.
+    There are two rows for each dyad, input and output, and one for the norm of the Euler parameters: one degree of
     freedom.
 
     Source: J. R. Dooley and J. M. McCarthy, on the dynamics of spherical four-bar linkages with the Euler parameters of

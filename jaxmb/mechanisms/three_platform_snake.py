@@ -44,9 +44,9 @@ def three_platform_snake(
 
     **Arguments:** `mass` [kg], `inertia` [kg m²] and `half` length [m] of a platform; `angles` φ [rad] and `rates`
     [rad/s] at the start, of a free motion; `gait(t)`: prescribes the angles, shape (2,), as a function of time; `form`:
-    the velocities are the shape's, with the connection, or the coordinates' rates, with constraints (always with a
-    gait); `equations`: their form, default `Projected()`; `model`: from its Lagrangian, or as rigid bodies `rear`,
-    `middle` and `front`.
+    the velocities are the rates of φ, `"connection"`, or of all coordinates, `"constraints"` (always with a gait);
+    `equations`: the form of the equations, default `Projected()`; `model`: from its Lagrangian, or as rigid bodies
+    `rear`, `middle` and `front`.
 
     **Labels:** `x`, `y` [m], `theta`, `phi1`, `phi2` [rad], and the velocities `u0`, `u1`, ….
     """

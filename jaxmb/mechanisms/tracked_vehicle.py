@@ -21,7 +21,7 @@ from ._wheel_contact import WheelContact
 from .mechanism import Mechanism, References, build, mechanism
 from .ride import PREFIXES, arm_travel
 
-# Arm pivots of five wheels, in the hull [m]; other numbers of pivots lie evenly between the outer two.
+# Arm pivots of five wheels, in the hull [m]; for other numbers of wheels the pivots lie evenly between the outer two.
 _PIVOTS = np.array([(1.639, -0.487), (0.972, -0.487), (0.305, -0.487), (-0.362, -0.487), (-1.028, -0.487)])
 
 
@@ -80,16 +80,23 @@ def tracked_vehicle(
     freedom; dimensions and masses close to the M113 model of Project Chrono. The reference values were computed in
     minimal coordinates by a Runge–Kutta method of order 8.
 
-    **Arguments:** `n_wheels` ≥ 1; `track`: `"loop"`, `"shoes"`, or `Shoes(...)` with numbers; `speed` [m/s]; `torque`
-    [N m], of the drive of each unit, shared by its wheels, or on its sprocket, with its reaction on the hull;
-    `terrain`, default a bump of 0.12 m from 4 m to 5.5 m; masses [kg] and inertias [kg m²], of the arms default 1.54
-    and a rod's; `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and below its pivot in the design
-    position; `pivots` [m], shape (n_wheels, 2), `sprocket` and `idler` [m] in the hull; torsion bars [N m/rad, N m
-    s/rad], that carry the design load in the design position; stops at ± `stop_angle` [rad] from there [N m/rad³];
-    track, of the length of the design position [N, N/m], of shoes by their tensioner; ground under each wheel or shoe
-    [N/m], with its damping [N s/m] under wheels, which with shoes acts between these and the discs in them; `friction`
-    with its `transition_speed` [m/s]; points of the hitch in the hulls [m], its stiffness and damping [N m/rad, N m
-    s/rad]; `gravity` [m/s²].
+    **Arguments:**
+
+    - `n_wheels` ≥ 1; `track`: `"loop"`, `"shoes"`, or `Shoes(...)` with numbers; `speed` [m/s].
+    - `torque` [N m] of the drive of each unit, shared by its wheels, or on its sprocket, with its reaction on the hull.
+    - `terrain`, default a bump of 0.12 m from 4 m to 5.5 m.
+    - masses [kg] and inertias [kg m²]; the default `arm_inertia` is a rod's plus 1.54.
+    - `radius` [m] of the wheels; `trail` and `drop` [m] of a wheel behind and below its pivot in the design position;
+        `pivots` [m], shape (n_wheels, 2), `sprocket` and `idler` [m] in the hull.
+    - `torsion_stiffness` [N m/rad] and `torsion_damping` [N m s/rad] of torsion bars that carry the design load in the
+        design position; `stop_stiffness` [N m/rad³] of stops at ± `stop_angle` [rad] from there.
+    - `pretension` [N] of the track in the design position, and `track_stiffness` [N/m]; of shoes by their tensioner.
+    - `ground_stiffness` [N/m] under each wheel or shoe; `ground_damping` [N s/m] under each wheel, or between shoes and
+        discs.
+    - `friction` with its `transition_speed` [m/s].
+    - `hitch_rear`, `hitch_front` [m], points of the hitch in the hulls; `hitch_stiffness` [N m/rad], `hitch_damping` [N
+        m s/rad].
+    - `gravity` [m/s²].
 
     **Labels:** `x`, `y` [m], `phi` [rad] of the hull, `a1`, … [rad] of the arms from their design position, upwards
     negative; of the towed unit `rear_x`, ….

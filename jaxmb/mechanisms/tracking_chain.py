@@ -42,7 +42,8 @@ def tracking_chain(
     by it, q3 − q1 behind by twice as much; `gains` [1/s, 1/s²] of the feedback that reduces deviations;
     `model`: from its Lagrangian, or as point masses `one`, `two` and `three` on a rail along x.
 
-    **Labels:** `q1`, `q2`, `q3` [m], `u0`, `u1`, `u2` [m/s].
+    **Labels:** `q1`, `q2`, `q3` [m], `u0`, `u1`, `u2` [m/s]; `force1`, `force3` [N], the control on the first and last
+    mass.
     """
     q, u = (offset, 0.0, 0.2 - offset), (0.5, 0.0, 0.5)
     numbers = {"stiffness": stiffness, "cubic": cubic, "damping": damping, "drive": drive}

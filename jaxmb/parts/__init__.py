@@ -21,8 +21,8 @@ tie = Maxwell("tie", "ground", "bar", stiffness=100.0, damping=20.0, point_a=(0.
 system = jaxmb.Scene([bar], joints=[pin], forces=[tie]).compile()
 ```
 
-Points, axes and joints of a part may be inputs: `separation_rate`, and `rate_of` for other functions of the part and
-the poses, contain their rates. A class names further such numbers, `moving = ("length",)`.
+Points, axes and numbers of joints may be inputs: `separation_rate`, and `rate_of` for other functions of the part and
+the poses, then include their rates. A class declares further such numbers, `moving = ("length",)`.
 
 A part is a class derived from one of the base classes. Helpers declare the meaning of its fields (`point()`, `axis()`,
 `length()`, `parameter()`, …), annotated with `Number`, `Numbers` (by name) or `Names`; its kernel is a pure function of

@@ -15,7 +15,7 @@ from .coordinate_parts import AbstractCoordinatePart, AbstractScalarPart
 
 
 class Motor(AbstractCoordinatePart, AbstractDynamicForce):
-    """A motor on a joint's coordinate, which follows a command with lag, and within a limit.
+    """A motor on a joint's coordinate that follows a command with lag and within a limit.
 
     ```python
     motor = jaxmb.Motor("motor", "pin.angle", mode="speed", command=10.0, gain=2.0, lag=0.05, limit=20.0)
@@ -52,7 +52,7 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
             raise ValueError(f"{self.label}: gain and damping belong to the modes 'speed' and 'position'.")
         if self.mode != "force" and self.gain is None:
             raise ValueError(
-                f"{self.label}: without a gain its command does nothing in the mode {self.mode!r}; give gain."
+                f"{self.label}: without a gain the command does nothing in the mode {self.mode!r}; give gain."
             )
         if self.mode == "speed" and np.any(self.damping):
             raise ValueError(f"{self.label}: damping belongs to the mode 'position'; with 'speed' use gain.")
@@ -100,9 +100,9 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     d(activation)/dt = control − activation`. In a `Motor` the force follows instead.
 
     **Arguments:** `control`, default zero, as an input of `simulate`, `"motor.control"`, a function of time; `gain` and
-    `bias`, shape (3,); `gear`; `middle` [rad], default zero, for angles in space only: the angle is taken within (−π,
-    π] of it; `control_range` and `force_range`, shape (2,), to which the control and f are clipped, default none; `lag`
-    [s] > 0, default none; `activation`, its initial value, default zero.
+    `bias`, shape (3,); `gear`; `middle` [rad], for angles in space only, default zero: the angle is wrapped to within
+    half a turn of `middle`; `control_range` and `force_range`, shape (2,), to which the control and f are clipped,
+    default none; `lag` [s] > 0, default none; `activation`, its initial value, default zero.
     """
 
     control: fields.Number = fields.parameter(default=0.0)

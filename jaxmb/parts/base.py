@@ -62,9 +62,10 @@ class ScalarCoordinate(NamedTuple):
 class KnownParts(NamedTuple):
     """Parts already resolved; the remaining parts are resolved from these.
 
-    **Fields:** the `space`; the `numbers` of bodies, by the name of a body or frame; `scalars`: the numbers of scalar
-    coordinates, by the name of their part; `frames` by name; `observed`: the frames that the scene names; the given
-    `poses` of all bodies and scalar coordinates; the `joints` by name, each with the numbers of its bodies.
+    **Fields:** the `space`; `numbers`: the index of a body, by its name or the name of a frame in it; `scalars`: the
+    indices of scalar coordinates, by the name of their part; `frames` by name; `observed`: the frames that the scene
+    names; the given `poses` of all bodies and scalar coordinates; the `joints` by name, each with the indices of its
+    bodies.
     """
 
     space: AbstractSpace
@@ -76,7 +77,7 @@ class KnownParts(NamedTuple):
     joints: dict[str, tuple[Any, tuple[int, ...]]]
 
     def source(self, name: str) -> tuple[Any, tuple[int, ...]]:
-        """A joint, a frame, or None for a body, with the numbers of its bodies."""
+        """The joint, the frame, or None for a body, with the indices of its bodies."""
         if name in self.joints:
             return self.joints[name]
         return self.frames[name] if name in self.observed else None, (self.numbers[name],)
@@ -125,8 +126,8 @@ class AbstractPart(eqx.Module):
         return True
 
     def is_of_length(self, field: str) -> Any:
-        """Hook: whether a number with a unit for angles and a unit for lengths has the second one, for each component
-        if they differ; None if unknown.
+        """Hook: whether a number that has one unit for angles and one for lengths belongs to a length, for each
+        component if they differ; None if unknown.
         """
         del field
 
@@ -163,8 +164,8 @@ class AbstractSpatialPart(AbstractPart):
 
 
 class AbstractBody(AbstractPart):
-    """A body with mass. The origin of its frame is the mass centre, unless it has a field `centre` that is not None:
-    the mass centre [m] in the frame.
+    """A body with mass. The origin of its frame is the mass centre, unless a field `centre` gives the mass centre [m]
+    in the frame.
 
     The points of parts on a body, and the poses, velocities and wrenches in kernels, refer to the frame. The body's
     coordinates and its motion refer to the mass centre.
@@ -199,7 +200,9 @@ class AbstractBody(AbstractPart):
 
     @abc.abstractmethod
     def velocities(self) -> Any:
-        """The initial guess of the velocity at the mass centre, likewise."""
+        """The initial guess of the velocity at the mass centre; only the linear velocity for a body that does not
+        rotate.
+        """
 
 
 class _Bodies:
@@ -224,8 +227,8 @@ class AbstractLaw(eqx.Module):
 class AbstractActor(AbstractPart):
     """A part that acts on bodies, or on frames fixed in them.
 
-    Its kernels see the poses and velocities of the frames and return wrenches on them. A scene fills in the
-    `body_frames` by the number of the body, `"0"` for the first; there is none where the part names a body itself.
+    Its kernels see the poses and velocities of the frames and return wrenches on them. A scene fills in `body_frames`
+    by the index of the body, `"0"` for the first, where the part names a frame instead of a body.
     """
 
     body_frames: Any = eqx.field(init=False, repr=False, metadata={"declaration": fields.Declaration("parts", of=dict)})
@@ -254,7 +257,7 @@ class AbstractActor(AbstractPart):
         return ()
 
     def may_vary(self, keys: tuple[str, ...]) -> bool:
-        """Hook: whether the number at the end of these keys may be an input. It may not if it moves a point in its body
+        """Hook: whether the number at the end of these keys may be an input. It may not if it moves a body-fixed point
         whose velocity matters, unless the kernels use `with_drift`.
         """
         del keys
@@ -262,7 +265,7 @@ class AbstractActor(AbstractPart):
 
     @abc.abstractmethod
     def settled(self, known: KnownParts) -> tuple[Self, tuple[int, ...]]:
-        """The part in a scene, with every number filled in, and the numbers of its bodies."""
+        """The part in a scene, with every number filled in, and the indices of its bodies."""
 
     def seen_poses(self, space: AbstractSpace, poses: Poses) -> Poses:
         """The poses that the kernels see, from poses of the bodies."""
@@ -282,7 +285,7 @@ class AbstractActor(AbstractPart):
         return self._on_frames(lambda frame, x, w: frame.wrench(space, x, w), poses, wrenches)
 
     def _on_frames(self, of_frame: Callable[..., Any], *rows: Any) -> Any:
-        """The last of the arrays of rows, with `of_frame(frame, …)` of all rows in place of a row that has a frame."""
+        """The last array; `of_frame(frame, …)` of its rows in all arrays replaces a row of a body with a frame."""
         frames = self.body_frames
         if not frames:
             return rows[-1]
@@ -304,7 +307,7 @@ class AbstractLink(AbstractActor):
     of_time: ClassVar[bool] = False
     # The quantities of its coordinates; unknown without an entry.
     quantities: ClassVar[Quantities] = {}
-    # Names of the coordinates that measure how the bodies slide over each other, where they do in two directions.
+    # Names of the coordinates whose rates are the slip, if the bodies slide over each other in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
 
     def is_length(self, coordinate: str) -> bool | None:
@@ -327,7 +330,7 @@ class AbstractLink(AbstractActor):
         return {}
 
     def given_in_time(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Array:
-        """Hook: the values of the function of time of a part that is `of_time`, while nothing moves."""
+        """Hook: for a part that is `of_time`, the values of its function of time at fixed poses and velocities."""
         raise NotImplementedError(f"{self.kind} says of_time = True, and needs a method given_in_time.")
 
     def coordinates_at(self, space: AbstractSpace, poses: Poses) -> dict[str, Array]:
@@ -336,7 +339,7 @@ class AbstractLink(AbstractActor):
 
     def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
         """A checked copy with every number filled in; world points and axes become body-fixed at the given poses."""
-        # Methods are called through the class: binding one creates a module, too slow for thousands of parts.
+        # Methods are called through the class: binding a method creates a module, too slow for thousands of parts.
         cls = type(self)
         cls.check(self, space.dimension)
         part = cls.complete(_body_fixed(self, space, poses), space, poses)
@@ -375,7 +378,8 @@ class AbstractLink(AbstractActor):
     ) -> tuple[ScalarCoordinate, ...]:
         """Hook: the scalar coordinates that the part adds, from all joints of the scene by name.
 
-        Its kernel sees each as a further body after `bodies`; the first entry of its pose is the coordinate.
+        The part's kernel sees each coordinate as a further body after `bodies`, and as the first entry of that body's
+        pose.
         """
         del space, parts
         return ()
@@ -399,9 +403,9 @@ class AbstractLink(AbstractActor):
         return self
 
     def shapes(self, space: AbstractSpace, size: float) -> tuple[tuple[int | None, AbstractShape], ...]:
-        """Hook: the shapes by which a picture shows the part, each with the number of its body, None for the world.
+        """Hook: the shapes by which a picture shows the part, each with the index of its body, None for the world.
 
-        **Arguments:** `size` [m]: the radius of a bar, to which symbols such as pins are drawn.
+        **Arguments:** `size` [m]: the radius of a bar, by which symbols such as pins are scaled.
         """
         del space, size
         return ()
@@ -409,8 +413,8 @@ class AbstractLink(AbstractActor):
     def path(self, space: AbstractSpace, poses: Poses) -> Float[Array, "points d"] | None:
         """Hook: the world points [m] of the line by which a picture shows the part; None without a line.
 
-        By `path_kind`, `"rod"` (the default) and `"coil"` have two points, `"belt"` is a closed line through any
-        number.
+        By `path_kind`, `"rod"` (also for None) and `"coil"` have two points; `"belt"` is a closed line through any
+        number of points.
         """
         return None if self.path_kind is None else both_points(space, self, poses)
 
@@ -449,7 +453,7 @@ class AbstractConstraint(AbstractLink):
 
     rows: AbstractVar[int]
     rheonomic: AbstractVar[bool]
-    # Their residuals are differentiated with respect to time.
+    # Constraints need no `drift`: their residuals are differentiated with respect to time.
     takes_drift: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -480,8 +484,8 @@ class AbstractConstraint(AbstractLink):
 
 
 class AbstractInertialConstraint(AbstractConstraint):
-    """A position constraint on a scalar coordinate that it adds, which has an `inertia` [kg m² of an angle, kg of a
-    length] and nothing else.
+    """A position constraint on a scalar coordinate that the part adds, whose only property is an `inertia` [kg m² of an
+    angle, kg of a length].
     """
 
     inertia: AbstractVar[Float[Array, ""]]
@@ -533,7 +537,7 @@ class AbstractTendon(AbstractLink):
         """The length at these poses of its bodies."""
 
     def residual(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "rows"]:
-        """Hook: its scalar coordinates minus their angles, less full turns; zero along a motion."""
+        """Hook: the scalar coordinates minus the angles that they count, modulo full turns; zero along a motion."""
         del space, t
         return jnp.zeros(0, poses.dtype)
 
@@ -569,7 +573,7 @@ class AbstractForce(AbstractLink):
     """A force law without potential energy: all its power is dissipated or supplied."""
 
     conservative = False
-    # Whether it acts where a gap is closed only, for `gaps`; no step then passes over the force.
+    # Whether the force acts only where one of its `gaps` is closed; then no step of the solver skips the force.
     has_gaps: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -588,8 +592,8 @@ class AbstractForce(AbstractLink):
         return 0.0
 
     def gap_pace(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Float[Array, ""]:
-        """Hook: a rate [1/s]; in an interval of 1/pace no gap closes and opens unless its rates at both ends say so. By
-        default the rate at which two bodies turn by a radian relative to each other.
+        """Hook: a rate [1/s]; in an interval of 1/pace no gap closes and opens unless its rates at both ends show it.
+        By default an upper bound of the relative angular velocity of two bodies.
         """
         del poses, t
         return 2 * jnp.max(norm(velocities[:, space.dimension :]))
@@ -618,8 +622,8 @@ class AbstractDynamicForce(AbstractForce):
         """The rate of every internal state [its unit/s], by the name of the field."""
 
     def state_sizes(self) -> dict[str, Any]:
-        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. Error control
-        counts a state that has stayed smaller than 1e-4 of its size as that much.
+        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. For error
+        control, the largest value of a state so far counts as at least 1e-4 of its size.
         """
         return {}
 

@@ -1,5 +1,5 @@
-"""The entry of a part's functions into a scene: its kernels are checked by abstract evaluation, and its functions are
-kept as JAX traces them then. Nothing is computed or compiled.
+"""What happens to a part's functions when it enters a scene: kernels are checked by abstract evaluation, and functions
+are kept as JAX traces them then. Nothing is computed or compiled.
 """
 
 import dataclasses
@@ -62,7 +62,7 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
 def captured(part: T, space: AbstractSpace, bodies: int) -> tuple[T, dict[str, Captured]]:
     """A part whose kernels have been checked, with its functions as JAX traces them now.
 
-    **Returns:** the part, and by name the kernels that a class of the user's may define: functions of the part and the
+    **Returns:** the part; and for a part of a user's class its kernels by name, as functions of the part and of the
     kernel's arguments after `space`.
     """
     part, functions = with_captured(part)
@@ -99,7 +99,7 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
 def is_of_user(value: Any) -> bool:
     """Whether a part, or a collection of modules, contains a module of a class that no installed package defines.
 
-    Modules whose weights are a number do not count: functions call them.
+    Modules whose weights are a parameter do not count: the part's functions call them.
     """
     if isinstance(value, dict):
         return any(map(is_of_user, value.values()))
@@ -115,7 +115,7 @@ def is_of_user(value: Any) -> bool:
 def with_captured(module: T) -> tuple[T, list[Captured]]:
     """A module with all functions in its fields captured, also in inner modules; and these functions.
 
-    Modules whose weights are a number stay: other functions call them.
+    Modules whose weights are a parameter stay: other functions call them.
     """
     functions: list[Captured] = []
 
@@ -165,7 +165,7 @@ def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str
 
 
 def _check_gaps(part: AbstractForce, kernel: Callable[..., Any], given: list[Any]) -> None:
-    """The same for any number of gaps."""
+    """As `check_returns`, for any number of gaps."""
     shape = getattr(_evaluated(part.label, "gaps", kernel, tuple(given)), "shape", ())
     if len(shape) != 1:
         raise ValueError(f"{part.label}: gaps must return a vector, got shape {shape}.")
@@ -181,7 +181,7 @@ def _arguments(space: AbstractSpace, bodies: int) -> tuple[Any, Any, Any]:
 
 
 def _check_state_rates(part: AbstractDynamicForce, kernel: Callable[..., Any], given: list[Any]) -> None:
-    """The same for the rates of internal states: each must have the shape of its state."""
+    """As `check_returns`, for the rates of internal states: each must have the shape of its state."""
     states = internal_states(part)
     rates = _evaluated(part.label, "state_rates", kernel, tuple(given))
     if not isinstance(rates, dict) or set(rates) != set(states):

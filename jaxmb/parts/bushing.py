@@ -20,11 +20,11 @@ class Bushing(AbstractPair, AbstractPotentialForce):
     system = jaxmb.Scene([bar], forces=[bush]).compile()
     ```
 
-    The motions are first the position of B's point relative to A's point in the axes of `body_a` [m]. In the plane the
-    relative angle minus `free_angle` follows [rad]. In space twice the vector part of the Euler parameters from
-    `orientation` to the relative attitude follows, in the axes of `body_b`. It is the rotation vector [rad] if small,
-    and `2 sin(angle/2)` along the axis of rotation in general: the moment of an isotropic spring is `stiffness
-    sin(angle)`. Both signs of the bodies' Euler parameters give the same wrench and energy.
+    The first motions are the position of B's point relative to A's point in the axes of `body_a` [m]. In the plane the
+    last is the relative angle minus `free_angle` [rad]. In space the last three are twice the vector part of the Euler
+    parameters from `orientation` to the relative attitude, in the axes of `body_b`: the rotation vector [rad] if small,
+    in general `2 sin(angle/2)` along the axis of rotation. The moment of an isotropic spring is `stiffness sin(angle)`.
+    Both signs of the bodies' Euler parameters give the same wrench and energy.
 
     **Arguments:**
 

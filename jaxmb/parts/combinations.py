@@ -55,10 +55,12 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
     For angles known up to full turns, the row and `yᵢ − other_zero[i]` are wrapped to [−π, π]. Gears with integer
     ratios then turn without end, other gears by half a turn to either side.
 
-    **Arguments:** `coordinate`, the name of x, such as `"finger.angle"`; `other`, the name or names of y;
-    `coefficients` of the polynomial, the constant first, with one row for each of several others: `((0, 0.5), (0,
-    0.5))` for the carrier of a differential; `zero` and `other_zero` [rad, m], for several others one each, default the
-    coordinates at the given poses.
+    **Arguments:**
+
+    - `coordinate`: the name of x, such as `"finger.angle"`; `other`: the name or names of y.
+    - `coefficients` of the polynomial, the constant first; for several y a row each, `((0, 0.5), (0, 0.5))` for the
+        carrier of a differential.
+    - `zero` and `other_zero` [rad, m], the latter a vector for several y; default the coordinates at the given poses.
     """
 
     coordinate: str = fields.name()
@@ -118,9 +120,9 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
     acceleration on the housing are neglected, as is usual for gears of high ratio. Where they matter, model the rotor
     as a body and the gear as a `JointCoupling`.
 
-    It adds one coordinate, one velocity and one row to the scene. The coordinate is x itself, which counts on through
-    full turns: `"rotor.angle"`, or `"rotor.displacement"` for a displacement or length. The reaction of the part is the
-    generalized force `−inertia ẍ`, on the last body of the joint.
+    It adds one coordinate, one velocity and one row to the scene. The coordinate is x with full turns counted:
+    `"rotor.angle"`, or `"rotor.displacement"` for a displacement or length. The reaction of the part is the generalized
+    force `−inertia ẍ`, on the last body of the joint.
 
     **Arguments:** `coordinate`, a number, such as `"hip.angle"`; `inertia` > 0 [kg m² of an angle, kg of a
     displacement].
@@ -154,7 +156,7 @@ class JointInertia(AbstractCombination, AbstractInertialConstraint):
 
 
 class FixedTendon(AbstractCombination, AbstractTendon):
-    """A weighted sum of coordinates of joints, `length = Σ coefficients[k] x_k`, as a tendon around pulleys has.
+    """A weighted sum of coordinates of joints, `length = Σ coefficients[k] x_k`: the length of a tendon around pulleys.
 
     ```python
     link = planar.Body("link", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(1.5, 0.0))
@@ -166,11 +168,11 @@ class FixedTendon(AbstractCombination, AbstractTendon):
 
     Springs, forces, drivers and actuators act on its coordinate, `"tendon.length"`.
 
-    Angles of hinges in space are in (−π, π] at the given poses. From there on they count through full turns, like a
-    cord that winds up; for each, the scene has a further coordinate, on which no force acts.
+    Angles of hinges in space are in (−π, π] at the given poses. Later full turns are counted, as for a cord that winds
+    up; for each such angle the scene has a further coordinate, on which no force acts.
 
     **Arguments:** `along`: the names of the coordinates, such as `("left.angle", "right.angle")`; `coefficients` [m/rad
-    of an angle], one for each.
+    for an angle], one for each coordinate.
     """
 
     along: fields.Names = fields.names()
@@ -230,7 +232,7 @@ class Tendon(AbstractTendon):
 
     **Arguments:** `path`: pairs (body, point), at least two; points [m] are body-fixed. A body may occur several times.
 
-    **Fields:** `bodies`, each once; `owners`, for each point the index of its body among them; `points`.
+    **Fields:** `bodies`, each once; `owners`, for each point the index of its body in `bodies`; `points`.
     """
 
     name: str = fields.name()

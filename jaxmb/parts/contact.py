@@ -286,18 +286,18 @@ class Contact(AbstractContact):
     potential, the energy of `normal`. The contact also exerts normal damping, with the coefficient
     `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body separates.
 
-    The distance d is normal to the terrain, exact on even ground and to first order in its curvature; the step has two
-    continuous derivatives.
+    The distance d is normal to the terrain, exact on even ground and to first order in its curvature; the function
+    `step` has two continuous derivatives.
 
     **Arguments:**
 
     - `bodies`: one name or several; all share one terrain, one law and one set of parameters.
     - `terrain`: an `AbstractTerrain`, from `jaxmb.terrain`; fixed in the world, but it rises and sinks if its numbers
         are inputs.
-    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
+    - `normal`: `Linear`, `Hertz` or `Bekker`; `friction`: `Coulomb`, `Janosi` or None; all from `jaxmb.contact`.
     - `radius` [m] ≥ 0, of shape () or (bodies,), 0 for a point.
     - `centres` [m], body-fixed, shape (d,) or (bodies, d), default the origins of the frames.
-    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, from which on it acts fully.
+    - `damping` [N s/m] ≥ 0, which acts fully from the depth `damping_depth` [m] > 0 on.
     - `smoothing` [m] > 0. Far above the ground a depth of `smoothing² / (4 |d|)` remains.
     """
 

@@ -16,7 +16,7 @@ from .frames import AbstractFrame
 from .names import unknown
 from .space import rate_of
 
-# The quantities of a body or a frame; the dimension of the space, None for both.
+# The quantities of a body or a frame, each with the dimension of its space, None for both.
 _OF_BODIES = {"position": None, "velocity": None, "angular_velocity": None, "angle": 2, "orientation": 3}
 
 
@@ -49,10 +49,10 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         returns the force [N m, N] on the coordinate that the controller `acts_on`, or a dictionary of forces by
         coordinate; and the rates of the internal states by name, `{}` without states. Controllers with the same
         function are computed together.
-    - `measures`: measured quantities by their names in the function: a joint's coordinate `"hinge.angle"` or its rate
-        `"hinge.angle_rate"`; of a body or frame `"cart.position"` and `velocity` [m, m/s] (world axes; a body's at the
-        mass centre, as in its motion), `angular_velocity` [rad/s] (in space in the axes of the body or frame), in the
-        plane `angle`, in space `orientation`.
+    - `measures`: measured quantities by their names in the function. Of a joint: a coordinate `"hinge.angle"` or its
+        rate `"hinge.angle_rate"`. Of a body or frame: `"cart.position"` and `velocity` [m, m/s] in world axes (of a
+        body at the mass centre, as in its motion); `angular_velocity` [rad/s] (in space in the axes of the body or
+        frame); `angle` in the plane; `orientation` in space.
     - `acts_on`: a coordinate, `"slide.displacement"`, or several.
     - `states`: the internal states, such as an integral, with their initial values; their names are `"pid.integral"`.
     - `parameters`: numbers, or modules as in `Force`, by name; they become parameters of the system, `"pid.gain"`.
@@ -66,8 +66,8 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     states: fields.Numbers = fields.internal_states_by_name()
     parameters: fields.Numbers = fields.numbers()
     # A scene fills in the names of the sources, and the names by which the function returns several forces. In
-    # `measures` and `acts_on` the number of a source then replaces its name, so that controllers of different joints
-    # are stacked.
+    # `measures` and `acts_on` the index of a source then replaces its name, so that controllers of different joints are
+    # stacked.
     source_names: tuple[str, ...] = fields.names(optional=True)
     force_names: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
     takes_bodies: ClassVar[bool] = True
@@ -143,7 +143,7 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
                 raise unknown("quantity", self._called(name), listed, self.label)
 
     def _called(self, name):
-        """The name of a quantity, with its source's name in place of the number."""
+        """The name of a quantity, with its source's name in place of the index."""
         source, quantity = name.split(".")
         return f"{self.source_names[int(source)]}.{quantity}"
 

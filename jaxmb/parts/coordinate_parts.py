@@ -32,8 +32,8 @@ from .space import rate_of, with_drift
 class AbstractOfJoints(AbstractLink):
     """A part that acts on joints and tendons, or measures them; also bodies and frames if it `takes_bodies`.
 
-    **Fields:** a scene fills in the `joints` by the number of the source (a joint, a tendon or a frame, none for a
-    body), and `places`: for each source the indices of its bodies in the part's bodies.
+    **Fields:** a scene fills in both. `joints`: the joints, tendons and frames by the index of the source, no entry for
+    a body. `places`: for each source, the indices of its bodies in the part's bodies.
     """
 
     name: str = fields.name()
@@ -86,7 +86,7 @@ class AbstractOfJoints(AbstractLink):
     def given_coordinate(self, k: int, coordinate: str, space: Any, poses: Any) -> np.ndarray:
         """A coordinate of a source at the given poses.
 
-        **Raises:** `ValueError` if the joint has no such coordinate; its class lists them.
+        **Raises:** `ValueError` if the joint has no such coordinate; the message lists its coordinates.
         """
         values = self.coordinates_of(k, space, poses)
         name, _, within = coordinate.partition(".")
@@ -101,7 +101,7 @@ class AbstractOfJoints(AbstractLink):
 class AbstractOfCoordinates(AbstractOfJoints):
     """A part that acts on coordinates of joints or tendons.
 
-    **Fields:** a scene fills in the names of the coordinates `within` their joints.
+    **Fields:** `within`: the names of the coordinates within their joints, which a scene fills in.
     """
 
     within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
@@ -123,7 +123,7 @@ class AbstractOfCoordinates(AbstractOfJoints):
         return self.are_lengths(range(len(self.within)))
 
     def are_lengths(self, numbers: Iterable[int]) -> Any:
-        """Whether each of the coordinates with these numbers is a length; None if unknown."""
+        """Whether each of the coordinates at these indices is a length; None if unknown."""
         lengths = [self.joints[str(k)].is_length(self.within[k]) for k in numbers]
         return None if None in lengths else np.array(lengths if len(lengths) > 1 else lengths[0])
 
@@ -219,8 +219,8 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
 
     **Arguments:** `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m] ≥ 0; `free` [rad, m], where the spring
     exerts no force, default the coordinate at the given poses. In space the spring of an angle takes the shortest way
-    to `free`, up to half a turn. With `middle` [rad] of its range, the angle counts within half a turn of `middle`
-    instead.
+    to `free`, up to half a turn. With `middle` [rad], the middle of its range, the angle is instead wrapped to within
+    half a turn of `middle`.
     """
 
     stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
@@ -317,13 +317,13 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     ```
 
     The depth δ beyond a stop is a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or value −
-    upper. The stop has the potential `½ stiffness δ²`, so that its force is `stiffness δ`, and the dissipation `damping
-    δ̇²`. With an `exponent` the stop is progressive: its potential is `stiffness δ^(exponent + 1) / (exponent + 1)`,
-    and its force nearly `stiffness d^exponent`.
+    upper. The potential is `½ stiffness δ²`, and the dissipated power `damping δ̇²`. With an `exponent` the stop is
+    progressive: the potential is `stiffness δ^(exponent + 1) / (exponent + 1)`. Beyond the bend the elastic force is
+    nearly `stiffness d`, or `stiffness d^exponent`.
 
-    **Arguments:** `lower` < `upper` [rad, m]; `stiffness` [N m/rad, N/m] ≥ 0, per power `exponent` of the angle or
-    length; `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, the width of
-    the ramp's bend. In space the range of an angle must be less than a full turn.
+    **Arguments:** `lower` < `upper` [rad, m]; `stiffness` ≥ 0 [N m/rad, N/m; N m/rad^exponent, N/m^exponent];
+    `exponent` > 0 and `damping` [N m s/rad, N s/m] ≥ 0, default none; `smoothing` [rad, m] > 0, the width of the ramp's
+    bend. In space the range of an angle must be less than a full turn.
     """
 
     lower: fields.Number = fields.parameter(unit=("rad", "m"))

@@ -31,7 +31,7 @@ from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
 class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     """Coulomb friction in a joint or a rigid contact, along one direction of slip, or two in a contact in space.
 
-    Subclasses define the velocity of `slip`. It adds one coordinate, one velocity and one row to the scene. The
+    Subclasses define the velocity of `slip`. The part adds one coordinate, one velocity and one row to the scene. The
     coordinate is its mode, `"rub.mode"`: 2 for stick, 1 or -1 for slip forwards or backwards, and 0 before the start of
     a motion and in open contacts. In stick, `slip = 0` is a constraint whose force is at most `static_coefficient`
     times the normal force. In slip, the force is `coefficient` times the normal force, against the slip. `simulate`
@@ -39,7 +39,7 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
 
     Contacts in space, and joints whose bodies slide over each other in two directions, add two of each. The modes
     `"rub.mode_1"` and `"rub.mode_2"` are both 2 in stick. In slip they are the components of a vector near the
-    direction of slip: of length one, or one half if slip has just begun from rest and is not visible yet.
+    direction of slip: of length one, or one half if slip has just begun from rest and is still below its tolerance.
 
     **Fields:** `joint`, its name, or `"joint.coordinate"`; `coefficient` μ ≥ 0 in slip; `static_coefficient` ≥ μ in
     stick, default μ.
@@ -70,7 +70,7 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
 
     @property
     def last(self) -> int:
-        """The number of the joint's last body."""
+        """The index of the joint's last body."""
         return len(self.joints["0"].bodies) - 1
 
     @property
@@ -167,14 +167,14 @@ class DryFriction(AbstractDryFriction):
 
     Several contacts in space that stick, such as the feet of a table, share undetermined forces. These are as small as
     possible, and where a contact reaches its limit others take more. If the normal forces are undetermined too, as with
-    four feet, the motion in slip may be as well, and the run may end with a failure. In the plane the run finds a
-    possible distribution, in which a foot of a body at rest may be at its limit: its mode is slip, at velocity zero,
-    and another foot bears the rest. The motion and the sum of the forces are determined.
+    four feet, the motion in slip may be undetermined as well, and the run may end with a failure. In the plane the run
+    finds a possible distribution, in which a foot of a body at rest may be at its limit: its mode is slip, at velocity
+    zero, and another foot bears the rest. The motion and the sum of the forces are determined.
 
     `Trajectory.reactions["rub"]` is its force on the last body, in stick and in slip.
 
-    If the normal force does not exist, or more than one does (Painlevé's paradox), the run ends with a failure that
-    names the friction. `Friction` lists the ways in which a joint rubs.
+    If no normal force exists, or several do (Painlevé's paradox), the run ends with a failure that names the friction.
+    `Friction` lists the ways in which a joint rubs.
 
     **Arguments:**
 

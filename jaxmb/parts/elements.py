@@ -25,7 +25,7 @@ class Coincident(NamedTuple):
         return dimension
 
     def moved(self, point: Callable[[int, Any], Any], direction: Callable[[int, Any], Any]) -> Self:
-        """The same for other axes of bodies 0 and 1: `point(k, s)` and `direction(k, v)` convert to body k."""
+        """The same element in other axes: `point(k, s)` and `direction(k, v)` convert to the axes of body k."""
         del direction
         return type(self)(point(0, self.point_a), point(1, self.point_b))
 

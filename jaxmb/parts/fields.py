@@ -51,19 +51,19 @@ class Declaration:
 
     **Fields:**
 
-    - `kind`: `"identity"` for a name that distinguishes stacked parts (`"identities"` for several), `"body"` for the
-        name of a body (`"bodies"` for several), `"number"`, `"numbers"` for a dictionary of numbers and modules,
-        `"module"` for a module whose weights are one number, `"law"` for a module with parameters, `"part"` for another
-        part of the scene (`"parts"` for a dictionary of them), `"state"` for a number of the initial guess, and
-        `"internal"` for an internal state (`"internals"` for a dictionary of them); states are not parameters.
-    - `shape` of a number, None for any, with None for any size; `sign`; `unit`, `"1"` for a number without unit, None
-        if unknown, and `("N m", "N")` for the units with an angle and with a length.
+    - `kind`: `"identity"`: a name that distinguishes stacked parts; `"body"`: the name of a body; `"number"`;
+        `"module"`: a module whose weights are one parameter; `"law"`: a module with parameters; `"part"`: another part
+        of the scene; `"state"`: a number of the initial guess; `"internal"`: an internal state. Plurals are tuples of
+        names (`"identities"`, `"bodies"`) and dictionaries (`"numbers"`, also of modules; `"parts"`; `"internals"`).
+        States are not parameters.
+    - `shape` of a number, None for any shape, with entries None for any size; `sign`; `unit`, `"1"` for a number
+        without unit, None if unknown, or two units, with an angle and with a length, `("N m", "N")`.
     - `body`: index, among the part's bodies, of the body that a point or direction is fixed in; None for the world.
     - `is_point`: whether the number is a point; `is_direction`: a unit vector; `is_attitude`: unit Euler parameters.
         Several points or unit vectors are rows.
     - `sizes`: whether the scene's size is computed from this length.
-    - `optional`: whether the field may be None, and is computed from the given poses; `at_origin`: whether a point that
-        is left out is the origin of its frame.
+    - `optional`: whether the field may be None and is then computed from the given poses; `at_origin`: whether a point
+        that is left out is the origin of its frame.
     - `gives`: the body-fixed fields that a world point or direction determines; `needed`: whether one or the other must
         be given.
     - `of`: the type of a law, or the words of a choice; `what`: a description of the law, for messages.
@@ -141,7 +141,7 @@ def as_parameter(value: Any) -> Any:
 
 
 def as_jax(value: Any) -> Array:
-    """The same as a JAX array, which tracers can index."""
+    """As `as_parameter`, but always a JAX array, which tracers can index."""
     if isinstance(value, Array) and value.dtype == jnp.result_type(float) and not is_weakly_typed(value):
         return value
     value = as_parameter(value)
@@ -411,7 +411,7 @@ def internal_state(
     ```
 
     The kernels of the part see the current value in this field; its given value is the initial guess. It is not a
-    parameter. `optional`: default None, without such a state.
+    parameter. `optional`: default None, which means no such state.
     """
     declaration = Declaration("internal", shape=shape, unit=unit, optional=optional)
     return _field(declaration, converter=_optional(_NUMBER), default=None if optional else default, kw_only=True)
@@ -623,7 +623,7 @@ def anonymous(part: Any) -> Any:
 
 
 def inner_parts(part: Any, prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """All other parts inside a part, at any depth, each after its path of keys."""
+    """All other parts inside a part, at any depth, each with its path of keys before it."""
     for name in _fields_of_parts(type(part)):
         value: Any = getattr(part, name)
         held = value if isinstance(value, dict) else {} if value is None else {None: value}

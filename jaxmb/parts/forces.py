@@ -28,8 +28,8 @@ class Gravity(AbstractPart):
 
 
 def over_ground(part: Any, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"]:
-    """A velocity [m/s] relative to the ground below a point, which rises and sinks if numbers of the part's `terrain`
-    are inputs.
+    """A velocity [m/s] relative to the ground below a point; the ground rises and sinks if numbers of the part's
+    `terrain` are inputs.
     """
     upwards = jnp.zeros_like(point).at[-1].set(1.0)
     return with_drift(part, velocity, lambda part: -part.terrain.height(point[:-1]) * upwards)
@@ -58,7 +58,8 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
     ```
 
     At zero length a pretension is taken as zero, since its direction is undefined; a spring of zero free length is
-    linear there. Damping acts against the velocity there, the limit along every motion that reaches zero length.
+    linear there. Damping then acts against the relative velocity, its limit along every motion that reaches zero
+    length.
 
     **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
     given poses.

@@ -14,7 +14,7 @@ from .space import AbstractSpace, Point, Pose, Velocity, Wrench
 
 
 class AbstractFrame(AbstractPart):
-    """A frame fixed in a body, or in another frame, its `base`, which a scene fills in.
+    """A frame fixed in a body or in another frame; a scene fills in its `base`, the other frame, or None.
 
     A part that names a frame in place of a body sees the pose and the velocity of the frame. Points and axes given with
     the part are in the frame's axes, from its origin.
@@ -107,7 +107,7 @@ class LinkFrame(AbstractFrame):
 
 
 def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBody]) -> dict[str, AbstractFrame]:
-    """Checked frames with their bases, by name; bodies whose mass centre is not their origin have a frame under their
+    """Checked frames with their bases, by name; each body whose mass centre is not its origin has a frame under its own
     name.
 
     **Raises:** `ValueError` for frames on unknown bodies, and frames that are fixed in themselves.

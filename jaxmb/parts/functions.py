@@ -120,12 +120,13 @@ class Force(AbstractPotentialForce):
         body was given `centre=`.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`. An equinox module, such as a
         neural network, may be among them: the function calls it as `parameters["net"](x)`, and all its weights are one
-        parameter, a vector. `with_parameters` takes a vector or a module of new weights, and `jaxmb.modules` gives it.
-    - `potential(poses, t, parameters)`: optional potential energy [J] of which these forces are the gradient, for the
-        energy balance.
+        parameter, a vector. `with_parameters` takes new weights as a vector or a module; `jaxmb.modules` returns the
+        module.
+    - `potential(poses, t, parameters)`: optional potential energy [J], for the energy balance; the forces are its
+        negative gradient.
     - `gap(poses, t, parameters)`: optional gap [m, rad], a number or a vector, for a force such as a contact that acts
-        only where it is negative. No step of `simulate` then passes over the force, however short it acts. The gap is a
-        distance from a convex shape, or varies with a joint; other shapes need a gap for each convex part.
+        only where the gap is negative. No step of `simulate` then passes over the force, however short it acts. The gap
+        is a distance from a convex shape, or varies with a joint; other shapes need a gap for each convex part.
     """
 
     name: str = fields.name()
@@ -178,9 +179,9 @@ class NonIdeal(AbstractNonIdeal):
 
     - `joint`: the name of a joint with a determinate reaction: no other joint may imply any of its rows.
     - `function`: as in `Force`, with a row for each of the joint's bodies. `reactions` are the joint's reaction
-        wrenches on them, in the same axes, in the presence of all these forces. Returned components in directions that
-        the joint blocks do not change the motion: they only reduce the reactions. Both moments are about the origins of
-        the frames.
+        wrenches on them, in the same axes, in the presence of all non-ideal forces. Returned components in directions
+        that the joint blocks do not change the motion: they only reduce the reactions. Moments, given and returned, are
+        about the origins of the frames.
     - `parameters`: as in `Force`.
     """
 

@@ -13,8 +13,8 @@ from .space import with_drift
 
 class KnifeEdge(AbstractVelocityConstraint):
     """A blade, skate or wheel that does not slip sideways. Rows 1: `n·v = 0`, with the velocity v of the contact point
-    and the normal n of the blade in its plane. In space `n = e × h`, with the direction h of the blade and the plane's
-    normal e.
+    and the normal n of the blade in the plane of motion. In space `n = e × h`, with the direction h of the blade and
+    the plane's normal e.
 
     ```python
     sled = planar.Body("sled", mass=1.0, inertia=0.1, velocity=(1.0, 0.0))

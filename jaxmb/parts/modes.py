@@ -1,10 +1,10 @@
 """Modes of contacts and of dry friction: coordinates that select their laws.
 
-A contact is open (0), closed (1), or closed while other closed contacts imply it and take the force (2). Dry friction
-in one direction is inactive (0), slips forwards or backwards (1, -1), sticks (2), or sticks while other friction
-implies it and takes the force (3). Friction in two directions has two modes. Both have the same number if it is
+A contact is open (0), closed (1), or closed but implied by other closed contacts, which take the force (2). Dry
+friction in one direction is inactive (0), slips forwards or backwards (1, -1), sticks (2), or sticks but is implied by
+other friction, which takes the force (3). Friction in two directions has two modes. Both have the same number if it is
 inactive or sticks. In slip they are the components of a vector near the direction of slip: of length one, or one half
-if slip has just begun from rest and is not visible yet.
+if slip has just begun from rest and is still below its tolerance.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,8 @@ from ..linalg.sums import with_entries
 
 OPEN, CLOSED, IMPLIED = 0, 1, 2
 FREE, FORWARD, STICK, IMPLIED_STICK = 0, 1, 2, 3
-# The length of the modes when slip in two directions has just begun, and the lengths between which slip is visible.
+# The length of the modes when slip in two directions has just begun, and the lengths between which slip is above its
+# tolerance.
 BEGUN, _SEEN, _HELD = 0.5, 0.75, 1.5
 
 
@@ -58,20 +59,20 @@ class SlipInPlane(NamedTuple):
 
     @property
     def begun(self) -> Bool[Array, "pairs"]:
-        """Friction whose slip has begun and is not visible yet."""
+        """Friction whose slip has begun and is still below its tolerance."""
         return (self.size > 0) & (self.size < _SEEN)
 
     @property
     def slides(self) -> Bool[Array, "pairs"]:
-        """Friction whose slip is visible."""
+        """Friction whose slip is above its tolerance."""
         return (self.size > _SEEN) & (self.size < _HELD)
 
 
 class Modes(NamedTuple):
     """The modes of a system's contacts, followed by the modes of its dry friction.
 
-    **Fields:** the `numbers`, whole except for slip in two directions; `n`, the number of contacts; `pairs`: among all
-    friction, the indices of the first directions of friction in two directions.
+    **Fields:** `numbers`: the modes, whole numbers except for slip in two directions; `n`: the number of contacts;
+    `pairs`: for each friction in two directions, the index of its first direction among all friction.
     """
 
     numbers: Float[Array, "laws"]

@@ -1,4 +1,4 @@
-"""Modules, such as neural networks, whose weights are one number of a part."""
+"""Modules, such as neural networks, whose weights are one parameter of a part."""
 
 import functools
 from typing import Any
@@ -14,7 +14,7 @@ from ..linalg.arrays import ARRAYS, is_traced
 
 
 class ModuleWeights(eqx.Module):
-    """A module as the vector of its weights, and the rest, which is static. A call calls the module.
+    """A module split into the vector of its weights and a static rest. A call calls the module.
 
     The weights are all arrays of floating-point numbers, raveled one after the other in the order of `jax.tree.leaves`.
 
@@ -38,8 +38,8 @@ class ModuleWeights(eqx.Module):
 def as_weights(module: Any) -> ModuleWeights:
     """A module as its weights and the rest; `ModuleWeights` are returned unchanged.
 
-    **Raises:** `ValueError` for a module without weights, and for arrays that are not of floating-point numbers, which
-    are neither weights nor static.
+    **Raises:** `ValueError` for a module without weights, and for arrays of other than floating-point numbers, which
+    can be neither weights nor static.
     """
     if not isinstance(module, eqx.Module):
         raise ValueError(f"expected an equinox module, such as an eqx.nn.MLP, got {module!r}")
@@ -71,7 +71,7 @@ def _(module: ModuleWeights) -> ModuleWeights:
 
 
 def with_weights(like: eqx.Module, values: Float[Array, "n"]) -> eqx.Module:
-    """The module whose weights are these.
+    """The module with these weights.
 
     **Arguments:** `like`: as in `ModuleWeights`.
     """

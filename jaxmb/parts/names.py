@@ -18,8 +18,8 @@ class UnknownNameError(ValueError, KeyError):
 
 
 def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> UnknownNameError:
-    """An error for an unknown name, with the nearest known names; for `"rod.phi"`, or `"rod"` where names have dots,
-    with all names of `"rod"`. `where`: the part or argument that has the name.
+    """An error for an unknown name, with the nearest known names. For `"rod.phi"`, or `"rod"` where names have dots,
+    these are names of `"rod"`. `where`: the part or argument that has the name.
     """
     lead = f"{where}: " if where else ""
     return UnknownNameError(f"{lead}Unknown {what} {name!r}{_hint(str(name), known)}")
@@ -54,8 +54,8 @@ def _alike(name: str, names: list[str]) -> list[str]:
 def check_arguments(what: str, signature: inspect.Signature, positional: int, names: Iterable[str]) -> None:
     """Raise a `TypeError` that lists the arguments of a function or class, for arguments that it does not take.
 
-    **Arguments:** `what`: its name; its `signature`; the number of `positional` arguments and the `names` of the
-    others.
+    **Arguments:** `what` and `signature`: the name and the signature of the function or class; `positional`: the number
+    of arguments by position; `names` of the others.
     """
     parameters = signature.parameters
     kinds = {parameter.kind for parameter in parameters.values()}

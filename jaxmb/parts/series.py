@@ -78,8 +78,9 @@ class Series(AbstractSignal):
     - `interpolation`: `"linear"`; `"cubic"`, the not-a-knot spline, whose first two derivatives are continuous;
         `"held"`, each value until the next time.
 
-    A call before the first or after the last time returns the value there; as an input of a motion a series must last
-    as long as the motion. `ts` and `values` may be traced: motions can be differentiated with respect to values.
+    A call before the first or after the last time returns the first or the last value; as an input of a motion a series
+    must last as long as the motion. `ts` and `values` may be traced: motions can be differentiated with respect to
+    values.
 
     **Raises:** `ValueError` for times that do not ascend, and for numbers that are not finite or of the wrong shape.
 
@@ -136,7 +137,7 @@ class Series(AbstractSignal):
             chord = (values[k + 1] - values[k]) / h
             before, after = self.slopes[k] - chord, chord - self.slopes[k + 1]
             inside = inside + h * s * (1 - s) * (before * (1 - s) + after * s)
-        # Not a clipped time, whose derivative would be halved at the first and the last time.
+        # The time is not clipped: clipping would halve the derivative at the first and the last time.
         return jnp.where(t < ts[0], values[0], jnp.where(t > ts[-1], values[-1], inside))
 
     def shape(self, t):
@@ -218,9 +219,9 @@ def as_signal(label: str, value: Any) -> AbstractSignal:
 
 
 def of_one_kind(signals: Sequence[AbstractSignal]) -> list[tuple[tuple[int, ...], AbstractSignal]]:
-    """Signals grouped by kind: their numbers, and one signal whose first axis runs over the group.
+    """Signals grouped by kind: their indices, and one signal whose first axis runs over the group.
 
-    Series with the same interpolation and shapes are of one kind; a series or function alone has no such axis.
+    Series with the same interpolation and shapes are of one kind; a group of one signal has no such axis.
     """
     kinds: dict[Any, list[int]] = {}
     for k, signal in enumerate(signals):
@@ -240,7 +241,7 @@ def of_each(signals: AbstractSignal, count: int) -> list[AbstractSignal]:
 
 
 def _spline_slopes(ts, values):
-    """Slopes at the knots of the spline with a continuous third derivative at the second and the last but one."""
+    """Slopes at the knots of the spline with a continuous third derivative at the second and the last but one knot."""
     n, flat = ts.shape[0], values.reshape(ts.shape[0], -1)
     h = jnp.diff(ts)[:, None]
     chords = jnp.diff(flat, axis=0) / h

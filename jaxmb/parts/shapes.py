@@ -172,7 +172,7 @@ class Mesh(AbstractShape):
                 f"Mesh: vertices and faces must have shapes (n, 3) and (m, 3), got {vertices.shape} and {faces.shape}."
             )
         if not np.all(np.isfinite(vertices)) or faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
-            raise ValueError("Mesh: vertices must be finite, and faces must be numbers of vertices.")
+            raise ValueError("Mesh: vertices must be finite, and faces must be indices of vertices.")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
@@ -182,13 +182,13 @@ class Mesh(AbstractShape):
 
     @classmethod
     def read(cls, path: str | Path, *, scale: VectorLike = 1.0, **place: Any) -> "Mesh":
-        """From a file that trimesh reads, such as STL, OBJ, PLY or GLB.
+        """A mesh from a file that trimesh reads, such as STL, OBJ, PLY or GLB.
 
         **Arguments:** `scale` [m per unit of the file], one number or one along each axis, negative for a mirror image;
         `position`, `orientation` and `color` as for all shapes.
 
         **Raises:** `ImportError` without trimesh, which `jaxmb[view]` installs; `ValueError` for a file that trimesh
-        cannot read, such as without an extension, which specifies its format.
+        cannot read, such as a file without the extension that specifies its format.
         """
         try:
             import trimesh
@@ -213,8 +213,8 @@ class Mesh(AbstractShape):
 class Ground(AbstractShape):
     """Ground without limits; a picture draws the visible part.
 
-    **Arguments:** `height(place)`: height [m] above the shape's plane z = 0 at the place, shape (2,), in its axes; in
-    the plane above y = 0, shape (1,). None for level ground.
+    **Arguments:** `height(place)`, None for level ground. In space: height [m] above the shape's plane z = 0 at a
+    place, shape (2,), in the shape's axes. In the plane: height above y = 0 at a place, shape (1,).
     """
 
     height: Callable[[Any], Any] | None = None

@@ -125,7 +125,7 @@ def _of_both(function, part, *rows):
 
 
 def nearest_to_origin(point: Point, axis: Point) -> Point:
-    """The point, nearest to the origin, of the line through a point along a unit vector."""
+    """The point nearest to the origin on the line through a point along a unit vector."""
     return point - jnp.dot(point, axis) * axis
 
 
@@ -170,8 +170,8 @@ def rate_of(
 
 
 def with_drift(part: Any, rate: Array, function: Callable[[Any], Array]) -> Array:
-    """The `rate` of `function(part)` by the motion of the bodies, plus its rate by inputs, such as a point that moves
-    in its body.
+    """The `rate` of `function(part)` due to the motion of the bodies, plus its rate due to inputs, such as a point that
+    moves in its body.
     """
     if part.drift is None:
         return rate
@@ -192,6 +192,6 @@ def moment_pair(space: AbstractSpace, poses: Float[Array, "2 p"], moment_W: Floa
 
 
 def round_shapes(space: AbstractSpace, body: int, radius: Any, centre: Any) -> tuple[tuple[int, AbstractShape], ...]:
-    """The shapes of a disc (in space of a ball), each with the number of its body; none for a point."""
+    """The shapes of a disc (in space of a ball), each with the index of its body; none for a point."""
     solid = wheel if space.dimension == 2 else marked_ball
     return tuple((body, shape) for shape in solid(radius, position=space.in_space(centre))) if radius > 0 else ()

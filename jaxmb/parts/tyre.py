@@ -50,8 +50,9 @@ class Tyre(AbstractDynamicForce, AbstractPotentialForce):
         `coefficient` μ > 0 of friction.
     - `relaxation_length` σ [m] > 0, of one direction or of all; `transition_speed` [m/s] > 0: rolling speeds below it
         are regularised.
-    - `deflection` [m], (d − 1,), an internal state: of the tread in the contact relative to the rim, forwards and, in
-        space, to the left; initially zero. Off the ground it follows the slip as well, without a force.
+    - `deflection` [m], (d − 1,), an internal state: the deflection of the tread in the contact relative to the rim,
+        forwards and, in space, to the left; initially zero. Off the ground it follows the slip as well, without a
+        force.
     """
 
     name: str = fields.name()

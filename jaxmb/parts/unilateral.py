@@ -1,8 +1,8 @@
 """Unilateral constraints: gaps that close at an instant, with an impact, and open again.
 
 A gap is a function of the poses of bodies that stays non-negative. An open gap has no effect; a closed gap is a
-constraint `gap = 0`, as in a joint, whose force pushes and never pulls. `simulate` finds the times of impacts and of
-loss of contact within its steps. Every pair that may touch must be named; no others are searched for.
+constraint `gap = 0`, whose force pushes and never pulls. `simulate` finds the times of impacts and of loss of contact
+within its steps. Every pair that may touch must be named; no others are searched for.
 """
 
 import abc
@@ -33,18 +33,18 @@ from .terrain import AbstractTerrain, distance
 
 
 class AbstractUnilateralConstraint(AbstractInertialConstraint):
-    """A gap between bodies, which stays non-negative.
+    """A gap between bodies; the gap stays non-negative.
 
-    Subclasses define the `gap` and list the bodies. It adds one coordinate, one velocity and one row to the scene. The
-    coordinate is its mode: 0 open, 1 closed, 2 closed but implied by other contacts. Its name is `"stop.mode"`:
-    `assemble(system, fix={"stop.mode": 1})` closes the gap.
+    Subclasses define the `gap` and list the bodies. The part adds one coordinate, one velocity and one row to the
+    scene. The coordinate is its mode: 0 open, 1 closed, 2 closed but implied by other contacts. Its name is
+    `"stop.mode"`: `assemble(system, fix={"stop.mode": 1})` closes the gap.
 
     By Newton's law of impact the gap opens at `restitution` times the rate at which it closed. By Poisson's law the
     impulse of restitution is `restitution` times the impulse of compression, or more where the gap would close. The two
     laws differ if friction or several contacts act at once. Contacts that are closed at the same time share the
-    impulse. With friction, or with several coefficients at once, Newton's law may give energy back (T. R. Kane and D.
-    A. Levinson, "Dynamics", McGraw-Hill, 1985, §5.9): all rebounds of such an impact are reduced by the same fraction,
-    so that no energy is gained.
+    impulse. With friction, or with several coefficients at once, Newton's law may add energy (T. R. Kane and D. A.
+    Levinson, "Dynamics", McGraw-Hill, 1985, §5.9); all rebounds of such an impact are reduced by the same fraction, so
+    that no energy is gained.
 
     **Arguments:**
 
@@ -177,7 +177,7 @@ class AbstractRigidContact(AbstractGeometricContact):
 
     def tangents(self, space: AbstractSpace, poses: Poses, pole: int = 0) -> Float[Array, "n d"]:
         """Unit vectors along which bodies slip: in the plane the outward normal turned clockwise; in space two
-        tangents, which turn with the normal, from an axis of the first of two bodies or of the world.
+        tangents, turned like the normal from an axis of the first of two bodies or of the world.
 
         **Arguments:** `pole`: in space this axis, 1, 2 or 3, negative for the opposite direction; zero in the plane.
         The normal must not be opposite to it.

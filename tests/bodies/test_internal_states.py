@@ -575,11 +575,11 @@ REFUSED = {
     ),
     "no gain of a speed": (
         lambda: motor_on_four_bar(gain=None),
-        "Motor 'motor': without a gain its command does nothing in the mode 'speed'; give gain",
+        "Motor 'motor': without a gain the command does nothing in the mode 'speed'; give gain",
     ),
     "no gain of a position": (
         lambda: motor_on_four_bar(mode="position", gain=None, damping=1.0),
-        "Motor 'motor': without a gain its command does nothing in the mode 'position'",
+        "Motor 'motor': without a gain the command does nothing in the mode 'position'",
     ),
     "shape of a command": (
         lambda: motor_on_four_bar(command=[1.0, 2.0]),

@@ -356,7 +356,7 @@ def test_shapes_are_checked():
         (lambda: shapes.Sphere(1.0, position=(0.0, 1.0)), "position must be 3 finite"),
         (lambda: shapes.Sphere(1.0, orientation=(0.0,) * 4), "orientation must not be zero"),
         (lambda: shapes.Mesh([[0.0, 0.0]], [[0, 0, 0]]), "shapes"),
-        (lambda: shapes.Mesh(np.eye(3), [[0, 1, 3]]), "numbers of vertices"),
+        (lambda: shapes.Mesh(np.eye(3), [[0, 1, 3]]), "indices of vertices"),
     ):
         with pytest.raises(ValueError, match=message):
             build()

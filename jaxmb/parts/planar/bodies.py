@@ -54,7 +54,7 @@ class Body(AbstractRigidBody):
     moments in `Trajectory.forces` refer to the mass centre; a `Frame` on the body shows the motion of the origin.
 
     **Arguments:** `mass` [kg] > 0; `inertia` [kg m²] > 0 about the mass centre; `centre` [m], shape (2,), the mass
-    centre in the frame, default its origin. If a changed `"name.centre"` moves the mass centre, the guess of the frame
+    centre in the frame, default its origin. A changed `"name.centre"` moves the mass centre; the guess of the frame
     stays.
     """
 

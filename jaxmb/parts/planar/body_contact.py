@@ -45,18 +45,18 @@ class _Disc:
 
 class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     """Base class of contacts of one disc with other bodies. Subclasses define numbers for each other body (`surfaces`),
-    the distance from its surface (`distance`) and the fraction of the force that acts (`share`). Both are functions of
-    these numbers and of the disc's centre in the other body's frame.
+    the distance from its surface (`distance`) and the fraction of the force that acts (`share`). `distance` and `share`
+    are functions of these numbers and of the disc's centre in the other body's frame.
 
-    The depth is smoothed, and damping and friction act, as in `Contact`; forces and their reactions act on one line.
+    The depth is smoothed, and damping and friction act, as in `Contact`; a force and its reaction act along one line.
 
     **Arguments:**
 
     - `name`, of the contact; `bodies`: names, first the disc's body, then the others; a body touched at several places
         is repeated.
-    - `normal`, `friction`: `Linear`, `Hertz` or `Bekker`; `Coulomb`, `Janosi` or None; from `jaxmb.contact`.
+    - `normal`: `Linear`, `Hertz` or `Bekker`; `friction`: `Coulomb`, `Janosi` or None; all from `jaxmb.contact`.
     - `radius` [m] > 0 of the disc, and its `centre` [m], fixed in its body, default the origin of the frame.
-    - `damping` [N s/m] ≥ 0, and `damping_depth` [m] > 0, from which on it acts fully.
+    - `damping` [N s/m] ≥ 0, which acts fully from the depth `damping_depth` [m] > 0 on.
     - `smoothing` [m] > 0. At a distance d a depth of `smoothing² / (4 d)` remains.
     """
 
@@ -162,7 +162,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         return on_disc + disc.wrench(touching, rub), on_others + reactions(touching, rub)
 
     def _rows(self, value, shape):
-        """A number for each other body, from a single number or from one for each."""
+        """A value for each other body, from one value for all or from one for each."""
         return jnp.broadcast_to(value, (len(self.bodies) - 1, *shape))
 
     def _check_rows(self, **shapes):
@@ -189,12 +189,12 @@ class PlateContact(AbstractBodyContact):
 
     A plate bears on both sides: it pushes a disc to the side of the disc's centre. A disc whose centre is driven across
     the line leaves on the other side. Near the ends the force fades. The depth is measured from the plate's line; the
-    potential is the energy of `normal` times a C² step, from one at the distance `edge` before the end to zero as far
-    behind it. Two plates in line thus bear a disc like a single plate, at any depth.
+    potential is the energy of `normal` times a C² step, from one at the distance `edge` before the end to zero at the
+    same distance behind the end. Two plates in line thus bear a disc like a single plate, at any depth.
 
     In a chain that bends away from the disc, neither plate bears at a corner. With `chain=True` the plates form a
     closed chain, each beginning at the end of the previous plate, and the corners bear as well. The depth at a corner
-    is measured from the point between the two ends; the potential is the energy of `normal` times the fraction left by
+    is measured from the midpoint of the two ends; the potential is the energy of `normal` times the fraction left by
     both plates, and each plate takes half of the force.
 
     **Arguments:**

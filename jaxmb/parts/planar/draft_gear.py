@@ -43,7 +43,7 @@ class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
     - `travel` x_max [m] > 0, the stroke at which the stop is reached, and its `stop_stiffness` k_s [N/m] ≥ 0.
     - `damping` c [N s/m] ≥ 0, acting outside the slack.
     - `transition_speed` v₀ [m/s] > 0, the speed at which 76 % of the friction acts; `smoothing` [m] > 0. The smaller
-        they are, the shorter the steps.
+        they are, the shorter the time steps.
     - `free_length` [m], default the length at the given poses.
     """
 
@@ -95,7 +95,7 @@ class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
     def gaps(self, space, poses, t):
         extension = norm(separation(space, self, poses)) - self.free_length
         strokes = jnp.stack([extension - self.slack, -extension - self.slack])
-        # The ramps begin half their width before.
+        # The ramps begin half their width before zero.
         return -jnp.concatenate([strokes, strokes - self.travel]) - 0.5 * self.smoothing
 
     def _against(self, stroke, rate):
@@ -111,7 +111,7 @@ class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
         return 0.5 * (1 + self.unloading) * (self.preload * ramp + self.stiffness * area) + self.stop_stiffness * stop
 
     def _engaged(self, x):
-        """A smooth step from 0 to 1 over the width `smoothing`, its integral and the integral of that."""
+        """A smooth step from 0 to 1 over the width `smoothing`, and its first and second integral."""
         width = self.smoothing
         z = jnp.clip(x / width + 0.5, 0.0, 1.0)
         beyond = jnp.maximum(x - 0.5 * width, 0.0)

@@ -246,7 +246,8 @@ class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     **Arguments:**
 
     - `name`, of the pair; `body_a`, `body_b`: the two gears by name; another joint holds each on its axle.
-    - `ratio`, not zero: speed of `body_b` over speed of `body_a`, negative for an external mesh (−radius_a / radius_b).
+    - `ratio`, not zero: speed of `body_b` over speed of `body_a`, both relative to the carrier; negative for an
+        external mesh (−radius_a / radius_b).
     - `carrier`: the body that holds both axles, default the ground.
     - `offset` [rad], default from the given poses.
     """

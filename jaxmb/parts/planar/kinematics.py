@@ -78,7 +78,7 @@ def _prepared(pose):
 
 
 def _cos_sin(pose):
-    """Each as an array of one element, which saves a reshape."""
+    """Cosine and sine of the angle, each as an array of one element, which saves a reshape."""
     if _prepared(pose):
         return pose[3:4], pose[4:5]
     xp, angle = namespace(pose), pose[2:3]

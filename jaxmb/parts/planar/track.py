@@ -42,9 +42,10 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         may occur several times.
     - `pretension` [N] ≥ 0, at the free length; `stiffness` [N/m] ≥ 0.
     - `free_length` [m], default from the given poses.
-    - `radii` [m] ≥ 0, shape (points,), of circles around the points, inside a track whose path is counter-clockwise.
+    - `radii` [m] ≥ 0, shape (points,), of circles around the points. The circles lie inside the track, and its path
+        must be counter-clockwise.
 
-    **Fields:** `bodies`, each once; `owners`, for each point the index of its body among them; `points`.
+    **Fields:** `bodies`, each once; `owners`, for each point the index of its body in `bodies`; `points`.
     """
 
     name: str = fields.name()
@@ -91,7 +92,7 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
             if xp.any(distance <= xp.abs(more)):
                 raise ValueError(f"{self.label}: a circle lies in its neighbour; remove it or make it smaller.")
             _, _, turn = self._tangents(self._lines(space, poses))
-            # For a turn next to an end of its range, rounding decides whether all add up to one.
+            # For a turn next to an end of its range, rounding decides whether all turns add up to a full turn.
             if xp.abs(xp.sum(turn) - 2 * np.pi) > 1.0 or xp.any(xp.abs(turn - 0.5 * np.pi) > np.pi - 1e-6):
                 raise ValueError(f"{self.label}: a path with radii must be counter-clockwise; reverse its order.")
         return self.filled(free_length=self.length(space, poses))
@@ -112,7 +113,7 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         return self._measured(self._lines(space, poses))[0]
 
     def _measured(self, d):
-        """Along the lines of centres `d`: the length, and unit vectors of the straight parts."""
+        """From the lines of centres `d`: the length of the track, and the unit vectors of its straight parts."""
         xp = namespace(d)
         if self.radii is None:
             sizes = norm(d)
@@ -121,8 +122,8 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
         return xp.sum(straight) + xp.dot(self.radii, turn), along
 
     def _tangents(self, d):
-        """Lengths and unit vectors of the straight parts along the lines of centres `d`, and the angles of the turns on
-        the circles before each.
+        """For each line of centres in `d`: length and unit vector of the straight part, and the angle of the turn on
+        the circle before it.
         """
         xp = namespace(d, self.radii)
         square = xp.sum(d * d, axis=1)
@@ -135,7 +136,7 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
             along = (straight[:, None] * d - more[:, None] * across) / square[:, None]
         into = xp.roll(along, 1, axis=0)
         turn = xp.arctan2(into[:, 0] * along[:, 1] - into[:, 1] * along[:, 0], xp.sum(into * along, axis=1))
-        # At its ends a track turns by half a turn or more; elsewhere it turns back by less than a quarter.
+        # A track may turn by half a turn or more at its ends; it turns backwards by less than a quarter turn.
         return straight, along, xp.where(turn < -0.5 * xp.pi, turn + 2 * xp.pi, turn)
 
     def path(self, space, poses):

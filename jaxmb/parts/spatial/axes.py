@@ -35,8 +35,8 @@ class ElementaryJoint(NamedTuple):
 
 
 def joints_through_b(space, part, poses: Float[Array, "2 p"], **axes: Any) -> list[ElementaryJoint]:
-    """The elementary joints of a joint through its point B, by the names of its coordinates, about `axes` in the
-    world.
+    """The elementary joints of a joint, all through its point B; their `axes` in the world are given by the names of
+    its coordinates.
     """
     values, point = part.coordinates(space, jax.numpy.asarray(poses)), space.point(poses[1], part.point_b)
     kinds = {name: _KINDS[part.quantities[name]] for name in axes}
@@ -74,8 +74,8 @@ def across(axis: Vector3, w: Vector3) -> Float[Array, "2"]:
 def half_sine(sine: Float[Array, "n"], cosine: Float[Array, ""]) -> Float[Array, "n"]:
     """Twice the sine of half an angle [rad, for small angles], as a vector along the vector of its sine.
 
-    A common factor of sine and cosine does not affect the result, which is zero if both are zero. It vanishes with the
-    angle, and there has the first and second derivatives of the sine. Half a turn away its length is two.
+    A common factor of sine and cosine does not affect the result, which is zero if both are zero. The result vanishes
+    with the angle, and there has the first and second derivatives of the sine. Half a turn away its length is two.
     """
     xp = namespace(sine, cosine)
     square = add_up([*(s * s for s in sine), cosine * cosine])
@@ -108,7 +108,7 @@ def rotation_error(part, poses: Float[Array, "k p"]) -> Vector3:
 def cosine_sine(space, part, poses: Float[Array, "k p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Cosine and sine of the angle from `x_a` to `x_b` about `axis_a`, as products of direction components.
 
-    Only the parts perpendicular to `axis_a` count. Both have a common factor, which is 1 if `x_a` and `x_b` are
+    Only the parts perpendicular to `axis_a` count. Cosine and sine have a common factor, 1 if `x_a` and `x_b` are
     perpendicular to `axis_a`.
     """
     x = direction_in_a(space, poses, part.x_b)

@@ -68,8 +68,8 @@ class Body(AbstractRigidBody):
     - `mass` [kg] > 0.
     - `inertia` [kg m²], shape (3, 3), about the mass centre in body axes, symmetric and positive definite (products of
         inertia enter as `−∫ x y dm`); or shape (3,), its diagonal, in principal axes.
-    - `centre` [m], shape (3,), the mass centre in the frame, default its origin. If a changed `"name.centre"` moves the
-        mass centre, the guess of the frame stays.
+    - `centre` [m], shape (3,), the mass centre in the frame, default its origin. A changed `"name.centre"` moves the
+        mass centre; the guess of the frame stays.
     """
 
     mass: fields.Number = fields.parameter(unit="kg", sign="positive")
@@ -101,7 +101,7 @@ def _check_inertia(body: AbstractRigidBody) -> None:
     if not np.allclose(inertia, inertia.T, rtol=0.0, atol=1e-9 * np.max(np.abs(inertia))):
         raise ValueError(f"{body.label}: inertia must be symmetric, got {inertia.tolist()}; use (J + J.T) / 2.")
     moments = np.linalg.eigvalsh(inertia)
-    # Moments this far below the largest are rounding errors, not a thin body.
+    # Moments this far below the largest come from rounding errors, not from a thin body.
     if moments[0] <= 1e-14 * np.max(np.abs(moments)):
         raise ValueError(
             f"{body.label}: inertia must be positive definite, got principal moments {moments.tolist()} kg m²; a "

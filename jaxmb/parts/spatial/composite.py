@@ -35,7 +35,7 @@ _INDEPENDENT = 1e-6
 
 
 class Composite(AbstractSpatialPart, AbstractJoint):
-    """Hinges and slides in succession, with no mass in between. Rows: 6 less the number of its coordinates.
+    """Hinges and slides in succession, with no mass in between. Rows: 6 less its degrees of freedom.
 
     ```python
     arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))
@@ -47,8 +47,8 @@ class Composite(AbstractSpatialPart, AbstractJoint):
     From `body_a` to `body_b` there are, in any order, up to three hinges, or a ball, and up to three slides. The
     coordinates are `angle_1`, … [rad] of the hinges and `displacement_1`, … [m] of the slides, each kind numbered in
     this order; a ball has `rotation` [rad], shape (3,), as in `Spherical`. The placement of B in A is the product of
-    all turns and shifts. The coordinates follow from it in closed form: the angles from the relative attitude, then the
-    displacements from the relative position, which is linear in them.
+    all turns and shifts. The coordinates follow from the placement in closed form: the angles from the relative
+    attitude, then the displacements from the relative position, which is linear in them.
 
     If all coordinates are zero, the two points coincide, the relative attitude is `orientation`, and the joints have
     the directions `axes`. This holds at the given poses if `point` is given and `orientation` is not. Consecutive
@@ -60,11 +60,11 @@ class Composite(AbstractSpatialPart, AbstractJoint):
     - `sequence`: the words `"hinge"`, `"slide"` and `"ball"` from A to B.
     - `axes`, shape (n, 3), unit, one for each word (a ball's has no effect), in the axes of `body_a`; or in the world
         at the given poses, `axes_W`.
-    - `points` [m], shape (hinges, 3), one on each hinge, in the frame of `body_a`, or in the world, `points_W`; by
-        default point A for all of them.
+    - `points` [m], shape (hinges, 3), one on each hinge, in the frame of `body_a`; or in the world, `points_W`; default
+        point A for each hinge.
     - `orientation`, shape (4,), unit Euler parameters: the attitude of `body_b` relative to `body_a` with all
         coordinates zero, default from the given poses.
-    - `middle` [rad], default zero: the second of three angles is taken in the half turn that contains it.
+    - `middle` [rad], default zero: the second of three angles is taken in the half turn that contains `middle`.
 
     Source: R. W. Brockett, "Robotic manipulators and the product of exponentials formula", Mathematical Theory of
     Networks and Systems, 1984; of three axes in any directions, P. B. Davenport, "Rotations about nonorthogonal axes",
@@ -215,8 +215,8 @@ class Composite(AbstractSpatialPart, AbstractJoint):
         return self.middle + shortest(flat + side * jnp.arctan2(jnp.sqrt(square), cosine) - self.middle)
 
     def _place(self, space, poses):
-        """In A: the place of the point of B without the displacements [m], and three directions, the slides first; none
-        without slides.
+        """In A: the position of point B without the displacements [m], and three directions, first those of the slides;
+        no directions without slides.
         """
         slides = self.sequence.count("slide")
         angles = functools.cache(lambda: self._angles(space, poses))

@@ -230,8 +230,8 @@ class Gimbal(AbstractOriented):
     ```
 
     Its coordinates are `angle_1`, `angle_2` and `angle_3` [rad], the turns about the three axes; the first is fixed in
-    `body_a`, the third in `body_b`. All are zero at the given poses, unless `orientation` is given. They are smooth
-    except where the second is a quarter turn, in (−π/2, π/2).
+    `body_a`, the third in `body_b`. All are zero at the given poses, unless `orientation` is given. The second lies in
+    [−π/2, π/2]; the angles are smooth except at the ends of this range.
 
     **Arguments:**
 
@@ -263,7 +263,7 @@ class Gimbal(AbstractOriented):
 
     def coordinates(self, space, poses):
         triad = jnp.stack([self.axis_1, self.axis_2, self.axis_3])
-        # The second and third axes, turned with B.
+        # The axes, turned with B.
         turned = multiply(relative_orientation(poses), conjugate(self.orientation))
         turned_axes = jnp.stack([rotate(turned, axis) for axis in triad], axis=1)
         c = jnp.sum(triad[:, :, None] * turned_axes[None], axis=1)

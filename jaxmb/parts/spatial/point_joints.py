@@ -10,8 +10,8 @@ from .axes import across, displacement_along, offset_in_a, perpendiculars
 
 
 class PointOnPlane(AbstractSpatialPart, AbstractAxisJoint):
-    """Point B of a body stays in a plane fixed in A, through A normal to the axis. Rows 1: the component along the axis
-    of d from A to B.
+    """Point B stays in the plane fixed in `body_a` through point A, normal to the axis. Rows 1: the component along the
+    axis of d from A to B.
 
     ```python
     arm = spatial.Body("arm", mass=1.0, inertia=spatial.box(1.0, 1.0, 0.1, 0.1), position=(0.5, 0.0, 0.0))

@@ -45,7 +45,7 @@ class AbstractDisc(AbstractRolling):
 
 
 def _uphill(space, part, pose):
-    """The part of the plane's normal that is perpendicular to the axle, `m = (n·n) e − (n·e) n`, n·n and |m|."""
+    """The plane's normal less its component along the axle, times n·n: `m = (n·n) e − (n·e) n`; with n·n and |m|."""
     n = space.direction(pose, part.axis)
     square = dot(n, n)
     m = square * part.normal - dot(n, part.normal) * n
