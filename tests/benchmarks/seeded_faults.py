@@ -58,7 +58,7 @@ def first_failure(file: str, code: str, wrong: str) -> str | None:
             raise ValueError(f"{file} has {code!r} {text.count(code)} times, not once.")
         path.write_text(text.replace(code, wrong))
         for tests in (f"tests/{file.split('/')[0]}", "tests"):
-            command = [sys.executable, "-m", "pytest", "-x", "-q", tests, f"--ignore={place}/tests/package"]
+            command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "1", tests, f"--ignore={place}/tests/package"]
             environment = os.environ | {"PYTHONPATH": place}
             out = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True).stdout
             failed = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - |$)", out, re.MULTILINE)
