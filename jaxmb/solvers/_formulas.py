@@ -37,8 +37,8 @@ class Family(NamedTuple):
     - `multiplicity`: conditions at each point of the past, 2 if the slope is used.
     - `highest`: the largest useful number k of points.
     - `stable`: the largest k of an A-stable formula.
-    - `growth`: the ratio by which every step may exceed the previous one, with 1, 2, ... points, without loss of
-        zero-stability; see `largest_growth` of `jaxmb.solvers.stability`.
+    - `growth`: for 1, 2, ... points the largest constant ratio of successive steps that keeps zero-stability; see
+        `largest_growth` of `jaxmb.solvers.stability`.
     """
 
     integrated: bool

@@ -1,10 +1,10 @@
-"""How often results are differentiated by times."""
+"""How often results can be differentiated by times."""
 
 import jax
 
 NO_THIRD_DERIVATIVES = (
-    "A third derivative by times of a run was asked for, by `t0`, `t1`, saved times or those of `jumps`, which have "
-    "first and second ones. A first one is in closed form: velocities and `Trajectory.accelerations`."
+    "A third derivative by times of a run (`t0`, `t1`, saved times, times of `jumps`) was asked for; only first and "
+    "second ones exist. First ones are in closed form: velocities and `Trajectory.accelerations`."
 )
 
 
