@@ -27,7 +27,7 @@ class AbstractPositiveDefinite(eqx.Module):
     def eliminate(self, share: Float[ArrayLike, ""] | None = None) -> "AbstractPositiveFactor":
         """Eliminate once, for any number of right-hand sides.
 
-        **Arguments:** `share`: this share of the largest entry is added to the diagonal, for pivots of implied rows.
+        **Arguments:** `share`: this share of its largest entry is added to the diagonal, for pivots of implied rows.
         """
 
 
