@@ -15,8 +15,8 @@ _CACHE, _FEWEST = 2**17, 8
 
 
 def in_blocks(function: Callable[[PyTree], PyTree], members: PyTree, most: int) -> PyTree:
-    """Apply a function of members along axis 0 of all arrays, such as a `jax.vmap`, to at most `most` members at once,
-    one block after the other. Copies of the last member fill up the last block.
+    """Apply a function of members along axis 0 of all arrays, such as a `jax.vmap`, block by block, to at most `most`
+    members at once. Copies of the last member fill up the last block.
     """
     count = jax.tree.leaves(members)[0].shape[0]
     number = -(-count // most)

@@ -177,8 +177,8 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
 
 
 def project_velocities(at: Instant, metric: AbstractInertia) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
-    """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed, as it
-    can if ψ is not linear in them.
+    """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed. It can
+    fail only if ψ is not linear in velocities.
     """
     system = at.system
 

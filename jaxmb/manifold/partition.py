@@ -60,10 +60,11 @@ else:
 # A stored position factor is refreshed after this many steps, or when Newton's method takes this many iterations.
 _AGE = 4
 _SLOW = 3
-# The stored factor is useless on the other side of a position where rank is lost, and if the nearness to it has changed
-# by this ratio since the factor was made. A factor of the present state then replaces it. (A parallelogram in space
-# that lies flat several times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40 cases end soon after that
-# position, as Newton's method fails at steps of any length; with this replacement none of 200.)
+# A stored factor is useless if the nearness to a loss of rank has changed by this ratio since the factor was made. It
+# is also useless on the other side of the position where rank is lost. A factor of the present state then replaces it.
+# (A parallelogram in space that lies flat several times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40
+# cases end soon after that position, as Newton's method fails at steps of any length; with this replacement none of
+# 200.)
 _MOVED = 1.5
 # A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten
 # seconds: 1e-7 with 4, 1e-8 with 2 and 4e-9 with 1.1, at 664, 628 and 623 steps. A chain of ten rods makes 19 charts
@@ -315,8 +316,8 @@ class Chart(eqx.Module):
     **Fields:**
 
     - `split`: the index sets.
-    - `quality`: of the last evaluation. Its entries are the largest scaled |H|, with redundant rows the largest entry
-        of the solution of the kept rows, and last the `nearness` to a loss of rank.
+    - `quality`: of the last evaluation: the largest scaled |H|; with redundant rows the largest entry of the solution
+        of the kept rows; and the `nearness` to a loss of rank.
     - `fresh`: the quality of the chart when it was made, with the `nearness` when the position factor was made.
     - `counters`: see the properties.
     - `redundant`: None if all rows are independent.

@@ -69,7 +69,7 @@ class Projection(AbstractManifold):
     eliminated along with the joints in an order that follows from their graph. For trains, cables, trees and local
     loops a step takes time in proportion to the number of bodies. The eigenvalues near the inverse of the step decide
     which formulas and steps are stable; only these are computed. Newton's matrix omits the change of the directions of
-    joints and forces in a step, so it takes up to 40 % more iterations than with `Partition`. Derivatives follow from
+    joints and forces in a step. So there are up to 40 % more iterations than with `Partition`. Derivatives follow from
     the exact equations.
 
     **Arguments:** `newton_tol`: with `Adams` and `Hermite`, the size of omitted Newton corrections of positions,

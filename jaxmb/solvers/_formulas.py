@@ -1,7 +1,7 @@
 """The second-derivative formulas, for steps of any size, from Newton's form of Hermite's interpolation polynomial.
 
-A formula advances `y' = f`, whose second derivative is `g`. It interpolates a quantity z at the end of the step, with
-its slope, and at points of the past, and imposes one condition on the polynomial:
+A formula advances `y' = f`, with the second derivative `g`. It interpolates a quantity z and its slope at the end of
+the step, and z at points of the past. One condition on the polynomial determines the end:
 
     family   z   points of the past     the polynomial                                order
     E        f   k                      integrated over the step gives the change     k + 2

@@ -2,10 +2,10 @@
 
 A step is counted as stiff under two conditions. First, the Jacobian, estimated from the corrector, is so large that the
 step is near the stability bound. Second, relative to the state, the vector field changes much less along the solution
-than by the corrector, or the state changes less than three times as much as by the corrector. So stability errors, not
-the motion, keep the step short. By measurement, this holds for fewer than one in ten steps of non-stiff motions, and
-for four in ten to all steps if stability limits them (the library's mechanisms; van der Pol, Robertson, HIRES;
-tolerances 1e-4 to 1e-9).
+than by the corrector; or the change of the state is less than three times the corrector's change. So stability errors,
+not the motion, keep the step short. By measurement, fewer than one in ten steps of non-stiff motions count as stiff. If
+stability limits the steps, four in ten to all do (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances
+1e-4 to 1e-9).
 
 Source of the first condition: E. Hairer, S. P. Nørsett and G. Wanner, Solving Ordinary Differential Equations I,
 Springer, 1993, for Runge-Kutta methods (DOPRI5's test).

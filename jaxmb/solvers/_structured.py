@@ -34,8 +34,8 @@ _ARNOLDI = 16
 _SMALL = 0.02
 # A smaller part of a vector outside the space of the preceding vectors consists of rounding errors.
 _ROUNDING = 1e-10
-# A matrix is renewed after a step whose corrections shrank more slowly than by the first factor, and in a step that
-# would need more than about the second number of further iterations.
+# A matrix is renewed after a step whose corrections shrank more slowly than by `_SLOW`. It is renewed in a step that
+# would need more than about `_PATIENCE` further iterations.
 _SLOW, _PATIENCE = 0.35, 8
 # The largest number of iterations for derivatives; in rounding units, the relative residual at which they end, and the
 # largest residual of a usable derivative.

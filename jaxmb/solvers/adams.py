@@ -37,8 +37,8 @@ from .tolerances import Tolerances, norm_of
 _TARGET = 0.2
 # Numbers of evaluations and matrices in a step.
 _WORK = np.array([2, 0], np.int32)
-# The local error of order k is a product of the spans h_n + ... + h_{n-m+1}. So it is proportional to the power k + 1
-# of the steps if all of them change, but to the power 1 + sum_{m<=k} 1/m if only the last step does.
+# The local error of order k is a product of the spans h_n + ... + h_{n-m+1}. If all steps change, it is proportional to
+# their power k + 1. If only the last step changes, it is proportional to its power 1 + sum_{m<=k} 1/m.
 _ORDERS = np.arange(1, LENGTH)
 _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
@@ -108,8 +108,8 @@ class Adams(AbstractMultistep):
     Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order k predicts with the
     Adams-Bashforth formula of order k and corrects with the Adams-Moulton formula of order k + 1. A step of any order
     takes two evaluations. At tolerances of about 1e-6 and below the method needs roughly half the evaluations of
-    high-order Runge-Kutta methods, so it pays when the vector field is expensive. The first step is Euler's, of order
-    one: it evaluates at its start instead of at a prediction.
+    high-order Runge-Kutta methods: it pays when the vector field is expensive. The first step is Euler's, of order one:
+    it evaluates at its start instead of at a prediction.
 
     Use it with `MultistepController`, which reads the error estimates and holds the tolerances:
 

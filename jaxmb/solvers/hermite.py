@@ -394,8 +394,8 @@ class Hermite(AbstractMultistep):
         return recent @ states, (recent * rates) @ states
 
     def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, begins: Any):
-        """The end of a step as a linear map of the tangents of the numbers, and of the state and the history at its
-        start, on the mesh of the step.
+        """The end of a step as a linear map, on the mesh of the step: of the tangents of the numbers, and of the state
+        and the history at its start.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and the numbers; `end`:
         its time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there; `begins`:

@@ -378,8 +378,8 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 
 def _recorded(equations, init_state, fixed, constants, limit, most):
-    """The last state of diffrax's loop, the rows of the last segment, and the starts of all segments with the choices
-    of all steps, None for a single segment. All but the state are packed.
+    """The last state of diffrax's loop, the rows of the last segment, and the data to repeat steps: the starts of all
+    segments and the choices of all steps, None for a single segment. All but the state are packed.
 
     A segment has at most `most` steps. The row of the start, if there is one, follows behind its rows.
     """
