@@ -81,7 +81,7 @@ class Factor(eqx.Module):
     rows: Int[Array, "r"] | None
 
     def for_matrix(self, matrix: Float[Array, "m n"]) -> "Factor":
-        """The same numbers, with the derivatives of the factor of a matrix of the same value in the same split."""
+        """The same numbers, with the derivatives of the factor of this `matrix`, which has the same value."""
         return _for_matrix(self, matrix)
 
 

@@ -34,8 +34,8 @@ _OTHERS = 2
 
 
 def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*batch"]:
-    """The next larger number, or the next smaller one for a direction of −1; next to zero the least normal number, as
-    in solvers that stop just before a jump.
+    """The next larger number, or the next smaller one for a direction of −1; after zero the least normal number, as in
+    solvers that stop just before a jump.
     """
     sign = jnp.asarray(direction, t.dtype)
     return jnp.where(t == 0, sign * jnp.finfo(t.dtype).tiny, jnp.nextafter(t, sign * jnp.inf))

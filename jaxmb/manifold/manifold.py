@@ -33,7 +33,7 @@ _MULTIPLIERS, _NULL_SPACE = Multipliers(), NullSpace()
 
 
 class AbstractManifold(eqx.Module):
-    """A policy that turns a system into a term, and a solver into one that respects the constraints.
+    """A policy that turns a system into a term, and a solver into a solver that respects the constraints.
 
     **Fields:**
 

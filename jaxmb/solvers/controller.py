@@ -124,8 +124,8 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
 
     The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm. The error
     of the result is then of the size of the tolerance. For tolerances near rounding errors the bound is larger, up to
-    one. To step exactly to some times, or over jumps, wrap it in `diffrax.ClipStepSizeController`. It is for `Adams`
-    and `Hermite`.
+    one. The controller is for `Adams` and `Hermite`; to step exactly to some times, or over jumps, wrap it in
+    `diffrax.ClipStepSizeController`.
 
     Without a given `dt0` a trial step of one ten-thousandth of the interval tells how long the first step may be. The
     trial is rejected, and counted as rejected, unless its length is about right.
@@ -303,7 +303,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         if _is_known(self.rtol) and np.any(np.asarray(self.rtol) < finest):
             raise ValueError(
                 f"`rtol={self.rtol}` is finer than a state of type {ravel(y0).dtype} can resolve; the least is "
-                f"{finest:.1e}. For finer ones switch on `jax_enable_x64`."
+                f"{finest:.1e}. For finer tolerances switch on `jax_enable_x64`."
             )
 
 

@@ -199,7 +199,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return chart
 
     def kept_at_start(self, chart: Chart) -> PyTree[Array]:
-        """The same for the start of a run, from the chart at the end of the first step, whose prediction is the start.
+        """`kept` for the start of a run, from the chart at the end of the first step, whose prediction is the start.
 
         `update_chart` chose the index sets at the start.
         """

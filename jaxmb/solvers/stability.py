@@ -198,7 +198,7 @@ def stability_angle(formula: Formula) -> float:
 def stiff_abscissa(formula: Formula) -> float:
     """The abscissa D of stiff stability: the smallest `D >= 0` such that the formula is stable for `Re μ <= -D`.
 
-    It does not describe small μ: a formula that is not zero-stable may have one, too.
+    D does not describe small μ: a formula that is not zero-stable may have a finite D, too.
 
     **Returns:** D to 1e-4; infinite for a formula that is stable in no such half-plane.
     """

@@ -14,8 +14,8 @@ def twice_differentiable(time):
     return time
 
 
-# The slope of a number is 1, the slope of the slope is 0, and the latter has no derivative. (Both are functions of the
-# number, so they are batched if it is.)
+# The slope of a number is 1, the slope of the slope is 0 and has no derivative. (Both are functions of the number, so
+# they are batched if it is.)
 @jax.custom_jvp
 def _slope(x):
     return 1.0 + _curvature(x)
