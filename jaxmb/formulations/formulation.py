@@ -28,10 +28,12 @@ else:
 class AbstractFormulation(eqx.Module):
     """A method of solving for accelerations and multipliers.
 
-    `inverts_mass` says whether it needs the inverse of the mass matrix, which some systems do not have. `partitions`
-    says whether it needs the velocities split into dependent and independent ones. A formulation that does not
-    partition needs only the independent rows, so no pivots are searched if no row is redundant. `takes_blocks` says
-    whether it takes a Jacobian in blocks as it is; others make one dense matrix of it.
+    **Fields:**
+
+    - `inverts_mass`: whether it needs the inverse of the mass matrix, which some systems do not have.
+    - `partitions`: whether it needs the velocities split into dependent and independent ones. Other formulations need
+        only the independent rows, so no pivots are searched if no row is redundant.
+    - `takes_blocks`: whether it takes a Jacobian in blocks as it is; others make one dense matrix of it.
     """
 
     partitions: AbstractVar[bool]
@@ -77,8 +79,8 @@ def suitable_jacobian(at: Instant, formulation: AbstractFormulation) -> Abstract
 
 
 def row_levels(system: AbstractEquation) -> Array:
-    """Levels for elimination: holonomic rows first, then nonholonomic rows, then rows of accelerations only, so that
-    the dependent velocities nest.
+    """Levels for elimination: 0 for holonomic rows, 1 for nonholonomic rows, 2 for rows of accelerations only.
+    `full_pivot` eliminates level 0 first, so that the dependent velocities nest.
     """
     row = jnp.arange(system.acceleration_rows)
     return (row >= system.position_rows).astype(int) + (row >= system.velocity_rows).astype(int)

@@ -12,7 +12,7 @@ The solution is unique wherever `x ↦ x⁰ + P C(x)` contracts, component by co
 is below 1. For one Coulomb law on one row this is exact. At 1, Painlevé's paradox, a solution ceases to exist or
 another one appears (P. Painlevé, "Sur les lois du frottement de glissement", C. R. Acad. Sci. 121, 1895). For several
 rows it is sufficient, and for laws that are not linear in the size of a single component it holds near the solution. A
-component that cannot change its sign, of a contact, may weaken itself without limit: there the diagonal keeps its sign.
+contact's component cannot change its sign, and may weaken itself without limit: there the diagonal keeps its sign.
 """
 
 from collections.abc import Callable

@@ -51,7 +51,7 @@ class AbstractLaws(eqx.Module):
         return Solution(*solved, jnp.array(False))
 
     def remembered(self, at: Instant, multipliers: Float[Array, "m"]) -> Memory:
-        """The memory of all multipliers."""
+        """The memory, from all multipliers."""
         del at, multipliers
         return None
 
@@ -135,7 +135,7 @@ def accelerations(
 def accelerations_at(
     at: Instant, formulation: AbstractFormulation, gamma_shift: Float[Array, "m"] | float = 0.0
 ) -> tuple[Float[Array, "nu"], Float[Array, "m"]]:
-    """The same at an instant."""
+    """`accelerations` at an instant."""
     check_mass(at.system, formulation)
     if at.system.acceleration_rows == 0:
         return at.inertia.solve(at.force), jnp.zeros(0, at.u.dtype)

@@ -13,10 +13,10 @@ class Multipliers(AbstractFormulation):
     motion = jaxmb.simulate(system, state, t1=1.0, formulation=jaxmb.formulations.Multipliers())
     ```
 
-    Needs a mass matrix that is cheap to solve with; cheapest for few constraints and many degrees of freedom. The
-    elimination follows the graph of joints: for chains, trees and local loops time and memory are proportional to the
-    number of joints. Solutions are refined until they meet the constraint rows to rounding errors. So all digits are
-    right even with light bodies between or at the ends of heavy ones, for ratios of masses up to 1e8 and more.
+    It needs a mass matrix that is cheap to solve with, and is cheapest for few constraints and many degrees of freedom.
+    The elimination follows the graph of joints: for chains, trees and local loops time and memory are proportional to
+    the number of joints. Solutions are refined until they satisfy the constraint rows to rounding errors. So all digits
+    are right even with light bodies between or at the ends of heavy ones, for ratios of masses up to 1e8 and more.
     """
 
     partitions: ClassVar[bool] = False
@@ -31,7 +31,7 @@ class Multipliers(AbstractFormulation):
 
 
 class FactoredMultipliers(AbstractFormulation):
-    """The same with a known `projector`, which has a factor of `A M⁻¹ Aᵀ`."""
+    """`Multipliers` with a known `projector`, which has a factor of `A M⁻¹ Aᵀ`."""
 
     projector: MassProjector
     partitions: ClassVar[bool] = False

@@ -14,7 +14,7 @@ class NullSpace(AbstractFormulation):
     motion = jaxmb.simulate(system, state, t1=1.0, formulation=jaxmb.formulations.NullSpace())
     ```
 
-    c is the shortest solution of `A c = γ`; both come from an orthogonal factorisation of Aᵀ. No coordinate is
+    c is the shortest solution of `A c = γ`; Z and c come from an orthogonal factorisation of Aᵀ. No coordinate is
     preferred over others, so no chart can become singular, and no pivots are searched if no row is redundant. The mass
     matrix may be singular, as long as every velocity without mass is constrained.
 

@@ -19,9 +19,9 @@ class Partitioned(AbstractFormulation):
     ```
 
     E spans the null space of A and c is the particular solution of `A c = γ`, both from the factor of the chart.
-    Cheapest if a chart is made anyway and the degrees of freedom are few; the default with `Partition`. If a light body
-    moves by itself on heavy ones, its accelerations lose as many digits as the ratio of the masses has; `Multipliers`
-    keeps them.
+    It is the default with `Partition`, and the cheapest formulation if a chart is made anyway and the degrees of
+    freedom are few. If a light body moves by itself on heavy ones, its accelerations lose as many digits as the ratio
+    of the masses has; `Multipliers` keeps these digits.
 
     **Reference:**
 
@@ -49,7 +49,7 @@ class Partitioned(AbstractFormulation):
 
 
 class ReducedPartitioned(AbstractFormulation):
-    """The same with a known `inverse` of `EᵀME`."""
+    """`Partitioned` with a known `inverse` of `EᵀME`."""
 
     inverse: Float[Array, "f f"]
     partitions: ClassVar[bool] = True

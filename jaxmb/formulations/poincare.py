@@ -14,9 +14,9 @@ class Poincare(AbstractFormulation):
     ```
 
     There Gauss' function is a squared distance, `𝒢 = |ṡ − L⁻¹F|²`, and the constraints are `B ṡ = γ` with `B = A L⁻ᵀ`.
-    In a frame adapted to them, from an orthogonal factorisation of Bᵀ, the constraints give the components of ṡ along
-    their rows, and the components across are unchanged. No equation remains to be solved. The multipliers belong to the
-    ideal constraint force `S = Aᵀ λ = L (ṡ − L⁻¹F)`.
+    An orthogonal factorisation of Bᵀ gives a frame adapted to the rows of B. The constraints give the components of ṡ
+    along the rows; the components across are those of L⁻¹F. No equation remains to be solved. The multipliers belong to
+    the ideal constraint force `S = Aᵀ λ = L (ṡ − L⁻¹F)`.
 
     The condition of B counts once, whereas in `A M⁻¹ Aᵀ` it is squared. Large forces that the constraints balance are
     not subtracted from each other.

@@ -19,15 +19,15 @@ class UdwadiaKalaba(AbstractFormulation):
     motion = jaxmb.simulate(system, state, t1=1.0, formulation=method)
     ```
 
-    **Arguments:** `method`: which form, with `a = M⁻¹F` and a root L of the mass matrix, `M = L Lᵀ`, for its square
-    root:
+    **Arguments:** `method`: one of these forms, with `a = M⁻¹F` and a root L of the mass matrix, `M = L Lᵀ`, in place
+    of its square root:
 
-    - `"moore_penrose"`: `u̇ = a + L⁻ᵀ B⁺ (γ − A a)`, `B = A L⁻ᵀ`. The best known.
+    - `"moore_penrose"`: `u̇ = a + L⁻ᵀ B⁺ (γ − A a)`, `B = A L⁻ᵀ`. The best known form.
     - `"inverses"`: `u̇ = A⁻γ + (I − A⁻A) G⁻ Lᵀ(a − A⁻γ)`, `G = Lᵀ(I − A⁻A)`, with any `A⁻` that solves consistent
-        equations (a {1}-inverse) and any `G⁻` that solves least squares (a {1,3}-inverse). The first follows from the
-        chart; for the second `(I − A⁻A) G⁻ = E (LᵀE)⁺` in the chart's basis E of the null space.
-    - `"singular_mass"`: `u̇ = [(I − A⁺A) M; A]⁺ [F; γ]`. Needs no inverse of M, which may be singular as long as every
-        velocity without mass is constrained, `rank [M; A] = n`.
+        equations (a {1}-inverse) and any `G⁻` that solves least squares (a {1,3}-inverse). A⁻ follows from the chart;
+        for G⁻, `(I − A⁻A) G⁻ = E (LᵀE)⁺` in the chart's basis E of the null space.
+    - `"singular_mass"`: `u̇ = [(I − A⁺A) M; A]⁺ [F; γ]`. M may be singular as long as every velocity without mass is
+        constrained, `rank [M; A] = n`.
 
     Ranks are structural: pseudo-inverses are taken of independent rows, from factors of fixed rank, so that derivatives
     exist.

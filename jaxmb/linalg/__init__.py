@@ -22,7 +22,7 @@ members of a batch are eliminated one after the other.
 **Many joints.** The Gram matrix `A M⁻¹ Aᵀ` couples joints that share a body. Its order of elimination follows from the
 graph: many joints at once, in one loop over the steps of the order (`elimination_order`, `block_elimination`). On one
 core, for a chain of 100 joints of two rows, the factor of the matrix takes 40 and a solution 30; for 1000 joints 400
-and 75. The size of the program does not depend on the number.
+and 75. The size of the program does not depend on the number of joints.
 
 Recursion over a spanning tree, the sparse form of coordinate partitioning, needs as many operations but makes them one
 after the other along each chain. In one process, for a chain of 100 pins, the linear algebra of a step took 48 by
@@ -30,8 +30,8 @@ elimination (one factor, four solutions, products). By recursion it took 240 (ac
 tree of 127 pins, seven deep, it took 80 and 96, without loops and changes of charts. So recursion is not offered.
 
 **Small blocks.** A batched dot of 2 × 2 or 3 × 3 blocks is a library call, whereas XLA fuses a sum of products with the
-surrounding operations (`blocks`, `rotations`). Written term by term it takes a third to a fifth of the time of a
-reduction. But a product of products must not be fused: each entry would compute its operands again. A reduction over
+surrounding operations (`blocks`, `rotations`). Written term by term, a product takes a third to a fifth of the time of
+a reduction. But a product of products must not be fused: each entry would compute its operands again. A reduction over
 some thousand numbers is a library call as well.
 """
 

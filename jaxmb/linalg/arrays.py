@@ -34,7 +34,7 @@ def is_traced(tree: Any) -> bool:
 class Derivatives(NamedTuple):
     """The derivatives that are being taken by each leaf of a pytree.
 
-    **Fields:** their `orders`, as far as known: under a `jax.jit` that is differentiated as a whole they are not;
+    **Fields:** `orders` of the derivatives, which are unknown under a `jax.jit` that is differentiated as a whole;
     `known`: whether the values of all leaves are known, as for derivatives outside of `jax.jit` and `jax.vmap`.
     """
 

@@ -31,9 +31,9 @@ def bilinear_primitive(
 ) -> Callable[..., Array]:
     """A primitive for a bilinear function of two arrays of one type.
 
-    **Arguments:** `evaluate(a, b, **static)`, which takes any leading axes that a and b share; `shape`, of the
-    result, likewise; `gradient_a(c, b, **static)` and `gradient_b(c, a, **static)`: the gradients of
-    `Σ c · evaluate(a, b)`; names of the static `parameters`.
+    **Arguments:** `evaluate(a, b, **static)`, with any leading axes that a and b share; `shape(a, b, **static)` of the
+    result; `gradient_a(c, b, **static)` and `gradient_b(c, a, **static)`: the gradients of `Σ c · evaluate(a, b)`;
+    names of the static `parameters`.
     """
 
     bind_strictly = define_bilinear(name, evaluate, shape, (gradient_a, gradient_b), parameters)

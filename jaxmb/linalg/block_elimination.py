@@ -1,10 +1,10 @@
 """Elimination of block-sparse matrices in a given order of their nodes.
 
 Blocks are of one size, and the pattern is symmetric: (i, j) has a block if (j, i) has one. The factors are `S = L D Lᵀ`
-of a symmetric matrix, and `S = L D U` of another one, real or complex, without a search for pivots. Positive definite
-matrices need none, nor do symmetric quasi-definite ones (positive definite in some nodes, negative definite in the
-others). For other matrices every pivot must be regular in the given order. One loop executes the steps of a stage of
-the order; each step eliminates some nodes at once.
+of a symmetric matrix, and `S = L D U` of any other matrix, real or complex, without a search for pivots. Positive
+definite matrices need no search, nor do symmetric quasi-definite ones (positive definite in some nodes, negative
+definite in the others). For other matrices every pivot must be regular in the given order. One loop executes the steps
+of a stage of the order; each step eliminates some nodes at once.
 
 Sources: J. W. H. Liu, "The multifrontal method for sparse matrix solution", SIAM Review 34(1), 1992; R. J. Vanderbei,
 "Symmetric quasidefinite matrices", SIAM J. Optim. 5(1), 1995.
@@ -25,9 +25,13 @@ from .sums import unchecked_take
 class BlockFactor(eqx.Module):
     """A factored matrix; numbers without derivatives.
 
-    **Fields:** for each stage, step and lane the `inverses` (steps, b, b, w) of the pivots, and the columns of the
-    pivots (steps, b, b, d, w) in L, `below`, and in Uᵀ, `right`, which is None for a symmetric matrix; `rest`: the
-    inverse of the dense matrix of the remaining nodes; the `order`.
+    **Fields:**
+
+    - `inverses`: of the pivots of each stage, (steps, b, b, w).
+    - `below`: the columns of the pivots of each stage in L, (steps, b, b, d, w).
+    - `right`: the same in Uᵀ, None for a symmetric matrix.
+    - `rest`: the inverse of the dense matrix of the remaining nodes.
+    - `order`: the order of elimination.
     """
 
     inverses: tuple[Inexact[Array, "s b b w"], ...]
@@ -91,8 +95,8 @@ def eliminate_blocks(
 
 
 # In a step the lanes are the last axis, so that each operation acts on long vectors. The barriers keep XLA from
-# computing an operand of a product again for each entry. Blocks are (n, b, b), below the diagonal; of a matrix that is
-# not symmetric (n, 2, b, b), with the transposes of the blocks to the right of it.
+# computing an operand of a product again for each entry. Blocks are (n, b, b), below the diagonal. Of a matrix that is
+# not symmetric they are (n, 2, b, b), with the transposes of the blocks above the diagonal.
 
 
 def _joined(sides, axis=0):

@@ -38,10 +38,10 @@ class JointOrder:
     **Fields:**
 
     - `rows` (joints, r): index of the rows of each joint among all m; padding has the index m.
-    - `kept` (joints, r): whether a row is independent of the others; not of padding.
+    - `kept` (joints, r): whether a row is independent of the others; false for padding.
     - `place` (m,): index of each row among the rows of the joints in order, raveled.
     - `bodies` (joints, k): the bodies; padding has the number of bodies.
-    - `blocks` (joints, k, r, v): index of their entries among the blocks of all joints as given to `block_jacobian`;
+    - `blocks` (joints, k, r, v): index of each entry among the blocks of all joints as given to `block_jacobian`;
         padding has the index of the zero at the end.
     - `on_bodies`: sums of the actions of joints on each body, from (joints · k) entries.
     - `velocity_index` (bodies + 1, v): index of each body's velocities among all n; padding, and the last row, for no
@@ -52,8 +52,8 @@ class JointOrder:
     - `hubs` (h,): the bodies that are nodes, after the joints; `on_hubs` (entries,): the blocks, by joint and body
         raveled, of joints on hubs, and `hub_places` their places among the stored blocks.
     - `nodes`: the order of elimination of joints and hubs.
-    - `left_out`: rows that are not eliminated, and `absolute`: numbers of parts that bind bodies to the world, not only
-        to each other; as given.
+    - `left_out`: indices of rows that are not eliminated, as given.
+    - `absolute`: indices of parts that bind bodies to the world, not only to each other, as given.
     """
 
     key: Any

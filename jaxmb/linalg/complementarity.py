@@ -13,8 +13,8 @@ from .elimination import solve
 
 # Entries of a column below this multiple of its largest one are rounding errors, not pivots.
 PIVOT = 1e-9
-# Right-hand sides are displaced by this multiple of their largest entry, differently in each row, since equal ones
-# could make the method cycle.
+# Right-hand sides are displaced by this multiple of their largest entry, differently in each row: with equal right-hand
+# sides the method could cycle.
 _APART = 1e-10
 
 
@@ -35,7 +35,7 @@ def scale_of(W: Float[Array, "k k"]) -> Float[Array, "k"]:
 
 
 def lemke(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
-    """The same for a W of any symmetry, in units in which its entries are of the size of one."""
+    """As `positive_components`, for any W in units in which its entries are of the size of one."""
     k, dtype = b.size, b.dtype
     right = b + _APART * jnp.max(jnp.abs(b), initial=0.0) * jnp.asarray(np.arange(1, k + 1) / k, dtype)
     # Columns: w, x, the artificial variable, the right-hand side; `basis`: the variable of each row.

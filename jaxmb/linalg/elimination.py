@@ -71,7 +71,7 @@ class Factor(eqx.Module):
     """The solved form of `A δx = −residual` in a given split, in matrices of full size.
 
     **Fields:** `right_inverse` (n × m): `δx = −right_inverse @ residual` makes `A δx = −residual` while the independent
-    columns keep their values; its columns of implied rows are zero. `null_space` (n × (n − r)): `δx = null_space @
+    columns keep their values; the columns of implied rows are zero. `null_space` (n × (n − r)): `δx = null_space @
     δx_i` spans the null space of A, with the identity on the independent rows and the influence matrix H on the
     dependent ones. `rows` (r,): the independent rows; None in tangents.
     """
@@ -81,7 +81,7 @@ class Factor(eqx.Module):
     rows: Int[Array, "r"] | None
 
     def for_matrix(self, matrix: Float[Array, "m n"]) -> "Factor":
-        """The same numbers, with the derivatives of the factor of a matrix of the same value in the same split."""
+        """The same numbers, with the derivatives of the factor of this `matrix`, which has the same value."""
         return _for_matrix(self, matrix)
 
 
@@ -111,7 +111,7 @@ def full_pivot(
     **Arguments:**
 
     - `A`: the matrix, m × n, any shape and rank.
-    - `scale`: size of a typical change of each column's coordinate (a length for translations, one for angles), shape
+    - `scale`: size of a typical change of each column's coordinate (a length for translations, 1 for angles), shape
         (n,); the matrix is equilibrated with it, and its rows brought to unit norm, before pivots are compared.
     - `level`: rows of level 0 are eliminated before rows of higher levels, shape (m,). This nests the dependent columns
         of nonholonomic rows in the independent columns of the holonomic ones.
@@ -183,7 +183,7 @@ def _inverse(permutation: Int[Array, "n"]) -> Int[Array, "n"]:
 def eliminate(A: Float[Array, "m n"], order: PivotOrder, rank: int) -> Factor:
     """Eliminate in the order of a chart, without search; differentiable in `A`.
 
-    **Arguments:** `A`: the matrix; `order` from `PivotSearch`; `rank`: its rank, static.
+    **Arguments:** `A`: the matrix; `order` from `PivotSearch`; `rank` of the matrix, static.
     """
     m, n = A.shape
     rows = order.rows[:rank]
@@ -289,15 +289,15 @@ def positive_solver(M: Float[Array, "n n"]) -> Callable[[Float[Array, "n *k"]], 
 
 
 def solve_positive(M: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """The same for a single b."""
+    """`M⁻¹ b`, as by `positive_solver`."""
     return positive_solver(M)(b)
 
 
 def solve(A: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """`A⁻¹ b` for any regular matrix.
 
-    Up to forty rows no library is called, since XLA would leave its loop over steps for the call. One correction gives
-    the residual of an elimination, up to a condition of 1e10.
+    Up to forty rows no library is called, since XLA would leave its loop over steps for the call. One correction makes
+    the residual as small as by elimination, up to a condition number of 1e10.
     """
     n = A.shape[0]
     if n == 0:

@@ -26,21 +26,21 @@ _DENSE_STEP = 0.15
 _DENSE_FLOP = 0.0003
 # The largest number of nodes of the dense matrix.
 _LARGEST_REST = 400
-# More levels than this are executed in one stage, and avoided if all bounds on the degree are tried.
+# An order of more levels than this is executed in one stage, and avoided if all bounds on the degree are tried.
 _MOST_LEVELS = 128
 _LANES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """Steps of elimination that one loop executes; in each, w nodes (lanes) that are not neighbours of each other.
+    """Steps of elimination that one loop executes; each takes w nodes (lanes) that are not neighbours of each other.
 
     Padding lanes have the index of the node after the last. Blocks of padding have the index after the last block, a
     zero block; on the diagonal the next index, the identity.
 
     **Fields:** `nodes` (steps, w): the nodes; `later` (steps, w, d): their neighbours that are eliminated later, in
-    order of elimination; `diagonal` (steps, w) and `columns` (steps, w, d): places of their blocks; `targets` (steps,
-    w, d (d + 1) / 2): places of the blocks that they change, by pairs of later neighbours, the later one first.
+    order of elimination; `diagonal` (steps, w) and `columns` (steps, w, d): places of the nodes' blocks; `targets`
+    (steps, w, d (d + 1) / 2): places of the blocks that a node changes, by pairs of later neighbours, the later first.
     """
 
     nodes: np.ndarray
@@ -60,7 +60,7 @@ class NodeOrder:
         the other, before the rest.
     - `blocks`: the number of stored blocks, original ones and fill, in the lower triangle with respect to the order;
         the diagonal blocks come first, in the order of the nodes.
-    - `row`, `column` (blocks,): the nodes of each; the row is the later of the two.
+    - `row`, `column` (blocks,): the nodes of each stored block; the row is the later of the two.
     - `stages`: the steps.
     - `rest`: the nodes that are eliminated last, as one dense matrix; `rest_blocks` (rest, rest): places of its blocks;
         a block above the diagonal has the place of the transposed block.
@@ -96,7 +96,7 @@ def order_nodes(
 
     **Arguments:** `neighbours` of each node, without itself; `size` of a block; `after`: the nodes that must be
     eliminated before each node; `every_bound`: whether to try orders that eliminate nodes of higher degrees at once
-    even if a node of low degree exists. Low degrees first may follow a chain and take a level for each node.
+    even if a node of low degree exists. An order by low degrees may follow a chain and take a level for each node.
     """
     tries = []
     for cap in _CAPS:
@@ -209,7 +209,7 @@ def _laid_out(neighbours, levels, rest, size, cost):
 
 
 def _cut(levels, size, most=2):
-    """Levels grouped in at most `most` stages, each with one number of lanes and one of later neighbours.
+    """Levels grouped in at most `most` stages, each with one number of lanes and one number of later neighbours.
 
     (A third stage saves no time in chains, trees and nets of up to 10 000 bodies, and compiles 10 to 25 % longer.)
     """

@@ -12,8 +12,8 @@ Tree = TypeVar("Tree")
 
 
 def nan_where(failed: Bool[Array, ""], values: Tree, inputs: PyTree = None) -> Tree:
-    """The values, or NaN if a computation failed, and the same for their derivatives by all `inputs`, even by inputs
-    that the computation did not reach.
+    """The values, or NaN if a computation failed. Then their derivatives by all `inputs` are NaN as well, even by
+    inputs that the computation did not reach.
     """
     factor, total = jnp.where(failed, jnp.nan, 1.0), _sum(inputs)
     # Zero, with a derivative of one with respect to every input; NaN if an input is infinite.

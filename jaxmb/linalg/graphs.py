@@ -27,9 +27,9 @@ def connected(count: int, edges: Iterable[Sequence[int]]) -> list[int]:
 
 
 class Component(NamedTuple):
-    """Joints that are on loops together, or a single one. Components form a tree, each below one vertex.
+    """Joints that are on loops together, or a single joint. Components form a tree, each below one vertex.
 
-    **Fields:** the numbers of its `joints`; `top`: the vertex that it shares with components above it, or the root.
+    **Fields:** the indices of its `joints`; `top`: the vertex that it shares with components above it, or the root.
     """
 
     joints: tuple[int, ...]
@@ -39,8 +39,8 @@ class Component(NamedTuple):
 def components(joints: Sequence[Collection[int]], ground: int) -> list[Component]:
     """The biconnected components, each below its top.
 
-    **Arguments:** `joints`: the bodies of each, the ground among them; `ground`: its number, one more than the last
-    body's. The root of a tree is the ground if it is connected, else the body of most joints.
+    **Arguments:** `joints`: the bodies of each joint, the ground among them; `ground`: the ground's index, after the
+    last body's. The root of a tree is the ground if it is connected, else the body of most joints.
     """
     # Edges (vertex, other, joint); a joint of three bodies is a triangle of edges.
     adjacent: list[list[tuple[int, int]]] = [[] for _ in range(ground + 1)]
@@ -103,7 +103,7 @@ def vertices_before(edges: Sequence[tuple[int, ...]], ground: int) -> list[tuple
     """The vertices that each edge waits for in an elimination. An edge of a spanning tree waits for the vertex below
     it, another edge for the vertices of a shortest loop through it.
 
-    **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its number, after the last vertex.
+    **Arguments:** `edges`: the vertices of each, without the ground; `ground`: its index, after the last vertex.
     """
     at: list[list[int]] = [[] for _ in range(ground + 1)]
     vertices = [ends if len(ends) > 1 else (*ends, ground) for ends in edges]

@@ -26,7 +26,7 @@ class SparsePivots:
     """The result of an elimination.
 
     **Fields:** `order`: the rows in the order in which they became pivots, then the dependent rows; `rank`, the number
-    of pivots; `ratios`: for each row the multiples of pivot rows, as they were then, that were subtracted.
+    of pivots; `ratios`: for each row the pivot rows subtracted from it, as reduced then, and their multiples.
     """
 
     order: Int[np.ndarray, "m"]
@@ -57,8 +57,8 @@ def sparse_pivots(
 ) -> SparsePivots:
     """Independent rows, and how the others depend on them.
 
-    **Arguments:** `rows`: the entries of each by column, of unit norm or zero; `level` of each: rows of low levels
-    become pivots first; `zero`: the largest remaining entry of a dependent row; `rounding`: smaller entries are
+    **Arguments:** `rows`: the entries of each row by column, of unit norm or zero; `level` of each row: rows of low
+    levels become pivots first; `zero`: the largest remaining entry of a dependent row; `rounding`: smaller entries are
     dropped.
     """
     elimination = _Elimination(rows, rounding)
@@ -70,8 +70,8 @@ def sparse_pivots(
 
 
 class _Elimination:
-    """The remaining rows, by column; for each column the remaining rows with an entry in it; and for each row the
-    subtracted multiples of others.
+    """The remaining `rows`, by column; for each of the `columns` the remaining rows with an entry in it; and for each
+    row the `ratios`, the subtracted multiples of others.
     """
 
     def __init__(self, rows, rounding):
@@ -84,7 +84,7 @@ class _Elimination:
                 self.columns.setdefault(c, set()).add(r)
 
     def run(self, candidates, zero):
-        """Eliminate with pivots in the `candidates` while any entry of theirs exceeds `zero`; the pivots' rows."""
+        """Eliminate with pivots in the `candidates` while any of their entries exceeds `zero`; returns pivot rows."""
         heap = [(len(self.rows[r]), r) for r in candidates if self._largest(r) > zero]
         heapq.heapify(heap)
         allowed, kept = set(candidates), []
@@ -134,7 +134,7 @@ class _Elimination:
         return row, column
 
     def _eliminate(self, row, column):
-        """Subtract multiples of a row from the others with an entry in the column; the rows that changed."""
+        """Subtract multiples of a row from the others with an entry in the column; returns the changed rows."""
         pivot = self.rows.pop(row)
         for c in pivot:
             self.columns[c].discard(row)
@@ -156,7 +156,7 @@ class _Elimination:
 
 
 def least_size(sizes: Float[np.ndarray, "*sets rows"]) -> Float[np.ndarray, "*sets 1"]:
-    """The norm of a row that counts as zero, for each set of rows."""
+    """The norm below which a row counts as zero, for each set of rows."""
     info = np.finfo(sizes.dtype)
     return np.maximum(info.eps**0.75 * np.max(sizes, axis=-1, initial=0.0, keepdims=True), info.tiny)
 
@@ -164,7 +164,7 @@ def least_size(sizes: Float[np.ndarray, "*sets rows"]) -> Float[np.ndarray, "*se
 def dense_pivots(
     A: Float[np.ndarray, "m n"], level: Int[np.ndarray, "m"], zero: float
 ) -> tuple[Int[np.ndarray, "m"], int]:
-    """Rows in the order of full pivoting, independent ones first, and the number of these.
+    """Rows in the order of full pivoting, independent ones first, and the number of independent rows.
 
     Rows of low levels become pivots first. An equilibrated pivot below eps to the power `zero` counts as zero.
     """

@@ -97,6 +97,6 @@ class DenseInertia(AbstractInertia):
 
 
 def _inverse_3x3(J):
-    # Row k of the cofactors is the product of the two rows after row k.
+    # Row k of the cofactors is the vector product of the two rows after row k.
     cofactors = jax.vmap(jax.vmap(cross))(J[:, np.array([1, 2, 0])], J[:, np.array([2, 0, 1])])
     return cofactors.swapaxes(1, 2) / jnp.sum(J[:, 0] * cofactors[:, 0], axis=-1)[:, None, None]

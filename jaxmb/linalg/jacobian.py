@@ -20,7 +20,8 @@ from .positive_definite import AbstractPositiveDefinite, AbstractPositiveFactor,
 from .rotations import norm
 from .sums import unchecked_take
 
-# A solution is refined until its rows are met to this many rounding errors of their summands, or this many times.
+# A solution is refined until it satisfies the rows to `_ROUNDING` rounding errors of their summands, or `_REFINEMENTS`
+# times.
 _ROUNDING = 512
 _REFINEMENTS = 4
 # Conjugate gradients: reduction of the residual, and largest number of iterations.
@@ -45,7 +46,7 @@ class AbstractJacobian(eqx.Module):
 
     @abc.abstractmethod
     def row_norms(self, scale: Float[Array, "n"]) -> Float[Array, "m"]:
-        """The norm of each row, its columns multiplied by a scale."""
+        """The norm of each row, with the columns multiplied by a scale."""
 
     @abc.abstractmethod
     def gather_rows(self, values: Float[Array, "m"]) -> Float[Array, "*r"]:
@@ -99,9 +100,9 @@ class MassProjector(eqx.Module):
         """x and λ of `M x = f + Aᵀ λ`, `A x = b`, for a metric without infinite entries; λ is zero for implied rows.
 
         With light bodies between heavy ones, the contribution of the heavy bodies to `A M⁻¹ Aᵀ` is lost in the rounding
-        errors of the light ones. So x is refined with the residuals of the rows until it meets them to rounding errors.
-        One refinement restores all digits for ratios of masses up to 1e8. It is differentiated implicitly, by the
-        equations that it solves.
+        errors of the light ones. So x is refined with the residuals of the rows until these are rounding errors. One
+        refinement restores all digits for ratios of masses up to 1e8. The solution is differentiated implicitly, by its
+        equations.
 
         Source: N. J. Higham, "Accuracy and Stability of Numerical Algorithms", 2nd ed., SIAM, 2002, chapter 12
         (iterative refinement in fixed precision, tested by the componentwise backward error of Oettli and Prager).
@@ -162,7 +163,7 @@ class MassProjector(eqx.Module):
     def cancel(self, residual: Float[Array, "m"]) -> Float[Array, "n"]:
         """The smallest displacement that changes the rows by `−residual`, to the digits of the factor.
 
-        For iterations, which evaluate the residual again. A metric with infinite entries holds these velocities.
+        For iterations, which evaluate the residual again. Infinite entries of the metric hold their velocities fixed.
         """
         return -self.direction(self.multipliers(residual))
 
@@ -211,8 +212,8 @@ class MassProjector(eqx.Module):
 class DenseJacobian(AbstractJacobian):
     """A full matrix.
 
-    **Fields:** `matrix` (m × n); its `factor` in a chart, or None without one; the independent `rows`, or None if all
-    rows with these `numbers`, default all rows, are independent and no pivots were searched.
+    **Fields:** `matrix` (m × n); its `factor` in a chart, or None without one; `rows`: the independent rows, None if no
+    pivots were searched; `numbers`: the indices of the independent rows then, None for all rows.
     """
 
     matrix: Float[Array, "m n"]

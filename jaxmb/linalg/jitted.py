@@ -21,7 +21,7 @@ _FOR_FEW_CALLS = {"xla_backend_optimization_level": 0}
 def jitted(
     function: Callable[_Arguments, _Result], options: dict[str, Any] | None = None
 ) -> Callable[_Arguments, _Result]:
-    """`jax.jit` of a function of pytrees. Leaves that are not arrays belong to the program; results have arrays only.
+    """`jax.jit` of a function of pytrees. Leaves that are not arrays are static; results contain only arrays.
 
     `equinox.filter_jit` does the same for any function, and takes twice as long to call a program of many numbers.
 

@@ -1,4 +1,4 @@
-"""Functions of many members, computed for as many at once as fit in the cache of a core."""
+"""Functions of many members, computed in blocks that fit in the cache of a core."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,16 +8,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
-# As many states of a motion are computed at once as have matrices that fit in these bytes, and at least the second
-# number. (Projecting 512 states on the constraints, µs for each with 1, 8, 64 and all at once: four-bar 5.4, 2.8, 2.1,
-# 2.7; Andrews' mechanism 20, 18, 20, 36; a chain of 100 links 100, 83, 122, 340; a tree of 300 links 246, 247, 446,
-# 1222.)
+# The matrices of a block of states fit in `_CACHE` bytes, but a block has at least `_FEWEST` states. (Projecting 512
+# states on the constraints, µs for each with 1, 8, 64 and all at once: four-bar 5.4, 2.8, 2.1, 2.7; Andrews' mechanism
+# 20, 18, 20, 36; a chain of 100 links 100, 83, 122, 340; a tree of 300 links 246, 247, 446, 1222.)
 _CACHE, _FEWEST = 2**17, 8
 
 
 def in_blocks(function: Callable[[PyTree], PyTree], members: PyTree, most: int) -> PyTree:
-    """Apply a function of members along axis 0 of all arrays, such as a `jax.vmap`, to at most `most` members at once,
-    one block after the other. Copies of the last member fill up the last block.
+    """Apply a function of members along axis 0 of all arrays, such as a `jax.vmap`, block by block, to at most `most`
+    members at once. Copies of the last member fill up the last block.
     """
     count = jax.tree.leaves(members)[0].shape[0]
     number = -(-count // most)

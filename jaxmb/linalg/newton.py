@@ -1,7 +1,7 @@
 """Newton's method and its chord variant inside `lax`, and the derivative of their solution.
 
 Iterations are not differentiated: the derivative of a root follows from its equation, by the implicit function theorem.
-(The iteration of the implicit solvers is in `solvers/_newton.py`, which imports nothing of the package.)
+(The iteration of the implicit solvers is in `solvers/_newton.py`, which does not use `linalg`.)
 """
 
 from collections.abc import Callable
@@ -62,12 +62,18 @@ def chord(
     iteration ends if the next correction is below `tol`, or at the level of rounding errors, where corrections stop
     shrinking. It fails if a correction is too large.
 
-    **Arguments:** `correct(x)`: the next iterate and the relative size of the correction; `first`: the size to which
-    the first correction is compared (1: the error of the matrix is as large as the first correction; 0: unknown, and a
-    second correction is made); `tol`; `most`: the largest number of corrections; `rate`: a lower bound of the factor by
-    which they shrink; `rounding`: the size below which they may stop shrinking, default some thousand rounding errors;
-    `peel`: whether the first correction precedes the loop, which saves half a microsecond for small programs, and
-    compiles them twice.
+    **Arguments:**
+
+    - `correct(x)`: the next iterate and the relative size of the correction.
+    - `first`: the size to which the first correction is compared. 1: the error of the matrix is as large as the first
+        correction; 0: unknown, and a second correction is made.
+    - `tol`: the bound of the next correction.
+    - `most`: the largest number of corrections.
+    - `rate`: a lower bound of the factor by which corrections shrink.
+    - `rounding`: the size below which they may stop shrinking, default some thousand rounding errors.
+    - `largest`: the size from which a correction is too large.
+    - `peel`: whether the first correction precedes the loop. This saves half a microsecond in small programs, and
+        compiles the correction twice.
 
     **Returns:** the last iterate, the number of corrections, and whether the iteration failed.
     """

@@ -1,4 +1,4 @@
-"""Lists of numbers that contain pairs, the components of plane vectors. The place of its first number names a pair."""
+"""Lists of numbers that contain pairs, the components of plane vectors. A pair is named by its first number's place."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,12 +25,12 @@ def placed_pairs(pairs: tuple[int, ...], values: Array, singles: Array, first: i
 
 
 def for_both(pairs: tuple[int, ...], values: Array, singles: Array) -> Array:
-    """The same with one value for both numbers of each pair."""
+    """`placed_pairs` with one value for both numbers of each pair."""
     return placed_pairs(pairs, jnp.stack([values, values], axis=1), singles)
 
 
 def for_first(pairs: tuple[int, ...], values: Array, singles: Array) -> Array:
-    """The same with a value for the first number of each pair, and zero for the second."""
+    """`placed_pairs` with a value for the first number of each pair, and zero for the second."""
     return placed_pairs(pairs, jnp.stack([values, jnp.zeros_like(values)], axis=1), singles)
 
 

@@ -27,7 +27,7 @@ class AbstractPositiveDefinite(eqx.Module):
     def eliminate(self, share: Float[ArrayLike, ""] | None = None) -> "AbstractPositiveFactor":
         """Eliminate once, for any number of right-hand sides.
 
-        **Arguments:** `share`: this share of the largest entry is added to the diagonal, for pivots of implied rows.
+        **Arguments:** `share`: this share of its largest entry is added to the diagonal, for pivots of implied rows.
         """
 
 
@@ -46,8 +46,8 @@ class AbstractPositiveFactor(eqx.Module):
 
     @abc.abstractmethod
     def smallest_pivot(self) -> Float[Array, ""]:
-        """The smallest pivot of a Gram matrix relative to its diagonal, between 0 (a row implied by the rows before it)
-        and 1 (a row orthogonal to them).
+        """The smallest pivot of a Gram matrix relative to its diagonal: 0 if a row is implied by the rows before it, 1
+        if all rows are orthogonal.
         """
 
     def refined(self, b: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from .._compat import define_linear
 from .digest import digest
 
-# The number of entries of a place that one pass adds up; more take another pass: the work is proportional to them.
+# The number of entries of a place that one pass adds up. More entries take another pass, so work grows with them.
 _WIDTH = 4
 
 
@@ -24,7 +24,7 @@ _WIDTH = 4
 class PlacedSums:
     """Which entries add up to the value of each place; static, compared by its `key`.
 
-    **Fields:** `passes`: each of shape (sums, width), indices into the entries of the pass before followed by a zero.
+    **Fields:** `passes`, each (sums, width): indices into the results of the pass before, followed by a zero.
     """
 
     key: Any

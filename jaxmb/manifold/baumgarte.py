@@ -30,7 +30,7 @@ class Baumgarte(AbstractManifold):
 
     Constraints between positions satisfy `Φ̈ + 2 rate Φ̇ + rate² Φ = 0`, constraints between velocities `ψ̇ + rate ψ =
     0`. The state is near the constraints, not on them, and a rate much faster than the motion makes the equations
-    stiff. For comparison with `Partition`, which needs no such number.
+    stiff. It is for comparison with `Partition`, which needs no rate.
 
     **Arguments:** `rate` [1/s] > 0.
     """

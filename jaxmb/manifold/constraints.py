@@ -34,7 +34,7 @@ class AbstractConstraints(eqx.Module):
 
     @abc.abstractmethod
     def restore(self, at: Instant, near: "SolvedState", tol: Scalar) -> "RestoredState":
-        """`restore`, without derivative."""
+        """The function `restore`, without derivative."""
 
     @abc.abstractmethod
     def at(self, instant: Instant) -> "AbstractConstraints":
@@ -106,10 +106,10 @@ class RestoredState(eqx.Module):
 def restore(at: Instant, near: SolvedState, tol: Scalar) -> RestoredState:
     """Restore a state to the constraints and find the accelerations there.
 
-    Derivatives are exact in a chart. Those of a projector are exact for a state on the constraints, and off them wrong
-    by the size of the displacement.
+    Derivatives are exact in a chart. With a projector they are exact for a state on the constraints, and otherwise
+    wrong by the size of the displacement.
 
-    **Arguments:** `at`: near the constraints; a chart keeps the independent entries of the state; `near`: a nearby
+    **Arguments:** `at`: an instant near the constraints, whose independent entries a chart keeps; `near`: a nearby
     state at the same time; `tol`: the size of omitted corrections, relative to the system's size, speed and
     accelerations.
     """
@@ -124,9 +124,9 @@ def solved(linearise: Linearise, at: Instant, udot: Float[Array, "nu"], memory: 
 
 @eqx.filter_custom_jvp
 def implicitly(linearise: Linearise, at: Instant, restored: RestoredState) -> RestoredState:
-    """A state that satisfies the constraints and the equations of motion, with its derivatives by them.
+    """A state that satisfies the constraints and the equations of motion, with derivatives by these equations.
 
-    **Arguments:** `at`: the instant that it was restored from; `restored`: the state, whose derivatives are ignored.
+    **Arguments:** `at`: the instant before the restoration; `restored`: the state, whose derivatives are ignored.
     """
     del linearise, at
     return restored
@@ -146,7 +146,7 @@ def _implicitly_jvp(primals, tangents):
 def rates_along(
     linearise: Linearise, at: Instant, udot: Float[Array, "nu"], along: State | None
 ) -> tuple[State, State, State]:
-    """A known state with its known rate, and the rate of the latter, as of `AbstractManifoldTerm.along_solution`."""
+    """A known state, its known rate, and the rate of this rate, as of `AbstractManifoldTerm.along_solution`."""
     if along is None:
         out = solved(linearise, at, udot)
         at, udot = at.with_(q=out.q, u=out.u), out.udot

@@ -16,8 +16,8 @@ from .projection import Projection
 class Unconstrained(AbstractManifold):
     """Integrate all coordinates, and constraints on the level of accelerations only.
 
-    The policy of systems without constraints. With constraints the integration drifts off them by its error, which is
-    for comparison only: saved states are the nearest ones on the constraints. Euler parameters are normalised where
+    This is the policy of systems without constraints. With constraints it is for comparison only: the integration
+    drifts off them by its error, and saved states are the nearest states on them. Euler parameters are normalised where
     they are used, so their length does not matter.
     """
 

@@ -22,7 +22,7 @@ NOT_PROJECTED: Any = diffrax.RESULTS.nonlinear_max_steps_reached
 _NOT_PROJECTED: Any = RESULTS.nonlinear_max_steps_reached
 # A smallest pivot below this at the end of a failed run means that the constraints are losing rank.
 _SINGULAR_PIVOT = 1e-3
-# The coupling of friction with its own reactions counts as singular if this close to it.
+# The coupling of friction with its own reactions counts as singular if a factor this close to 1 makes it singular.
 _SINGULAR_COUPLING = 1e-3
 
 

@@ -34,8 +34,8 @@ _OTHERS = 2
 
 
 def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*batch"]:
-    """The next larger number, or the next smaller one for a direction of −1; next to zero the least normal number, as
-    in solvers that stop just before a jump.
+    """The next larger number, or the next smaller one for a direction of −1; after zero the least normal number, as in
+    solvers that stop just before a jump.
     """
     sign = jnp.asarray(direction, t.dtype)
     return jnp.where(t == 0, sign * jnp.finfo(t.dtype).tiny, jnp.nextafter(t, sign * jnp.inf))
@@ -51,8 +51,8 @@ def after_jumps(
     """
     fixed = lax.stop_gradient(t)
     at_jump = jnp.isin(fixed, jumps, method="binary_search")
-    # A run backward from a jump begins at the number before it, which is then its last time. Without a step it has one
-    # time.
+    # A run backward from a jump begins at the number before the jump, which is then the last time of the run. A run
+    # without steps has one time.
     last, earlier = jnp.maximum(t0, t1), next_number(fixed, -1)
     at_end = ((fixed == last) | (earlier == last)) & (t0 != t1)
     moved = jnp.where(at_end, earlier, jnp.where(at_jump, next_number(fixed, 1), fixed))
@@ -90,8 +90,8 @@ def after_jump(
 class Jump(NamedTuple):
     """A jump of a prescribed rate or of its derivative.
 
-    **Fields:** `t`: the first time after it [s], in the precision of the state; `row`: its number among the rows of ψ
-    followed by the rows of A.
+    **Fields:** `t`: the first time after it [s], in the precision of the state; `row`: the index of its row among the
+    rows of ψ followed by the rows of A.
     """
 
     t: np.floating
@@ -101,7 +101,7 @@ class Jump(NamedTuple):
 def find_jumps(
     system: AbstractEquation, q: Coordinates, t0: Scalar, t1: Scalar, restarts: Float[ArrayLike, "times"]
 ) -> list[Jump]:
-    """Search for times between two others at which prescribed rates, or their derivatives, jump.
+    """Search for times between `t0` and `t1` at which prescribed rates, or their derivatives, jump.
 
     Each row is examined between each two neighbouring `restarts`. The place with the least even changes in equal
     intervals is divided, and the least even part is followed, again and again. A smooth function becomes even, a jump

@@ -31,7 +31,7 @@ def counted_components(system: AbstractSystem) -> tuple[int, ...] | None:
         return None
     modes = np.isin(np.arange(system.nq), system.contacts.places)
     along = system.held_velocities(modes)
-    assert along is not None, "a mode is no part of a rotation"
+    assert along is not None, "a mode is not part of a rotation"
     uncounted = np.concatenate([modes, along, np.zeros(system.nz, bool)])
     return tuple(np.flatnonzero(~uncounted).tolist())
 

@@ -33,11 +33,14 @@ _MULTIPLIERS, _NULL_SPACE = Multipliers(), NullSpace()
 
 
 class AbstractManifold(eqx.Module):
-    """A policy that turns a system into a term, and a solver into one that respects the constraints.
+    """A policy that turns a system into a term, and a solver into a solver that respects the constraints.
 
-    `restores` says whether every step ends on the constraints, and `newton_tol`, if given, up to which size of the last
-    Newton correction of positions. `takes_impulses` says whether velocities follow a jump of prescribed rates,
-    `uses_charts` whether independent coordinates are chosen.
+    **Fields:**
+
+    - `restores`: whether every step ends on the constraints.
+    - `newton_tol`: the size of the last Newton correction of positions, if given.
+    - `takes_impulses`: whether velocities follow a jump of prescribed rates.
+    - `uses_charts`: whether independent coordinates are chosen.
     """
 
     restores: AbstractVar[bool]
@@ -67,7 +70,7 @@ class AbstractManifold(eqx.Module):
 
     def contact_tolerance(self, system: AbstractEquation, rtol: Scalar) -> ContactTolerance | None:
         """The sizes that count as zero when contacts close, relative to the system's size; None without contacts. Gaps
-        count as zero up to a thousandth of the tolerance of integration, and up to a given tolerance of positions.
+        count as zero up to a thousandth of the tolerance of integration, or up to `newton_tol` if this is larger.
         """
         if not system.contacts:
             return None

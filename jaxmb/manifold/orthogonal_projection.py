@@ -37,7 +37,8 @@ _MEASURED = 0.6
 # The last measured correction of velocities for nonlinear constraints, relative to the speed, as a power of eps: the
 # remaining error is of the size of its square.
 _MEASURED_SPEED = 0.4
-# The number of corrections of velocities near constraints not linear in them, and of further ones from far away.
+# For constraints that are not linear in velocities: the number of corrections of velocities, and of further corrections
+# from far away.
 _FEW, _MORE = 3, 5
 
 
@@ -72,7 +73,7 @@ class ProjectorConstraints(AbstractConstraints):
             return u + step, _largest(step, scale) / speed
 
         # Velocities and accelerations are exact to the rounding errors of their summands. Both equations are linear, so
-        # corrections may be large: for a body at rest nothing else remains.
+        # corrections may be as large as the values: for a body at rest they are all that remains.
         rounding, any_size = jnp.finfo(start.dtype).eps ** 0.5, jnp.inf
         u, _, failed_u = chord(
             turn, at.u, first=one, tol=tol, most=_ITERATIONS, rate=rate, rounding=rounding, largest=any_size
@@ -85,8 +86,8 @@ class ProjectorConstraints(AbstractConstraints):
             _, multipliers = x
             free = given + inertia.solve(here.constraint_force(multipliers))
             change = -fixed.multipliers(here.acceleration_residual(free))
-            # The part that the constraints add to free accelerations shrinks with the distance. For a light body
-            # between heavy ones it is wrong by much more than the body's acceleration changes.
+            # This step, the part that constraints add to free accelerations, shrinks with the distance. For a light
+            # body between heavy ones its error is much larger than the change of the body's acceleration.
             step = fixed.direction(change)
             return (free + step, multipliers + change), _largest(step, scale) / strength
 
@@ -176,8 +177,8 @@ def projected(system: AbstractEquation, t: Scalar, y: State) -> tuple[State, Boo
 
 
 def project_velocities(at: Instant, metric: AbstractInertia) -> tuple[Float[Array, "nu"], Bool[Array, ""]]:
-    """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed, as it
-    can if ψ is not linear in them.
+    """The velocities that satisfy ψ after the smallest change in a metric, and whether Newton's method failed. It can
+    fail only if ψ is not linear in velocities.
     """
     system = at.system
 
@@ -245,7 +246,7 @@ def project_in_metric(
 ) -> tuple[Instant, MassProjector, Int[Array, ""], Bool[Array, ""]]:
     """Project a state on constraints that are linear in velocities, by the smallest displacement in a metric.
 
-    Derivatives are exact for a state on the constraints, and off them wrong by the size of the displacement.
+    Derivatives are exact for a state on the constraints, and otherwise wrong by the size of the displacement.
 
     **Arguments:** `metric_of(at)`: the metric at an instant; `linearized_at`: the projector at a nearby state, whose
     derivatives are ignored, for a chord method, or None for Newton's method; `tol`: the size of the last correction,

@@ -60,10 +60,11 @@ else:
 # A stored position factor is refreshed after this many steps, or when Newton's method takes this many iterations.
 _AGE = 4
 _SLOW = 3
-# The stored factor is useless if the nearness to a loss of rank has changed by this factor since it was made, and on
-# the other side of that position. A factor of the present state then replaces it. (A parallelogram in space that lies
-# flat several times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40 cases end soon after that position, as
-# Newton's method fails at steps of any length; with this replacement none of 200.)
+# A stored factor is useless if the nearness to a loss of rank has changed by this ratio since the factor was made. It
+# is also useless on the other side of the position where rank is lost. A factor of the present state then replaces it.
+# (A parallelogram in space that lies flat several times, rtol 1e-4 to 1e-10: with the stored factor alone 35 of 40
+# cases end soon after that position, as Newton's method fails at steps of any length; with this replacement none of
+# 200.)
 _MOVED = 1.5
 # A chart is replaced when its influence matrix has grown by this factor. (A pendulum at rtol 1e-10, error after ten
 # seconds: 1e-7 with 4, 1e-8 with 2 and 4e-9 with 1.1, at 664, 628 and 623 steps. A chain of ten rods makes 19 charts
@@ -72,10 +73,11 @@ _GROWTH = 1.1
 # The same for the solution of the kept rows. If other rows are redundant, the kept rows can lose rank at a position
 # where all rows together do not, and H does not show it.
 _ROW_GROWTH = 4.0
-# No step ends nearer, by this factor, to a position where the rows lose rank than it began. Otherwise round-off at its
-# end would be divided by the cube of the distance, and the next steps would creep. The retry, of 0.7 of the length,
-# ends at a third of the distance, and the next step crosses. (Linkages that lie flat several times, 60 speeds: without
-# this bound nine end there at rtol 1e-10, and energies are off by up to 7e-4 at 1e-6; with it none, and 2e-6.)
+# No step ends nearer than it began, by this factor, to a position where the rows lose rank. Otherwise round-off at its
+# end would be divided by the cube of the distance, and the next steps would be very short. The retry, of 0.7 of the
+# length, ends at a third of the distance, and the next step crosses. (Linkages that lie flat several times, 60 speeds:
+# without this bound nine end there at rtol 1e-10, and energies are off by up to 7e-4 at 1e-6; with this bound none ends
+# there, and energies are off by up to 2e-6.)
 _NEARER = 8.0
 # Redundant rows may be violated by this multiple of Newton's tolerance, or of the pivots that count as zero.
 _ALLOWED = 8.0
@@ -102,7 +104,7 @@ class ConstrainedAcceleration(eqx.Module):
 def acceleration(at: Instant, formulation: AbstractFormulation, split: AbstractSplit) -> ConstrainedAcceleration:
     """Accelerations at coordinates on the manifold or near it.
 
-    **Arguments:** `at`: independent velocities exact, dependent ones a guess.
+    **Arguments:** `at`: an instant with exact independent velocities; the dependent ones are a guess.
     """
     out = _acceleration(*lax.stop_gradient((at, formulation, split)))
     linearise = eqx.Partial(_at_coordinates, split, out.factor, out.every)
@@ -245,16 +247,18 @@ class Partition(AbstractManifold):
     constraints to Newton's tolerance at the end of every step. The error of a step is measured on all components. A
     chart is replaced when its influence matrix H has grown by the factor `max_influence`, or when redundant rows would
     serve better than the kept ones. The solver's history contains all components, so a new chart needs no restart. No
-    step ends much nearer than it began to a position where rows lose rank, such as a linkage that lies flat. It is made
-    shorter, so that the next step passes over that position.
+    step ends much nearer than it began to a position where rows lose rank, such as a linkage that lies flat. Such a
+    step is shortened, so that the next step passes over that position.
 
     The formulation finds the accelerations of predicted states; the accelerations of corrected states follow by one
-    step of Newton's method with the same factor.
+    correction of Newton's method with the same factor.
 
-    **Arguments:** `max_influence`: bound on `max |H|` (scaled), relative to 1 or to its value when the chart was made,
-    whichever is larger: errors of the independent components reach the dependent ones multiplied by H and its rates;
-    `newton_tol`: size of the last Newton correction relative to the system's size, default tied to the tolerance of
-    integration.
+    **Arguments:**
+
+    - `max_influence`: bound on `max |H|` (scaled), relative to 1 or to its value when the chart was made, whichever is
+        larger. Errors of the independent components reach the dependent ones multiplied by H and its rates.
+    - `newton_tol`: size of the last Newton correction relative to the system's size; default a thousandth of the
+        tolerance of integration, at most 1e-6.
     """
 
     max_influence: float = eqx.field(static=True, default=_GROWTH)
@@ -309,11 +313,16 @@ class RedundantRows(eqx.Module):
 class Chart(eqx.Module):
     """The index sets with their quality and counters.
 
-    **Fields:** `split`; `quality` at the last evaluation and of the `fresh` chart: the largest scaled |H|; with
-    redundant rows the largest entry of the solution of the kept ones; and the `nearness` to a loss of rank, in `fresh`
-    as of the position factor; `counters`: see the properties; `redundant`: None if all rows are independent;
-    `multipliers`: the memories of the system's laws at the prediction of the last step and at its end, None without
-    any.
+    **Fields:**
+
+    - `split`: the index sets.
+    - `quality`: of the last evaluation: the largest scaled |H|; with redundant rows the largest entry of the solution
+        of the kept rows; and the `nearness` to a loss of rank.
+    - `fresh`: the quality of the chart when it was made, with the `nearness` when the position factor was made.
+    - `counters`: see the properties.
+    - `redundant`: None if all rows are independent.
+    - `multipliers`: the memories of the system's laws at the prediction of the last step and at its end, None without
+        any.
     """
 
     split: AbstractSplit
@@ -400,7 +409,7 @@ class AbstractChartTerm(AbstractConstrainedTerm):
 
     @abc.abstractmethod
     def _kept(self, chart: Chart, k: int) -> Any:
-        """See `kept`; from the memory of the laws at the prediction of a step, 0, or at its end, 1."""
+        """See `kept`; with the memory of the laws at the prediction of a step (k = 0) or at its end (k = 1)."""
 
     def kept(self, chart):
         return self._kept(chart, 1)
@@ -497,7 +506,7 @@ def _both(first, second):
 
 
 def _counted(chart, iterations):
-    """The chart after a Newton iteration for positions."""
+    """The chart after Newton's iterations for positions."""
     age, _, newton, charts, singular = chart.counters
     counters = jnp.stack([age, iterations, newton + iterations, charts, singular])
     return dataclasses.replace(chart, counters=counters)

@@ -53,14 +53,14 @@ class Projection(AbstractManifold):
     ```
 
     With a Runge–Kutta solver the projection is the smallest change in the coordinates' scales, first of the
-    configuration, then of the velocities. A first-same-as-last derivative is kept across the projection: the difference
-    is of the size of the local error.
+    configuration, then of the velocities. A first-same-as-last derivative is kept across the projection, which changes
+    it by the size of the local error.
 
     With `Adams` the projection is the smallest change in the metric of the mass matrix. One factor of `A M⁻¹ Aᵀ` for
     each step, at its prediction, serves positions, velocities and accelerations. The elimination follows the graph of
     joints: for chains, trees and local loops a step takes time and memory in proportion to the number of joints.
-    Constraints must be linear in velocities. If some are not ideal or act on accelerations, each evaluation needs a
-    separate factor. Servos need a second factor; friction needs a solution for each row of the joints with friction,
+    Constraints must be linear in velocities. If some are not ideal or act on accelerations, each evaluation needs its
+    own factor. Servos need a second factor; friction needs a solution for each row of the joints with friction,
     and a full matrix of the size of all these rows. In a scene large enough for sparse elimination implied rows are
     omitted, the same ones throughout a motion; in smaller scenes no row may be redundant.
 
@@ -69,12 +69,12 @@ class Projection(AbstractManifold):
     eliminated along with the joints in an order that follows from their graph. For trains, cables, trees and local
     loops a step takes time in proportion to the number of bodies. The eigenvalues near the inverse of the step decide
     which formulas and steps are stable; only these are computed. Newton's matrix omits the change of the directions of
-    joints and forces in a step, so it takes up to 40 % more iterations than with `Partition`. Derivatives follow from
+    joints and forces in a step. So there are up to 40 % more iterations than with `Partition`. Derivatives follow from
     the exact equations.
 
     **Arguments:** `newton_tol`: with `Adams` and `Hermite`, the size of omitted Newton corrections of positions,
-    velocities and accelerations, relative to the system's; default 1e-12 or a thousandth of the tolerance of
-    integration.
+    velocities and accelerations, relative to the system's; default the smaller of 1e-12 and a thousandth of the
+    tolerance of integration.
     """
 
     newton_tol: float | None = eqx.field(static=True, default=None)  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -75,7 +75,7 @@ class AbstractSplit(eqx.Module):
     def push(self, at: Instant, along: Instant, factor: Factor | None) -> Float[Array, "nq"]:
         """The tangent of coordinates on the constraints, from the tangent before the restoration.
 
-        **Arguments:** the `factor` of the velocities' Jacobian, if it is known.
+        **Arguments:** `factor` of the velocities' Jacobian, if it is known.
         """
 
     def at_evaluation(self, factor: Factor) -> Self:
@@ -222,7 +222,7 @@ def kind_of_split(system: AbstractEquation) -> type[AbstractSplit]:
 
 @eqx.filter_custom_jvp
 def restore_positions(at: Instant, split: AbstractSplit, outdated: Bool[Array, ""], tol: float) -> Restored:
-    """Solve `Φ = 0` for the dependent coordinates by Newton with a fixed matrix: `(q, iterations, failed)`.
+    """Solve `Φ = 0` for the dependent coordinates by the chord method: `(q, iterations, failed)`.
 
     **Arguments:** `outdated`: whether the stored matrix is known to be useless here.
     """

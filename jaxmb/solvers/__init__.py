@@ -1,14 +1,14 @@
 """Multistep methods as diffrax solvers, with variable order and step, on vector fields and on manifolds.
 
-Any solver of diffrax is one for `simulate`, as these are for `diffrax.diffeqsolve`, with a `MultistepController`. A
-multistep method of one's own derives from `AbstractMultistep`, with a field for its tolerances. Its steps are made of
-evaluations of the term that diffrax gives it, at predicted and at corrected states:
+`simulate` takes any solver of diffrax, and `diffrax.diffeqsolve` takes these with a `MultistepController`. A multistep
+method of your own derives from `AbstractMultistep`, with a field for its tolerances. A step evaluates the term that
+diffrax gives it, at predicted and at corrected states:
 
 ```python
 from jaxmb import solvers
 
 tolerances: solvers.Tolerances = solvers.tolerances_of("Heun")
-adjoint = solvers.MeshAdjoint(most=1024)  # Derivatives of up to so many steps of a multistep method.
+adjoint = solvers.MeshAdjoint(most=1024)  # Keeps the numbers of so many steps for derivatives.
 
 def heun(term, t, h, y, args, chart):
     now = solvers.evaluate(term, t, solvers.ravel(y), y, chart, args)
@@ -17,7 +17,7 @@ def heun(term, t, h, y, args, chart):
     y1 = solvers.unravel_like(y, end.y)
     return y1, jnp.max(jnp.abs(end.y - predicted.y)), solvers.next_chart(term, t + h, y1, end.chart, args)
 
-def next_step(error):  # Of a method of one order, whose error is of second order in the step.
+def next_step(error):  # For a method of fixed order, whose error is of second order in the step.
     never, errors = jnp.array(False), jnp.stack([jnp.inf, error, jnp.inf])
     may = {"may_fall": never, "may_rise": never, "known": ~never}
     return solvers.choose_order(errors, jnp.full(3, 2.0), jnp.ones(()), target=0.5, work=jnp.array([2, 0]), **may)

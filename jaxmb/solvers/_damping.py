@@ -4,8 +4,8 @@ Formulas that are not A-stable amplify lightly damped vibrations of stiff spring
 axis with `|h λ|` of order one to ten. An error estimate detects such oscillations only when they are as large as the
 tolerance, and then steps become as short as with an explicit method. The eigenvalues predict them.
 
-A-stable formulas damp components that should grow if `h λ` is large, and their error estimates as well. The equation of
-such a step has several solutions, and Newton's method may find the wrong one.
+If `h λ` is large, A-stable formulas damp components that should grow, and also the error estimates of these components.
+The equation of such a step has several solutions, and Newton's method may find the wrong one.
 """
 
 import functools
@@ -36,8 +36,9 @@ _FOLDS = 2.0
 
 @functools.cache
 def sectors(family: str) -> NDArray[np.float64]:
-    """The angle from the negative real axis within which solutions do not grow, for each number of points k, from zero,
-    and each size of `h λ`; infinite if they do not grow in the whole left half-plane.
+    """The angle from the negative real axis within which solutions do not grow; infinite for the whole left half-plane.
+
+    Rows are the numbers of points k, from zero; columns are the sizes of `h λ`.
     """
     highest = FAMILIES[family].highest
     out = np.full((highest + 1, _SIZES.size), np.inf)

@@ -17,8 +17,8 @@ from ._newton import AbstractLinearization, StepEquation
 
 # The matrix is renewed after a step whose corrections shrank more slowly than by this factor.
 _SLOW = 0.2
-# The derivative of the Jacobian along the motion is a difference over this power of the rounding unit, in steps. With
-# longer ones the stiff truncation error slows Newton's method, with shorter ones the rounding error.
+# The derivative of the Jacobian along the motion is a difference over a time of this power of the rounding unit, in
+# steps. Over longer times the stiff truncation error slows Newton's method, over shorter times the rounding error.
 _AHEAD = 0.4
 
 
@@ -152,11 +152,13 @@ def linearize(
 
 
 class Inverses(NamedTuple):
-    """Inverses for `(P - C) x = r`, with `P = 1 - a J - b J²` and `C = b K`, K the derivative of g for a held rate.
+    """Inverses for `(1 - a J - b J² - C) x = r`. `C = b K`, with the derivative K of g for a held rate.
 
-    **Fields:** `p`: P⁻¹; `p_rate`: `P⁻¹ (a + b J)`; `missing`: b minus the factor of J² in P; `c`: `(1 - P⁻¹ (C +
-    missing J²))⁻¹`, to be applied after P⁻¹. With a wrong rate `c` can be so small that it hides errors: errors of a
-    step are measured by P⁻¹ alone.
+    The part of `1 - a J - b J²` with complex roots is `P = 1 - a J - (b - missing) J²`.
+
+    **Fields:** `p`: P⁻¹; `p_rate`: `P⁻¹ (a + (b - missing) J)`; `missing`: the part of b that P leaves out, zero for
+    complex roots; `c`: `(1 - P⁻¹ (C + missing J²))⁻¹`, to be applied after P⁻¹. With a wrong rate a small `c` hides
+    errors, so errors of a step are measured by P⁻¹ alone.
     """
 
     p: Float[Array, "free free"]
@@ -170,7 +172,7 @@ def inverses_of(
 ) -> Inverses:
     """The inverses of Newton's method, each as accurate as the inverse of a matrix with a single J.
 
-    **Arguments:** `held`: the derivative of g for a held rate.
+    **Arguments:** `held_acceleration`: the derivative of g for a held rate.
     """
     identity = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     # 1 - a x - b x^2 = (1 - r x)(1 - r* x): one complex matrix instead of the square of a large one. The roots are
@@ -178,7 +180,7 @@ def inverses_of(
     product, least = -b - a**2 / 4, a**2 / 1000 + jnp.finfo(jacobian.dtype).tiny
     real, imaginary = a / 2, jnp.sqrt(jnp.maximum(product, least))
     once = inverse(lax.complex(identity - real * jacobian, -imaginary * jacobian))
-    # The imaginary parts of r, r^2 and 1 times this inverse, over the imaginary part of r.
+    # `p`, `p_rate` and `across`: the imaginary parts of r, r^2 and 1 times this inverse, over the imaginary part of r.
     along, across = jnp.real(once), jnp.imag(once) / imaginary
     p_rate = a * along + (real**2 - imaginary**2) * across
     p = along + real * across

@@ -34,10 +34,10 @@ def derivatives(field: Field, t: Any, y: Float[Array, " n"]) -> Derivatives:
 def probed_derivatives(
     field: Field, t: Any, y: Float[Array, " n"], size: Float[Array, " n"] | None = None, along: bool = False
 ) -> tuple[Derivatives, Bool[Array, ""]]:
-    """The same, and whether differences of f contradict its derivative.
+    """The result of `derivatives`, and whether differences of f contradict the derivative of f.
 
     **Arguments:** `size` of the components, if known; `along`: whether to take differences along the manifold only,
-    where a projection returns to it.
+    for a field that projects states on it.
     """
     eps = jnp.finfo(y.dtype).eps
     size = jnp.abs(y) + (jnp.mean(jnp.abs(y)) if size is None else size)
@@ -50,7 +50,7 @@ def probed_derivatives(
         (state, f), push, rest = jax.linearize(field, t, y, has_aux=True)
         times = jnp.stack([jnp.ones_like(t), jnp.zeros_like(t)])
         (_, move), (g, slope) = jax.vmap(push)(times, jnp.stack([f, way]))
-        # The same direction at both states: the mean of both slopes is that of the difference to second order.
+        # With the same direction at both states, the mean slope is the slope of the difference to second order.
         way = lax.stop_gradient(move) if along else way
         return (y + way, way), (Derivatives(state, f, g, rest), slope)
 

@@ -1,7 +1,7 @@
 """The second-derivative formulas, for steps of any size, from Newton's form of Hermite's interpolation polynomial.
 
-A formula advances `y' = f`, whose second derivative is `g`. It interpolates a quantity z at the end of the step, with
-its slope, and at points of the past, and imposes one condition on the polynomial:
+A formula advances `y' = f`, with the second derivative `g`. It interpolates a quantity z and its slope at the end of
+the step, and z at points of the past. One condition on the polynomial determines the end:
 
     family   z   points of the past     the polynomial                                order
     E        f   k                      integrated over the step gives the change     k + 2
@@ -37,8 +37,8 @@ class Family(NamedTuple):
     - `multiplicity`: conditions at each point of the past, 2 if the slope is used.
     - `highest`: the largest useful number k of points.
     - `stable`: the largest k of an A-stable formula.
-    - `growth`: the ratio by which every step may exceed the previous one, with 1, 2, ... points, without loss of
-        zero-stability; see `largest_growth` of `jaxmb.solvers.stability`.
+    - `growth`: for 1, 2, ... points the largest constant ratio of successive steps that keeps zero-stability; see
+        `largest_growth` of `jaxmb.solvers.stability`.
     """
 
     integrated: bool

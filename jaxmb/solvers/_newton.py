@@ -25,9 +25,9 @@ else:
     from equinox import AbstractVar
 
 _MAX_ITERATIONS = 10
-# If a matrix of an earlier step has failed, this number of steps compute new ones.
+# After a matrix of an earlier step has failed, this number of steps compute new matrices.
 _DISTRUST = 10
-# If a correction is larger than this fraction of the state and its change, the matrix is unreliable after it.
+# After a correction larger than this fraction of the state and its change, the matrix is unreliable.
 _FAR = 0.1
 # The largest number of matrices for a step; and the code for success.
 _ATTEMPTS, _DONE = 4, 9
@@ -36,8 +36,8 @@ _ATTEMPTS, _DONE = 4, 9
 class StepEquation(eqx.Module):
     """The equation `y = past + a f(t, y) + b g(t, y)` of a step.
 
-    **Fields:** `field`; `jacobian(y)`: its derivative with known structure and the direction of time, or None; `t`, the
-    end of the step, and `h`, its length; `past`, `a`, `b`; `free`: indices of the unknowns in the state.
+    **Fields:** `field`; `jacobian(y)`: the field's derivative with known structure and the direction of time, or None;
+    `t`: the end of the step; `h`: its length; `past`, `a`, `b`; `free`: indices of the unknowns in the state.
     """
 
     field: Field
@@ -56,7 +56,7 @@ class AbstractLinearization(eqx.Module):
     **Fields:** `spectrum`: eigenvalues of the derivative J of the field; `renewals`: the number of next steps that must
     compute a new linearisation.
 
-    The method `inverses` returns the argument `inverses` of the others, the solved form of Newton's equation.
+    The method `inverses` returns the solved form of Newton's equation, the argument `inverses` of other methods.
     """
 
     spectrum: AbstractVar[Complex[Array, " k"]]
@@ -92,11 +92,11 @@ class AbstractLinearization(eqx.Module):
 
     @abc.abstractmethod
     def observed(self, inverses: Any, anew: Bool[Array, ""]) -> Any:
-        """With a spectrum that needs the inverses; `anew`: whether the linearisation is new."""
+        """The linearisation with its spectrum, if this needs the inverses; `anew`: whether the linearisation is new."""
 
     @abc.abstractmethod
     def moved(self, change: Float[Array, " free"]) -> Float[Array, " n"]:
-        """The change of the state with the unknowns."""
+        """The change of the state for a change of the unknowns."""
 
     @abc.abstractmethod
     def correction(
@@ -108,9 +108,9 @@ class AbstractLinearization(eqx.Module):
         g: Float[Array, " n"],
         along: Float[Array, " n"],
     ) -> tuple[Float[Array, " free"], Float[Array, " free"], Float[Array, " n"], Float[Array, " n"]]:
-        """The correction of the unknowns, with and without the derivative of g for a held rate, and f and g after it.
+        """The correction of the unknowns, with and without the derivative of g for a held rate; f and g after it.
 
-        **Arguments:** `f`, `g`: at y, g along a rate `along` that approaches f.
+        **Arguments:** `f`, `g`: at y; `along`: the rate that g is along, which approaches f.
         """
 
     @abc.abstractmethod
@@ -128,9 +128,10 @@ class AbstractLinearization(eqx.Module):
         free: Int[Array, " free"],
         push: Callable[..., tuple[Array, Array, Array]],
     ) -> Callable[..., tuple[Array, Array, Array]]:
-        """The tangents of `(y, f, g)` at the end of a step, as a linear function of `(by_numbers, load)`. The first are
-        the tangents of `(y, f, g)` for a held y and rate, the second is the tangent of `past + a f + b g` for held f
-        and g.
+        """The tangents of `(y, f, g)` at the end of a step, as a linear function of `(by_numbers, load)`.
+
+        `by_numbers`: the tangents of `(y, f, g)` for a held y and rate; `load`: the tangent of `past + a f + b g` for
+        held f and g.
 
         **Arguments:** `push`: the tangents of `(y, f, g)` by the tangents of y and of the rate that g is along.
         """
@@ -206,19 +207,21 @@ class Newton(eqx.Module):
 
     The iteration starts from the predicted y and rate, with the current iteration matrix (modified Newton). If
     iterations with it would cost more than a new matrix, a new one is computed at the best y so far, for the rate
-    there. The prediction is too inaccurate for that where the direction of a stiff spring turns: stiffness multiplies
-    the error of its rate, which changes the matrix considerably.
+    there. Where the direction of a stiff spring turns, the prediction is too inaccurate for a new matrix: stiffness
+    multiplies the error of the predicted rate, and this error changes the matrix considerably.
 
     g is evaluated along the predicted rate, then along the f after each correction. In f itself, stiffness multiplies
     the error of y. In g this error would spoil other components by the change of the Jacobian, times the square of the
-    step. Newton's method would then converge only from nearby, on Robertson's reaction from a basin below round-off.
+    step. Newton's method would then converge only from nearby: for Robertson's reaction, from a basin below round-off.
 
     If the error of the prediction is as large as the state, as at the end of a fast transient, there is no second
-    correction. Otherwise, with a large matrix, it might appear negligible far from any solution.
+    correction. With a large matrix the second correction might appear negligible far from any solution.
 
-    **Fields:** the `equation`; `size`: the norm of a correction in units of the tolerance; `tol`: the norm of the last
-    correction. It is not applied to y, and to f and g only through the current matrix, since stiffness would multiply
-    its error there and spoil predictions.
+    The last correction is not applied to y. It is applied to f and g only through the current matrix, since stiffness
+    would multiply its error there and spoil predictions.
+
+    **Fields:** the `equation`; `size`: the norm of a correction in units of the tolerance; `tol`: the largest norm of
+    the last correction.
     """
 
     equation: StepEquation
@@ -317,7 +320,7 @@ def tangents_nearby(
         y, f, g = map(jnp.add, by_numbers, push(x, along))
         change, without, *corrected = matrix.correction(inverses, equation, y, f, g, along)
         now = jnp.maximum(size(matrix.moved(change)), size(matrix.moved(without)))
-        # At a start the rate is known after the first evaluation, and after the second g along it.
+        # At a start the first evaluation gives the rate, the second gives g along this rate.
         now = jnp.where(begins, jnp.where(k == 0, jnp.inf, 0.0).astype(now.dtype), now)
         f, g = (jnp.where(begins, *both) for both in zip((f, g), corrected, strict=True))
         return k + 1, jnp.where(begins, x, x - matrix.moved(change)), f, (y, f, g), now, last

@@ -1,10 +1,11 @@
 """Whether stability, instead of accuracy, limits the steps of Adams' method.
 
 A step is counted as stiff under two conditions. First, the Jacobian, estimated from the corrector, is so large that the
-step is near the stability bound. Second, along the solution the vector field changes much less than that, relative to
-the state, or the state changes less than in the corrector. So stability errors, not the motion, keep the step short. By
-measurement, this holds for fewer than one in ten steps of non-stiff motions, and for four in ten to all steps if
-stability limits them (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances 1e-4 to 1e-9).
+step is near the stability bound. Second, relative to the state, the vector field changes much less along the solution
+than by the corrector; or the change of the state is less than three times the corrector's change. So stability errors,
+not the motion, keep the step short. By measurement, fewer than one in ten steps of non-stiff motions count as stiff. If
+stability limits the steps, four in ten to all do (the library's mechanisms; van der Pol, Robertson, HIRES; tolerances
+1e-4 to 1e-9).
 
 Source of the first condition: E. Hairer, S. P. Nørsett and G. Wanner, Solving Ordinary Differential Equations I,
 Springer, 1993, for Runge-Kutta methods (DOPRI5's test).
@@ -21,14 +22,14 @@ from numpy.typing import NDArray
 from ._history import HIGHEST_ORDER
 from .stability import adams, spectral_radius
 
-# A step is stiff above these fractions of the stability bound and of the changes along the solution.
+# The factors of the conditions: for the stability bound, for the changes of the field, for the change of the state.
 _NEAR, _FASTER, _SMALLER = 0.3, 10.0, 3.0
 # The increment for a stiff step, the decrement for any other, and the sum from which the motion counts as stiff.
 _UP, _DOWN, _STIFF = 3, 1, 150
 
 
 class Stiffness(eqx.Module):
-    """**Fields:** `steps`: the number of stiff steps; `level`: the evidence, which other steps decrease."""
+    """**Fields:** `steps`: the number of stiff steps; `level`: the evidence, which non-stiff steps decrease."""
 
     steps: Int[Array, ""]
     level: Int[Array, ""]

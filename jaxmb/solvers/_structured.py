@@ -1,10 +1,11 @@
-"""Newton's method with a Jacobian that knows its structure, as some terms on a manifold do.
+"""Newton's method with a Jacobian of known structure, which some terms on a manifold provide.
 
 All components of the state are unknowns, and each iterate is projected on the manifold. The solution is the projection
-of `past + a f + b g`. With `1 - a x - b x² = (1 - r x)(1 - r* x)` one factor of `1 - r J` for a complex number r solves
-for corrections. The eigenvalues of J near 1 / r decide which formulas and steps are stable; they follow from Arnoldi's
-method with the same factor. The factor leaves out some terms of the exact derivative, so Newton's method converges
-linearly. The derivative of its solution is found by iteration with the exact function, preconditioned by the factor.
+of `past + a f + b g`. With `1 - a x - b x² = (1 - r x)(1 - r* x)`, one factorisation of `1 - r J` for a complex number
+r solves for corrections. The eigenvalues of J near 1 / r decide which formulas and steps are stable; they follow from
+Arnoldi's method with the same factorisation. It leaves out some terms of the exact derivative, so Newton's method
+converges linearly. The derivative of the solution is found by iteration with the exact function, preconditioned by the
+factorisation.
 
 Sources: Y. Saad, "Numerical Methods for Large Eigenvalue Problems", SIAM, 2011 (shift-and-invert Arnoldi); S. C.
 Eisenstat, H. C. Elman and M. H. Schultz, SIAM J. Numer. Anal. 20(2), 1983 (generalized conjugate residuals).
@@ -28,12 +29,13 @@ from .manifold_term import AbstractFieldJacobian, AbstractResolvent
 
 # Steps of Arnoldi's method for the spectrum.
 _ARNOLDI = 16
-# Eigenvalues of the inverse below this belong to components that decay, or change, in much less than a step.
+# Eigenvalues of the inverse below this fraction of the largest belong to components that decay, or change, in much less
+# than a step.
 _SMALL = 0.02
-# The part of a vector outside the space of the preceding vectors, at most, that is rounding errors.
+# A smaller part of a vector outside the space of the preceding vectors consists of rounding errors.
 _ROUNDING = 1e-10
-# A matrix is renewed after a step whose corrections shrank more slowly than by the first factor, and in a step that
-# would need more than about the second number of further iterations.
+# A matrix is renewed after a step whose corrections shrank more slowly than by `_SLOW`. It is renewed in a step that
+# would need more than about `_PATIENCE` further iterations.
 _SLOW, _PATIENCE = 0.35, 8
 # The largest number of iterations for derivatives; in rounding units, the relative residual at which they end, and the
 # largest residual of a usable derivative.
@@ -41,7 +43,7 @@ _ITERATIONS, _RESIDUAL, _LARGEST_RESIDUAL = 40, 50, 1e5
 
 
 class StructuredInverses(eqx.Module):
-    """The factor of `1 - r J`, and the numbers of the step.
+    """The factorisation of `1 - r J`, and the numbers of the step.
 
     **Fields:** `resolvent`; `a`, `b`; `r`.
     """
@@ -52,7 +54,7 @@ class StructuredInverses(eqx.Module):
     r: Complex[Array, ""]
 
     def solve(self, x: Float[Array, " n"], rates: Float[Array, " n"] | None = None) -> Any:
-        """`(1 - a J - b J²)⁻¹ (x + (a + b J) rates)` of tangent vectors, and J times that."""
+        """`(1 - a J - b J²)⁻¹ (x + (a + b J) rates)` of tangent vectors, and J times this result."""
         real, imaginary = jnp.real(self.r), jnp.imag(self.r)
         load = lax.complex(x, -real / imaginary * x)
         if rates is not None:
@@ -106,7 +108,7 @@ class StructuredLinearization(AbstractLinearization):
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def observed(self, inverses: StructuredInverses, anew: Bool[Array, ""]) -> "StructuredLinearization":
-        """With the spectrum of a new matrix."""
+        """The same with the spectrum, computed if the matrix is new."""
         find = lambda old: _spectrum(inverses, self.jacobian.project)
         return eqx.tree_at(lambda m: m.spectrum, self, cond_of_any_lane(anew, find, lambda old: old, self.spectrum))
 

@@ -37,8 +37,8 @@ from .tolerances import Tolerances, norm_of
 _TARGET = 0.2
 # Numbers of evaluations and matrices in a step.
 _WORK = np.array([2, 0], np.int32)
-# The local error of order k is a product of the spans h_n + ... + h_{n-m+1}. So it is proportional to the power k + 1
-# of the steps if all of them change, but to the power 1 + sum_{m<=k} 1/m if only the last step does.
+# The local error of order k is a product of the spans h_n + ... + h_{n-m+1}. If all steps change, it is proportional to
+# their power k + 1. If only the last step changes, it is proportional to its power 1 + sum_{m<=k} 1/m.
 _ORDERS = np.arange(1, LENGTH)
 _RESPONSES = np.append(1.0, GAIN * (_ORDERS + 1) / (1 + np.cumsum(1 / _ORDERS)))
 
@@ -85,8 +85,8 @@ class _Step(AbstractAttempt):
     """The numbers of a step.
 
     **Fields:** the state `after` it and the history there; the local `errors` of three formulas; the `mismatch` of the
-    corrector at the end; the evaluations of the prediction (`first`) and of the corrected state (`second`). A first
-    step has one error, and beside it the state before it and the change by its derivative.
+    corrector at the end; the evaluations of the prediction (`first`) and of the corrected state (`second`). In a first
+    step the rows of `errors` are the state before it, the error, and the change by its derivative.
     """
 
     after: Float[Array, " n"]
@@ -106,12 +106,12 @@ class Adams(AbstractMultistep):
     """Adams' method of variable order (1 to 13) and variable step, for non-stiff problems.
 
     Predictor, evaluation, corrector, evaluation (PECE) with local extrapolation: a step of order k predicts with the
-    Adams-Bashforth formula of order k and corrects with the Adams-Moulton formula of order k + 1. Two evaluations a
-    step, whatever the order; at tolerances of about 1e-6 and below it needs roughly half the evaluations of high-order
-    Runge-Kutta methods, so it pays when the vector field is expensive. The first step, of order one, evaluates at its
-    start instead of at a prediction: it is Euler's.
+    Adams-Bashforth formula of order k and corrects with the Adams-Moulton formula of order k + 1. A step of any order
+    takes two evaluations. At tolerances of about 1e-6 and below the method needs roughly half the evaluations of
+    high-order Runge-Kutta methods: it pays when the vector field is expensive. The first step is Euler's, of order one:
+    it evaluates at its start instead of at a prediction.
 
-    Use it with `MultistepController`, which reads its error estimates and from which it takes the tolerances:
+    Use it with `MultistepController`, which reads the error estimates and holds the tolerances:
 
     ```python
     import diffrax
@@ -165,10 +165,10 @@ class Adams(AbstractMultistep):
         """**Arguments:**
 
         - `min_order`, `max_order`: bounds of the order; equal values fix it, after a start from order one.
-        - `stiffness`: whether to count the steps that are limited by stability instead of accuracy, in
-            `AdamsState.stiffness`, and whether to stop at a stiff motion, with `diffrax.RESULTS.nonlinear_divergence`.
+        - `stiffness`: "count" counts the steps that are limited by stability instead of accuracy, in
+            `AdamsState.stiffness`; "stop" also stops at a stiff motion, with `diffrax.RESULTS.nonlinear_divergence`.
         - `rtol`, `atol`, `norm`: only for steps that no error estimate controls (`diffrax.ConstantStepSize`,
-            `diffrax.StepTo`): the tolerances by which the order is then chosen. Otherwise leave them out.
+            `diffrax.StepTo`). They then control the order. Otherwise leave them out.
 
         **Raises:** `ValueError` if the bounds are not orders of the method, for another word for `stiffness`, or if
         only one tolerance is given.
@@ -234,7 +234,7 @@ class Adams(AbstractMultistep):
         sums = of.sums(history.differences)
         predicted = before + of.h * sums[2]
         first = evaluate(terms, jnp.where(starts, history.mesh[0], t1), predicted, like, chart, args)
-        # At a start there was no history to predict from: this is its first point, with the first derivative.
+        # At a start there is no history to predict from: it begins with this derivative.
         f = jnp.where(starts, first.f, jnp.zeros((), before.dtype))
         partial_sums, neighbours, mean = of.with_first(sums, f)
         history = eqx.tree_at(lambda history: history.known, history, jnp.maximum(history.known, 1))

@@ -2,8 +2,8 @@
 
 A step evaluates its field twice, at a prediction and at the corrected state, which differ by the local error. The
 tangent of a step uses one linearisation for both, at the corrected state, which is on its manifold and has a known
-field. So nothing is solved, and little of a step is stored. It is the same method, applied to the tangent equation on
-the mesh of the motion. It differs from the derivative of the step by less than the local error of the tangent.
+field. So nothing is solved, and little of a step is stored. The linear map is the same method, applied to the tangent
+equation on the mesh of the motion. It differs from the derivative of the step by less than the tangent's local error.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ class Coefficients(eqx.Module):
         return sums[:LENGTH], sums[LENGTH:-1], sums[-1]
 
     def with_first(self, sums: tuple[Array, Array, Array], f: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """The same for a latest derivative that is larger by `f`."""
+        """The `sums` for a latest derivative that is larger by `f`."""
         every, near, mean = (weights * f[None] for weights in jnp.split(self.products[:, :1], [LENGTH, LENGTH + 3]))
         return sums[0] + every, sums[1] + near, sums[2] + mean[0]
 
@@ -73,8 +73,8 @@ class AdamsRow(eqx.Module):
 
     **Fields:** its `end`; the `mesh`, the `order` and the number of `known` points at its start; state `y` and field
     `f` at its end; `kept`: the numbers kept of the chart there; `jump` at its start, None if steps have none. In the
-    row of a start the order is zero, and `known` is zero unless the memory is given. Then y, f and the chart belong to
-    the start.
+    row of a start the order is zero, `known` is zero unless the memory is given, and y, f and the chart belong to the
+    start.
     """
 
     end: Any
@@ -91,7 +91,7 @@ class AdamsSteps(AbstractSteps):
     """The steps of `Adams`.
 
     **Fields:** `jumps`: whether they may begin after a jump; `evaluates`: whether the first step after a jump evaluates
-    at its start, and at its end, only; `begins`: whether the run begins with a jump.
+    only at its start and at its end; `begins`: whether the run begins with a jump.
     """
 
     jumps: bool = eqx.field(static=True)
@@ -116,8 +116,8 @@ class AdamsSteps(AbstractSteps):
         return AdamsRow(before.tnext, mesh, order, count, ravel(after.y), new.history.differences[0], kept, jump)
 
     def _restart(self, terms, after):
-        """The numbers known after one step from a restart. Second derivatives, which do not exist through events, would
-        need the tangent of the field.
+        """The numbers known after one step from a restart, for terms with guards, else None. Without guards there are
+        second derivatives, which would need the tangent of the field.
         """
         if guards_of(terms) is None or not self.evaluates:
             return None
@@ -207,6 +207,6 @@ class AdamsSteps(AbstractSteps):
 
 def _at_start(terms, after):
     """The field at a start, and the numbers kept of the chart there, from the state of the solver after one step."""
-    # The derivative at its end, and this minus the derivative at its start.
+    # `change`: the derivative at the end of the step minus the derivative at its start.
     last, change, *_ = after.history.differences
     return last - change, kept_of_chart(terms, after.chart, at_start=True)

@@ -15,7 +15,7 @@ from jax.core import Tracer
 
 
 def opened(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A Python function that closes over traced values, as a module whose leaves they are; anything else unchanged.
+    """A Python function that closes over traced values, as a module with them as leaves; anything else unchanged.
 
     Traced values in functions that it closes over, in defaults and in `functools.partial` count as well.
     """

@@ -31,8 +31,8 @@ _WITHOUT_ESTIMATE = 0.25
 _REPEATED = (0.95, 0.5, 0.1)
 # The length of the trial before the first step, in units of the interval, and the factors from it to the first step.
 _TRIAL, _SHORTER, _LONGER = 1e-4, 1e-8, 100.0
-# The recovery from a step shortened by a wrapper is at most this factor, unless the step's own error allows a longer
-# one; beyond it, differences are rounding errors.
+# The recovery from a step shortened by a wrapper is at most this factor, unless the step's own error allows a larger
+# one. Beyond this factor, differences are rounding errors.
 _RECOVERY = 100.0
 # After a step without an estimate, this number of steps grow by at most this factor, so that unsolvable long steps are
 # not tried again and again.
@@ -61,7 +61,7 @@ def states_inside(controller_state: Any, kind: type) -> list[Any]:
 
 
 class AbstractControllerAround(diffrax.AbstractAdaptiveStepSizeController):
-    """A controller around another one, `controller`, with the latter's tolerances."""
+    """Wraps another `controller`, and has its tolerances."""
 
     controller: AbstractVar[Any]
 
@@ -115,7 +115,7 @@ class ControllerState(AbstractControllerState):
 
 
 class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerState, Any]):
-    """The longest steps that the error estimates of a multistep method allow, at the order that allows the longest.
+    """Takes the longest steps that the error estimates of a multistep method allow, at the order that allows them.
 
     ```python
     control = jaxmb.solvers.MultistepController(rtol=1e-6, atol=1e-8, dtmax=0.05)
@@ -123,11 +123,12 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
     ```
 
     The local error of a step, weighted by `atol + rtol * |y|`, is kept below one twentieth in the given norm. The error
-    of the result is then of the size of the tolerance. Near rounding errors the bound is larger, up to one. For `Adams`
-    and `Hermite`; to step exactly to some times, or over jumps, wrap it in `diffrax.ClipStepSizeController`.
+    of the result is then of the size of the tolerance. For tolerances near rounding errors the bound is larger, up to
+    one. The controller is for `Adams` and `Hermite`; to step exactly to some times, or over jumps, wrap it in
+    `diffrax.ClipStepSizeController`.
 
-    Without a given `dt0` the first step is a trial of one ten-thousandth of the interval, whose error tells how long
-    the first step may be. It is rejected and counted as that, unless it happens to be of about the right length.
+    Without a given `dt0` a trial step of one ten-thousandth of the interval tells how long the first step may be. The
+    trial is rejected, and counted as rejected, unless its length is about right.
 
     If no acceptable step is found down to `dtmin`, or to the resolution of the floating-point time, the solve ends with
     `diffrax.RESULTS.dt_min_reached`.
@@ -162,15 +163,15 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         - `rtol`, `atol`: relative and absolute tolerance: scalars, or vectors with one entry for each component of the
             raveled state.
         - `norm`: the norm of the weighted error.
-        - `scales`: sizes that `atol` is relative to, of coordinates and velocities whose units do not matter.
+        - `scales`: sizes of coordinates and velocities that `atol` is relative to, whatever their units.
         - `dtmin`, `dtmax`: bounds of the step.
         - `force_dtmin`: if true, steps of size `dtmin` are accepted with any error, and the solve continues.
         - `safety`: multiplies every step that the error estimates allow.
-        - `factormin`, `factormax`: the smallest factor after a rejection, except before the first step, and the largest
-            after an accepted step.
+        - `factormin`: the smallest factor after a rejection, except before the first step.
+        - `factormax`: the largest factor after an accepted step that no wrapper shortened.
 
-        **Raises:** `ValueError` for tolerances that are not positive and finite or finer than the floating-point state
-        can resolve, and for inconsistent bounds.
+        **Raises:** `ValueError` for tolerances that are not positive and finite, for an `rtol` finer than the
+        floating-point state can resolve, and for inconsistent bounds.
         """
         self.rtol = rtol
         self.atol = atol
@@ -302,7 +303,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         if _is_known(self.rtol) and np.any(np.asarray(self.rtol) < finest):
             raise ValueError(
                 f"`rtol={self.rtol}` is finer than a state of type {ravel(y0).dtype} can resolve; the least is "
-                f"{finest:.1e}. For finer ones switch on `jax_enable_x64`."
+                f"{finest:.1e}. For finer tolerances switch on `jax_enable_x64`."
             )
 
 

@@ -1,4 +1,4 @@
-"""Evaluations of a term; a plain vector field is one on a manifold without constraints.
+"""Evaluations of a term. A plain vector field counts as a term on a manifold without constraints.
 
 diffrax wraps the terms of a solver so that time always increases; derivatives here are with respect to that time.
 States are raveled: one vector of all components.
@@ -140,8 +140,8 @@ def project_near(term: Any, t: Any, flat: Array, like: PyTree[Array], before: Ev
 
 
 def jacobian_of(term: Any, t: Any, like: PyTree[Array], args: Args) -> Callable[[Array], Any]:
-    """`y -> (J, direction)` for raveled states, a pytree: the derivative, with known structure, of a vector field in
-    the time of the term, and the direction of that time; None for both if the term does not know the structure.
+    """`y -> (J, direction)` for raveled states, a pytree. J is the derivative, with known structure, of the vector
+    field in the term's time, and `direction` the direction of this time. None if the structure is unknown.
     """
     return eqx.Partial(_jacobian, term, t, like, args)
 
@@ -181,8 +181,8 @@ def at_solution(
 
 
 def solution_of(term: Any, t: Any, like: PyTree[Array], kept: PyTree[Array], args: Args) -> Any:
-    """`(t, y, f, along) -> (y, f, g)` for raveled states, a pytree: a known state, its vector field, and the rate of
-    the latter along a rate of the state (None: the field), with their derivatives by the equations.
+    """`(t, y, f, along) -> (y, f, g)` for raveled states, a pytree: a known state, the vector field there, and the
+    field's rate along a rate of the state (None: the field), with their derivatives by the equations.
     """
     direction = direction_of(term)
     manifold = _manifold(term).closed(t * direction, like, args)

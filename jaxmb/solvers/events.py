@@ -29,13 +29,14 @@ else:
 
 # A zero is found to this fraction of a step, or in this many evaluations, by bisection after the first few.
 _FRACTION, _EVALUATIONS, _SECANTS = 1e-13, 60, 12
-# A step ends at a zero that is this fraction of it from its end: its interpolant does not resolve a smaller one.
+# A zero this fraction of a step before its end counts as at the end: the interpolant resolves no smaller distance.
 _END = 1e-9
 # After an event that follows another one at once, the next step is this fraction of the last attempted step.
 _SHORTER = 1e-2
-# At the middle of a step, gaps must follow a cubic polynomial and forces the mean of both ends, up to these fractions.
-# Otherwise it is halved, so many times at most, since guards may jump. If the differences exceed a hundredth of that,
-# or if a force varies, the next step is at most twice as long: they could repeat themselves in a longer one.
+# At the middle of a step, gaps must follow a cubic polynomial and forces the mean of both ends, up to the first two
+# fractions. Otherwise the step is halved, at most `_HALVED` times in a row, since guards may jump. If the differences
+# exceed a hundredth of that, or if a force varies, the next step is at most twice as long: a longer one could hide a
+# repetition.
 _COARSE, _BENT, _HALVED, _NOT_SMOOTH, _VARIES, _GROWTH = 0.25, 0.05, 4, 0.01, 0.4, 2.0
 # The next start has this share of the length that the error of the last start allows.
 _START_SAFETY = 0.92
@@ -45,7 +46,7 @@ _FAINT = 1e-3
 NO_STATE: Any = diffrax.RESULTS.internal_error
 # At the start of a run a guard may be this negative, by rounding of the given state, if it rises in the step.
 _OVERLAP = 1e-5
-# If a guard is zero at the start of a step as well, its rise is searched down to this power of two.
+# If a guard is zero at the start of a step as well, a point with a positive guard is searched in so many halvings.
 _HALVINGS = 30
 
 
@@ -62,7 +63,8 @@ class Crossing(AbstractErrorWithMore):
     a guard is negative within the step; the `lowest` guard at its end; `falling`: 1 if a guard falls through zero
     there; `lost`: 1 if an event at its start led to no state, and the state is infinite; `coarse`: above 1 if the step
     is too long for guards that vary in it; `touch` and `near` of the guards; `retry`: the factor by which a multistep
-    method could retry the step, infinite for methods without restarts; `idle`: 1 if the step restarts after no change.
+    method could retry the step, infinite for methods without restarts; `idle`: 1 if the jump at its start changed
+    nothing.
     """
 
     error: PyTree
@@ -96,8 +98,8 @@ def cond_of_jumps(guards: AbstractGuards | None) -> Callable:
     return cond_of_any_lane if guards is None else cond_of_lanes
 
 
-# The phases of the search in a step, for: a zero at its end or middle; the least force; the zero of a guard's rate; a
-# point before a zero with positive guards; the zero; nothing.
+# The phases of the search in a step. `_LOOK`: at its ends and middle; `_LEAST`: at the least force; `_DIP`: for the
+# zero of a guard's rate; `_RISE`: for a point with positive guards before a zero; `_ZERO`: for the zero.
 _LOOK, _LEAST, _DIP, _RISE, _ZERO, _DONE = range(6)
 # Guards are evaluated first at these points, all at once: one point takes nearly as long. Later evaluations, which few
 # steps need, repeat one point three times.
@@ -123,7 +125,7 @@ class _Search(NamedTuple):
     **Fields:** the `phase`; `s`: the next point of evaluation; `bracket`: of the function that changes its sign; which
     guards are `looked_at`, and which are `waiting`; the guards and their `rates` at the `end` of the step, the guards
     and their `slopes` at its `middle`, the rates at its `start`; `begins`: see `AbstractGuards`; `dips`: whether a
-    guard is negative within the step; how `coarse` it is; `count`: evaluations in this phase.
+    guard is negative within the step; how `coarse` the step is; `count`: evaluations in this phase.
     """
 
     phase: Any
@@ -154,9 +156,9 @@ def crossing(
 ) -> Crossing:
     """Search for zeros of guards in a step.
 
-    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's time; `ends`: the states before
-    a jump at its start, at its start, and at its end; `at(t)`: a state in between; `made_jump`: whether it starts with
-    a jump; `retry`: see `Crossing`.
+    **Arguments:** `direction` of time; `step`: its first and last time, in the solver's time; `ends`: the states at its
+    start before and after a jump, and at its end; `at(t)`: a state in between; `made_jump`: whether the step starts
+    with a jump; `retry`: see `Crossing`.
     """
     (t0, t1), (before, y0, y1) = step, ends
     sign, forces = jnp.asarray(direction, t0.dtype), guards.forces(y0)
@@ -200,9 +202,9 @@ def crossing(
         coarse=zero,
         count=jnp.array(0),
     )
-    # In few vectors, since the loop copies each of its numbers.
+    # In few vectors, since the loop copies each array.
     layout = Layout(first)
-    # Each lane evaluates its guards at a few points; few of them have a zero to find.
+    # Each lane evaluates its guards at a few points; few lanes have a zero to find.
     phase = lambda packed: layout.unpacked(packed).phase
     looks, goes = lambda packed: phase(packed) <= _LEAST, lambda packed: phase(packed) != _DONE
     last = layout.unpacked(loop_of_lanes(looks, goes, advance, layout.packed(first)))
@@ -232,8 +234,8 @@ def _looked(search: _Search, values, rates, step_data):
     """The guards at the end, the middle and the start of a step.
 
     Looks for guards that are negative in the middle and for guards that are least within one of the halves. The step is
-    coarse if forces vary, or if a guard's rate in the middle differs from a cubic polynomial. The polynomial follows
-    from the rates at both ends, the value at the end and the value in the middle.
+    coarse if forces vary, or if a guard's rate in the middle differs from the rate of a cubic polynomial. The
+    polynomial follows from the rates at both ends, the value at the end and the value in the middle.
     """
     (last, values, first), (ends, rates, start) = values, rates
     search = search._replace(s=0.5 * search.s, end=last, rates=ends, middle=values, slopes=rates, start=start)
@@ -255,8 +257,9 @@ def _looked(search: _Search, values, rates, step_data):
 
 
 def _next_force(search: _Search, first, step_data):
-    """The step is coarse where forces vary by more than a parabola shows; a force with a parabola next to zero is
-    searched next. Its values are the `first` ones, in the middle, and at the end.
+    """The step is coarse where forces vary much, or not linearly. The search goes on at the least point of the force
+    whose parabola is lowest there, if this is near zero. The parabola goes through the values at the start (`first`),
+    in the middle and at the end.
     """
     middle, last = search.middle, search.end
     bent, sloped = 2 * (first + last - 2 * middle), 4 * middle - 3 * first - last
@@ -299,11 +302,11 @@ def _chosen(condition, one: _Search, other: _Search) -> _Search:
 
 def _next_dip(search: _Search, step_data):
     """The search for the zero of the rate of the next waiting guard: the guard that is lowest at the end of the step.
-    Without one, guards that are negative at the end are next, or else the search is done.
+    Without a waiting guard, guards that are negative at the end are next, or else the search is done.
     """
     least = jnp.argmin(jnp.where(search.waiting, search.end, jnp.inf))
     guard, half = jnp.arange(search.start.size) == least, 0.5 * jnp.ones_like(search.s)
-    # In the first half where the guard rises at the middle.
+    # In the first half if the guard rises at the middle.
     middle, first = search.slopes[least], search.slopes[least] > 0
     of_a, of_b = jnp.where(first, search.start[least], middle), jnp.where(first, middle, search.rates[least])
     turn = Bracket(jnp.where(first, 0.0, half), jnp.where(first, half, 2 * half), of_a, of_b, jnp.array(0))
@@ -376,7 +379,7 @@ def _is_short(search: _Search):
 
 
 def _narrowed(search: _Search, value):
-    """The shorter interval with a value at `s` in it, and the next point of evaluation."""
+    """The search with its interval shortened by a value at `s`, and with the next point of evaluation."""
     bracket, s = narrowed(search.bracket, search.s, value, search.count >= _SECANTS, 0.5 * _FRACTION)
     return search._replace(bracket=bracket, s=s)
 
@@ -387,8 +390,8 @@ def narrowed(bracket: Bracket, s: Any, value: Any, bisects: Any, least: float = 
     Source: M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11,
     1971 (the Illinois method). If the same end moves twice, the value at the other end counts half.
 
-    **Arguments:** `value` at `s`; `bisects`: whether the middle is next; `least`: the distance of the next point from
-    both ends, so that the interval becomes that short once one end is at the zero.
+    **Arguments:** `value` at `s`; `bisects`: whether the middle is next; `least`: the least distance of the next point
+    from both ends, so that the interval becomes that short once one end is at the zero.
     """
     a, b, of_a, of_b, moved = bracket
     same = jnp.sign(value) == jnp.sign(of_b)
@@ -405,11 +408,11 @@ def narrowed(bracket: Bracket, s: Any, value: Any, bisects: Any, least: float = 
 class EventState(AbstractControllerState):
     """The state of `EventController`.
 
-    **Fields:** `inner`: the state of the controller inside; `target`: the time at which the attempted step is made to
-    end, infinite without one; its `length` before that; the `count` of events, their `times` and the raveled `states`
-    before them, in buffers; `touch` of the guards; `halved`: how many times in a row a step was halved; `starts`:
-    whether the method restarts with this step; `start`: the length that the error of the last start allows; `ended`:
-    whether the last step ended at an event.
+    **Fields:** `inner`: the state of the controller inside; `target`: the time of a zero at which the attempted step is
+    made to end, else infinite; `length` of the attempted step before it was shortened; the `count` of events, their
+    `times` and the raveled `states` before them, in buffers; `touch` of the guards; `halved`: how many times in a row a
+    step was halved; `starts`: whether the method restarts with this step; `start`: the length that the error of the
+    last start allows; `ended`: whether the last step ended at an event.
     """
 
     inner: Any
@@ -430,10 +433,10 @@ class EventState(AbstractControllerState):
 
 
 class EventController(AbstractControllerAround):
-    """A controller around another one, whose steps end at events; at most `most` of them.
+    """Wraps a controller so that steps end at events, at most `most` events.
 
-    Too many events end the solve with `diffrax.RESULTS.dt_min_reached`, an event that leads to no state with
-    `NO_STATE`.
+    The solve ends with `diffrax.RESULTS.dt_min_reached` after too many events, and with `NO_STATE` if an event leads to
+    no state.
     """
 
     controller: Any
@@ -506,7 +509,7 @@ class _Tried(NamedTuple):
     """A step from `t0` to `t1` that was tried.
 
     **Fields:** `target`, `coarse`, `retry`: see `Crossing`; `halved`, `inner`: of the state before it, see
-    `EventState`; `starts`: whether the method restarts after the step, and did with it.
+    `EventState`; `starts`: whether the method restarts after the step, and whether it restarted with the step.
     """
 
     t0: Any
@@ -535,14 +538,14 @@ class _Plan(NamedTuple):
     ended: Any
 
 
-# Steps that the controller inside refuses; that pass a zero; that are too coarse; without an event; that end at one.
+# Steps refused by the controller inside, over a zero, too coarse, without an event, and ending at an event.
 _REFUSED, _CROSSED, _TOO_COARSE, _PASSED, _ENDED = range(5)
 
 
 def _verdict(keep, step: tuple[Any, Any], crossing: Crossing, before: EventState):
     """The kind of a step, if the controller inside would `keep` it."""
     t0, t1 = step
-    # Compilers may round a value that is computed in two places differently.
+    # Compilers may round the same value differently in two places.
     meant = jnp.abs(t1 - before.target) <= 4 * jnp.finfo(before.target.dtype).eps * jnp.abs(t1)
     close = (t1 - crossing.target) <= _END * (t1 - t0)
     at_zero = jnp.where(meant, jnp.abs(crossing.lowest) <= crossing.near, crossing.falling > 0)

@@ -23,13 +23,13 @@ _PIECES, _GROWTH = 8, 4.0
 # A contact is hidden if it is this many times deeper than at both ends of the step. It is also hidden if its depth
 # differs by this fraction from the cubic polynomial through gaps and rates at both ends.
 _DEEPER, _OFF = 2.0, 0.2
-# Depths below this fraction of the width in which a force sets in do not count (a ramp has it at a distance of 25 000
-# widths). Depths below the next fraction may differ from the polynomial, since the contact is not closed yet.
+# Depths below this fraction of the width in which a force sets in do not count (the depth of a ramp at a distance of
+# 25 000 widths). Depths below the next fraction may differ from the polynomial: the contact is not closed yet.
 _FAINT, _NEAR = 1e-5, 0.25
 # Pieces this short, relative to the step, are not divided; after this many looks the step is shortened.
 _SHORTEST, _LOOKS = 1e-9, 256
 # The uncertainty of a gap is this many times its difference from the integral of its rates. A step that may hide a
-# contact within the uncertainty is halved: an interpolant with more stages than the step may have seen a force in them.
+# contact within the uncertainty is halved: the additional stages of an interpolant may have seen a force.
 _UNCERTAIN = 2.0
 
 
@@ -59,7 +59,8 @@ class _Walk(NamedTuple):
     """The progress along a step, whose times are fractions of it.
 
     **Fields:** the `start` and the `length` of the next stretch; the `ends` of the step; by how much gaps are
-    `uncertain`; whether the step `hides` a force; `target`: the time of its least gap; the number of `looks`.
+    `uncertain`; whether the step `hides` a force; `target`: the time up to which the step may go; the number of
+    `looks`.
     """
 
     start: Any
@@ -108,7 +109,7 @@ def hidden(gaps: AbstractGaps, direction: Any, error: PyTree, step: tuple[Any, A
 
 
 def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
-    """A stretch further, or into the first piece of this stretch that may hide a force.
+    """One stretch further, or into the first piece of this stretch that may hide a force.
 
     **Arguments:** at times `s` in the step the `gaps`, their `rates` in units of the step, and the `pace`.
     """
@@ -135,8 +136,8 @@ def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
 
 
 def _score(ends: _Ends, s, gaps, varies, touch):
-    """How much deeper contacts are than their ends show, at times of a step; zero where nothing is hidden. Contacts
-    that do not vary are hidden only where they are deeper than at both ends.
+    """How much deeper contacts are than the ends of the step show, at times of the step; zero where nothing is hidden.
+    Contacts that do not vary are hidden only where they are deeper than at both ends.
     """
     s, widths = s.astype(gaps.dtype)[:, None], ends.widths[None]
     depth, first, last = (_depth(gap, widths) for gap in (gaps, ends.first[None], ends.last[None]))
@@ -191,11 +192,11 @@ def _least(gaps, rates, piece):
 
 
 class AbstractWithoutJumps(AbstractControllerAround):
-    """A controller around another one that adds no jumps."""
+    """Wraps a controller, and adds no jumps."""
 
 
 class GapController(AbstractWithoutJumps):
-    """A controller around another one, whose steps pass over no force that sets in and ends within them."""
+    """Wraps a controller so that no step passes over a force that sets in and ends within it."""
 
     controller: Any
 

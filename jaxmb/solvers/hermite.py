@@ -54,7 +54,7 @@ class HermiteState(AbstractMultistepState):
     **Fields:**
 
     - `history`: the mesh, and scaled divided differences: of f and y in the families that integrate, otherwise of y.
-    - `slope`: their time derivatives at the latest point.
+    - `slope`: the time derivatives of the same quantities at the latest point.
     - `order_index`: k, the number of points of the past in the formula of the next step.
     - `matrix`: the linearisation for Newton's method.
     - `step_counts`: `step_counts[0]` counts the starts (the first, and the restarts after jumps), `step_counts[k]` the
@@ -394,8 +394,8 @@ class Hermite(AbstractMultistep):
         return recent @ states, (recent * rates) @ states
 
     def linearised(self, formula: Formula, equations, end, free, matrix: AbstractLinearization, begins: Any):
-        """The end of a step as a linear map of the tangents of the numbers, and of the state and the history at its
-        start, on the mesh of the step.
+        """The end of a step as a linear map, on the mesh of the step: of the tangents of the numbers, and of the state
+        and the history at its start.
 
         **Arguments:** `equations`: the solution of the equations, a function of the numbers, and the numbers; `end`:
         its time, and the state and the field there; the `free` unknowns; a `matrix` of Newton's method there; `begins`:
@@ -435,7 +435,7 @@ class Hermite(AbstractMultistep):
     def equation(
         self, formula: Formula, before: Float[Array, " n"], differences: Float[Array, "length m"]
     ) -> tuple[Float[Array, " n"], Float[Array, ""], Float[Array, ""]]:
-        """`(past, a, b)` of the equation `y = past + a f + b g` of a step; `past` is linear in the arguments."""
+        """`(past, a, b)` of the equation `y = past + a f + b g` of a step; `past` is linear in the arrays."""
         base = before if FAMILIES[self.family].integrated else jnp.zeros_like(before)
         of, nodes = formula.coefficients, formula.nodes
         past = base + formula.unit * (of.past[nodes] @ differences[:, : before.size])
@@ -544,9 +544,9 @@ class Hermite(AbstractMultistep):
         """Weighted norms of the errors of the formulas with these numbers of points.
 
         The error of a formula is the change by the next formula; Newton's matrix converts this residual to an error of
-        y. If constraints determine the other components from few free ones, the error of the free ones passes through
-        zero now and then. So the part of the others' change counts as well that does not follow from the free ones. (A
-        four-bar with the same evaluations: errors of a half to a fifth, in proportion to the tolerance.)
+        y. If constraints determine the other components from few free ones, the error of the free components passes
+        through zero now and then. So the change of the other components that does not follow from the free ones counts
+        as well. (With the same evaluations of a four-bar, errors fall to a half or a fifth, and follow the tolerance.)
         """
         ends = lax.stop_gradient(ends)
         changes = ends[family.multiplicity * (points + 1)] - ends[family.multiplicity * points]

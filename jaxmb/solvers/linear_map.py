@@ -25,8 +25,8 @@ class _Programs:
     """A map and its transpose on lists of arrays.
 
     **Fields:** `forward(residuals, x, used)`, whose values may be anything where they are not `used`;
-    `backward(residuals, cotangents)`, where None stands for a zero cotangent; `again`: both in a form with right
-    derivatives by residuals; the shapes of `inputs` and `outputs`.
+    `backward(residuals, cotangents)`, where None stands for a zero cotangent; `again`: both in a form with correct
+    derivatives by the residuals; the shapes of `inputs` and `outputs`.
     """
 
     def __init__(self, forward: Callable, backward: Callable, again: tuple[Callable, Callable], inputs, outputs):
@@ -34,7 +34,7 @@ class _Programs:
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
 
     def program_of(self, operands: Sequence[jax.ShapeDtypeStruct]) -> Any:
-        """The traced map for operands of these shapes, residuals and x, which distinguishes it from others."""
+        """The traced map for operands (residuals and x) of these shapes; it distinguishes the map from others."""
         count = len(operands) - len(self.inputs)
         return jax.make_jaxpr(lambda *arrays: _evaluate(*arrays, programs=self, split=count))(*operands)
 
@@ -102,7 +102,7 @@ def linear_map(
     - `again`: both in a form that may be differentiated by the residuals.
     - `residuals`: the other data of the map, a pytree.
     - `x`: a pytree of floating-point arrays.
-    - `like`: a pytree of arrays or shapes, as of the value.
+    - `like`: a pytree of arrays or shapes with the structure of the value.
 
     Derivatives by the residuals exist in forward mode only; reverse mode raises a `TypeError`.
     """

@@ -32,7 +32,7 @@ class ManifoldEvaluation(NamedTuple):
 
     - `y`: the state, on the manifold if a projection was requested.
     - `f`: the vector field there.
-    - `chart`: the chart with the same index sets, which may carry counters, and data that make the next evaluation
+    - `chart`: the chart, with the same index sets; it may carry counters, and data that make the next evaluation
         cheaper.
     - `failed`: true if the state could not be evaluated or projected; a smaller step is then tried.
     - `factors`: data for a cheaper projection of a nearby state at the same time; any pytree of arrays, or None.
@@ -92,8 +92,8 @@ class AbstractGuards(eqx.Module):
 
     @abc.abstractmethod
     def rates(self, t: Any, y: PyTree[Array]) -> Float[Array, "guards"]:
-        """The rates of guards that may be negative in the middle of a step alone, and of guards whose zeros are passed
-        in one direction only; infinite for others.
+        """The rates of guards that may be negative in the middle of a step only, and of guards that pass their zeros in
+        one direction only; infinite for others.
         """
 
     @abc.abstractmethod
@@ -179,7 +179,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         """Project a state on the manifold, and evaluate the vector field there.
 
         The independent components of `y` are kept; the others are a first guess and are solved for. `linearized_at` is
-        an evaluation at the same time, of the prediction that `y` corrects, or in a first step of the state before it.
+        an evaluation of the prediction that `y` corrects, at the same time, or in a first step of the state before it.
         Its `factors` may make this evaluation cheap.
         """
 
@@ -199,7 +199,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return chart
 
     def kept_at_start(self, chart: Chart) -> PyTree[Array]:
-        """The same for the start of a run, from the chart at the end of the first step, whose prediction is the start.
+        """`kept` for the start of a run, from the chart at the end of the first step, whose prediction is the start.
 
         `update_chart` chose the index sets at the start.
         """
@@ -217,7 +217,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
         return out.y, out.f
 
     def along_solution(self, t: Any, y: Y, f: Y, along: Y | None, kept: PyTree[Array], args: Args) -> tuple[Y, Y, Y]:
-        """The same with the rate of the vector field, for a rate `along` of the state, by default the vector field.
+        """`at_solution`, and the rate of the vector field along a rate `along` of the state, by default the field.
 
         A manifold that knows the rate of its equations overrides this method.
         """
@@ -249,7 +249,7 @@ class AbstractManifoldTerm(diffrax.AbstractTerm[Y, Any]):
 
     @property
     def guards(self) -> AbstractGuards | None:
-        """The functions at whose zeros `after_jump` gives the state after them; by default None."""
+        """The functions whose zeros are events; `after_jump` gives the state after an event. By default None."""
         return None
 
     @property

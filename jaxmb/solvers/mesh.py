@@ -28,17 +28,18 @@ from .steps import AbstractSteps, LinearStep, Moving
 from .whole_steps import jump_times, steps_of
 
 _TOO_LONG = (
-    "Second derivatives need the rows of all steps, of which {} are kept; this run has more: simulate(..., "
-    "adjoint=jaxmb.solvers.MeshAdjoint(most)) keeps others."
+    "Second derivatives need the rows of all steps, of which {} are kept. This run has more steps: choose the number "
+    "of rows by simulate(..., adjoint=jaxmb.solvers.MeshAdjoint(most))."
 )
 
 
 class Saved(eqx.Module):
     """A series of saved states.
 
-    **Fields:** `start`: whether it begins with the start; its `times`, or None; `steps`: it saves every so many steps,
-    0 for none; `events`: whether it saves the state before each event; its `length`; `passed`: how many states and how
-    many of the times were passed. Of events the second number is 1 if the next step found the last one void.
+    **Fields:** `start`: whether it begins with the start; its `times`, or None; `steps`: the number of steps from one
+    saved state to the next, 0 for none; `events`: whether it saves the state before each event; its `length`; `passed`:
+    how many states and how many of the times were passed. For events the second number is 1 if the next step found the
+    last event void.
     """
 
     start: bool = eqx.field(static=True)
@@ -331,8 +332,8 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
 class MeshAdjoint(diffrax.AbstractAdjoint):
     """Derivatives of a solve on its mesh, in every mode.
 
-    **Arguments:** `most`: the number of steps whose rows are kept; `begins`: whether the run begins with a jump, so
-    that nothing precedes its first step.
+    **Arguments:** `most`: the number of steps whose rows are kept; `begins`: whether the run begins with a jump; then
+    its first step uses nothing from before.
     """
 
     most: int = eqx.field(static=True)
@@ -377,10 +378,10 @@ class MeshAdjoint(diffrax.AbstractAdjoint):
 
 
 def _recorded(equations, init_state, fixed, constants, limit, most):
-    """The last state of diffrax's loop, the rows of the last segment, and the starts of all segments with the choices
-    of all steps, None for a single segment. All but the first are packed.
+    """The last state of diffrax's loop, the rows of the last segment, and the data to repeat steps: the starts of all
+    segments and the choices of all steps, None for a single segment. All but the state are packed.
 
-    The segment has at most `most` steps; behind its rows follows the row of the start if there is one.
+    A segment has at most `most` steps. The row of the start, if there is one, follows behind its rows.
     """
     (given, steps), terms = fixed, equations["terms"]
     size = min(most, given["max_steps"])
@@ -399,7 +400,7 @@ def _recorded(equations, init_state, fixed, constants, limit, most):
             if steps.starts:
                 first = _written(first, 0, layout.packed(first_of(steps, terms, old, new)), kept & (k == 0))
             if starts is not None:
-                # In the middle of a segment the row goes behind the last start.
+                # In the middle of a segment the state is written behind the starts.
                 place = jnp.where(remainder(k, size) == 0, k // size, segments)
                 starts = _written(starts, place, of_starts.packed(start_of(steps, since, old)), True)
                 choices = _written(choices, k, of_choices.packed(choice_of(steps, old, new)), kept)

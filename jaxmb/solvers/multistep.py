@@ -101,7 +101,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
     **Fields:**
 
-    - `tolerances`: from `tolerances_of`, filled in from the controller before the solver is asked for anything.
+    - `tolerances`: from `tolerances_of`, filled in from the controller before any other use of the solver.
     - `tangent_control`: None; set if a tangent's error is controlled.
     - `solves_implicitly`: whether a step solves an equation for the independent components of the state; an
         `AbstractManifoldTerm` must then name them (`free`).
@@ -114,7 +114,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     solves_implicitly: AbstractVar[bool]
     finest: ClassVar[float] = 0.0
 
-    # diffrax fills in the tolerances of a step size controller here; it is not a root finder.
+    # diffrax fills in the tolerances of a step size controller here; they are not a root finder.
     @property
     def root_finder(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.tolerances
@@ -198,7 +198,8 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     def statistics(self, solver_state: Any, controller_state: Any, stats: dict[str, Any]) -> dict[str, Any]:
         """Counts of an integration, from the final states and diffrax's `stats`.
 
-        They include `num_evaluations` of the vector field; with `SaveAt(solver_state=True, controller_state=True)`.
+        They include `num_evaluations` of the vector field. `SaveAt(solver_state=True, controller_state=True)` gives the
+        states.
         """
 
     @abc.abstractmethod
@@ -291,7 +292,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
     def grown_sizes(
         self, sizes: Float[Array, " sizes"] | None, after: Float[Array, " n"]
     ) -> Float[Array, " sizes"] | None:
-        """The same after a step."""
+        """The sizes after a step."""
         scales = self.tolerances.scales
         return None if scales is None or sizes is None else scales.grown(sizes, after)
 

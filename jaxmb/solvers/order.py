@@ -30,7 +30,7 @@ class StepEstimate(eqx.Module):
         have an estimate.
     - `response`: the power of these factors by which to change the next step alone, with the earlier steps given.
     - `limit`: the largest factor by which the next step may grow.
-    - `work`: evaluations of the vector field, and matrices computed. Not integers, unexpected by diffrax in an error.
+    - `work`: evaluations of the vector field, and matrices computed; as floats, since diffrax expects these in errors.
     """
 
     error: Float[Array, ""]
@@ -42,7 +42,7 @@ class StepEstimate(eqx.Module):
 
 
 def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
-    """The estimate of a step, which must not be accepted where `off`."""
+    """The estimate of a step, changed so that the step is not accepted where `off`."""
     parts = lambda e: (e.error, e.growth, e.retry, e.response)
     values = zip(parts(estimate), (jnp.inf, 0.0, _REFUSED, 1.0), strict=True)
     changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]
@@ -82,7 +82,7 @@ def choose_order(
     - `work`, `limit`: as in `StepEstimate`.
     - `bounded`: limits the growth factors of the three formulas for stability.
 
-    **Returns:** `(-1, 0 or 1, StepEstimate)`.
+    **Returns:** the change of order (-1, 0 or 1) and a `StepEstimate`.
     """
     errors = lax.stop_gradient(errors)
     dtype = errors.dtype

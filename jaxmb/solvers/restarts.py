@@ -45,7 +45,7 @@ class Jump(eqx.Module):
     """The stored numbers of a start.
 
     **Fields:** `made`: whether there was a jump; the times `before` and after it (`time`); the state `y`, the field `f`
-    and the `chart` before it; `after` it, None if derivatives find these numbers again.
+    and the `chart` before it; `after`: the numbers after it, None if derivatives compute them again.
     """
 
     made: Any
@@ -90,7 +90,7 @@ def restarts(
         return push
     raveled = jax.numpy_dtype_promotion("standard")(ravel_pytree)
     _, unraveled = raveled((moved, jump.y, jump.f))
-    # The transpose of a program that finds an event would be a second one of its size; a matrix is transposed at once.
+    # The transpose of a program that finds an event would be a second one of its size; a matrix needs none.
     column = lambda unit: jnp.concatenate(restarted(*unraveled(unit)))
     every = lambda: jax.vmap(column)(jnp.eye(columns, dtype=jump.y.dtype))
     none = jnp.zeros((columns, n * len(blank)), jump.y.dtype)
@@ -112,7 +112,7 @@ def _restart(of, like, jump, numbers, at_jump, moved, flat, f):
     if not at_jump:
         delay = delayed = None
     else:
-        # The jump is later by this time, which is zero: the state moves on before the jump, and back after it.
+        # The jump is delayed by this time, whose value is zero: the state moves on before the jump, and back after it.
         time = moved.jumps[jnp.argmin(jnp.abs(moved.jumps - jump.time))]
         delay = twice_differentiable(time - lax.stop_gradient(time))
         delay = jnp.where(_is_jump(lax.stop_gradient(moved.jumps), jump), delay, 0.0)
@@ -138,6 +138,6 @@ def _is_jump(jumps, jump):
 
 
 def _moved_on(field, t, flat, f, time):
-    """A state moved on by a `time` of zero, right to the second derivative by it; `f`: the field at the state."""
+    """A state moved on by a `time` of zero, with the first two derivatives by it; `f`: the field at the state."""
     step = time.astype(flat.dtype)
     return flat + step / 2 * (f + field(t + time, flat + step * f))

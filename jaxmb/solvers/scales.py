@@ -27,7 +27,7 @@ class Block(eqx.Module):
 
     **Fields:** its `name`; `size`: the number of its components; `initial`: the expected size at the start of a motion,
     in natural units, for a block that is zero but for rounding errors; None for a block with a least size of 1e-4;
-    `rate_of`: the name of the preceding block whose rate of change it is, or None.
+    `rate_of`: the name of a preceding block if this one is its rate of change, else None.
     """
 
     name: str = eqx.field(static=True)

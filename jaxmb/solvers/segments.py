@@ -77,7 +77,7 @@ def first_of(steps: AbstractSteps, terms: PyTree, old: Any, new: Any) -> Row:
 
 
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
-    """The choices made for the same step."""
+    """The choices made for the step between two states of diffrax's loop."""
     jump = (old.tprev, jnp.asarray(old.made_jump)) if steps.jumps else (None, None)
     chosen = steps.chosen(steps.alone(new.solver_state))
     return Choice(old.tnext, *jump, _at_event(old, new), chosen)

@@ -92,9 +92,9 @@ def formula(family: str, k: int) -> Formula:
 
     **Arguments:**
 
-    - `family`: "E" (the interpolant of f, with its slope at the end, is integrated over the step), "H" (with its slope
-        at every point), "B" (the interpolant of y, with its slope at the end, has the second derivative g there), or
-        "Y" (with its slope at every point).
+    - `family`: "E": the interpolant of f, with its slope at the end, is integrated over the step; "H": the same with
+        the slope at every point. "B": the interpolant of y, with its slope at the end, has the second derivative g
+        there; "Y": the same with the slope at every point.
     - `k`: the number of points of the past, at least 1, also those without practical use.
 
     **Returns:** a `Formula`.
@@ -108,8 +108,8 @@ def formula(family: str, k: int) -> Formula:
 def adams(k: int) -> Formula:
     """Adams' predictor and corrector of order k with local extrapolation (PECE), on the test equation.
 
-    The formula of Adams and Bashforth of order k predicts, the formula of Adams and Moulton of order k + 1 corrects,
-    and the derivative is evaluated after both. With the coefficients `p_j` and `q_j` of the two,
+    The formula of Adams and Bashforth of order k predicts, the formula of Adams and Moulton of order k + 1 corrects.
+    The derivative is evaluated after each. With the coefficients `p_j` and `q_j` of the two formulas,
 
         y_{n+1} = y_n + h q_0 λ (y_n + h sum_j p_j f_{n+1-j}) + h sum_j q_j f_{n+1-j},  j = 1 ... k,
 
@@ -198,7 +198,7 @@ def stability_angle(formula: Formula) -> float:
 def stiff_abscissa(formula: Formula) -> float:
     """The abscissa D of stiff stability: the smallest `D >= 0` such that the formula is stable for `Re μ <= -D`.
 
-    It does not describe small μ: a formula that is not zero-stable may have one, too.
+    D does not describe small μ: a formula that is not zero-stable may have a finite D, too.
 
     **Returns:** D to 1e-4; infinite for a formula that is stable in no such half-plane.
     """

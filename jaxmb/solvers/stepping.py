@@ -1,6 +1,6 @@
 """The loop over the steps of a solve, in place of diffrax's loop.
 
-It computes the same from the same state, for `diffrax.diffeqsolve` and the adjoints of this package. A step that would
+From the same state it computes the same, for `diffrax.diffeqsolve` and the adjoints of this package. A step that would
 end within a hundred rounding errors of the end of the run ends there. One operation finds that time: diffrax takes
 fifteen hundred, a tenth of the time to trace and compile a small mechanism. A run that fails has no event. The time of
 an event is searched only in members of a batch that have an event, so a failed member does not stop the others.
@@ -54,7 +54,8 @@ class _Solve(NamedTuple):
 def loop(*, init_state: Any, outer_while_loop: Callable[..., Any], **given: Any) -> tuple[Any, dict[str, Any]]:
     """The last state of the loop, and its statistics (none), for an adjoint.
 
-    **Arguments:** as of diffrax's loop; `outer_while_loop(proceed, advance, state, max_steps=, buffers=)`: over steps.
+    **Arguments:** as of diffrax's loop. The loop over steps is `outer_while_loop(proceed, advance, state, max_steps=,
+    buffers=)`.
     """
     constants = constant_fields(init_state, **given)
     return ended(stepped(init_state, outer_while_loop, constants, **given), constants, **given), {}

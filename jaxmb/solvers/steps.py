@@ -28,7 +28,7 @@ class LinearStep(NamedTuple):
     """A step as linear maps of tangents.
 
     **Fields:** `push(dmoved, w, memory)`: the tangents of the raveled state at the end, of the solver's memory, and of
-    the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time, from the latter.
+    the step's dense output; `at(dense, t)`: the tangent of the raveled state at a time, from the dense output's.
     """
 
     push: Callable[..., tuple[Array, PyTree, PyTree]]

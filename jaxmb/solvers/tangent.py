@@ -1,11 +1,13 @@
 """Error control of tangents beside the state.
 
 Steps that follow a motion may lie far outside the stability region of a mode that is not excited. The motion does not
-show it, but its derivatives grow from step to step without bound. A differentiated solve therefore carries a tangent w
-of the state along, `w' = J(t, y) w`, and keeps its local error small as well. Its start excites every mode.
+show this mode, but the motion's derivatives grow from step to step without bound. A differentiated solve therefore
+carries a tangent w of the state along, `w' = J(t, y) w`, and keeps its local error small as well. The start of w
+excites every mode.
 
-Nor does a motion show a force of strength zero, but its derivative by the strength is a function of time that steps
-must resolve. With derivatives by parameters, the solve also carries a tangent that parameters cause, `d' = J d + f_p`.
+Nor does a motion show a force of strength zero. But the motion's derivative by this strength is a function of time that
+steps must resolve. With derivatives by parameters, the solve also carries a tangent that parameters cause,
+`d' = J d + f_p`.
 
 Tangents that are carried along have no derivatives. They differentiate the numerical solution: each step is
 differentiated along the tangents of the state and of the solver's memory. The derivative of the error estimate is then
@@ -60,7 +62,7 @@ class TangentControl(eqx.Module):
     restored: tuple[Float[Array, " n"], ...] | None = None
 
     def starts(self) -> tuple[Float[Array, " n"], ...]:
-        """A start with entries of random signs between one half and one unit, always the same; and a faint one."""
+        """A start with entries of one half to one unit and of random signs, always the same; and a faint start."""
         if self.restored is not None:
             return self.restored
         random = np.random.default_rng(0)
@@ -89,7 +91,7 @@ class TangentControl(eqx.Module):
     def on_constraints(self, restore: Any, term: PyTree, y0: PyTree) -> "TangentControl":
         """The same with starts that are tangents of the states returned by `restore(term, y)`, for a term.
 
-        Otherwise a solver that projects its steps would end the first one, however short, at another tangent.
+        Otherwise a solver that projects its steps would end the first step, however short, at another tangent.
         """
         none = jax.tree.map(lambda _: None, term)
         starts = [
@@ -136,7 +138,7 @@ class Tangent(eqx.Module):
 
 
 def pushed(function: Any, at: PyTree, along: tuple[PyTree, ...], differentiable: Any = None) -> tuple[PyTree, list]:
-    """`function(*at)` and its derivatives `along` tangents, which have no derivatives.
+    """`function(*at)` and its derivatives `along` tangents; these have no derivatives of their own.
 
     **Arguments:** `function`: a pytree, since it has derivatives as well; `differentiable`: another form of the same
     function that adjoints can differentiate, if needed.

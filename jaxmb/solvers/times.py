@@ -1,10 +1,10 @@
-"""How often results are differentiated by times."""
+"""How often results can be differentiated by times."""
 
 import jax
 
 NO_THIRD_DERIVATIVES = (
-    "A third derivative by times of a run was asked for, by `t0`, `t1`, saved times or those of `jumps`, which have "
-    "first and second ones. A first one is in closed form: velocities and `Trajectory.accelerations`."
+    "A third derivative by times of a run (`t0`, `t1`, saved times, times of `jumps`) was asked for; only first and "
+    "second ones exist. First ones are in closed form: velocities and `Trajectory.accelerations`."
 )
 
 
@@ -14,8 +14,8 @@ def twice_differentiable(time):
     return time
 
 
-# The slope of a number is 1, the slope of the slope is 0, and the latter has no derivative. (Both are functions of the
-# number, so they are batched if it is.)
+# The slope of a number is 1, the slope of the slope is 0 and has no derivative. (Both are functions of the number, so
+# they are batched if it is.)
 @jax.custom_jvp
 def _slope(x):
     return 1.0 + _curvature(x)

@@ -78,7 +78,7 @@ class Tolerances(eqx.Module):
     """Tolerances and norm of a multistep method, from `tolerances_of`.
 
     They are filled in from the step size controller (see `from_controller` of `jaxmb._compat`: diffrax has no other way
-    to tell a solver of it); otherwise they are `fixed`, for steps that no error estimate controls.
+    to tell a solver its controller); otherwise they are `fixed`, for steps that no error estimate controls.
     """
 
     rtol: Any
@@ -110,9 +110,9 @@ class Tolerances(eqx.Module):
     def of_step(self, y0: Array, y1: Array, h: Any, sizes: Array | None, finest: float = 0.0) -> Array:
         """The error tolerated in each component in one step of a multistep method, from `y0` to `y1` in a time h.
 
-        **Arguments:** `finest`: the smallest relative tolerance, in units of the machine precision, where rounding
-        dominates the estimates. Every `rtol` of one to twenty times `finest` has the same steps, to the last bit, for
-        equal `atol / rtol`.
+        **Arguments:** `finest`: the smallest relative tolerance of a step, in units of the machine precision; below it
+        rounding dominates the estimates. Every `rtol` of one to twenty times `finest` has the same steps, to the last
+        bit, for equal `atol / rtol`.
         """
         with jax.numpy_dtype_promotion("standard"):
             whole = jnp.maximum(self.rtol, float(jnp.finfo(y0.dtype).eps))
