@@ -45,7 +45,7 @@ def check_kinds(*given: Any) -> None:
 
 
 def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
-    """Refuse steps without error estimates for a method that chooses its order by tolerances and has none."""
+    """Refuse steps without error estimates for a method that chooses its order by tolerances, unless it has its own."""
     estimates = stepsize_controller is None or isinstance(
         stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
     )
@@ -54,7 +54,7 @@ def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
         raise ValueError(
             f"{method} chooses its order by tolerances, which {steps} does not have: give them to the solver, as in "
             f"solver=jaxmb.solvers.{method}(rtol=1e-8, atol=1e-10), or take a method of one order, as diffrax.Tsit5(). "
-            "Steps that are only bounded have simulate(..., dtmax=0.01)."
+            "To bound steps only, use simulate(..., dtmax=0.01)."
         )
 
 
@@ -70,7 +70,7 @@ def check_error_estimate(steps: Any, stepsize_controller: Any, event: Any, rtol:
     if event is not None or steps:
         what = "an event" if event is not None else "SaveAt(steps=True)"
         raise ValueError(
-            f"error=True compares two runs at the same times, which {what} does not have; give saveat=times."
+            f"error=True compares two runs at the same times, which {what} does not give; use saveat=times."
         )
     least = _CLOSEST * float(jnp.finfo(rtol.dtype).eps)
     if not is_traced(rtol) and rtol < least:

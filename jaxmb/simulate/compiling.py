@@ -21,8 +21,8 @@ _COMPILED, _LONG = "/jax/core/compile/backend_compile_duration", 0.5
 class _Wait:
     """A wait for a program.
 
-    **Fields:** `began`: when its tracing began; `ended`: when its compilation ended, None before; `told`: whether the
-    user was.
+    **Fields:** `began`: when tracing began; `ended`: when compilation ended, None before; `told`: whether the user was
+    told.
     """
 
     def __init__(self, system: AbstractSystem):
