@@ -146,8 +146,8 @@ class SlipSearch:
         return new, answers, x, turned, count + 1
 
     def in_lines(self, e, across):
-        """The answers if pairs act along directions and across them, where the limit of the force is `across` times the
-        limit along; and the equations for the forces.
+        """The answers if pairs act along and across directions, and the equations for the forces. The limit of a force
+        across is `across` times the limit along.
         """
         n, m, dry = self.n, len(self.dry.contact_of), self.dry
         unpaired = np.diag(~np.isin(np.arange(n + m), self.both)).astype(self.W.dtype)

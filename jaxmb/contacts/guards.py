@@ -66,8 +66,8 @@ class ContactGuards(AbstractGuards):
         return jnp.where(acts, reserves_of_active, free / system.length)
 
     def _in_plane(self, slips, modes, rates, u):
-        """The slips with the guards of slip in two directions: it has neither turned by more than 60 degrees from its
-        modes nor become slow; slip that has just begun is neither back at rest nor faster.
+        """The slips, with guards for slip in two directions: it has neither turned by more than 60 degrees from its
+        modes nor become slow. Slip that has just begun is neither back at rest nor fast enough to be followed.
         """
         system, pairs = self.system, modes.pairs
         if not pairs:
