@@ -127,7 +127,7 @@ def meet_constraints(
 def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array, "nq"]:
     """Gauss–Newton from a guess to the constraints along velocities, without motion along fixed velocities.
 
-    Without a dense matrix if the system has an order of elimination. The regularisation of the normal equations is
+    No dense matrix is formed if the system has an order of elimination. The regularisation of the normal equations is
     proportional to the residuals.
 
     **Arguments:** `start`: a guess at rest.

@@ -166,8 +166,8 @@ def _changing(at, steady):
     names = {name: rates[index] for name, index in at.system.state_names().items() if not np.all(steady[index])}
     listed = ", ".join(f"{name} ({np.max(np.abs(rate)):.3g} per second)" for name, rate in names.items())
     return (
-        f"In the equilibrium internal states change: {listed}. They are those of the guess; give values at which they "
-        "rest with fix, such as a motor's torque after its lag."
+        f"In the equilibrium internal states change: {listed}. Their values are from the guess; give values at which "
+        "they rest with fix, such as a motor's torque after its lag."
     )
 
 
