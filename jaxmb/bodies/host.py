@@ -195,7 +195,7 @@ class HostScene(AbstractHost):
         return self.normalize(q + self.along(q, step))
 
     def holds(self, q):
-        """Whether the constraints hold, without a joint that is half a turn away from closing."""
+        """Whether the constraints hold, and no joint is half a turn away from closing."""
         if not super().holds(q):
             return False
         poses, direction = self._prepared(q), self._layout.space.direction
