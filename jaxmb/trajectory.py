@@ -117,16 +117,19 @@ class Trajectory(eqx.Module):
     - `ys`: a `State` with a leading axis of time.
     - `result`: how the motion ended.
     - `closer`: the same motion at tighter tolerances, after `error=True`.
-    - `stats`: counts of the integration:
-        - `num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`; `orders`: accepted steps
-            at order 1, 2, …;
-        - `linearised_steps`: whether derivatives use one linearisation of the equations at each step, or the derivative
-            of each step as it is, which costs more;
-        - with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`;
-        - of `Hermite` `num_evaluations` of f with its time derivative, `num_matrices` made, `past_points`: accepted
-            steps with 1, 2, … points of the past, and `wrong_derivative`: whether differences of f contradict its
-            derivative;
-        - with contacts `num_events`: the number of times of `events`.
+    - `stats`: counts of the integration, by name.
+
+    **Counts:**
+
+    - `num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`.
+    - `orders`: accepted steps at order 1, 2, ….
+    - `linearised_steps`: whether derivatives use one linearisation of the equations at each step, or the derivative of
+        each step as it is, which costs more.
+    - With `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`.
+    - With `Hermite`, `num_evaluations` of f with its time derivative, `num_matrices` made, `past_points`: accepted
+        steps with 1, 2, … points of the past, and `wrong_derivative`: whether differences of f contradict its
+        derivative.
+    - With contacts or dry friction, `num_events`: the number of times of `events`.
 
     `trajectory["crank"]` is the motion of a body, a `BodyMotion`, and `trajectory["hip"]` the motion of a joint, a
     frame or a part with internal states, a `PartMotion`. In generalized coordinates `trajectory["theta"]` is a
