@@ -163,7 +163,9 @@ def checked_longest_step(dtmax: Any, stepsize_controller: Any, solver: Any, dtyp
             "dtmax bounds the steps that rtol and atol choose: give it to the stepsize_controller, or leave that out."
         )
     if isinstance(solver, AbstractMultistep) and solver.tolerances.fixed:
-        raise ValueError(f"dtmax needs the tolerances of simulate: leave those of {type(solver).__name__} out.")
+        raise ValueError(
+            f"dtmax needs the tolerances of simulate: leave out the tolerances of {type(solver).__name__}."
+        )
     longest = real_array("dtmax", dtmax, dtype)
     if not is_traced(longest) and not longest > 0:
         raise ValueError(f"dtmax must be positive, got {dtmax}; leave it out for steps of any length.")

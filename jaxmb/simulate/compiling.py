@@ -14,7 +14,7 @@ from ..system import AbstractSystem
 
 # The time [s] after which a user is told.
 _PATIENCE = 2.0
-# The event that JAX reports at the end of a compilation; shorter compilations than this [s] are of single operations.
+# The event that JAX reports at the end of a compilation; compilations shorter than `_LONG` [s] are single operations.
 _COMPILED, _LONG = "/jax/core/compile/backend_compile_duration", 0.5
 
 

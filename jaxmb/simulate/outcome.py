@@ -109,7 +109,7 @@ def warn_of_stiffness(stats) -> None:
         return
     warnings.warn(
         f"The motion is stiff: in {stats['stiff_steps']} of {stats['num_steps']} steps of Adams' method stability was "
-        "the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
+        "the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer steps.",
         stacklevel=5,
     )
 
@@ -182,7 +182,7 @@ def about_steps(outcome: Outcome, span: Span, stats, stiff) -> str:
     if stiff:
         return text + (
             "It is stiff there: stability is the limit of its steps. simulate(..., solver=jaxmb.solvers.Hermite()) "
-            "takes longer ones."
+            "takes longer steps."
         )
     cure = "A larger max_steps or a coarser rtol takes it further"
     if stiff is None:

@@ -174,8 +174,8 @@ def _moving_times(series, saved, span):
 
 
 def seen(function: Any, ts: Any, ys: Any, start: tuple[Any, State]) -> Any:
-    """The values of a user's function of saved states. Entries after the end of a run, whose states are infinite, are
-    infinite, or zero for integers, and have no derivatives.
+    """The values of a user's function of saved states. After the end of a run, where states are infinite, values are
+    infinite (integers zero) and have no derivatives.
     """
     never = lambda x: jnp.inf if jnp.issubdtype(x.dtype, jnp.inexact) else 0
 
@@ -203,7 +203,7 @@ def corrected(correction: Any, system: AbstractSystem, ts: Any, ys: Any, start: 
 
 
 def _replaced(values, old, new):
-    """Values in which the `old` ones, which run up or down, are replaced by the `new` ones."""
+    """The values with `old` times, which ascend or descend, replaced by `new` times."""
     order = jnp.argsort(old)
     k = order[jnp.clip(jnp.searchsorted(old[order], values), 0, old.size - 1)]
     return jnp.where(values == old[k], new[k], values)

@@ -94,9 +94,9 @@ def simulate(
     **Returns:** a `Trajectory`. With `throw=False` it has the part of the motion before a failure, and `result` says
     why it failed; under a trace it is NaN.
 
-    **Raises:** `ValueError` for arguments of the wrong type or out of range, for combinations that cannot work, and for
-    a state that violates the constraints, unless the manifold lets states drift; `RuntimeError`, unless `throw=False`,
-    when the integration fails.
+    **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work.
+    Also for a state that violates the constraints, unless the manifold lets states drift. `RuntimeError` if the
+    integration fails, unless `throw=False`.
     """
     asked = Asked(
         system,
