@@ -149,7 +149,7 @@ class ContactEvents(eqx.Module):
     def _rows(self) -> list[Event]:
         if isinstance(self.times, Tracer) or self.times.ndim != 1:
             raise ValueError(
-                "The events of one motion are a table, those of a batch or under jit are arrays: see the fields of "
+                "The events of one motion are a table; in a batch or under jit they are arrays: see the fields of "
                 "ContactEvents."
             )
         concrete = jax.tree.map(np.asarray, self)

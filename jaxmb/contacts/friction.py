@@ -17,8 +17,8 @@ from ..linalg.pairs import for_both, of_pairs, placed_pairs
 from ..linalg.rotations import norm
 from .dry_laws import Answers, Dry, in_lines, laws_of
 
-# The search for directions of slip ends when they change by less than this, or after this many rounds, each with this
-# many steps of Newton's method.
+# The search for directions of slip ends when they change by less than `_TURN`, or after `_TURNS` rounds. A round has
+# `_CORRECTIONS` steps of Newton's method.
 _TURN, _TURNS, _CORRECTIONS = 1e-7, 60, 2
 # The least limit of a force across its direction, as a fraction of its limit along it.
 _ACROSS = 0.01

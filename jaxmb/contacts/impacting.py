@@ -26,8 +26,8 @@ from .forces import directions, free_accelerations, friction_coefficients
 from .problem import Laws, Problem, is_implied
 from .tolerance import REST, ContactTolerance
 
-# The number of rounds of impulses and forces that decide which contacts stay closed and which friction sticks, if
-# normal forces of joints depend on the friction in them. Without such friction, low bounces decide in a second round.
+# If normal forces of joints depend on the friction in them, this many rounds of impulses and forces decide which
+# contacts stay closed and which friction sticks. Without such friction, low bounces decide in a second round.
 _ROUNDS = 4
 # Rebounds without gain of energy are found in this many trials, to this fraction of the summands of the energy.
 _TRIALS, _GAIN = 40, 1e-12
@@ -526,8 +526,8 @@ class Impacting:
         is_held = self.independent(is_held)
         cancelled = is_held & cancelled
         if m:
-            # Otherwise bodies that move side by side would approach at a rate which is too small beside slips to close
-            # their contact, and each step would end with an event.
+            # Otherwise bodies that move side by side would approach: at a rate too small, beside slips, to close their
+            # contact. Each step would then end with an event.
             drifts = jnp.pad(staying & ~is_held[:n] & ~implied & (rate[:n] < 0), (0, m))
             cancelled = self.independent(cancelled | drifts)
         return is_held, jnp.where(cancelled, solved_components(self.influence, rates_left, cancelled), 0.0)

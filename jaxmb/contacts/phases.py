@@ -110,15 +110,15 @@ class Phases:
 
     def solved(self, before, dbefore, phase: Phase, normal):
         """The derivatives of the impulses of a phase and of the velocities at its end, and the matrix of the equations
-        for the former; see `equations`.
+        for the impulses; see `equations`.
         """
         plain, matrix, right = self.equations(before, dbefore, phase, normal)
         impulses = solve(matrix, right)
         return impulses, plain + impulses @ self.moves, matrix
 
     def equations(self, before, dbefore, phase: Phase, normal):
-        """The derivatives of the velocities after a phase at fixed impulses, and the linear equations for those of the
-        impulses.
+        """The derivatives of the velocities after a phase at fixed impulses, and the linear equations for the impulses'
+        derivatives.
 
         **Arguments:** the velocities `before` the phase, and their derivative; `normal`: the changes of the normal
         impulses of contacts that are not held.
