@@ -86,7 +86,7 @@ def setup(
     **Arguments:**
 
     - `x64`: whether JAX computes in double precision; False leaves its precision as it is.
-    - `compile`: with `"quickly"` programs compile in about six tenths of the time, with `"for speed"` programs of small
+    - `compile`: with `"quickly"` programs compile in about six tenths of the time. With `"for speed"` programs of small
         machines run in a third to three quarters of the time. With `"for batches"` members of `jaxmb.batch` and `sweep`
         are computed side by side. Results differ in rounding. All three set options of XLA for processors in the
         environment variable `XLA_FLAGS`; options that are set there already stay. With `None`, or if JAX has an

@@ -131,8 +131,8 @@ class Trajectory(eqx.Module):
         derivative.
     - With contacts or dry friction, `num_events`: the number of times of `events`.
 
-    `trajectory["crank"]` is the motion of a body, a `BodyMotion`, and `trajectory["hip"]` the motion of a joint, a
-    frame or a part with internal states, a `PartMotion`. In generalized coordinates `trajectory["theta"]` is a
+    `trajectory["crank"]` is a `BodyMotion`, the motion of a body. `trajectory["hip"]` is a `PartMotion`, the motion of
+    a joint, a frame or a part with internal states. In generalized coordinates `trajectory["theta"]` is a
     coordinate and `trajectory["theta_rate"]` its rate, shape (times,). `events` are the events of contacts and dry
     friction, as a table.
 
@@ -470,8 +470,8 @@ class PartMotion:
     `.angle_rate`, `.angle_acceleration`, `.force`, …, of a frame `.position`, `.specific_force`, …; `dir` lists them,
     and the classes of joints and frames describe them. Axis 0 is time, after the batch's axes.
 
-    An angle of a joint is continued over full turns. Saved times must be so close that its change between two of them
-    differs by less than half a turn from the trapezoidal rule of its rate.
+    An angle of a joint is continued over full turns. Saved times must be close: between two of them, the angle's change
+    must differ by less than half a turn from the trapezoidal rule of its rate.
     """
 
     def __init__(self, trajectory: Trajectory, name: str):

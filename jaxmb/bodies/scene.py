@@ -383,7 +383,7 @@ def _check_names(scene: Scene):
             for name in part.sources:
                 if name in body_names and name not in allowed and not part.takes_bodies:
                     raise ValueError(
-                        f"{part.label}: {name!r} is no joint; it acts on joints, and there are "
+                        f"{part.label}: {name!r} is not a joint; the part acts on joints, and there are "
                         f"{', '.join(map(repr, joints)) or 'none'}."
                     )
                 if isinstance(part, AbstractNonIdeal | AbstractDryFriction) and name in stops:

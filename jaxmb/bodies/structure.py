@@ -294,7 +294,7 @@ def _check_determined(system, implied):
             if involved:
                 raise ValueError(
                     f"{g.group.part.kind} {name!r} needs the force of {joint!r}, which is not determined: "
-                    f"rows of {', '.join(sorted(involved))} imply one another. Remove the redundant ones."
+                    f"rows of {', '.join(sorted(involved))} imply one another. Remove redundant joints."
                 )
 
 

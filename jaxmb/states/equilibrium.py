@@ -412,8 +412,8 @@ def _search(
         step = _step(local, downhill=downhill)
         longest = xp.max(xp.abs(step))
         step = step * xp.minimum(1.0, radius / xp.where(longest > 0, longest, 1.0))
-        # After a small Newton step the error is of the order of the step's square, plus the rows' correction, whose
-        # effect on the forces is not counted.
+        # After a small Newton step the error is of the order of the step's square, plus the rows' correction. The
+        # effect of the correction on the forces is not counted.
         return q, local, step, radius, good & (size <= close) & (off <= close**1.5) & (k > 0), k + 1
 
     # Without a linearisation yet, the first step is zero unless it is given.

@@ -44,7 +44,7 @@ class Measure(NamedTuple):
     """A quantity of all systems of one structure.
 
     **Fields:** `shape` at one time; `view(system, place, ts, ys, solved)`, made by `view_of_motion`; `place`: static
-    values that choose a quantity of the view, and the numbers of the part as arrays; `of_forces` as in `Quantity`.
+    values that choose a quantity of the view, and the indices of the part as arrays; `of_forces` as in `Quantity`.
     """
 
     shape: tuple[int, ...]
@@ -74,7 +74,7 @@ def view_of_motion(view: Callable[..., Any]) -> Callable[..., Any]:
     """Compile `view(system, place, ts, ys, …)` of a motion, and vectorise it over batches of motions.
 
     The axes of a batch come first in all arrays, except arrays in `place`. Other values in `place` are static. The
-    numbers of a part are arrays in `place`, so that all parts of one kind share a program.
+    indices of a part are arrays in `place`, so that all parts of one kind share a program.
     """
 
     def of_all(system, place, ts, *arrays):
@@ -126,8 +126,8 @@ class BodyMotion(NamedTuple):
 class Reaction(NamedTuple):
     """The force that a joint exerts on its last body that is not the ground; the other body receives the opposite.
 
-    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on the body, or about the mass centre
-    for a joint without points, world axes, a scalar in the plane; `multipliers` of the joint's rows.
+    **Fields:** `force` [N], world axes; `moment` [N m], world axes, a scalar in the plane: about the joint's point on
+    the body, or about the mass centre for a joint without points; `multipliers` of the joint's rows.
     """
 
     force: Float[Array, "*times d"]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-_NO_MOMENTUM = "Momentum is that of bodies; this system has none. Compute it from the coordinates."
+_NO_MOMENTUM = "Momentum is defined for bodies; this system has none. Compute momentum from the coordinates."
 
 
 class AbstractSystem(AbstractEquation):
