@@ -291,7 +291,7 @@ _LANES = 4096
 def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
     """`lax.cond` that under `vmap` is computed only for the lanes that take it, one after the other on a CPU.
 
-    So a branch that few lanes take costs the other lanes nothing. On other devices up to `_LANES` lanes go at once.
+    So a branch that a lane rarely takes costs the other lanes nothing. Elsewhere up to `_LANES` lanes go at once.
     Under differentiation it is `cond_of_any_lane`. (jax.custom_batching.custom_vmap within jax.custom_jvp, 0.7 to 0.10;
     equinox.filter_closure_convert, 0.13.)
     """

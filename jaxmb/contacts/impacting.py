@@ -526,8 +526,8 @@ class Impacting:
         is_held = self.independent(is_held)
         cancelled = is_held & cancelled
         if m:
-            # Otherwise bodies that move side by side would approach: at a rate too small, beside slips, to close their
-            # contact. Each step would then end with an event.
+            # Otherwise bodies that move side by side would approach, too slowly beside slips to close their contact.
+            # Each step would then end with an event.
             drifts = jnp.pad(staying & ~is_held[:n] & ~implied & (rate[:n] < 0), (0, m))
             cancelled = self.independent(cancelled | drifts)
         return is_held, jnp.where(cancelled, solved_components(self.influence, rates_left, cancelled), 0.0)

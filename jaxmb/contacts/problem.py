@@ -68,7 +68,7 @@ class Laws(NamedTuple):
     def of_impulses(self, approach, touching, reactions) -> Problem:
         """The impulses of contacts that are `touching`.
 
-        Friction in joints has no impulse; the problem has zeros for its `reactions`.
+        Friction in joints has no impulse; the problem has zeros in place of the `reactions`.
 
         **Arguments:** `approach`: the rates before the impact, minus the rates of the rebounds.
         """

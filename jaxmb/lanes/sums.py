@@ -8,8 +8,8 @@ from jax import lax
 
 from .evaluate import apart, rule
 
-# Sums of more terms are called in parts, since LLVM does not vectorise them. XLA's own operations compute longer
-# reductions, and longer searches and cumulative sums.
+# Sums of more than `_TERMS` terms are called in parts, since LLVM does not vectorise them. XLA's own operations compute
+# reductions of more than `_REDUCED` entries, and searches and cumulative sums of more than `_SEARCHED`.
 _TERMS, _REDUCED, _SEARCHED = 16, 16, 64
 _OPERATIONS = {
     "reduce_sum": lax.add,

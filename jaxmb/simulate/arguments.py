@@ -136,7 +136,7 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
     nq, nu, nz = system.nq, system.nu, system.nz
     if (state.z is None) != (nz == 0):
         has = f"has {nz} internal states" if nz else "has no internal states"
-        raise ValueError(f"The system {has} and the state {'none' if state.z is None else 'some, in z'}; {cure}.")
+        raise ValueError(f"The system {has}, but the state has {'none' if state.z is None else 'some, in z'}; {cure}.")
     of_states = [] if state.z is None else [("z", state.z, nz)]
     for name, value, size in (("q", state.q, nq), ("u", state.u, nu), *of_states):
         kind = value.dtype if isinstance(value, ARRAYS) else type(value)

@@ -16,8 +16,9 @@ _MEMORY, _FEWEST_STEPS = 2**24, 1024
 _MORE = 8
 # Derivatives keep the rows of this many steps, or of fewer if they do not fit in this many bytes.
 MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
-# The structures of systems and solvers with long motions in this process, of at least as many steps as derivatives keep
-# at once. The next derivative outside of `jit` then does not try the smaller program first.
+# The structures of systems and solvers with long motions in this process, with or without derivatives. Long motions
+# take at least as many steps as derivatives keep at once; the next derivative outside of `jit` then does not try the
+# smaller program first.
 # Only a few are kept, since structures hold the functions of users.
 _long: collections.deque[Any] = collections.deque(maxlen=16)
 

@@ -82,9 +82,9 @@ def assemble(
     the system's size and angles in radians. Coordinates that `fix` does not hold may depend on a parameter, and a
     derivative by the parameter contains their change.
 
-    **Raises:** `ValueError` if the mechanism cannot be assembled, naming joints with their residuals; if coordinates
-    cannot be fixed together; or if rates contradict each other. Consistent rates may outnumber the degrees of freedom.
-    With `throw=True` under `jit`, a run-time error without the names.
+    **Raises:** `ValueError` if the mechanism cannot be assembled, coordinates cannot be fixed together, or rates
+    contradict each other; the message names the joints with their residuals, the coordinates or the rates. Consistent
+    rates may outnumber the degrees of freedom. With `throw=True` under `jit`, a run-time error without the names.
     """
     check_system("assemble", system)
     of_bodies = guess is None and rates is None
