@@ -101,7 +101,7 @@ def probability(name: str, value: Any) -> float:
 
 
 def warn_of_degrees(label: str, angle: Any, stacklevel: int) -> None:
-    """Warn of an angle [rad] of more than a full turn; `stacklevel`: the user's place as this function's caller."""
+    """Warn of an angle [rad] of more than a full turn; `stacklevel`: the user's place, counted from the caller."""
     if not is_traced(angle) and abs(float(angle)) > 2 * np.pi:
         warnings.warn(
             f"{label}: the angle {angle:g} rad is more than a full turn; angles are in radians, "

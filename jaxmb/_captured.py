@@ -85,8 +85,8 @@ class Captured:
 class CapturedModule(eqx.Module):
     """A captured function, differentiable by the arrays of an equinox module and by closed-over traced values.
 
-    **Fields:** `module`: the module with these arrays, None for a function without; `known`: the function, which takes
-    the module first if there is one.
+    **Fields:** `module`: the module with these arrays and values, None for a function without them; `known`: the
+    function, which takes the module first if there is one.
     """
 
     module: Any

@@ -78,7 +78,7 @@ def sizes_of_scan(params: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def is_of_jax(primitive: Primitive) -> bool:
-    """Whether an operation is one of JAX, and not one that is made of others.
+    """Whether an operation is JAX's own, and not made by another package.
 
     (Primitive.impl, a function of the package that made it, 0.9 to 0.12.)
     """
@@ -291,8 +291,8 @@ _LANES = 4096
 def cond_of_lanes(pred: Any, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
     """`lax.cond` that under `vmap` is computed only for the lanes that take it, one after the other on a CPU.
 
-    So a branch that a lane takes rarely costs the others nothing. Elsewhere up to `_LANES` lanes go at once. Under
-    differentiation it is `cond_of_any_lane`. (jax.custom_batching.custom_vmap within jax.custom_jvp, 0.7 to 0.10;
+    So a branch that a lane rarely takes costs the other lanes nothing. Elsewhere up to `_LANES` lanes go at once.
+    Under differentiation it is `cond_of_any_lane`. (jax.custom_batching.custom_vmap within jax.custom_jvp, 0.7 to 0.10;
     equinox.filter_closure_convert, 0.13.)
     """
     taken, static = eqx.partition((eqx.filter_closure_convert(true_fn, operand), operand), eqx.is_array)
@@ -374,7 +374,7 @@ while_loop = eqxi.while_loop
 
 
 def buffer_set(buffer: Any, index: Any, x: Array, pred: Any = True) -> Any:
-    """The same with an entry, which is written once; unchanged if `pred` is false."""
+    """The buffer with an entry `x`, which is written only once; unchanged if `pred` is false."""
     return eqxi.buffer_at_set(buffer, index, x, pred=pred)
 
 
@@ -450,7 +450,7 @@ def direction_of(term: Any) -> Any:
 
 
 def with_inner(terms: Any, inner: Any, direction: Any) -> Any:
-    """The same with another term inside and another direction."""
+    """Wrapped terms with another inner term and another direction."""
     return eqx.tree_at(lambda terms: (terms.term, terms.direction), terms, (inner, direction))
 
 

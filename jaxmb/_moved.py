@@ -6,8 +6,8 @@ import sys
 def tell_of_moved(package: str, **now: str) -> None:
     """Let the errors of a module for names that it had before say what to write.
 
-    **Arguments:** `package`: name of the module; `now`: what to write, by the name of before. For others that a module
-    of jaxmb defines, the error names that module. A `__getattr__` of the module finds its `__all__` as before.
+    **Arguments:** `package`: name of the module; `now`: what to write, by the former name. For other names that some
+    module of jaxmb defines, the error says which. A `__getattr__` of the module still finds the names in its `__all__`.
     """
     module = sys.modules[package]
     found, names = (vars(module).get(own) for own in ("__getattr__", "__all__"))
@@ -26,7 +26,7 @@ def tell_of_moved(package: str, **now: str) -> None:
 
 
 def _home(package: str, name: str) -> str | None:
-    """The module that defines a class or function, of a package if it is there."""
+    """The module that defines a class or function, in this package if it is there."""
     modules = [own for own in sys.modules if own.split(".")[0] == __package__]
     modules.sort(key=lambda own: (not own.startswith(package), own))
     return next((own for own in modules if getattr(vars(sys.modules[own]).get(name), "__module__", "") == own), None)

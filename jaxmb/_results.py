@@ -47,7 +47,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "or a design variable is outside its bounds. `jaxmb.with_parameters` with numbers that are not traced names it."
     )
     # The last results, in the order of their introduction, since results are stored by their numbers.
-    saved_outside = "A saved time is not between `t0` and `t1`, or not a number, or before the one that it follows."
+    saved_outside = "A saved time is not between `t0` and `t1`, or not a number, or before the previous saved time."
     input_ended = "An input is a `Series` that is not known for the whole motion, from `t0` to `t1`."
     impacts_backward = "Impacts cannot be undone: with contacts `t1` must be after `t0`."
     friction_undetermined = (

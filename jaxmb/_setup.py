@@ -51,10 +51,10 @@ _FOR_BATCHES = _FOR_SPEED | {
     "xla_cpu_prefer_vector_width": "512",
 }
 _OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, "for batches": _FOR_BATCHES, None: {}}
-# Python collects garbage after so many more new than deleted objects. Tracing a program makes a million objects with
-# little garbage, and with the default of 700 the collection takes a sixth of the time.
+# Python collects garbage when new objects outnumber deleted objects by this. Tracing a program makes a million objects
+# with little garbage, and with the default of 700 the collection takes a sixth of the time.
 _NEW_OBJECTS = 50_000
-# The folder in place of the program's choice, or `off`.
+# The environment variable with a folder that replaces the program's choice, or `off`.
 VARIABLE = "JAXMB_CACHE"
 MAX_BYTES = 2**27
 # Settings of JAX besides the folder: to keep every program, since hundreds of small ones take seconds together too.
@@ -86,11 +86,11 @@ def setup(
     **Arguments:**
 
     - `x64`: whether JAX computes in double precision; False leaves its precision as it is.
-    - `compile`: with `"quickly"` programs compile in about six tenths of the time, with `"for speed"` programs of small
+    - `compile`: with `"quickly"` programs compile in about six tenths of the time. With `"for speed"` programs of small
         machines run in a third to three quarters of the time. With `"for batches"` members of `jaxmb.batch` and `sweep`
         are computed side by side. Results differ in rounding. All three set options of XLA for processors in the
-        environment variable `XLA_FLAGS`; options that are set there already stay. None sets none, and if JAX has an
-        accelerator none are set.
+        environment variable `XLA_FLAGS`; options that are set there already stay. With `None`, or if JAX has an
+        accelerator, no options are set.
     - `keep`: whether compiled programs are kept on disk, for this and later processes; or the folder to keep them in,
         by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME`, in `~/.cache`, on macOS `~/Library/Caches`,
         on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes precedence: another folder, or `off`.

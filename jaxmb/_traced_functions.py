@@ -59,8 +59,8 @@ def traced_by_jax(what: str, argument: str) -> Iterator[None]:
         raise ValueError(f"{_line(error)} asks for {error}, which {what} does not get; {name} has {listed}.") from error
     except NEED_NUMBERS as error:
         raise ValueError(
-            f"{_line(error)} needs {argument} as a number, and {what} is traced by JAX: there is no `if`, `while`, "
-            f"`float()`, `int()`, or function of NumPy or `math` of what depends on {argument}. Use jnp.where or "
+            f"{_line(error)} needs {argument} as a number, and {what} is traced by JAX: values that depend on "
+            f"{argument} have no `if`, `while`, `float()`, `int()`, or function of NumPy or `math`. Use jnp.where or "
             "jax.lax.cond for `if`, jax.lax.while_loop for `while`, and jax.numpy for NumPy and `math`."
         ) from error
     except Exception as error:
@@ -114,7 +114,7 @@ def with_note(function: Callable[..., Any], what: str) -> Callable[..., Any]:
 
 
 def asked_argument(error: KeyError) -> tuple[str, Mapping[Any, Any]] | None:
-    """The dictionary argument of the user's function that lacks the name that a line asked for, and its name.
+    """The argument of the user's function that lacks the name asked for: the argument's own name and its dictionary.
 
     None for another dictionary, which is the user's, and for an `UnknownNameError`.
     """

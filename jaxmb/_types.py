@@ -27,11 +27,15 @@ class State(eqx.Module):
     released = jaxmb.State(q=state.q, u=jnp.zeros(3))
     ```
 
-    **Fields:** `q`: coordinates, shape `(nq,)`; `u`: velocities, shape `(nu,)`. Their meaning depends on the system:
-    for a planar scene (x, y, angle) [m, m, rad] a body and their rates, for a spatial one (position [m], Euler
-    parameters) and (velocity [m/s] in the world frame, angular velocity [rad/s] in the body frame); contacts and
-    friction have a coordinate each, their mode, after the coordinates of the bodies: see `system.coordinate_names()`.
-    `z`: internal states of first order, shape `(nz,)`, such as the torque of a motor with lag; None if no part has any.
+    **Fields:**
+
+    - `q`: coordinates, shape `(nq,)`, listed by `system.coordinate_names()`. A planar scene has (x, y, angle)
+        [m, m, rad] of each body, a spatial scene (position [m], Euler parameters). Modes of contacts and friction
+        follow.
+    - `u`: velocities, shape `(nu,)`. A planar scene has the rates of q, a spatial scene (velocity [m/s] in the world
+        frame, angular velocity [rad/s] in the body frame).
+    - `z`: internal states of first order, shape `(nz,)`, such as the torque of a motor with lag; None if no part has
+        any.
     """
 
     q: Float[Array, "... nq"]

@@ -34,8 +34,8 @@ from .system.quantities import Reaction, Solved, with_shapes
 class ConstraintViolation(NamedTuple):
     """Largest residuals, shape (times,), in units that do not depend on the form of the constraints.
 
-    **Fields:** `position`: the changes of coordinates that restore them, in the system's size and radians; `velocity`:
-    the changes of velocities, in these units per second.
+    **Fields:** `position`: the changes of coordinates that satisfy the constraints, in units of the system's size and
+    radians; `velocity`: the changes of velocities, in these units per second.
     """
 
     position: Float[Array, "times"]
@@ -111,21 +111,33 @@ class Trajectory(eqx.Module):
     motion["bar"].angle, motion["pin"].angle_rate, motion.energy, motion.constraint_violation
     ```
 
-    **Fields:** `ts` [s], shape (times,); `ys`, a `State` with a leading axis of time; `stats`, counts of the
-    integration (`num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`, `orders`: accepted
-    steps at order 1, 2, …; with `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`; of `Hermite`
-    `num_evaluations` of f with its time derivative, `num_matrices` made, `past_points`: accepted steps with 1, 2, …
-    points of the past, and `wrong_derivative`: whether differences of f contradict its derivative; `num_events`: times
-    of `events`; and `linearised_steps`: whether derivatives use one linearisation of the equations at each step, or the
-    derivative of each step as it is, which costs more); `result`, how it ended. `trajectory["crank"]` is the motion of
-    a body, a `BodyMotion`, and `trajectory["hip"]` the motion of a joint, a frame or a part with internal states, a
-    `PartMotion`; of a system in generalized coordinates `trajectory["theta"]` is a coordinate and
-    `trajectory["theta_rate"]` its rate, shape (times,).
+    **Fields:**
 
-    `events` are the impacts of unilateral constraints, as a table.
+    - `ts` [s], shape (times,).
+    - `ys`: a `State` with a leading axis of time.
+    - `result`: how the motion ended.
+    - `closer`: the same motion at tighter tolerances, after `error=True`.
+    - `stats`: counts of the integration, by name.
+
+    **Counts:**
+
+    - `num_steps`, `num_rejected_steps`, `num_evaluations`, `newton_iterations`, `charts`.
+    - `orders`: accepted steps at order 1, 2, ….
+    - `linearised_steps`: whether derivatives use one linearisation of the equations at each step, or the derivative of
+        each step as it is, which costs more.
+    - With `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`.
+    - With `Hermite`, `num_evaluations` of f with its time derivative, `num_matrices` made, `past_points`: accepted
+        steps with 1, 2, … points of the past, and `wrong_derivative`: whether differences of f contradict its
+        derivative.
+    - With contacts or dry friction, `num_events`: the number of times of `events`.
+
+    `trajectory["crank"]` is a `BodyMotion`, the motion of a body. `trajectory["hip"]` is a `PartMotion`, the motion of
+    a joint, a frame or a part with internal states. In generalized coordinates `trajectory["theta"]` is a
+    coordinate and `trajectory["theta_rate"]` its rate, shape (times,). `events` are the events of contacts and dry
+    friction, as a table.
 
     In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before the
-    axes given here. `closer` is the same motion at tighter tolerances, after `error=True`.
+    axes given here.
     """
 
     system: Any
@@ -246,8 +258,8 @@ class Trajectory(eqx.Module):
         same times of every member.
 
         At the time t of an announced jump, velocities are taken after it, as in saved states; at `numpy.nextafter(t,
-        -numpy.inf)` before it. The state is NaN outside of the run, and if Newton's method finds no state on the
-        constraints, as between steps that are too long.
+        -numpy.inf)` before it. The state is NaN outside of the run, and where Newton's method finds no state on the
+        constraints, as within steps that are too long.
         """
         if self.interpolation is None:
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
@@ -332,7 +344,7 @@ class Trajectory(eqx.Module):
     @property
     def forces(self) -> Mapping[str, Array]:
         """Wrenches of the applied forces by name, on each of the part's bodies in order, shape (times, bodies, 3) or
-        (times, bodies, 6): force [N] in world axes and moment [N m] about the mass centre, in space in body axes.
+        (times, bodies, 6): force [N] in world axes; moment [N m] about the mass centre, in body axes in space.
 
         Friction in a joint is among them under its own name, on the bodies of the joint; the reaction of the joint
         excludes it.
@@ -359,7 +371,7 @@ class Trajectory(eqx.Module):
         return jax.vmap(at)(self.ts, self.ys)
 
     def trimmed(self) -> "Trajectory":
-        """Without the padding of `SaveAt(steps=True)` and of runs that ended early; the same under `jit` and `vmap`."""
+        """Without the padding of `SaveAt(steps=True)` and of runs ended early; unchanged under `jit` and `vmap`."""
         if isinstance(self.ts, Tracer) or self.ts is None or self.ts.ndim != 1:
             return self
         finite = np.isfinite(np.asarray(self.ts))
@@ -371,7 +383,7 @@ class Trajectory(eqx.Module):
         return changed(self, ts=ts, ys=ys)
 
     def to_dict(self) -> dict[str, np.ndarray]:
-        """Arrays by name: `t`, `energy`, `"crank.angle"`, …, and `stats.…`."""
+        """Arrays by name: `t`, `q`, `u`, `energy`, `"crank.angle"`, …, and `stats.…`."""
         out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
         if self.ys.z is not None:
             out["z"] = np.asarray(self.ys.z)
@@ -458,8 +470,8 @@ class PartMotion:
     `.angle_rate`, `.angle_acceleration`, `.force`, …, of a frame `.position`, `.specific_force`, …; `dir` lists them,
     and the classes of joints and frames describe them. Axis 0 is time, after the batch's axes.
 
-    An angle of a joint is continued over full turns. Saved times must be so close that its change between two of them
-    differs by less than half a turn from the trapezoidal rule of its rate.
+    An angle of a joint is continued over full turns. Saved times must be close: between two of them, the angle's change
+    must differ by less than half a turn from the trapezoidal rule of its rate.
     """
 
     def __init__(self, trajectory: Trajectory, name: str):
@@ -498,8 +510,8 @@ class GlobalError(NamedTuple):
 
     @property
     def largest(self) -> Array:
-        """The largest error of the saved coordinates, velocities and internal states, relative to the largest of each
-        kind: in units of the system's size, or of a state's typical size, so that metres and radians compare.
+        """The largest error of the saved coordinates, velocities and internal states, relative to the largest value of
+        each kind. Units are the system's size or a state's typical size, so that metres and radians compare.
         """
         return _largest_error(self.motion)
 

@@ -97,7 +97,7 @@ class BodySet(eqx.Module):
         return rates
 
     def normalize(self, q: Coordinates) -> Float[Array, "nq"]:
-        """Coordinates in space with Euler parameters of length one, and with counts of turns."""
+        """Coordinates in space with Euler parameters of length one, and with exact counts of turns."""
         q = self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
         for g in self.turn_counts:
             # A count of turns does not depend on the time.
@@ -164,7 +164,7 @@ class BodySet(eqx.Module):
     # Inertia and forces
 
     def inertia(self, of_scalars: Sequence[tuple[np.ndarray, Array]]) -> AbstractInertia:
-        """M, from the bodies and pairs `of_scalars`: numbers of scalar coordinates, and their inertias."""
+        """M, from the bodies and pairs `of_scalars`: indices of scalar coordinates, and their inertias."""
         if self.layout.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.moments_of_inertia)
         mass = self._masses_of_coordinates(of_scalars)

@@ -66,7 +66,7 @@ class ConstraintSet(eqx.Module):
 
     @property
     def scalar_inertias(self) -> list[tuple[np.ndarray, Array]]:
-        """Pairs for each group with moving scalar coordinates: the coordinates' numbers, and their inertias."""
+        """Pairs for each group with moving scalar coordinates: the coordinates' indices, and their inertias."""
         # No force changes the velocity of a friction mode, so any inertia will do.
         modes = [
             (g.group.body_index[:, k], jnp.ones_like(g.group.part.coefficient))

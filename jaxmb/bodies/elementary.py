@@ -39,7 +39,7 @@ class Listed(NamedTuple):
     """One element of stacked joints of one type.
 
     **Fields:** the `element`, with a leading axis for the joints on its vectors; `bodies` of the joints, (joints, 2);
-    `rows`: the number of the element's first row in each joint.
+    `rows`: for each joint, the index of the element's first row.
     """
 
     element: Element
@@ -54,7 +54,7 @@ class Places:
     **Fields:** `of_vectors`: the body of each vector; `pairs`: bodies A and B of all points that coincide, then of all
     products; `between`: the two bodies that an element's vector connects, the ground twice without such a vector;
     `with_x`: which products have a vector X; `with_points`: which products have a vector between points; `order`: the
-    permutation of rows into the joints' order; `ground`: the number of the ground.
+    permutation of rows into the joints' order; `ground`: the index of the ground.
     """
 
     key: Any
@@ -314,7 +314,7 @@ def is_elementary(group: AbstractConstraintGroup) -> bool:
 def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> ElementaryRows | None:
     """The rows of the elementary groups in `groups`; None without such groups.
 
-    **Arguments:** `ground`: the number of the ground.
+    **Arguments:** `ground`: the index of the ground.
     """
     listed = _listed(groups)
     return stacked(listed, ground, groups[0].group.layout.space.dimension) if listed else None

@@ -22,8 +22,8 @@ from .groups import Acting, BodyPoses, ForceGroup, Kinematics, joined
 class StateField(NamedTuple):
     """An internal state of stacked parts.
 
-    **Fields:** the number of the `group`; the field's `name`, and the `keys` that lead to it; names of the parts,
-    `members`; the state's `shape` in one part; `start`: the index in z of the first part's state.
+    **Fields:** `group`: the index of the group; the field's `name`, and the `keys` that lead to it; `members`: names of
+    the parts; the state's `shape` in one part; `start`: the index in z of the first part's state.
     """
 
     group: int

@@ -32,7 +32,7 @@ BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 # For more parts than this, `given_in_time` gives one combination of the parts' functions of time.
 _MOST_OF_TIME = 32
 
-# Wrenches of parts, shape (parts, k, v), and the numbers of the loaded bodies, shape (parts, k).
+# Wrenches of parts, shape (parts, k, v), and the indices of the loaded bodies, shape (parts, k).
 Acting: TypeAlias = tuple[Float[Array, "parts k v"], np.ndarray]
 
 
@@ -47,8 +47,8 @@ class Kinematics(NamedTuple):
 class Input(eqx.Module):
     """A parameter of stacked parts that is a function of time, or several functions of one kind.
 
-    **Fields:** the `signal`; `names` of the parameters; `keys` that lead to the parameter in a part; the numbers of the
-    parts, `members`; `moves`: whether the parameter moves points, axes or joints, so that its rate counts too.
+    **Fields:** the `signal`; `names` of the parameters; `keys` that lead to the parameter in a part; `members`: indices
+    of the parts; `moves`: whether the parameter moves points, axes or joints, so that its rate counts too.
     """
 
     signal: AbstractSignal
@@ -76,7 +76,7 @@ class Input(eqx.Module):
         return member == self.members[0] if len(self.members) == 1 else self._entry(True, False, member)
 
     def _entry(self, of_members, of_others, member):
-        """`of_members[k]` for member number k, `of_others` for other parts; their large indices are clipped."""
+        """`of_members[k]` if `member` is `members[k]`, `of_others` for other parts; larger indices are clipped."""
         entries = np.full(max(self.members) + 2, of_others)
         entries[list(self.members)] = of_members
         return jnp.asarray(entries).at[member].get(mode="clip", wrap_negative_indices=False)
@@ -101,7 +101,7 @@ class Group(eqx.Module):
     **Fields:** `part`: the structure of one part, with a leading axis on every number; `names` and `bodies` of the
     parts; the `layout`; `inputs`, which replace numbers by functions of time; `inner`: for parts within the parts, the
     keys that lead there and the inner parts' names; `kernels` of a user's class by name, captured when the scene was
-    compiled; `chosen`: the numbers of the parts, None for all parts.
+    compiled; `chosen`: the indices of the parts, None for all parts.
     """
 
     part: Any
@@ -114,7 +114,7 @@ class Group(eqx.Module):
     chosen: Int[Array, "parts"] | None = None
 
     def only(self, member: Any) -> Self:
-        """The group of one part, whose number may be traced. `names` and `bodies` still list all parts."""
+        """The group of one part, whose index may be traced. `names` and `bodies` still list all parts."""
         part = jax.tree.map(lambda leaf: leaf[member][None], self.part)
         return dataclasses.replace(self, part=part, chosen=jnp.asarray(member)[None])
 
@@ -127,7 +127,7 @@ class Group(eqx.Module):
         return jax.vmap(single)(members, self.part, *per_part)
 
     def kernel(self, name: str) -> Callable[..., Any]:
-        """A kernel as a function of one part and of the arguments after `space`; without arguments a property."""
+        """A kernel as a function of one part and of the arguments after `space`; without arguments it is a property."""
         space = self.layout.space
         plain = lambda part, *arguments: getattr(part, name)(space, *arguments) if arguments else getattr(part, name)
         return dict(self.kernels).get(name, plain)
@@ -179,7 +179,7 @@ def stack(
 ) -> tuple[Group, ...]:
     """Group parts that share type, static fields and shapes, in order of first appearance.
 
-    **Arguments:** `parts` with the numbers of their bodies; `check(part, space, bodies)`: called for the first part of
+    **Arguments:** `parts` with the indices of their bodies; `check(part, space, bodies)`: called for the first part of
     each group, since all parts of a group share their functions.
     """
     groups: dict[Any, list] = {}
@@ -233,7 +233,7 @@ class AbstractGroup(eqx.Module):
         return self.group.part.named(name)
 
     def only(self, member: Any) -> Self:
-        """The group of one part, whose number may be traced."""
+        """The group of one part, whose index may be traced."""
         rest = jax.tree.map(lambda leaf: leaf[member][None], dataclasses.replace(self, group=None))
         return dataclasses.replace(rest, group=self.group.only(member))
 
@@ -244,7 +244,7 @@ class AbstractGroup(eqx.Module):
     def given_in_time(self, now: Kinematics) -> Float[Array, "n"]:
         """Values of the parts' functions of time while nothing moves.
 
-        Of many parts a combination, with random weights so that no two values cancel.
+        Many parts give a combination of their values, with random weights so that no two values cancel.
         """
         given = self._of_motion("given_in_time", now)
         parts = given.shape[0]

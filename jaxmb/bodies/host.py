@@ -195,7 +195,7 @@ class HostScene(AbstractHost):
         return self.normalize(q + self.along(q, step))
 
     def holds(self, q):
-        """Whether the constraints hold, without a joint that is half a turn away from closing."""
+        """Whether the constraints hold, and no joint is half a turn away from closing."""
         if not super().holds(q):
             return False
         poses, direction = self._prepared(q), self._layout.space.direction
@@ -211,7 +211,9 @@ def _flat(pieces):
 
 
 def host_scene(system: Any, t: Any) -> HostScene | None:
-    """The constraints of a system in NumPy; None for a system without constraints, or with many."""
+    """The constraints of a system in NumPy; None without constraints or with many, with counts of turns, and in single
+    precision.
+    """
     small = 0 < system.acceleration_rows <= MOST and system.nq <= MOST and system.guess.q.dtype == np.float64
     return HostScene(system, t) if small and not system.bodies.turn_counts else None
 

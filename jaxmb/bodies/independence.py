@@ -25,7 +25,7 @@ _NEGLIGIBLE = 1e-6
 
 
 class JointRows(NamedTuple):
-    """A constraint of one kernel: its bodies, the number of its `first` row in A, and the number of its `rows`."""
+    """A constraint of one kernel: its bodies, the index of its `first` row in A, and its count of `rows`."""
 
     bodies: tuple[int, ...]
     first: int
@@ -33,14 +33,14 @@ class JointRows(NamedTuple):
 
     @property
     def numbers(self) -> Int[np.ndarray, "rows"]:
-        """The numbers of its rows in A."""
+        """The indices of its rows in A."""
         return np.arange(self.first, self.first + self.rows)
 
 
 class Subset(NamedTuple):
-    """Rows of A that depend on each other only, in columns that determine their rank.
+    """A group of rows of A that depend only on each other, in columns that determine their rank.
 
-    **Fields:** numbers of the `parts`; `rows` and `columns` of A; `kept`: independent rows, low levels first;
+    **Fields:** indices of the `parts`; `rows` and `columns` of A; `kept`: independent rows, low levels first;
     `dropped`: the remaining rows; `is_sparse`: whether the rows are too many for dense matrices; `shares` of kept rows
     in dropped rows.
     """
@@ -74,7 +74,7 @@ class JointBlocks(NamedTuple):
     scale: Float[np.ndarray, "nu"]
 
     def dense(self, numbers: Sequence[int], columns: Int[np.ndarray, "n"]) -> Float[np.ndarray, "m n"]:
-        """The rows of the parts with these `numbers`, in some `columns`, as a dense matrix."""
+        """The rows of the parts with indices `numbers`, in some `columns`, as a dense matrix."""
         out = np.zeros((sum(self.parts[p].rows for p in numbers), columns.size), self.scale.dtype)
         row = 0
         for p in numbers:
@@ -156,7 +156,7 @@ class JointBlocks(NamedTuple):
         return frozenset(out)
 
     def _alike(self, numbers):
-        """For each shape of blocks the parts' numbers, bodies (parts, k), and blocks (parts, rows, k, v)."""
+        """For each shape of blocks the parts' indices, bodies (parts, k), and blocks (parts, rows, k, v)."""
         groups: dict[tuple[int, ...], list[int]] = {}
         for p in numbers:
             groups.setdefault(self.blocks[p].shape, []).append(p)
@@ -170,7 +170,7 @@ class JointBlocks(NamedTuple):
     def _regular_parts(self, held):
         """Parts whose rows are all independent while one body is held: `dense_pivots` of many matrices at once.
 
-        **Arguments:** `held`: the held body of each part, by the part's number.
+        **Arguments:** `held`: the held body of each part, by the part's index.
         """
         out = set()
         of_bodies = np.append(self.scale, 0.0)[np.minimum(self.layout.velocity_index, self.layout.nu)]

@@ -25,8 +25,8 @@ ORDERS = ("", "_rate", "_acceleration")
 class JointCoordinate(NamedTuple):
     """A coordinate of a joint.
 
-    **Fields:** the number of the joint's `group`; the joint's number in the group, `member`; the name within the joint,
-    `field`; the `shape`; `periodic`: whether the coordinate is an angle known up to full turns.
+    **Fields:** `group`: the index of the joint's group; `member`: the joint's index in the group; `field`: the name
+    within the joint; the `shape`; `periodic`: whether the coordinate is an angle known up to full turns.
     """
 
     group: int
@@ -57,8 +57,8 @@ def joint_coordinates(
 def joint_measures(coordinates: Mapping[str, JointCoordinate]) -> dict[str, Measure]:
     """Coordinates of joints, their rates and accelerations, as quantities of a motion.
 
-    Angles known up to full turns are unwrapped: of all possible changes in an interval, the nearest to the trapezoidal
-    rule of the rate counts.
+    Angles known up to full turns are unwrapped: the change in an interval is the possible change nearest to the
+    trapezoidal rule of the rate.
     """
     out = {}
     for name, coordinate in coordinates.items():

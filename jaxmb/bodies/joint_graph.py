@@ -49,7 +49,7 @@ def elimination_order(system: Any, left_out: tuple[int, ...], absolute: frozense
 def joint_order(system: Any, left_out: tuple[int, ...] = (), absolute: frozenset[int] = frozenset()) -> JointOrder:
     """The order of elimination of a scene's joints.
 
-    **Arguments:** `left_out`: rows of A that are not eliminated, such as implied rows; `absolute`: numbers of parts
+    **Arguments:** `left_out`: rows of A that are not eliminated, such as implied rows; `absolute`: indices of parts
     that bind bodies to the world, not only to each other.
     """
     parts = tuple((g.group.bodies, g.rows) for g in system.constraints.groups)
@@ -154,9 +154,10 @@ def _nodes(joints, of_body, hubs, below, size):
 
 
 def _gram(joints, of_body, hubs, nodes, most):
-    """Pairs of blocks, by joint and body raveled, whose products make up the Gram matrix, and their places in it.
+    """Pairs of blocks whose products make up the Gram matrix, and the places of the products in it.
 
-    Also the blocks of joints on hubs, and their places. Places are numbers of stored blocks.
+    Also the blocks of joints on hubs, and their places. Indices of blocks are by joint and body, raveled; places are
+    indices of stored blocks.
     """
     stored = {pair: k for k, pair in enumerate(zip(nodes.row.tolist(), nodes.column.tolist(), strict=True))}
     block = lambda joint, body: joint * most + joints[joint][0].index(body)
@@ -178,7 +179,7 @@ def _gram(joints, of_body, hubs, nodes, most):
 
 
 def _merged(parts, ground):
-    """Joints as moving bodies and numbers of parts; a joint takes parts of the same bodies while their rows fit in."""
+    """Joints as moving bodies and indices of parts; a joint takes parts of the same bodies while their rows fit in."""
     widest = max(rows for _, rows in parts)
     joints: list[tuple[tuple[int, ...], list[int]]] = []
     open_joints: dict[frozenset[int], int] = {}

@@ -15,7 +15,7 @@ class Layout:
     """Bodies in order, each with contiguous entries in q and u; then scalar coordinates; then the ground.
 
     A body that does not rotate (a point mass) has translations only; the rest of its pose is constant. A scalar
-    coordinate is like a body with the first entry of the pose only and, if it moves, of the velocity.
+    coordinate has only the first entry of a pose and, if it moves, the first entry of a velocity.
     """
 
     space: AbstractSpace
@@ -28,7 +28,7 @@ class Layout:
 
     @property
     def ground(self) -> int:
-        """The number of the ground, equal to the count of bodies and scalar coordinates."""
+        """The index of the ground, equal to the count of bodies and scalar coordinates."""
         return len(self.rotates) + len(self.scalars)
 
     @property
@@ -37,7 +37,7 @@ class Layout:
         return self.space.dimension == 3
 
     def is_place(self, numbers: Sequence[int]) -> np.ndarray:
-        """Which numbers belong to bodies or the ground, not to scalar coordinates."""
+        """Which indices belong to bodies or the ground, not to scalar coordinates."""
         index = np.array(numbers)
         return (index < self.bodies) | (index == self.ground)
 
@@ -48,7 +48,7 @@ class Layout:
 
     @functools.cached_property
     def turning(self) -> list[int]:
-        """Numbers of the bodies with Euler parameters: in space all bodies that rotate."""
+        """Indices of the bodies with Euler parameters: in space all bodies that rotate."""
         return [k for k, rotates in enumerate(self.rotates) if rotates and self.spatial]
 
     @functools.cached_property

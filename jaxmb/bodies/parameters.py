@@ -37,8 +37,8 @@ _GROUPS = (
 class StackedNumber(NamedTuple):
     """A parameter in a group of stacked parts.
 
-    **Fields:** `name`; the `path` of the groups in the system; the number of the `group`; `keys` that lead to the
-    parameter in a part; the part's number, `member`; the field as `declared`.
+    **Fields:** `name`; the `path` of the groups in the system; `group`: the index of the group; `keys` that lead to the
+    parameter in a part; `member`: the index of the part; the field as `declared`.
     """
 
     name: str
@@ -162,7 +162,7 @@ def _accessor(path: str, group: int, keys: tuple[str, ...]):
 def _inputs(
     groups: Mapping[str, Sequence[Any]], signals: Mapping[str, AbstractSignal]
 ) -> dict[tuple[str, int], list[Input]]:
-    """Parameters that are functions of time, by the path and the number of their group.
+    """Parameters that are functions of time, by the path and the index of their group.
 
     **Raises:** `ValueError` for a parameter that must be constant, and for a jump in a position constraint.
     """

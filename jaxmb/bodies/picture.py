@@ -69,7 +69,7 @@ def _pictured(group):
 
 
 def _shapes(part, space, width):
-    """The shapes of a part in the frames of their bodies, each with the number of its body."""
+    """The shapes of a part in the frames of their bodies, each with the index of its body within the part."""
     for k, shape in part.shapes(space, width):
         frame = part.body_frames.get(str(k))
         rest = np.asarray(space.ground)

@@ -19,8 +19,8 @@ from .groups import AbstractGroup, Group
 class Place(NamedTuple):
     """The place of a part among groups.
 
-    **Fields:** the number of the `group`; the part's number in the group, `member`; the position of its `last` moving
-    body; `on_bodies`: which of its bodies are not scalar coordinates.
+    **Fields:** `group`: the index of the group; `member`: the part's index in the group; `last`: the index of its last
+    moving body in the part; `on_bodies`: which of its bodies are not scalar coordinates.
     """
 
     group: int

@@ -236,7 +236,7 @@ class Scene(eqx.Module):
 
 
 def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int], dict[str, tuple[int, ...]]]:
-    """The layout; numbers of bodies and ground by name; numbers of the scalar coordinates of parts by name."""
+    """The layout; indices of bodies and ground by name; indices of the scalar coordinates of parts by name."""
     joints = {part.name: part for part in scene.joints}
     links = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractLink)]
     scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
@@ -278,7 +278,7 @@ def _scalars(system):
 
 
 def _settled(scene: Scene, resolved: KnownParts, layout: Layout):
-    """Parts and laws of joints with every number resolved, each with the numbers of its bodies; and gravity."""
+    """Parts and laws of joints with every number resolved, each with the indices of its bodies; and gravity."""
     parts, laws = [], []
     acting = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractActor)]
     # Gravity acts on every body, so it is not an actor on named bodies.
@@ -383,7 +383,7 @@ def _check_names(scene: Scene):
             for name in part.sources:
                 if name in body_names and name not in allowed and not part.takes_bodies:
                     raise ValueError(
-                        f"{part.label}: {name!r} is no joint; it acts on joints, and there are "
+                        f"{part.label}: {name!r} is not a joint; the part acts on joints, and there are "
                         f"{', '.join(map(repr, joints)) or 'none'}."
                     )
                 if isinstance(part, AbstractNonIdeal | AbstractDryFriction) and name in stops:
@@ -421,7 +421,7 @@ def _check_rotation(part, components, bodies, layout, poses):
 def _loaded(part):
     """The part with unit values for zero forces and moments, since inputs may replace them.
 
-    So do zeros among the parameters of a user's function.
+    Zeros among the parameters of a user's function become ones too.
     """
     filled = lambda x: np.ones_like(x) if isinstance(x, ARRAYS) and not np.any(x) else x
     ones = {}
@@ -446,7 +446,7 @@ def _turned(part, space, poses, kernels):
 
     def turned(poses):
         strength = _strength(part, space, poses, varied(space.velocity_size))
-        # The length of an arm that is due to rounding.
+        # Arms up to this length are rounding errors.
         least = 100 * float(np.finfo(poses.dtype).eps) * jnp.max(jnp.abs(poses[:, :d]))
         return jnp.any(strength[:, d:] > least * jnp.max(strength[:, :d]), axis=1)
 
@@ -469,7 +469,7 @@ def _inner(part):
 
 
 def _length(parts, guess, layout):
-    """The scene's size [m]: the largest arm of a joint or distance between neighbours."""
+    """The scene's size [m]: the largest length of a part, else the largest coordinate of a given position, else 1."""
     lengths = (
         values[name]
         for part in parts

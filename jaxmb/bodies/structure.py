@@ -183,7 +183,7 @@ def _asked(system, q):
 
 
 def _motions_as_one(layout, q):
-    """Velocities in translations and rotations of all bodies as one, with zeros for scalar coordinates and ground."""
+    """Velocities as all bodies translate or rotate as one rigid body; zeros for scalar coordinates and ground."""
     poses: Any = np.append(q, layout.space.ground)[layout.pose_index[: layout.bodies]]
     d = layout.space.dimension
     moved = np.tile(np.eye(d, layout.space.velocity_size)[:, None], (1, len(poses), 1))
@@ -263,7 +263,7 @@ def _check_locked(system, joints, subsets):
 
 
 def _connected(system, parts):
-    """Sets of bodies that position constraints connect without the ground, with their parts; no sets with a driver."""
+    """Sets of bodies that position constraints connect, the ground left out, with their parts; none with a driver."""
     ground = system.layout.ground
     rheonomic = [moving for g in system.constraints.position for moving in [g.rheonomic] * len(g.group.bodies)]
     moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]
@@ -294,7 +294,7 @@ def _check_determined(system, implied):
             if involved:
                 raise ValueError(
                     f"{g.group.part.kind} {name!r} needs the force of {joint!r}, which is not determined: "
-                    f"rows of {', '.join(sorted(involved))} imply one another. Remove the redundant ones."
+                    f"rows of {', '.join(sorted(involved))} imply one another. Remove redundant joints."
                 )
 
 

@@ -1,5 +1,4 @@
-"""Laws of dry friction beside the laws of contacts, of which some hold: contacts that are closed, friction that sticks
-or slips in a direction.
+"""Which laws of contacts and dry friction hold: contacts that are closed, friction that sticks or slips in a direction.
 
 Source: F. Pfeiffer and Ch. Glocker, "Multibody Dynamics with Unilateral Contacts", Wiley, 1996, §6.3.
 """
@@ -16,10 +15,10 @@ from ..linalg.complementarity import PIVOT, lemke, scale_of
 class Dry(NamedTuple):
     """Laws of dry friction beside the laws of contacts.
 
-    **Fields:** `contact_of`: the number of the contact of each law, -1 for friction with its own normal force; `pairs`:
-    the numbers of the first of two successive laws, for friction in two directions; the `coefficient`; `slips`: 1 or -1
-    where it slips, for pairs the components of a unit vector, and 0 where it may stick; the `bound` of the force, to
-    which the contact's bound is added.
+    **Fields:** `contact_of`: the index of each law's contact, -1 for friction with its own normal force; `pairs`: the
+    index of the first of two successive laws, for friction in two directions; the `coefficient`; `slips`: 1 or -1 where
+    friction slips, for pairs the components of a unit vector, and 0 where it may stick; `bound`: the limit of the force
+    without its contact, which adds `coefficient` times its own force.
     """
 
     contact_of: tuple[int, ...]
@@ -104,7 +103,7 @@ def laws_of(
     """The matrix and the right-hand side of the linear equations for the forces, or impulses, x of contacts and
     friction, given which laws hold; differentiable.
 
-    **Arguments:** see `frictional`; of `dry` the coefficients and bounds of slip.
+    **Arguments:** see `frictional`; `dry` has the coefficients and bounds of slip.
     """
     m = len(dry.contact_of)
     n = b.size - m

@@ -49,12 +49,17 @@ class Event(NamedTuple):
     impacts = [(event.time, event.part, event.impulse) for event in motion.events if event.kind == "impact"]
     ```
 
-    **Fields:** the `time` [s]; the name of the `part`; its `kind`: `"impact"`, after which the gap opens again,
-    `"close"`, `"open"`, `"rest"`: the end of infinitely many bounces, or `"impulse"` of a contact that stays closed
-    while others strike; of friction `"stick"`, `"slip"`, or `"impact"` for an impulse alone; the `impulse` [N s, N m
-    s]; `kinetic_energy_lost` [J]: the kinetic energy that all bodies together lose at this time, the same for each
-    part. It is negative if a driver, whose speed is given, does more work at the impact than the impact dissipates.
-    `ContactEvents.kinetic_energy_lost` has one value for each time.
+    **Fields:**
+
+    - `time` [s].
+    - `part`: the name of the part.
+    - `kind`: of a contact `"impact"`, after which the gap opens again, `"close"`, `"open"`, `"rest"`: the end of
+        infinitely many bounces, or `"impulse"`: it stays closed while others strike. Of friction `"stick"`, `"slip"`,
+        or `"impact"` for an impulse alone.
+    - `impulse` [N s, N m s].
+    - `kinetic_energy_lost` [J]: the kinetic energy that all bodies together lose at this time, the same for each part.
+        It is negative if a driver, whose speed is given, does more work at the impact than the impact dissipates.
+        `ContactEvents.kinetic_energy_lost` has one value for each time.
     """
 
     time: float
@@ -77,14 +82,19 @@ class ContactEvents(eqx.Module):
     event may be the state before it or after it. Times, impulses and energies have first derivatives; `rest` counts as
     a constant.
 
-    **Fields:** the `names` of the parts, twice for friction in space, which has two directions; `contacts`: how many of
-    them, the first ones, are contacts; `times` [s], shape (events,); `impulses` [N s, of angles N m s], shape (events,
-    parts); `kinetic_energy_lost` [J], shape (events,): by all bodies at the impact, negative if a driver gave more;
-    `before` and `after`: modes. A contact has 0 if it is open, 1 if it is closed, 2 if others imply it; friction has 1
-    and -1 if it slips forwards and backwards, in space 1, 2 if it sticks, 0 if it does not act. `rest` [s], shape
-    (events, parts): the time from an event to the end of infinitely many bounces too low to be resolved, after which
-    the contact is at rest; zero without such bounces. Under `jit` or in a batch there are as many events as
-    `max_events`, with infinite times after the last.
+    **Fields:**
+
+    - `names` of the parts, contacts first; twice for friction in space, which has two directions.
+    - `contacts`: the number of contacts among `names`.
+    - `times` [s], shape (events,). Under `jit` or in a batch there are as many events as `max_events`, with infinite
+        times after the last.
+    - `impulses` [N s, of angles N m s], shape (events, parts).
+    - `kinetic_energy_lost` [J], shape (events,): by all bodies at the impact, negative if a driver gave more.
+    - `before` and `after`: modes, shape (events, parts). A contact has 0 if it is open, 1 if it is closed, 2 if others
+        imply it. Friction has 1 and -1 if it slips forwards and backwards, in space 1; 2 if it sticks, 0 if it does not
+        act.
+    - `rest` [s], shape (events, parts): the time from an event to the end of infinitely many bounces too low to be
+        resolved, after which the contact is at rest; zero without such bounces.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -139,7 +149,7 @@ class ContactEvents(eqx.Module):
     def _rows(self) -> list[Event]:
         if isinstance(self.times, Tracer) or self.times.ndim != 1:
             raise ValueError(
-                "The events of one motion are a table, those of a batch or under jit are arrays: see the fields of "
+                "The events of one motion are a table; in a batch or under jit they are arrays: see the fields of "
                 "ContactEvents."
             )
         concrete = jax.tree.map(np.asarray, self)

@@ -17,8 +17,8 @@ from ..linalg.pairs import for_both, of_pairs, placed_pairs
 from ..linalg.rotations import norm
 from .dry_laws import Answers, Dry, in_lines, laws_of
 
-# The search for directions of slip ends when they change by less than this, or after this many rounds, each with this
-# many steps of Newton's method.
+# The search for directions of slip ends when they change by less than `_TURN`, or after `_TURNS` rounds. A round has
+# `_CORRECTIONS` steps of Newton's method.
 _TURN, _TURNS, _CORRECTIONS = 1e-7, 60, 2
 # The least limit of a force across its direction, as a fraction of its limit along it.
 _ACROSS = 0.01
@@ -146,8 +146,8 @@ class SlipSearch:
         return new, answers, x, turned, count + 1
 
     def in_lines(self, e, across):
-        """The answers if pairs act along directions and across them, where the limit of the force is `across` times the
-        limit along; and the equations for the forces.
+        """The answers if pairs act along and across directions, and the equations for the forces. The limit of a force
+        across is `across` times the limit along.
         """
         n, m, dry = self.n, len(self.dry.contact_of), self.dry
         unpaired = np.diag(~np.isin(np.arange(n + m), self.both)).astype(self.W.dtype)

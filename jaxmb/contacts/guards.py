@@ -25,9 +25,8 @@ _RATE = 64
 
 
 class ContactGuards(AbstractGuards):
-    """The guards of contacts and dry friction: gaps of open contacts, in units of the system's size, and forces of
-    closed contacts, relative to the largest forces; slips, in units of the size per second, and the reserves of
-    sticking friction.
+    """The guards of contacts and dry friction. Gaps of open contacts are in units of the system's size, slips in this
+    unit per second; forces of closed contacts and reserves of sticking friction are relative to the largest forces.
 
     A gap g with a kink at its peak p counts as g (1 - g / 2p), which is smooth and the same near zero.
     """
@@ -66,8 +65,8 @@ class ContactGuards(AbstractGuards):
         return jnp.where(acts, reserves_of_active, free / system.length)
 
     def _in_plane(self, slips, modes, rates, u):
-        """The slips with the guards of slip in two directions: it has neither turned by more than 60 degrees from its
-        modes nor become slow; slip that has just begun is neither back at rest nor faster.
+        """The slips, with guards for slip in two directions: it has neither turned by more than 60 degrees from its
+        modes nor become slow. Slip that has just begun is neither back at rest nor fast enough to be followed.
         """
         system, pairs = self.system, modes.pairs
         if not pairs:

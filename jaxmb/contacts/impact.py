@@ -153,8 +153,8 @@ def _later(event: Event, at, along):
 
 
 def _release(system, tolerance, event, at, along):
-    """The derivative of the time at which a force reaches its limit. The limit is zero for a contact that opens;
-    friction that sticks begins to slip there.
+    """The derivative of the time at which a force reaches its limit: zero for a contact that opens, the limit of
+    sticking for friction that begins to slip.
     """
     (t, y), (dsystem, dt, dy) = at, along
     before, after = map(system.contacts.as_modes, event.modes)

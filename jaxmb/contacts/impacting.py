@@ -26,8 +26,8 @@ from .forces import directions, free_accelerations, friction_coefficients
 from .problem import Laws, Problem, is_implied
 from .tolerance import REST, ContactTolerance
 
-# The number of rounds of impulses and forces that decide which contacts stay closed and which friction sticks, if
-# normal forces of joints depend on the friction in them. Without such friction, low bounces decide in a second round.
+# If normal forces of joints depend on the friction in them, this many rounds of impulses and forces decide which
+# contacts stay closed and which friction sticks. Without such friction, low bounces decide in a second round.
 _ROUNDS = 4
 # Rebounds without gain of energy are found in this many trials, to this fraction of the summands of the energy.
 _TRIALS, _GAIN = 40, 1e-12
@@ -36,7 +36,7 @@ _TRIALS, _GAIN = 40, 1e-12
 class Event(NamedTuple):
     """The numbers of an event, for its derivative as well.
 
-    **Fields:** `late`: the time until then; `first`: the gap or slip that is zero first, none if `hits` is false;
+    **Fields:** `late`: the time until the event; `first`: the gap or slip that is zero first, none if `hits` is false;
     accelerations `before` and `after`; velocities before (`at`) and after (`u`); `held`: contacts whose gaps have the
     rates of the impact, and friction whose slip is zero; `low`: contacts that would bounce lower than the resolution;
     `slips`: the direction of slip in the impact, or zero; `share` of the rebounds at which no energy is gained;
@@ -144,8 +144,8 @@ class Round(NamedTuple):
     **Fields:** the `problem` of the next impulses or forces; `when` the event is; contacts that bounce too `low` to be
     resolved, and for how long (`rest`); `struck`: the impact; `answers`: the laws that hold with the `forces` after it;
     whether all problems were `solvable`; `rounds`: the number of rounds after which closed contacts and sticking
-    friction are known; the `trial` of a share of the rebounds; by Poisson's law the `compression`; `pushed`: the
-    impulses with which contacts pushed then and at least push again.
+    friction are known; the `trial` of a share of the rebounds; by Poisson's law the `compression`, and `pushed`: its
+    impulses plus the least impulses of the expansion.
     """
 
     problem: Problem
@@ -178,7 +178,7 @@ class Moves(NamedTuple):
 
     @classmethod
     def at(cls, system, t, q, u, inertia: AbstractInertia, unmet) -> "Moves":
-        """The moves at a state, whose velocities leave the rates of all rows `unmet`."""
+        """The moves at a state; `unmet`: the rates of all rows at its velocities."""
         rows, jacobian = directions(system, t, q, u)
         projector = jacobian.projector(inertia)
         # The last entry has no impulse.
@@ -193,7 +193,8 @@ class Impacting:
     """An event at a state. Each round first finds impulses, in one phase or in the two of Poisson's law, and then the
     forces after them.
 
-    The first impulse is zero, and the forces after it are the forces before the event, which determine its time.
+    In the first round the impulse is zero; its forces are the forces before the event, which determine the event's
+    time.
 
     **Fields:** `tolerance` [m, rad]; t, q and the velocities `u`; the `inertia` and the `modes` there; the `gap`s, and
     the `rates` of gaps and slips; the `moves`; the `laws`; `slow`: the velocity up to which slip in a plane has ended.
@@ -252,8 +253,8 @@ class Impacting:
         return jnp.abs(self.moves.rows) @ add_up(map(jnp.abs, velocities))
 
     def accelerated(self, u):
-        """Accelerations without contacts and friction, along coordinates and along the laws' directions; and the
-        reactions of the joints with friction, without forces along the laws and by a unit of each.
+        """Accelerations without contacts and friction, as `u̇` and along the laws' directions. Also the reactions of the
+        joints with friction: without forces along the laws, and by a unit force along each.
         """
         system, t, q = self.system, self.t, self.q
         udot, multipliers, opening = free_accelerations(system, self.formulation, self.moves.projector, t, q, u)
@@ -265,7 +266,7 @@ class Impacting:
     # The time of the event
 
     def at_event(self, before, curve) -> When:
-        """The first of the next zeros, by accelerations until then and accelerations along the directions."""
+        """The next zero of a gap or slip, by the accelerations `before` it and the accelerations along the laws."""
         n, system = self.contacts.n, self.system
         until, about_to = self.zeros(curve)
         # A zero far off in time does not count: its rates are rounding errors.
@@ -298,8 +299,9 @@ class Impacting:
         return until, jnp.concatenate([about_to, ends])
 
     def slips(self, rates, curve):
-        """Which friction may come to rest, how fast it slips, and how fast that changes, along its modes; friction in
-        two directions has these in its first number.
+        """Which friction may come to rest, its velocity of slip, and the rate of that velocity, along its modes.
+
+        Friction in two directions has these values at its first law.
         """
         modes, pairs = self.modes, self.contacts.pairs
         single = modes.slides, modes.of_friction * rates, modes.of_friction * curve
@@ -383,8 +385,8 @@ class Impacting:
         return before._replace(problem=problem, when=when)
 
     def settle(self, k, before: Round, answers, forces) -> Round:
-        """The laws that hold after an impact with their forces, and the problem of the impulses in a further round.
-        Other contacts may bounce too low there to be resolved.
+        """The laws that hold after an impact with their forces, and the problem of the impulses in a further round. In
+        that round, other contacts may bounce too low to be resolved.
         """
         struck, curve = before.struck, before.problem.free + self.influence @ forces
         low, rest = self.low_bounces(before, curve[: self.contacts.n], k == 2 * self.turns - 1)
@@ -442,7 +444,7 @@ class Impacting:
         )
 
     def goes_on(self, carry):
-        """Whether a round is not at its end, or another round follows."""
+        """Whether the round has further turns, or another round follows."""
         k, last = carry
         extra_rounds = k // self.turns - 1 - last.rounds
         return (k % self.turns != 0) | (extra_rounds < 0) | (last.trial.again & (extra_rounds < _TRIALS))
@@ -524,8 +526,8 @@ class Impacting:
         is_held = self.independent(is_held)
         cancelled = is_held & cancelled
         if m:
-            # Otherwise bodies that move side by side would approach at a rate too small, beside slips, to close their
-            # contact. Each step would end with an event.
+            # Otherwise bodies that move side by side would approach, too slowly beside slips to close their contact.
+            # Each step would then end with an event.
             drifts = jnp.pad(staying & ~is_held[:n] & ~implied & (rate[:n] < 0), (0, m))
             cancelled = self.independent(cancelled | drifts)
         return is_held, jnp.where(cancelled, solved_components(self.influence, rates_left, cancelled), 0.0)

@@ -80,8 +80,8 @@ class Phases:
         return impulses + less, change + less @ self.moves
 
     def in_one(self, bounce):
-        """The derivatives of the impulses and of the velocities at a fixed share of the rebounds, and of the impulses
-        by that share, whose rates are `bounce`.
+        """The derivatives of impulses and velocities at a fixed share of the rebounds, and the derivative of the
+        impulses by that share. `bounce`: the rates of the whole rebounds.
         """
         event = self.event
         last = Phase(event.u, event.held, event.slips, event.impulses)
@@ -110,14 +110,15 @@ class Phases:
 
     def solved(self, before, dbefore, phase: Phase, normal):
         """The derivatives of the impulses of a phase and of the velocities at its end, and the matrix of the equations
-        for the former; see `equations`.
+        for the impulses; see `equations`.
         """
         plain, matrix, right = self.equations(before, dbefore, phase, normal)
         impulses = solve(matrix, right)
         return impulses, plain + impulses @ self.moves, matrix
 
     def equations(self, before, dbefore, phase: Phase, normal):
-        """The velocities after a phase without a change of its impulses, and the linear equations for the change.
+        """The derivatives of the velocities after a phase at fixed impulses, and the linear equations for the impulses'
+        derivatives.
 
         **Arguments:** the velocities `before` the phase, and their derivative; `normal`: the changes of the normal
         impulses of contacts that are not held.

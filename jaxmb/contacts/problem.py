@@ -31,9 +31,9 @@ _CORRECTIONS = 6
 class Problem(NamedTuple):
     """The unknown impulses, or forces.
 
-    **Fields:** `free`: the rates or accelerations along the directions of the laws without them; `among`: the laws that
-    may have any; of friction see `Dry`; `reactions` of the joints with friction, without forces along the laws and by a
-    unit of each, None without such friction.
+    **Fields:** `free`: the rates or accelerations along the laws without the unknowns; `among`: the laws that may have
+    any; `coefficient`, `slips` and `bound`: see `Dry`; `reactions` of the joints with friction, without forces along
+    the laws and by a unit force along each, None without such friction.
     """
 
     free: Float[Array, "laws"]
@@ -68,16 +68,16 @@ class Laws(NamedTuple):
     def of_impulses(self, approach, touching, reactions) -> Problem:
         """The impulses of contacts that are `touching`.
 
-        Friction in joints has no impulse, and needs no `reactions`, which are zeros of their shape.
+        Friction in joints has no impulse; the problem has zeros in place of the `reactions`.
 
-        **Arguments:** `approach`: the rates before the impact, plus the rates of restitution.
+        **Arguments:** `approach`: the rates before the impact, minus the rates of the rebounds.
         """
         reactions = jax.tree.map(jnp.zeros_like, reactions)
         none, may = jnp.zeros(self.contacts.m, approach.dtype), self._may(touching) & ~self.contacts.in_joints
         return Problem(approach, jnp.concatenate([touching, may]), self.coefficient, none, none, reactions)
 
     def of_expansion(self, free, again, touching, reactions) -> Problem:
-        """The impulses in an expansion, besides the impulses with which contacts push `again` at least.
+        """The impulses in an expansion, beyond the least normal impulses `again`.
 
         **Arguments:** `free`: the rates at the end of compression.
         """
@@ -91,8 +91,8 @@ class Laws(NamedTuple):
     def of_forces(self, opening, reactions, staying, slips, modes, forces) -> Problem:
         """The forces after an event, of contacts that are `staying`, and of friction.
 
-        **Arguments:** `opening`: the accelerations without them; `slips`: the direction of slip, zero where friction
-        may stick; `forces`: approximate ones, on which the normal forces of joints depend.
+        **Arguments:** `opening`: the accelerations without these forces; `slips`: the direction of slip, zero where
+        friction may stick; `forces`: approximate forces, by which the normal forces of joints are found.
         """
         # Friction that has just reached its limit is beyond it, up to the resolution of the search for laws.
         limit = self.limit * jnp.where(modes.sticks, 1 - _REACHED, 1 + _HELD)

@@ -11,15 +11,15 @@ from ..system.equation import AbstractEquation
 REST = 1e-9
 # Multiples of the gap that counts as zero: see the members of `ContactTolerance`.
 _NEAR, _BOUNCE, _FAR = 1e2, 1e3, 1e6
-# Slip in two directions, whose direction is undefined at rest, ends at this multiple of it per second: larger errors of
-# integration turn slower slips.
+# Slip in two directions, whose direction is undefined at rest, ends at this multiple of that gap per second: slower
+# slips are turned more by errors of integration.
 _SLOW = 1e4
 
 
 class ContactTolerance(eqx.Module):
-    """The sizes of gaps and slips that count as zero at an event, all multiples of one.
+    """The sizes of gaps and slips that count as zero at an event, all multiples of `touch`.
 
-    **Fields:** `touch`: gaps down to minus this count as zero, in units of the system's size, or in metres and radians
+    **Fields:** `touch`: gaps down to `-touch` count as zero, in units of the system's size, or in metres and radians
     (`in_metres`).
     """
 

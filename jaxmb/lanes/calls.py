@@ -1,10 +1,10 @@
-"""Equations of a program that only call another one."""
+"""Equations of a program that only call another program."""
 
 from typing import Any
 
 from .._compat import ClosedJaxpr
 
-# The parameter that holds the called program, by the names of the equations. (JAX 0.9 to 0.12.)
+# The parameter that holds the called program, by the name of the primitive. (JAX 0.9 to 0.12.)
 _PROGRAMS = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
@@ -13,7 +13,7 @@ _PROGRAMS = {
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
     "checkpoint": "jaxpr",
-    # Functions with a rule for batches of their own.
+    # Functions with their own rule for batches.
     "custom_vmap_call": "call",
 }
 

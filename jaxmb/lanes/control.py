@@ -33,7 +33,7 @@ def _cond(lanes, equation, values):
 
 
 def _of_some(lanes, program, takes, operands, other):
-    """The outputs of a program for the members that take it, one after the other, and the `other` ones else."""
+    """The outputs of a program for members that take it, one after the other, and the `other` outputs elsewhere."""
 
     def of_next(carry):
         left, out = carry

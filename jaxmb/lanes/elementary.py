@@ -1,6 +1,6 @@
 """Sine, cosine and powers by operations that the compiler vectorises, in double precision.
 
-The library's functions are called for one number after the other.
+The library's functions compute one number at a time.
 """
 
 import math
@@ -16,7 +16,7 @@ _HALF_PI = Fraction("1.570796326794896619231321691639751442098584699687552910487
 
 
 def _in_parts(number: Fraction, bits: tuple[int, ...]) -> tuple[float, ...]:
-    """A number as a sum: parts with so many bits behind the point, and the rest."""
+    """A number as a sum of parts with these numbers of bits behind the binary point, and the rest."""
     parts = []
     for count in bits:
         part = Fraction(round(number * 2**count), 2**count)
@@ -45,7 +45,7 @@ def _where_small(x, of_small, of_any):
 
 
 def _sin_cos(x):
-    """By Taylor's series of the rest beside the nearest multiple of π/2, to three units in the last place."""
+    """By Taylor's series of the distance from the nearest multiple of π/2, to three units in the last place."""
     quarter = lax.round(x * float(1 / _HALF_PI), lax.RoundingMethod.TO_NEAREST_EVEN)
     rest = x
     for part in _PARTS:
@@ -61,7 +61,7 @@ def _sin_cos(x):
 
 
 def power(x: Any, y: Any) -> Any:
-    """`x ** y`, to 1e-14 of it."""
+    """`x ** y`, with a relative error of 1e-14."""
     normal = (x >= jnp.finfo(x.dtype).tiny) & jnp.isfinite(x)
     exponent = y * _log(jnp.where(normal, x, 1.0))
     plain = jnp.all(normal & (jnp.abs(exponent) < _LARGEST_EXPONENT))
@@ -81,7 +81,7 @@ def _log(x):
 
 
 def _exp(x):
-    """The exponential of numbers that leave it far from overflow."""
+    """The exponential of numbers for which it is far from overflow."""
     n = lax.round(x / math.log(2), lax.RoundingMethod.TO_NEAREST_EVEN)
     rest = (x - n * _LOG_2[0]) - n * _LOG_2[1]
     scale = lax.bitcast_convert_type((n.astype(jnp.int64) + 1023) << 52, jnp.float64)

@@ -40,8 +40,8 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 class Lanes(NamedTuple):
     """How a program is evaluated.
 
-    **Fields:** the number of members, `size`; whether branches are `rare`: of a condition with a branch that does
-    nothing the members that take the other one are computed alone.
+    **Fields:** `size`: the number of members; `rare`: whether, in a condition with a branch that does nothing, members
+    that take the other branch are computed one after the other.
     """
 
     size: int
@@ -55,7 +55,7 @@ class Lanes(NamedTuple):
         return lax.broadcast_in_dim(array, (*array.shape, self.size), tuple(range(array.ndim)))
 
     def outputs(self, program: Any, values: list[Value], varies: list[bool]) -> list[Any]:
-        """The arrays of the outputs of a closed program, with members where they are said to vary."""
+        """The arrays of the outputs of a closed program, with members in the outputs marked by `varies`."""
         out = self.run(program, values)
         return [self.spread(x) if spread else x.array for x, spread in zip(out, varies, strict=True)]
 
@@ -89,7 +89,7 @@ _LOOPS = ("while", "scan", "cond")
 
 
 def by_vmap(lanes, equation, values):
-    """An equation without a rule: a primitive of ours by its equations, one of JAX by its rule for batches."""
+    """An equation without a rule: JAX's own primitive by its rule for batches, any other by its equations."""
     if not is_of_jax(equation.primitive):
         like = [like_of(atom.aval) for atom in equation.invars]
         return lanes.run(jax.make_jaxpr(lambda *x: equation.primitive.impl(*x, **equation.params))(*like), values)
@@ -112,8 +112,8 @@ def apart(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def in_lanes(program: Any, size: int) -> Callable[..., list[Any]]:
-    """A closed program of one member as a function of arrays with `size` members along their last axis, whose results
-    have them there as well.
+    """A closed program of one member, as a function of arrays with `size` members along their last axis. Results have
+    members along their last axis as well.
     """
 
     def of_members(*arrays):

@@ -9,7 +9,7 @@ from jax import lax
 
 from .evaluate import apart, by_vmap, rule
 
-# Of a table of up to so many rows a row is selected; of a larger one it is gathered.
+# Rows of tables of at most this many rows are selected; rows of larger tables are gathered.
 _SELECTED = 8
 _MODE = lax.GatherScatterMode
 
@@ -43,7 +43,7 @@ def _dynamic_slice(lanes, equation, values):
 
 
 def _starts(indices):
-    """Indices that members share, with the first one of the members."""
+    """Start indices that members share, followed by zero for the axis of the members."""
     start = [jnp.asarray(index.array) for index in indices]
     return [*start, jnp.zeros((), start[0].dtype)]
 
@@ -67,8 +67,8 @@ def _dynamic_update_slice(lanes, equation, values):
 
 
 def _written(lanes, table, part, places):
-    """A large table with the part of each member written at its place, if that is in the table. The loop writes into
-    the table, which is not copied.
+    """A large table with the part of each member written at its place, if this place is in the table. The loop does
+    not copy the table.
     """
     largest = [n - k for n, k in zip(table.shape[:-1], part.shape[:-1], strict=True)]
 
@@ -84,7 +84,7 @@ def _written(lanes, table, part, places):
 
 
 def _at(places: dict[int, Any], shape: tuple[int, ...]) -> Any:
-    """Where an array has the indices of each member along some axes."""
+    """A mask of the entries at each member's indices along some axes."""
     mask = jnp.ones(shape, bool)
     for axis, place in places.items():
         place = lax.broadcast_in_dim(place, shape, (len(shape) - 1,) * place.ndim)
@@ -124,7 +124,7 @@ def _entries_of_members(table, *places):
 
 
 def _selected_rows(lanes, equation, table, index):
-    """Rows of a small table, (*batch, members) of them, by selection."""
+    """Rows of a small table, by selection; `index`: shape (*batch, members)."""
     params, (batch, size) = equation.params, (index.shape[:-1], lanes.size)
     numbers, mode = params["dimension_numbers"], params["mode"]
     (axis,) = map(int, numbers.start_index_map)
@@ -139,14 +139,14 @@ def _selected_rows(lanes, equation, table, index):
         out = jnp.where(place == k, row(k), out)
     if mode == _MODE.FILL_OR_DROP:
         out = jnp.where((place >= 0) & (place < len(table)), out, _filling(params["fill_value"], out.dtype))
-    # Axes of the rows stand where the gather puts them.
+    # The order of axes is that of the gather.
     of_batch, of_rest = iter(range(len(batch))), iter(range(len(batch), count))
     order = [next(of_rest if k in numbers.offset_dims else of_batch) for k in range(count)]
     return lax.transpose(out, (*order, count))
 
 
 def _filling(given, dtype):
-    """The value outside of a table, as JAX has it."""
+    """JAX's value for entries outside of a table."""
     if given is not None:
         return jnp.asarray(given, dtype)
     if jnp.issubdtype(dtype, jnp.inexact):

@@ -1,4 +1,4 @@
-"""Rules of operations element by element, and of those that move elements."""
+"""Rules of elementwise operations, and of operations that move elements."""
 
 import jax.numpy as jnp
 from jax import lax
@@ -84,7 +84,7 @@ _ELEMENTWISE = [
     "nonbatchable",
     "nontraceable",
 ]
-# Library functions of double precision that have a form which vectorises.
+# Functions that have a vectorised form in double precision.
 _BY_OPERATIONS = {"sin": elementary.sin, "cos": elementary.cos, "pow": elementary.power}
 
 
@@ -115,7 +115,7 @@ def _elementwise(lanes, equation, values):
 def _select_if_vmap(lanes, equation, values):
     condition, *cases = values
     if not condition.varies:
-        # The second one is that of members that have ended, of which there are none.
+        # The second case is for members that have ended; there are none.
         return [cases[0]]
     return jnp.where(condition.array, *map(lanes.spread, cases))
 

@@ -8,8 +8,8 @@ from jax import lax
 
 from .evaluate import apart, rule
 
-# Sums of more terms are called in parts: LLVM does not vectorise longer ones. Reductions of more than the second number
-# are those of XLA, and searches of more than the third.
+# Sums of more than `_TERMS` terms are called in parts, since LLVM does not vectorise them. XLA's own operations compute
+# reductions of more than `_REDUCED` entries, and searches and cumulative sums of more than `_SEARCHED`.
 _TERMS, _REDUCED, _SEARCHED = 16, 16, 64
 _OPERATIONS = {
     "reduce_sum": lax.add,
@@ -68,7 +68,7 @@ def _position(lanes, equation, values):
     for k, entry in enumerate(others, 1):
         better = entry > best if equation.primitive.name == "argmax" else entry < best
         if jnp.issubdtype(array.dtype, jnp.floating):
-            # The first number that is none.
+            # The first NaN.
             better = (better | jnp.isnan(entry)) & ~jnp.isnan(best)
         best, place = jnp.where(better, entry, best), jnp.where(better, jnp.asarray(k, dtype), place)
     return place
@@ -106,7 +106,7 @@ def _dot_general(lanes, equation, values):
 
 
 def _ordered(lanes, value, shape, inner, batch, dtype):
-    """A factor with batched axes first, then one contracted axis, then free ones; the sizes of the first and last."""
+    """A factor with batched axes first, then one contracted axis, then free axes; sizes of batched and of free axes."""
     array = jnp.asarray(value.array) if dtype is None else jnp.asarray(value.array, dtype)
     free = [axis for axis in range(len(shape)) if axis not in inner and axis not in batch]
     array = lax.transpose(array, [*batch, *inner, *free, *([len(shape)] if value.varies else [])])

@@ -35,7 +35,7 @@ def _of_equation(equation, given):
 
 
 def varying_in_while(params: Any, given: list[bool]) -> tuple[bool, list[bool]]:
-    """Whether members differ in whether a loop goes on, and which numbers that it carries differ."""
+    """Whether the condition of a loop differs between members, and which of its carried values differ."""
     of_cond, of_body = params["cond_nconsts"], params["body_nconsts"]
     for_cond, for_body, carry = given[:of_cond], given[of_cond : of_cond + of_body], given[of_cond + of_body :]
     while True:
@@ -48,7 +48,7 @@ def varying_in_while(params: Any, given: list[bool]) -> tuple[bool, list[bool]]:
 
 
 def varying_in_scan(params: Any, given: list[bool]) -> tuple[list[bool], list[bool]]:
-    """Which numbers that a scan carries differ, and which of all its outputs do."""
+    """Which carried values of a scan differ between members, and which of all its outputs differ."""
     constants, carried = sizes_of_scan(params)
     fixed, carry, scanned = given[:constants], given[constants : constants + carried], given[constants + carried :]
     while True:

@@ -45,7 +45,7 @@ def check_kinds(*given: Any) -> None:
 
 
 def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
-    """Refuse steps without error estimates for a method that chooses its order by tolerances and has none."""
+    """Refuse steps without error estimates for a method that chooses its order by tolerances, unless it has its own."""
     estimates = stepsize_controller is None or isinstance(
         stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
     )
@@ -54,7 +54,7 @@ def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
         raise ValueError(
             f"{method} chooses its order by tolerances, which {steps} does not have: give them to the solver, as in "
             f"solver=jaxmb.solvers.{method}(rtol=1e-8, atol=1e-10), or take a method of one order, as diffrax.Tsit5(). "
-            "Steps that are only bounded have simulate(..., dtmax=0.01)."
+            "To bound steps only, use simulate(..., dtmax=0.01)."
         )
 
 
@@ -70,7 +70,7 @@ def check_error_estimate(steps: Any, stepsize_controller: Any, event: Any, rtol:
     if event is not None or steps:
         what = "an event" if event is not None else "SaveAt(steps=True)"
         raise ValueError(
-            f"error=True compares two runs at the same times, which {what} does not have; give saveat=times."
+            f"error=True compares two runs at the same times, which {what} does not give; use saveat=times."
         )
     least = _CLOSEST * float(jnp.finfo(rtol.dtype).eps)
     if not is_traced(rtol) and rtol < least:
@@ -136,7 +136,7 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
     nq, nu, nz = system.nq, system.nu, system.nz
     if (state.z is None) != (nz == 0):
         has = f"has {nz} internal states" if nz else "has no internal states"
-        raise ValueError(f"The system {has} and the state {'none' if state.z is None else 'some, in z'}; {cure}.")
+        raise ValueError(f"The system {has}, but the state has {'none' if state.z is None else 'some, in z'}; {cure}.")
     of_states = [] if state.z is None else [("z", state.z, nz)]
     for name, value, size in (("q", state.q, nq), ("u", state.u, nu), *of_states):
         kind = value.dtype if isinstance(value, ARRAYS) else type(value)
@@ -163,7 +163,9 @@ def checked_longest_step(dtmax: Any, stepsize_controller: Any, solver: Any, dtyp
             "dtmax bounds the steps that rtol and atol choose: give it to the stepsize_controller, or leave that out."
         )
     if isinstance(solver, AbstractMultistep) and solver.tolerances.fixed:
-        raise ValueError(f"dtmax needs the tolerances of simulate: leave those of {type(solver).__name__} out.")
+        raise ValueError(
+            f"dtmax needs the tolerances of simulate: leave out the tolerances of {type(solver).__name__}."
+        )
     longest = real_array("dtmax", dtmax, dtype)
     if not is_traced(longest) and not longest > 0:
         raise ValueError(f"dtmax must be positive, got {dtmax}; leave it out for steps of any length.")

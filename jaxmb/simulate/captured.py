@@ -24,7 +24,7 @@ def captured_event(event: diffrax.Event | None, t: Any, state: State) -> diffrax
 
 
 def captured_call(function: Any, *args: Any, **named: Any) -> Any:
-    """A user's function, identified by its present computation; functions of packages and anything else unchanged."""
+    """A user's function, identified by its present computation; functions of packages and other objects as they are."""
     if not callable(function) or is_installed(getattr(getattr(function, "__code__", None), "co_filename", None)):
         return function
     module = CapturedModule(function)

@@ -14,15 +14,15 @@ from ..system import AbstractSystem
 
 # The time [s] after which a user is told.
 _PATIENCE = 2.0
-# The event that JAX reports at the end of a compilation; shorter compilations than this [s] are of single operations.
+# The event that JAX reports at the end of a compilation; compilations shorter than `_LONG` [s] are single operations.
 _COMPILED, _LONG = "/jax/core/compile/backend_compile_duration", 0.5
 
 
 class _Wait:
     """A wait for a program.
 
-    **Fields:** `began`: when its tracing began; `ended`: when its compilation ended, None before; `told`: whether the
-    user was.
+    **Fields:** `began`: when tracing began; `ended`: when compilation ended, None before; `told`: whether the user was
+    told.
     """
 
     def __init__(self, system: AbstractSystem):

@@ -1,4 +1,4 @@
-"""The integration of a motion by diffrax's protocol; if it is differentiated, its mesh resolves derivatives."""
+"""The integration of a motion by diffrax's protocol, on a mesh that also resolves derivatives if there are any."""
 
 import dataclasses
 from typing import Any
@@ -28,7 +28,8 @@ def integrated(
     """The solution of `diffrax.diffeqsolve`, with derivatives.
 
     **Arguments:** `integration`: term, solver and options of `diffeqsolve`; `control` of tangents, None for none;
-    `projects_steps`: whether states return to constraints after steps; `differentiated`: whether it is known to be.
+    `projects_steps`: whether states return to constraints after steps; `differentiated`: whether derivatives are known
+    to be taken.
     """
     if differentiated:
         # Then the run without derivatives is not traced.
@@ -71,7 +72,7 @@ def _with_tangents(integration, control, room, projects_steps):
 
 
 def _solution(term, solver, options, room, derivatives):
-    """The solution, whose states are saved before the user's function is applied to them."""
+    """The solution; with `derivatives`, the user's function is applied after states are saved."""
     adjoint, saveat = room.adjoint, options["saveat"]
     function = saveat.subs[0].fn
     if function is not STATES and derivatives is not None:

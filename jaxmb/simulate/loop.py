@@ -29,7 +29,7 @@ class Loop(diffrax.AbstractAdjoint):
 
     @classmethod
     def around(cls, saveat: diffrax.SaveAt, limit: Any, derivatives: MeshAdjoint | None):
-        """A loop for `saveat`, and the `SaveAt` for diffrax instead."""
+        """A loop for `saveat`, and the `SaveAt` that diffrax gets instead."""
         first, *rest = saveat.subs
         # diffrax does not take an empty series.
         placeholder = first.t1 or first.ts is not None

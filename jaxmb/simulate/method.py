@@ -96,8 +96,8 @@ def adapts(controller: Any) -> bool:
 
 
 def running_scales(system: AbstractSystem, state: State, duration: Any) -> RunningScales:
-    """Scales in natural units of coordinates, velocities and internal states. The expected size of velocities at rest
-    is one unit in the whole duration [s].
+    """Scales in natural units of coordinates, velocities and internal states. Velocities are expected to reach at least
+    one unit per `duration` [s].
     """
     units = natural_units(system, system.velocity_scale(), state.q.dtype)
     units, rate = lax.stop_gradient((units, 1 / jnp.where(duration > 0, duration, 1.0)))

@@ -109,15 +109,15 @@ def warn_of_stiffness(stats) -> None:
         return
     warnings.warn(
         f"The motion is stiff: in {stats['stiff_steps']} of {stats['num_steps']} steps of Adams' method stability was "
-        "the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer ones.",
+        "the limit. simulate(..., solver=jaxmb.solvers.Hermite()) takes longer steps.",
         stacklevel=5,
     )
 
 
 def warn_of_wrong_derivative() -> None:
     warnings.warn(
-        "The derivative of the vector field contradicts its differences. `Hermite` needs it, and its results would be "
-        "wrong: look for `stop_gradient`, rounding and integers in the functions of parts.",
+        "The derivative of the vector field contradicts its differences, so the results of `Hermite` may be wrong: "
+        "look for `stop_gradient`, rounding and integers in the functions of parts.",
         stacklevel=5,
     )
 
@@ -182,7 +182,7 @@ def about_steps(outcome: Outcome, span: Span, stats, stiff) -> str:
     if stiff:
         return text + (
             "It is stiff there: stability is the limit of its steps. simulate(..., solver=jaxmb.solvers.Hermite()) "
-            "takes longer ones."
+            "takes longer steps."
         )
     cure = "A larger max_steps or a coarser rtol takes it further"
     if stiff is None:
@@ -196,7 +196,7 @@ def is_stiff_at_end(probe, stats, solver) -> bool | None:
     """Whether a motion that took the largest number of steps is stiff at its end; None if it took too few steps to
     tell, or if Adams' method cannot go on from there.
 
-    **Arguments:** `probe(solver, steps)`: the trajectory from there with a solver, in at most this number of steps.
+    **Arguments:** `probe(solver, steps)`: the trajectory from there with a solver, in at most `steps` steps.
     """
     if isinstance(solver, AbstractMultistep) and solver.solves_implicitly:
         return False
@@ -251,8 +251,8 @@ def about_lost_rank(lost: LostRank) -> str:
 
 
 def about_unmet(system, outcome: Outcome, ahead, rates) -> str:
-    """The joints with the largest residuals just beyond the end, by the next step without constraints or a shorter one;
-    empty if residuals are small beside the displacement, as for smooth constraints.
+    """The joints with the largest residuals after the next step, or a shorter one, taken without constraints. Empty if
+    residuals are small beside the displacement, as for smooth constraints.
     """
     t, y = outcome.t, outcome.y
     speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=0.0)

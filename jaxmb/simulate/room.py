@@ -16,8 +16,9 @@ _MEMORY, _FEWEST_STEPS = 2**24, 1024
 _MORE = 8
 # Derivatives keep the rows of this many steps, or of fewer if they do not fit in this many bytes.
 MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
-# The structures of systems and solvers with long motions in this process, with or without derivatives: at least as many
-# steps as derivatives keep at once. The next derivative outside of `jit` then does not try the smaller program first.
+# The structures of systems and solvers with long motions in this process, with or without derivatives. Long motions
+# take at least as many steps as derivatives keep at once; the next derivative outside of `jit` then does not try the
+# smaller program first.
 # Only a few are kept, since structures hold the functions of users.
 _long: collections.deque[Any] = collections.deque(maxlen=16)
 
@@ -40,11 +41,11 @@ class Room(NamedTuple):
 def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool, tries: bool) -> list[int]:
     """The numbers of steps for which programs have buffers; if a motion takes more steps, the next program is used.
 
-    If no numbers of single steps are kept, the next power of 4 from `max_steps`, so that one program serves several
-    numbers. A derivative of more steps than `kept_steps` has a program that recomputes rows. So the first program has
-    only `kept_steps` if it `tries`, which needs concrete values.
+    If nothing is kept of single steps, the number is the next power of 4 from `max_steps`, so that one program serves
+    several numbers. Derivatives of more than `kept_steps` steps recompute rows. With `tries`, which needs concrete
+    values, the first program therefore has only `kept_steps`.
 
-    If states of steps are kept, `max_steps` under a trace, and otherwise first a number that takes little memory.
+    If states of steps are kept, the number is `max_steps` under a trace; otherwise the first takes little memory.
     """
     # Dense output keeps, for each number of the state, the history of a multistep method.
     kept = 16 if saveat.dense else int(saveat.subs[0].steps)

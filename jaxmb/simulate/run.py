@@ -93,7 +93,7 @@ _ALONE = {"event": None, "direction": None, "error": False, "throw": False, "pro
 class Ended(NamedTuple):
     """A run that was solved.
 
-    **Fields:** its `outcome`, and the `flags` of it as numbers, None under a trace.
+    **Fields:** `flags`: the flags of the `outcome` as numbers, None under a trace.
     """
 
     problem: Problem

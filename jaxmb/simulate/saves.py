@@ -77,7 +77,7 @@ def with_end(saveat: diffrax.SaveAt, t: Any, state: State) -> diffrax.SaveAt:
 
 
 def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
-    """The same with times behind the end of the run, which are not saved: one program serves several numbers."""
+    """The same with times beyond the end added, which are not saved: one program serves several numbers of times."""
     first, last = saveat.subs
     if first.ts is None or first.ts.shape[0] == 0 or start == end:
         # In an empty interval every time would be saved.
@@ -91,8 +91,8 @@ def padded(saveat: diffrax.SaveAt, start: Any, end: Any) -> diffrax.SaveAt:
 class SavedTimes(NamedTuple):
     """The user's series of saved states in the program of a run.
 
-    **Fields:** the `series` as given, whose times have derivatives; the `times` without derivatives, None if it has
-    none; `after`: the same, moved behind jumps; `outside`: whether times lie outside of the run, or turn back.
+    **Fields:** the `series`, whose times have derivatives; its `times` without derivatives, None if it has no times;
+    `after`: the same, moved behind jumps; `outside`: whether times lie outside of the run, or turn back.
     """
 
     series: diffrax.SubSaveAt
@@ -124,7 +124,7 @@ class SavedTimes(NamedTuple):
         return self._replace(after=after_jumps(self.times, jumps, t0, t1))
 
     def told(self, saveat: diffrax.SaveAt, t0: Any, finite: Any, function: Any) -> diffrax.SaveAt:
-        """The `SaveAt` for the solver: a function of states, saved all at once if the start has no `finite` numbers."""
+        """The `SaveAt` for the solver, with a `function` of states; all times are `t0` if the start is not `finite`."""
         times = None if self.after is None else jnp.where(finite, self.after, t0)
         first, *rest = saveat.subs
         return changed(saveat, subs=(changed(first, ts=times, fn=function), *rest))
@@ -174,8 +174,8 @@ def _moving_times(series, saved, span):
 
 
 def seen(function: Any, ts: Any, ys: Any, start: tuple[Any, State]) -> Any:
-    """The values of a user's function of saved states. Entries after the end of a run, whose states are infinite, are
-    infinite, or zero for integers, and have no derivatives.
+    """The values of a user's function of saved states. After the end of a run, where states are infinite, values are
+    infinite (integers zero) and have no derivatives.
     """
     never = lambda x: jnp.inf if jnp.issubdtype(x.dtype, jnp.inexact) else 0
 
@@ -188,7 +188,7 @@ def seen(function: Any, ts: Any, ys: Any, start: tuple[Any, State]) -> Any:
 
 
 def corrected(correction: Any, system: AbstractSystem, ts: Any, ys: Any, start: tuple[Any, State]) -> tuple[Any, Any]:
-    """Saved states, returned to the constraints, and whether one failed; unchanged after the end of a run."""
+    """Saved states, returned to the constraints, and whether this failed; entries after the end of a run stay."""
     finite = jnp.isfinite(ts)
     # Elsewhere the start is corrected instead, which has no failure and no derivative.
     at_start, y0 = lax.stop_gradient(start)
@@ -203,7 +203,7 @@ def corrected(correction: Any, system: AbstractSystem, ts: Any, ys: Any, start: 
 
 
 def _replaced(values, old, new):
-    """Values in which the `old` ones, which run up or down, are replaced by the `new` ones."""
+    """The values with `old` times, which ascend or descend, replaced by `new` times."""
     order = jnp.argsort(old)
     k = order[jnp.clip(jnp.searchsorted(old[order], values), 0, old.size - 1)]
     return jnp.where(values == old[k], new[k], values)

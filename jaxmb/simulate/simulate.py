@@ -53,7 +53,7 @@ def simulate(
     ```
 
     The first call for a system compiles a program, which takes seconds. Later calls with other numbers, times and
-    tolerances do not. `jax.jit` is not needed: it compiles the motion again, as a part of its function.
+    tolerances reuse it. `jax.jit` is not needed: it compiles the motion again, as a part of its function.
 
     `jaxmb help` has more on `tolerances`, `derivatives`, `contacts`, `inputs`, `throw` (motions that fail) and
     `large-scenes`.
@@ -80,8 +80,8 @@ def simulate(
     - `dt0`: first step [s], default chosen from the motion. `dtmax`: longest step [s], default none.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
     - `adjoint`: another method of differentiation, one of diffrax's adjoints.
-    - `direction`: parameters by name with a change of each; in a differentiated run, steps resolve the effect of these
-        changes. Default: all parameters with derivatives. `{}` leaves the steps of the motion alone.
+    - `direction`: changes of parameters by name; in a differentiated run, steps resolve the effect of these changes.
+        Default: all parameters with derivatives. `{}` leaves the steps of the motion alone.
     - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector; the solver restarts there.
     - `event`, `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event sees interpolated states between
@@ -94,9 +94,9 @@ def simulate(
     **Returns:** a `Trajectory`. With `throw=False` it has the part of the motion before a failure, and `result` says
     why it failed; under a trace it is NaN.
 
-    **Raises:** `ValueError` for arguments of the wrong type or out of range, for combinations that cannot work, and for
-    a state that violates the constraints, unless the manifold lets states drift; `RuntimeError`, unless `throw=False`,
-    when the integration fails.
+    **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work.
+    Also for a state that violates the constraints, unless the manifold lets states drift. `RuntimeError` if the
+    integration fails, unless `throw=False`.
     """
     asked = Asked(
         system,

@@ -76,8 +76,9 @@ class Problem(NamedTuple):
 class Start(NamedTuple):
     """The start of a run.
 
-    **Fields:** the `given` state, NaN if it violates the constraints, and `y`, which follows a moving start; whether it
-    is `consistent`; whether parameters are in their range (`valid`); `finite`: all this, and finite numbers.
+    **Fields:** the `given` state, NaN if it violates the constraints, and `y`, which follows a moving start; whether
+    the state is `consistent`; whether parameters are in their range (`valid`); `finite`: whether both hold and all
+    numbers of the state are finite.
     """
 
     given: State
@@ -167,8 +168,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     result, stuck, ran_out, coupling = _verdict(problem, span, start, end, solution, lost, saves.outside)
     motion, failed = (ys, solution.interpolation), has_failed(result)
     if problem.traced:
-        # Otherwise a derivative would belong to the part before the failure. The error belongs to the value, not to a
-        # derivative taken alone.
+        # Otherwise a derivative computed alone, which raises no error, would be of the part before the failure.
         inputs = system, problem.state, problem.span, method.formulation, method.policy, stops.event, first.fn
         motion = nan_where(failed, motion, inputs)
     stats = _statistics(problem, solver, solution, end)

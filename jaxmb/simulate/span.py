@@ -1,7 +1,7 @@
 """The interval of a run, and derivatives by its times: its start, its end, and the saved times.
 
 The mesh of a run has no derivatives. The states at a moving time follow by Taylor's series of the solution, with
-coefficients from the field there. It has two terms, so that second derivatives are right as well.
+coefficients from the field there. The series has two terms, so that second derivatives are right as well.
 """
 
 import contextlib

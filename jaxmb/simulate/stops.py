@@ -16,7 +16,7 @@ from ..system import AbstractSystem
 from ..system.inputs import input_break_times, turning_times
 from .method import adapts
 
-# The stops and the jumps of inputs of the last few runs: a loop of simulations searches for them once.
+# The turns and the jumps of inputs of the last few runs: a loop of simulations searches for them once.
 _turns, _breaks = Recent(8), Recent(8)
 
 
@@ -34,7 +34,7 @@ class Stops(NamedTuple):
 
     def around(self, controller: Any, contacts: bool, gaps: bool) -> Any:
         """A controller that steps to these times and restarts there, and at events of `contacts`. If forces have
-        `gaps`, its steps do not hide them.
+        `gaps`, no step passes over a force that acts in a gap.
         """
         controller = EventController(controller, self.max_events) if contacts else controller
         controller = GapController(controller) if gaps else controller

@@ -26,8 +26,8 @@ class Watch(NamedTuple):
     """The watched parameters of a run that is differentiated.
 
     **Fields:** `changes`: values of parameters with their changes, by name, whose tangent is watched; None for all
-    differentiated parameters, and empty for no tangent; `differentiated`: by which leaves of the system and the state
-    derivatives are taken, empty if unknown.
+    differentiated parameters, and empty for no tangent; `differentiated`: for each leaf of the system and the state,
+    whether derivatives are taken by it; empty if unknown.
     """
 
     changes: dict[str, tuple[Any, Any]] | None
@@ -46,8 +46,8 @@ class Watch(NamedTuple):
         return None
 
     def control(self, system: AbstractSystem, start: State, duration: Any, direction: Any) -> TangentControl | None:
-        """The control of tangents, in the sizes of coordinates, and of velocities in the duration [s] of the motion;
-        None if no tangent is watched.
+        """The control of tangents, in natural units, for velocities at the rate of the `start` or one unit per
+        `duration` [s], whichever is larger; None if no tangent is watched.
         """
         if self.changes == {}:
             return None
@@ -84,7 +84,7 @@ def parameter_changes(
 def pushed(function: Callable[..., Any], at: Any, used: Any) -> Any:
     """The tangent of a function along a change of all leaves that are `used`; None if none is.
 
-    Each changes by its size, or by one if it is zero, with random signs, always the same.
+    Each leaf changes by about its size, or about one if it is zero, with random signs that are the same in every call.
     """
     random = np.random.default_rng(0)
 

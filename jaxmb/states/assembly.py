@@ -65,11 +65,12 @@ def assemble(
         zero. So a lone `angular_velocity` of a body that a joint holds is changed, with a warning: prescribe it by
         `rates`.
     - `fix`: coordinates that must have these values, by name: `{"crank.angle": 0.3}` of a body, `{"hip.angle": 0.3}` of
-        a joint. `{"floor.mode": 1}` closes a contact, 0 opens it. Values of internal states, `{"motor.torque": 2.0}`;
-        other internal states are taken from the guess.
+        a joint. `{"floor.mode": 1}` closes a contact, 0 opens it. `{"motor.torque": 2.0}` sets an internal state; other
+        internal states are taken from the guess.
     - `rates`: rates that must have these values, by the names of rates or of coordinates: `{"crank.angle": 2.0}` is
-        `{"crank.angle_rate": 2.0}`. Also rates of joints, `"hip.angle_rate"`; in space `"body.angular_velocity"` (body
-        frame) and `"body.velocity"`; of a `LagrangianSystem` `"theta_rate"`, or the quasi-velocities `u0`, `u1`, ….
+        `{"crank.angle_rate": 2.0}`. Other names are `"hip.angle_rate"` of a joint; `"body.angular_velocity"` (body
+        frame) and `"body.velocity"` in space; and for a `LagrangianSystem` `"theta_rate"`, or the quasi-velocities
+        `u0`, `u1`, ….
     - `t`: the time, for driven mechanisms [s].
     - `throw`: whether to raise an error if the mechanism cannot be assembled. By default an error is raised, except
         under `jit`, `vmap` or a derivative. There, and with `False` everywhere, the state is NaN, so that one member of
@@ -77,13 +78,13 @@ def assemble(
         by a callback to Python; JAX does not cache such programs on disk.
 
     **Returns:** a `State`, differentiable by the parameters, the guess and the prescribed values. It is the closest
-    state to the guess: the sum of the squares of all changes is the least, of positions and velocities in units of the
-    system's size, of angles in radians. Coordinates that `fix` does not hold may depend on a parameter, and a
+    state to the guess: the sum of the squares of all changes is the least, with positions and velocities in units of
+    the system's size and angles in radians. Coordinates that `fix` does not hold may depend on a parameter, and a
     derivative by the parameter contains their change.
 
-    **Raises:** `ValueError` naming the joints with their residuals if the mechanism cannot be assembled, the
-    coordinates that cannot be fixed together, or rates that contradict each other; consistent rates may outnumber the
-    degrees of freedom. With `throw=True` under `jit`, a run-time error without the names.
+    **Raises:** `ValueError` if the mechanism cannot be assembled, coordinates cannot be fixed together, or rates
+    contradict each other; the message names the joints with their residuals, the coordinates or the rates. Consistent
+    rates may outnumber the degrees of freedom. With `throw=True` under `jit`, a run-time error without the names.
     """
     check_system("assemble", system)
     of_bodies = guess is None and rates is None
@@ -141,8 +142,8 @@ def _warn_of_changed_velocities(system, given, assembled):
         rest = f", and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
         first = changed[0].split(" is ")[0]
         warnings.warn(
-            "The velocities given with the bodies, of which those left out are zero, contradict the constraints. Of "
-            f"the closest ones that do not, {'; '.join(changed[:_NAMED])}{rest}. "
+            "The velocities given with the bodies contradict the constraints; velocities left out are zero. In the "
+            f"closest consistent state {'; '.join(changed[:_NAMED])}{rest}. "
             f"assemble(system, rates={{{first!r}: …}}) prescribes a rate, from which the others follow.",
             stacklevel=4,
         )

@@ -42,8 +42,8 @@ _ITERATIONS = 400
 _PROGRESS = 0.999
 # Pivots of implied rows, relative to the largest entry of the diagonal.
 _SHIFT = 1e-13
-# In blocks this share is a multiple of the largest residual, as in the method of Levenberg and Marquardt, but at least
-# this power of eps, 1e-11 in double precision.
+# In blocks these pivots are a multiple of the largest residual, as in the method of Levenberg and Marquardt. They are
+# at least this power of eps, 1e-11 in double precision.
 #
 # Off the constraints implied rows contradict each other by the square of the distance. Multipliers are this square over
 # the pivot, with errors of eps over the pivot again. (Bennett's linkage, from poses that are off by 1e-9 to 1e-1:
@@ -71,7 +71,7 @@ def tolerance(dtype) -> float:
 
 def independent_above(dtype) -> float:
     """The pivot or singular value, relative to the largest, below which rows depend on each other: 9e-8 in double
-    precision. A search reaches a singular configuration to the root of eps only, so its pivots there are a few of it.
+    precision. A search reaches a singular configuration to the root of eps only; its pivots there are a few such roots.
     """
     return float(jnp.finfo(dtype).eps) ** 0.45
 
@@ -127,7 +127,7 @@ def meet_constraints(
 def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array, "nq"]:
     """Gauss–Newton from a guess to the constraints along velocities, without motion along fixed velocities.
 
-    Without a dense matrix if the system has an order of elimination. The regularisation of the normal equations is
+    No dense matrix is formed if the system has an order of elimination. The regularisation of the normal equations is
     proportional to the residuals.
 
     **Arguments:** `start`: a guess at rest.

@@ -166,8 +166,8 @@ def _changing(at, steady):
     names = {name: rates[index] for name, index in at.system.state_names().items() if not np.all(steady[index])}
     listed = ", ".join(f"{name} ({np.max(np.abs(rate)):.3g} per second)" for name, rate in names.items())
     return (
-        f"In the equilibrium internal states change: {listed}. They are those of the guess; give values at which they "
-        "rest with fix, such as a motor's torque after its lag."
+        f"In the equilibrium internal states change: {listed}. Their values are from the guess; give values at which "
+        "they rest with fix, such as a motor's torque after its lag."
     )
 
 
@@ -412,8 +412,8 @@ def _search(
         step = _step(local, downhill=downhill)
         longest = xp.max(xp.abs(step))
         step = step * xp.minimum(1.0, radius / xp.where(longest > 0, longest, 1.0))
-        # After a small Newton step the error is of the order of the step's square, plus the rows' correction, whose
-        # effect on the forces is not counted.
+        # After a small Newton step the error is of the order of the step's square, plus the rows' correction. The
+        # effect of the correction on the forces is not counted.
         return q, local, step, radius, good & (size <= close) & (off <= close**1.5) & (k > 0), k + 1
 
     # Without a linearisation yet, the first step is zero unless it is given.

@@ -14,8 +14,9 @@ from .closest import independent_above, largest_residual, tolerance
 
 # The largest numbers of rows and coordinates whose dense matrices are cheap.
 MOST = 150
-# Largest numbers of Gauss–Newton steps, of Newton steps, and of steps to the velocities of constraints that are not
-# linear; the largest share of squared residuals after a useful step; the size of the last step, as a power of eps.
+# Largest numbers of Gauss–Newton steps (`_STEPS`), of Newton steps, and of steps to velocities of constraints that are
+# not linear. `_PROGRESS`: the largest share of squared residuals after a useful step. `_SMALL`: the size of the last
+# step, as a power of eps.
 _STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.999, 0.75
 # A full step is not shortened if it reduces the squared residuals below this share.
 _WHOLE = 0.01

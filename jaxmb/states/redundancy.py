@@ -43,10 +43,10 @@ def check_gradients(system: AbstractSystem, sizes: Float[np.ndarray, "m"]) -> No
 
 
 class DependentRows(NamedTuple):
-    """Rows of A that depend on each other only.
+    """A group of rows of A that depend only on each other.
 
-    **Fields:** the `rows`, and the `independent` rows among them, as numbers among the rows of A; `positions`:
-    independent rows of Φ and of the coordinates' invariants, as numbers among the rows of `coordinate_residual`.
+    **Fields:** `rows` and the `independent` rows among them, as indices of rows of A; `positions`: independent rows of
+    Φ and of the coordinates' invariants, as indices of rows of `coordinate_residual`.
     """
 
     rows: Int[np.ndarray, "m"]
@@ -57,9 +57,9 @@ class DependentRows(NamedTuple):
 class Nearby(NamedTuple):
     """The constraints at a displaced configuration.
 
-    **Fields:** `unmet`: Φ and the coordinates' invariants; `step(number, rows)`: the smallest displacement of a group,
-    to first order, that satisfies these rows of its `positions`; `remains(number, kept, dropped)`: the parts of dropped
-    rows of A that kept rows do not explain.
+    **Fields:** `unmet`: Φ and the coordinates' invariants; `step(number, rows)`: the smallest displacement of the group
+    with index `number`, to first order, that satisfies these rows of its `positions`; `remains(number, kept, dropped)`:
+    the parts of dropped rows of A that kept rows do not explain.
     """
 
     unmet: Float[np.ndarray, "mq"]

@@ -43,11 +43,11 @@ class ContactSet:
 
     **Fields:**
 
-    - For each law: its name in `names`; the number of its row of A in `rows`; the index of its mode in q in `places`.
+    - For each law: its name in `names`; the index of its row of A in `rows`; the index of its mode in q in `places`.
     - For each contact: whether impacts follow Poisson's law, `by_poisson`, or Newton's.
-    - For each direction of friction: the number of its contact in `contact_of`, -1 in a joint; and in `releases`,
+    - For each direction of friction: the index of its contact in `contact_of`, -1 in a joint; and in `releases`,
         whether coefficients of slip and stick differ, so that accelerations jump as slip begins.
-    - `pairs`: for friction with two directions, the number of the first; the second follows.
+    - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
     """
 
     names: tuple[str, ...] = ()

@@ -240,7 +240,7 @@ class AbstractEquation(eqx.Module):
 
     @property
     def friction_rows(self) -> Int[np.ndarray, "k"]:
-        """Numbers of the rows of A with multipliers on which C depends."""
+        """Indices of the rows of A on whose multipliers C depends."""
         return np.zeros(0, int)
 
     def nonideal_force(

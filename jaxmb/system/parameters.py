@@ -63,9 +63,9 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
     the bodies' frames is kept as well: if `"rod.centre"` moves a mass centre, its guess moves too. The length of a bar
     appears in the points of its joints and in its inertia: change all of them, or give it one name by `design`.
 
-    **Arguments:** `values`: new numbers by name, as in `parameters`, of the same shapes. For the weights of a module, a
-    vector or a module that differs in its weights only. New design variables change all parameters that follow from
-    them.
+    **Arguments:** `values`: new numbers by name, as in `parameters`, of the same shapes. The weights of a module are
+    given by a vector, or by a module that differs in its weights only. New design variables change all parameters that
+    follow from them.
 
     **Returns:** the system with the new parameters.
 

@@ -1,11 +1,11 @@
 """Quantities of a motion, and the names of rates.
 
 Rates have the same names everywhere: in `rates=`, `free_initial`, `Sensor`, measured data, states of `linearise`, and
-`trajectory["hip"].angle_rate`. The rate of a coordinate has the coordinate's name and `_rate`: `"hip.angle_rate"` of a
-joint, `"crank.angle_rate"` and `"crank.x_rate"` of a body, `"theta_rate"` of a `LagrangianSystem`. The velocities of a
-body are `"crank.velocity"` and `"crank.angular_velocity"`; in space `"frame.wx"`, `"frame.wy"` and `"frame.wz"` are
-components of the angular velocity in body axes. Only `rates=` takes names of coordinates too, as in
-`rates={"crank.angle": 2.0}`.
+`trajectory["hip"].angle_rate`. The name of a coordinate's rate is the coordinate's name with `_rate`:
+`"hip.angle_rate"` of a joint, `"crank.angle_rate"` and `"crank.x_rate"` of a body, `"theta_rate"` of a
+`LagrangianSystem`. The velocities of a body are `"crank.velocity"` and `"crank.angular_velocity"`; in space
+`"frame.wx"`, `"frame.wy"` and `"frame.wz"` are components of the angular velocity in body axes. Only `rates=` takes
+names of coordinates too, as in `rates={"crank.angle": 2.0}`.
 """
 
 import functools
@@ -44,7 +44,7 @@ class Measure(NamedTuple):
     """A quantity of all systems of one structure.
 
     **Fields:** `shape` at one time; `view(system, place, ts, ys, solved)`, made by `view_of_motion`; `place`: static
-    values that choose a quantity of the view, and the numbers of the part as arrays; `of_forces` as in `Quantity`.
+    values that choose a quantity of the view, and the indices of the part as arrays; `of_forces` as in `Quantity`.
     """
 
     shape: tuple[int, ...]
@@ -73,8 +73,8 @@ class Quantities(Mapping[str, Quantity]):
 def view_of_motion(view: Callable[..., Any]) -> Callable[..., Any]:
     """Compile `view(system, place, ts, ys, …)` of a motion, and vectorise it over batches of motions.
 
-    The axes of a batch come first in all arrays, except arrays in `place`. The static values in `place` belong to the
-    program. The numbers of a part are arrays in `place`, so that all parts of one kind share a program.
+    The axes of a batch come first in all arrays, except arrays in `place`. Other values in `place` are static. The
+    indices of a part are arrays in `place`, so that all parts of one kind share a program.
     """
 
     def of_all(system, place, ts, *arrays):
@@ -126,8 +126,8 @@ class BodyMotion(NamedTuple):
 class Reaction(NamedTuple):
     """The force that a joint exerts on its last body that is not the ground; the other body receives the opposite.
 
-    **Fields:** `force` [N], world axes; `moment` [N m] about the joint's point on the body, or about the mass centre
-    for a joint without points, world axes, a scalar in the plane; `multipliers` of the joint's rows.
+    **Fields:** `force` [N], world axes; `moment` [N m], world axes, a scalar in the plane: about the joint's point on
+    the body, or about the mass centre for a joint without points; `multipliers` of the joint's rows.
     """
 
     force: Float[Array, "*times d"]

@@ -14,7 +14,7 @@ _MOST = 64
 
 
 def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], dict[str, Any]]:
-    """Cache a method that returns a dictionary, which depends on the structure of its object's `system` only.
+    """Cache a method that returns a dictionary, if the result depends only on the structure of its object's `system`.
 
     The method gets the system with zeros in its arrays, and without the axes of a batch. Systems with one structure
     have the same compiled programs, so a cached result is never out of date.

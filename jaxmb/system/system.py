@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractVar
 
-_NO_MOMENTUM = "Momentum is that of bodies; this system has none. Compute it from the coordinates."
+_NO_MOMENTUM = "Momentum is defined for bodies; this system has none. Compute momentum from the coordinates."
 
 
 class AbstractSystem(AbstractEquation):
@@ -32,7 +32,7 @@ class AbstractSystem(AbstractEquation):
 
     - `guess`: the default guess of `assemble`.
     - `design`: the design variables in order of addition; later variables may determine earlier variables.
-    - `rows`: for every row of A, the name of its part and its number within the part.
+    - `rows`: for every row of A, the name of its part and its index within the part.
     - `state_ends`: for each kind of internal state, in the order of z, the index after its last entry.
     - `body_names`: names of the bodies; `Trajectory[name]` is the motion of a body, or of a coordinate in a model
         without bodies.
@@ -132,9 +132,9 @@ class AbstractSystem(AbstractEquation):
         return False
 
     def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "k"]:
-        """Values of these functions while nothing moves, such as a prescribed motion or a force.
+        """Values of the functions of time, such as a prescribed motion or a force, while nothing moves.
 
-        For many parts of one kind a combination of the values; empty if `of_time` is False.
+        Many parts of one kind give a combination of their values. Empty if `of_time` is False.
         """
         return jnp.zeros(0, q.dtype)
 
@@ -153,7 +153,7 @@ class AbstractSystem(AbstractEquation):
         raise ValueError(_NO_MOMENTUM)
 
     def angular_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "*d"]:
-        """Moment of momentum about the world origin [kg m²/s]; a scalar in the plane, in space world axes, (3,)."""
+        """Moment of momentum about the world origin [kg m²/s], world axes; a scalar in the plane, (3,) in space."""
         raise ValueError(_NO_MOMENTUM)
 
     # Descriptions

@@ -532,13 +532,13 @@ REFUSED = {
     ),
     "a state without z": (
         lambda: mb.simulate(system := cart_and_pole(), mb.State(system.guess.q, system.guess.u), t1=1.0),
-        "The system has 1 internal states and the state none",
+        "The system has 1 internal states, but the state has none",
     ),
     "a state with z": (
         lambda: mb.simulate(
             (own := mechanisms.four_bar()).system, mb.State(own.state.q, own.state.u, np.zeros(2)), t1=1.0
         ),
-        "The system has no internal states and the state some",
+        "The system has no internal states, but the state has some",
     ),
     "an output's shape": (
         lambda: cart_and_pole_with(lambda t, m, s, p: (jnp.zeros(2), {"integral": 0.0})),

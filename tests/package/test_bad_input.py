@@ -434,7 +434,7 @@ def test_what_only_bodies_have():
     with pytest.raises(ValueError, match="this system has none"):
         _ = motion.forces
     for name in ("linear_momentum", "angular_momentum"):
-        with pytest.raises(ValueError, match="Momentum is that of bodies"):
+        with pytest.raises(ValueError, match="Momentum is defined for bodies"):
             getattr(motion, name)
     with pytest.raises(ValueError, match=r"Unknown quantity 'q0\.rat'; did you mean 'q0_rate'"):
         motion.quantity("q0.rat")

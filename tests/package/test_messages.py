@@ -235,7 +235,7 @@ def test_scenes_are_compiled_outside_of_traced_functions(where):
 def test_a_body_where_a_joint_is_needed():
     bar = planar.Body("bar", mass=1.0, inertia=1.0)
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
-    with pytest.raises(ValueError, match=r"JointSpring 'spring': 'bar' is no joint; it acts on joints.*'pin'"):
+    with pytest.raises(ValueError, match=r"JointSpring 'spring': 'bar' is not a joint; the part acts on joints.*'pin'"):
         mb.Scene([bar], joints=[pin], forces=[mb.JointSpring("spring", "bar.angle", stiffness=1.0)]).compile()
 
 

@@ -173,5 +173,5 @@ def test_dtmax_that_cannot_work():
             dtmax=0.1,
             stepsize_controller=mb.solvers.MultistepController(1e-6, 1e-8),
         )
-    with pytest.raises(ValueError, match="leave those of Adams out"):
+    with pytest.raises(ValueError, match="leave out the tolerances of Adams"):
         mb.simulate(system, system.guess, t1=1.0, dtmax=0.1, solver=mb.solvers.Adams(rtol=1e-6, atol=1e-8))
