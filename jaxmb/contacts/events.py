@@ -91,8 +91,8 @@ class ContactEvents(eqx.Module):
     - `impulses` [N s, of angles N m s], shape (events, parts).
     - `kinetic_energy_lost` [J], shape (events,): by all bodies at the impact, negative if a driver gave more.
     - `before` and `after`: modes, shape (events, parts). A contact has 0 if it is open, 1 if it is closed, 2 if others
-        imply it. Friction has 1 and -1 if it slips forwards and backwards, in space 1; 2 if it sticks, 0 if it does not
-        act.
+        imply it. Friction has 1 and -1 if it slips forwards and backwards, in space 1; 2 if it sticks, 3 if it sticks
+        and other friction implies it, 0 if it does not act.
     - `rest` [s], shape (events, parts): the time from an event to the end of infinitely many bounces too low to be
         resolved, after which the contact is at rest; zero without such bounces.
     """
@@ -174,9 +174,11 @@ class ContactEvents(eqx.Module):
             # Friction in two directions has two rows.
             i, of_both = self.names.index(name), impulses[self.names.index(name) :][: self.names.count(name)]
             impulse = float(np.linalg.norm(of_both) if of_both.size > 1 else of_both[0])
-            after, changed = self.after[k, i], self.before[k, i] != self.after[k, i]
+            before, after = self.before[k, i], self.after[k, i]
+            # Friction that sticks goes on sticking when other friction begins or ceases to imply it.
+            changed = before != after and min(before, after) < STICK
             if impulse != 0 or (changed and after != FREE):
-                kind = "stick" if after == STICK else "slip" if after != FREE else "impact"
+                kind = "stick" if after >= STICK else "slip" if after != FREE else "impact"
                 yield Event(time, name, kind if changed else "impact", impulse, lost)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxmb.contacts.dry_laws import Answers, Dry, laws_of
+from jaxmb.contacts.events import ContactEvents
 from jaxmb.contacts.friction import SlipSearch, frictional, with_implied
 from jaxmb.linalg.pairs import of_pairs
 
@@ -88,3 +89,11 @@ def test_stick_that_others_imply():
     answers = Answers(jnp.zeros(0, bool), yes, none, jnp.array(True), ~yes)
     found = with_implied(jnp.asarray(rows @ rows.T), answers)
     assert np.sum(found.sticks) == 2 and np.sum(found.implied) == 1 and not np.any(found.sticks & found.implied)
+
+
+def test_friction_that_others_imply_sticks():
+    """It is not slip, and no event happens where two frictions exchange the force."""
+    modes = np.array([[[1.0, 1.0], [2.0, 3.0]], [[2.0, 3.0], [3.0, 2.0]], [[3.0, 2.0], [1.0, 1.0]]])
+    none = np.zeros((3, 2))
+    events = ContactEvents(("one", "other"), 0, np.arange(3.0), none, np.zeros(3), modes[:, 0], modes[:, 1], none)
+    assert [(event.time, event.kind) for event in events] == [(0.0, "stick")] * 2 + [(2.0, "slip")] * 2
