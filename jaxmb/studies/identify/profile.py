@@ -129,7 +129,7 @@ class _Held:
 
 
 def _end(values, ratios, best, limit, sign) -> float:
-    """The value at which the ratio reaches a limit on one side, by the signed root of the ratio, which is nearly
+    """The value at which the ratio reaches a limit on one side, by interpolating the root of the ratio, which is nearly
     linear.
     """
     side = (values - best) * sign >= 0

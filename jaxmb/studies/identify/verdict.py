@@ -214,10 +214,11 @@ def _not_noise(series: Sequence[Series], directions: int, loss: Loss) -> Iterato
 
 
 def dependences(series: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
-    """How residuals depend on others, the dependent fraction of their mean square, and the probability under noise."""
+    """By test: how residuals depend on others, the predictable share of their mean square, and its chance under noise.
+    """
     n = r.size
     changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
-    # For normal noise, which the fitted directions may have made slightly smoother.
+    # The probability for normal noise, which the fitted directions may have made slightly smoother.
     yield (
         f"change their sign {changes} times in {n} samples",
         float(np.cos(np.pi * changes / (n - 1))),

@@ -38,8 +38,8 @@ _SAME = 1e-6
 def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State, Array]:
     """q̇, u̇ and ż of a state, and the multipliers.
 
-    In independent accelerations: with multipliers, derivatives for light and heavy bodies together lose as many digits
-    as the ratio of their masses has.
+    The unknowns are independent accelerations. With multipliers, derivatives for light and heavy bodies together would
+    lose as many digits as the ratio of their masses has.
     """
     at = Instant.of(system, t, state)
     udot, multipliers = accelerations_at(at, Partitioned())
@@ -193,7 +193,7 @@ def fastest(system, state, field):
 
 
 def _applied(system, t, state):
-    """The largest acceleration by applied forces without constraints, in the same units."""
+    """The largest acceleration by applied forces without constraints [1/s²], lengths in units of the system's size."""
     if not system.positive_definite_mass:
         return jnp.zeros((), state.q.dtype)
     at = Instant.of(system, t, state)

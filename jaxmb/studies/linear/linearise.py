@@ -50,7 +50,8 @@ def linearise(
     on level ground.
 
     In a steady motion bodies travel and turn together, uniformly, and wheels may spin in addition. States are then seen
-    from a frame that moves with each body, in which A is constant; this is verified a little later along the motion.
+    from a frame that moves with each body, in which A is constant; a comparison a little later along the motion
+    verifies this.
 
     **Arguments:**
 
@@ -63,7 +64,7 @@ def linearise(
         small turns about body axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a smooth function of
         q. Pivoting chooses further states if they are too few.
     - `rates`: likewise names of rates, `"crank.angle_rate"`, `"hip.angle_rate"`, `"frame.wx"`, or of coordinates, for
-        their rates; default the rates of the coordinates, as far as they are independent.
+        their rates; default the rates of `coordinates`, as far as these rates are independent.
 
     **Returns:** a `Linearisation`. Under `jit` and `vmap` chosen states have numbers instead of names, since the choice
     depends on values; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to

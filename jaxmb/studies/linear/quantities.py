@@ -14,8 +14,8 @@ from ...system.quantities import Solved, component_names
 
 
 def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
-    """The components with these names, each as the name of its array and its place in it; an array's name means all its
-    components.
+    """The components with these names, each as the name of its array and its index in the raveled array; an array's
+    name means all its components.
 
     **Raises:** `ValueError` for unknown or repeated names, and for a single text instead of a sequence.
     """
