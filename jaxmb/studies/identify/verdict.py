@@ -214,8 +214,7 @@ def _not_noise(series: Sequence[Series], directions: int, loss: Loss) -> Iterato
 
 
 def dependences(series: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
-    """By test: how residuals depend on others, the predictable share of their mean square, and its chance under noise.
-    """
+    """By test: how residuals depend on others, the predictable share of their mean square, and its chance in noise."""
     n = r.size
     changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
     # The probability for normal noise, which the fitted directions may have made slightly smoother.
