@@ -91,8 +91,9 @@ def stress_test(
     "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
 
     **Returns:** a `Table` of variants. `error` is the largest error at the end of coordinates, velocities and internal
-    states, each relative to their largest value; or "small" if less than the accuracy of the reference ("known to"),
-    "unknown" without a reference, or "refused" if the variant cannot be built or its run fails. Notes give the reasons.
+    states, each relative to their largest value. Words replace it: "small" if it is below the accuracy of the reference
+    ("known to"), "unknown" without a reference, "refused" if the variant cannot be built or its run fails. Notes give
+    the reasons.
     """
     mechanism = subject(system, state, t1)
     solver = Adams() if solver is None else solver

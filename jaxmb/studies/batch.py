@@ -24,8 +24,8 @@ _CARRIED, _MOST = 2**20, 64
 # Ratio of the bytes that the equations of a loop body write to the bytes that its fused kernels read and write (rule of
 # thumb).
 _FUSED = 3
-# The members that fill a vector register side by side, in double precision; and the most bytes that a loop carries for
-# each of them: larger loops, such as of Bricard's mechanism, would compile for minutes.
+# The number of members side by side, which fill a vector register in double precision; and the most bytes that their
+# loop carries for one: larger loops, such as of Bricard's mechanism, would compile for minutes.
 _SIDE_BY_SIDE, _MOST_SIDE_BY_SIDE = 8, 2**14
 # Arrays of several axes with at least this number of rows count as tables, of which a step writes one row.
 _LONG = 1024
@@ -41,10 +41,10 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     ```
 
     The members of a block go through the loop of a simulation together, until the slowest member has ended. Each
-    operation acts on the numbers of all members. The caches hold the numbers of some tens of simulations. So
-    `jax.vmap` of a few hundred takes longer than blocks, or even than one run after the other. Use `jax.vmap` for
-    functions without loops. Use it on a GPU as well, where it pays from some hundred members on: a step of a four-bar
-    takes 0.2 ms there, and a step of 65 536 four-bars 2 ms (H100; on a core, a step of a four-bar takes 0.01 ms).
+    operation acts on the numbers of all members. The caches hold the numbers of some tens of simulations. So `jax.vmap`
+    of a few hundred takes longer than blocks, or even than one run after the other. Use `jax.vmap` for functions
+    without loops. Use it on a GPU as well, where it pays from some hundred members on: on an H100, a step of a four-bar
+    takes 0.2 ms, and of 65 536 four-bars 2 ms; on a core, a step of one takes 0.01 ms.
 
     **Arguments:**
 

@@ -49,7 +49,7 @@ class Identification(Printed, Fit):
         noise, each an `Outlier`.
     - `iterations`: the number of simulated trials; halved steps of multiple shooting do not count.
     - `system`, `state`: with the estimated parameters, ready for `simulate`; of the first experiment.
-    - `systems`, `states`: the same by experiment.
+    - `systems`, `states`: of all experiments, by name.
     - `objectives` of all starts, the smallest first: minus the logarithm of likelihood and prior.
     - `continuity`: the largest gap between segments in multiple shooting.
     - `reasons` for missing standard deviations, in a few words, by component.

@@ -261,7 +261,7 @@ def _trial(
     of_bodies = fix.keys() <= system.coordinate_names().keys() and rates.keys() <= known_rates.keys()
     assembled = not initial and of_bodies and not constraints_depend_on(same, experiment.t0, guess, changed)
     if assembled:
-        # Values that are the same for all trials are computed, and differentiated, once.
+        # A state that is the same for all trials is computed, and differentiated, once.
         guess = _assembled(prefix, same, guess, fix=fix, rates=rates, t=experiment.t0)
     if not experiment.held_out:
         for source, what in unknown_here.values():

@@ -49,9 +49,9 @@ def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State
 class LinearEquations(NamedTuple):
     """The linear equations and their tests.
 
-    `residual`: X − S at the state, (n,); `steady`: whether it vanishes; `moving`: whether the state has velocities;
-    `constant`: whether A, B of every input and C, D of every output are the same a little later, (1 + inputs +
-    outputs,); `bound`: the mask of inputs that move constraints.
+    `residual`: X − S at the state, (n,); `steady`: whether the residual vanishes; `moving`: whether the state has
+    velocities; `constant`: whether A, B of every input and C, D of every output are the same a little later, (1 +
+    inputs + outputs,); `bound`: the mask of inputs that move constraints.
     """
 
     A: Float[Array, "k k"]
@@ -132,7 +132,7 @@ def linear_equations(
         return residual, largest, largest <= allowed, constant
 
     residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], values))
-    # The first displacement with the motion's field that leaves the equations unchanged; otherwise the nearest.
+    # The first displacement whose field is the motion's and that leaves the equations unchanged; otherwise the nearest.
     good = steady & constant[:, 0]
     nearest = jnp.where(jnp.any(steady), jnp.argmax(steady), jnp.argmin(largest))
     best = jnp.where(jnp.any(good), jnp.argmax(good), nearest)

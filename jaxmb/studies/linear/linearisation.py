@@ -26,9 +26,8 @@ _ROUNDING = 10
 class Mode(eqx.Module):
     """A mode of a linearised motion: `x(t) = x₀ + Re(amplitude e^{λ t} shape)`.
 
-    **Fields:** `eigenvalue` λ [1/s]; `q`, `u` and `z`, the shape in all coordinates, velocities and internal states,
-    complex, (nq,), (nu,) and (nz,), with largest displacement one in units of the system's size; `system`, `state`,
-    `t`.
+    **Fields:** `eigenvalue` λ [1/s]; `q`, `u` and `z`: the complex shape in all coordinates (nq,), velocities (nu,) and
+    internal states (nz,), with a largest displacement of one in units of the system's size; `system`, `state`, `t`.
     """
 
     eigenvalue: Complex[Array, ""]

@@ -70,10 +70,10 @@ def linearise(
     depends on values; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to
     parameters and the state are exact; derivatives of A hold the choice of states fixed.
 
-    **Raises:** `ValueError` for unknown names, too many of them and dependent ones; for a state that violates the
-    constraints, is singular, or is not an equilibrium or steady motion, with the remaining accelerations; for a motion
-    whose linear equations change with time; for closed contacts and dry friction; and for inputs that move joints.
-    Under a trace the result is NaN instead.
+    **Raises:** `ValueError` for unknown, too many or dependent names; for a state that violates the constraints, is
+    singular, or is not an equilibrium or steady motion, with the remaining accelerations; for a motion whose linear
+    equations change with time; for closed contacts and dry friction; and for inputs that move joints. Under a trace the
+    result is NaN instead.
     """
     check_system("linearise", system)
     state = checked_guess("linearise", system, state)

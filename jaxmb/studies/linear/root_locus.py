@@ -23,9 +23,13 @@ class RootLocus(eqx.Module):
     locus.eigenvalues[-1], locus.states
     ```
 
-    **Fields:** `name` and `values` of the parameter, (values,); `eigenvalues` [1/s], (values, k): column j is one mode,
-    tracked; `shapes`, (values, nq + nu, k), of the modes in all coordinates and velocities, each of norm one in units
-    of the system's size; `states`, names of the states.
+    **Fields:**
+
+    - `name` and `values` of the parameter, (values,).
+    - `eigenvalues` [1/s], (values, k): each column is one tracked mode.
+    - `shapes` of the modes in all coordinates and velocities, (values, nq + nu, k), each of norm one in units of the
+        system's size.
+    - `states`: names of the states.
     """
 
     name: str = eqx.field(static=True)
@@ -69,7 +73,7 @@ def root_locus(
     ```
 
     Modes at neighbouring values are matched, all at once, by the overlap of their shapes and the distance of their
-    eigenvalues, so that modes keep their columns if eigenvalues cross.
+    eigenvalues. So modes keep their columns if eigenvalues cross.
 
     **Arguments:**
 

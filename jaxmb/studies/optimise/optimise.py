@@ -36,9 +36,12 @@ _FIRST, _LAST = 3, 9
 class ConstrainedOutput:
     """A component of a constrained output at the optimum.
 
-    **Fields:** its bounds `low` and `high`; the values `before` and `after`; whether a bound is `active`; `multiplier`
-    ≥ 0, the gain in the objective per unit by which the active bound is relaxed; `tolerance`, by which the value may be
-    out of bounds, in the output's unit.
+    **Fields:**
+
+    - `name`; `low` and `high`: its bounds; `before` and `after`: its values at the start and at the optimum.
+    - `active`: whether the value is at a bound.
+    - `multiplier` ≥ 0: the gain in the objective per unit by which the active bound is relaxed.
+    - `tolerance`: by how much the value may be out of bounds, in the output's unit.
     """
 
     name: str
@@ -206,8 +209,8 @@ def optimise(
     angle.
 
     **Constraints hold** to a millionth of their bound, or of the distance of both bounds if smaller. To a bound of
-    zero, they hold to a millionth of the output at the start, or of its change when a parameter changes by its scale,
-    if larger. `Optimum.constraints` has the tolerances.
+    zero, they hold to a millionth of the output at the start or, if larger, of its change when a parameter changes by
+    its scale. `Optimum.constraints` has the tolerances.
 
     **A minimum** is distinguished from a maximum, a saddle and a flat objective by some trials beside the result, which
     `trials` does not count.

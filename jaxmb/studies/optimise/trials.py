@@ -71,7 +71,7 @@ class Trials:
     def __call__(self, z: np.ndarray) -> Trial:
         z = np.clip(np.asarray(z, float), *self.box)
         trial = self._kept.get(z.tobytes())
-        # A failed line search begins again with the same points.
+        # After a failure, a line search begins again with the same points.
         if trial is None:
             trial = evaluate(self.program, z)
             self.count += 1
@@ -128,8 +128,9 @@ def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
     """Sizes of the lower and the upper side of constraints: the size of each side's bound, so that a far bound does not
     loosen the other side, or the distance of both bounds if smaller.
 
-    A bound of zero has the size of the output's first value, or of its change when a parameter changes by its scale, if
-    larger, but of the other bound at most. A bound of almost zero has a size far above rounding errors of these values.
+    A bound of zero has the size of the output's first value or, if larger, of its change when a parameter changes by
+    its scale; but at most the size of the other bound. A bound of almost zero has a size far above rounding errors of
+    these values.
     """
     or_infinite = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
     of_bounds = or_infinite(np.abs([limits.low, limits.high]))

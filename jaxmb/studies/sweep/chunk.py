@@ -27,7 +27,7 @@ class Task(NamedTuple):
 
 
 class Job(NamedTuple):
-    """What a process needs to compute chunks: the same everywhere, so that the bits are the same.
+    """What a process needs to compute chunks; equal for all processes, so that the bits are the same.
 
     **Fields:** the `function` and its `outputs`; `chunk`: the number of members of each; the folder of the `store`, if
     there is one; `on_cores`: whether a process computes blocks on all its cores. Workers of a user's executor do not,

@@ -119,7 +119,7 @@ def unstacked(dataset: Any) -> Any:
     grid = dict(json.loads(dataset.attrs.pop("grid")))
     if not grid:
         return dataset
-    # A coordinate of more than one dimension cannot have the name of one of them.
+    # A coordinate of more than one dimension cannot have the name of one of its dimensions.
     several = {name for name in grid if name in dataset.coords and dataset[name].ndim > 1}
     axes = {name: f"{name}_index" if name in several else name for name in grid}
     sizes = {axes[name]: size for name, size in grid.items()}

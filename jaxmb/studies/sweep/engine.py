@@ -76,7 +76,7 @@ def on_executor(job: Job, tasks: list[Task], executor: futures.Executor, in_flig
 
 
 def on_processes(job: Job, tasks: list[Task], processes: int) -> Chunks:
-    """Compute chunks on a pool of processes of this machine, and on a new one for what is left if one of them dies."""
+    """Compute chunks on a pool of processes of this machine; if a process dies, a new pool computes what is left."""
     left, breaks = {task.place: task for task in tasks}, 0
     while left:
         pool = futures.ProcessPoolExecutor(

@@ -81,7 +81,7 @@ def sweep(
         a pandas DataFrame, an xarray Dataset.
     - `store`: a folder to write to, in zarr format 3, which all processes can reach. Without it the result is in memory
         only. Where it holds a part of this sweep, only the missing part is computed: after an interruption, the same
-        call goes on, and the result has the same bits. `load_sweep` reads it at any time.
+        call goes on, to a result with the same bits. `load_sweep` reads it at any time.
     - `dims`: names of the dimensions of an output by its name, default `angle_0`, `angle_1`, …
     - `coords`: values along a dimension by its name.
     - `units`: units by the name of a parameter, output or dimension.
