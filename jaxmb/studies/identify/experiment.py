@@ -245,7 +245,9 @@ def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "t
             f"{times[place]:g}; sort the samples, one at each time."
         )
     if times[0] < t0 or times[-1] <= t0:
-        raise ValueError(f"{label} must lie after t0 = {t0}, got times from {times[0]:g} to {times[-1]:g}.")
+        raise ValueError(
+            f"{label} must begin at or after t0 = {t0} and end after it, got {times[0]:g} to {times[-1]:g}."
+        )
     return jnp.asarray(times, dtype=jnp.result_type(float))
 
 

@@ -85,7 +85,9 @@ def linearise(
     state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
     if system.contacts.m:
         names = ", ".join(system.contacts.friction_names)
-        raise ValueError(f"linearise: {names} may stick or slip, which no linear equation describes. Remove it.")
+        raise ValueError(
+            f"linearise: {names} may stick or slip, which no linear equation describes. Remove the friction."
+        )
     opens = system.contacts.modes(state.q).open
     if not is_traced(opens) and not np.all(opens):
         closed = [name for name, is_open in zip(system.contacts.contact_names, opens, strict=True) if not is_open]

@@ -40,7 +40,7 @@ def checked_names(kind: str, names: Iterable[str]) -> tuple[str, ...]:
     **Raises:** `ValueError` for a single text, for names that are not text, and for repeated names.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
-        raise ValueError(f"Names are given in a sequence, ({names!r},), also a single {kind}.")
+        raise ValueError(f"Give names in a sequence, ({names!r},), even for a single {kind}.")
     names = tuple(names)
     for name in names:
         if not isinstance(name, str):

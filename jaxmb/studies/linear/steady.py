@@ -84,8 +84,8 @@ def steady_motion(
     if system.contacts.m:
         names = ", ".join(system.contacts.friction_names)
         raise ValueError(
-            f"steady_motion: {names} may stick or slip, which the search does not support. Remove it, or use smooth "
-            "`Friction`."
+            f"steady_motion: {names} may stick or slip, which the search does not support. Remove the friction, or use "
+            "smooth `Friction`."
         )
     guess = checked_guess("steady_motion", system, guess)
     t = jnp.asarray(checked_time("steady_motion", t, guess.q.dtype))

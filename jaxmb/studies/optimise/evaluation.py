@@ -199,6 +199,6 @@ def with_derivatives(program: Program, rows: int) -> Program:
             continue
         return trial
     raise ValueError(
-        "The function has no derivatives in either mode. A jax.custom_vjp rules out forward mode, a loop such as "
-        "jax.lax.while_loop reverse mode; a simulation has the mode of its adjoint."
+        "The function has no derivatives in either mode. A jax.custom_vjp rules out forward mode; a loop such as "
+        "jax.lax.while_loop rules out reverse mode; a simulation has the mode of its adjoint."
     ) from first

@@ -244,7 +244,7 @@ def _check_version(version: Any, unknown: Sequence[Any]) -> None:
         more = f" (and {len(unknown) - 1} more like it)" if len(unknown) > 1 else ""
         raise ValueError(
             f"The program of the sweep calls {name}{more} from Python, and a store cannot tell whether that has "
-            "changed. Give version=, a text or number that you change when it changes, or leave out the store."
+            "changed. Give version=, a text or integer that you change when it changes, or leave out the store."
         )
 
 
