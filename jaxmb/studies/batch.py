@@ -56,10 +56,10 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
         Functions without loops have one block, and so have all functions on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array. Its results have members
-    along axis 0 as well. It is compiled at its first call. Values other than arrays, such as names, are the same for
-    all members, and so are values that the function refers to. The last block is filled up with copies of the last
-    member, which costs time and does not change results. The function has derivatives in all modes; reverse mode keeps
-    the values that it needs from all blocks at once.
+    along axis 0 as well. The function is compiled at its first call. Values other than arrays, such as names, are the
+    same for all members, and so are values that the function refers to. The last block is filled up with copies of the
+    last member, which costs time and does not change results. The function has derivatives in all modes; reverse mode
+    keeps the values that it needs from all blocks at once.
 
     **Raises:** `ValueError` for a size that is not an integer of at least 1; for arguments without members or of
     different numbers of members; for a function that needs an argument as a number; and, unless `size=1`, for an

@@ -8,8 +8,8 @@ from jaxtyping import Float
 # A direction of unknowns is undetermined if the residuals are less sensitive to it than this, relative to the strongest
 # direction.
 _UNDETERMINED = 1e-6
-# It is also undetermined if the data's sensitivity is below this multiple of the motions' relative tolerance, the
-# accuracy of derivatives.
+# A direction is also undetermined if the data's sensitivity is below this multiple of the motions' relative tolerance,
+# the accuracy of derivatives.
 _TOLERANCES = 100.0
 # Least share in an undetermined direction that makes a component undetermined.
 _SHARE = 0.1

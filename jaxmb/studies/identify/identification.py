@@ -36,10 +36,10 @@ class Identification(Printed, Fit):
         and remedies. `message`: the verdict in one sentence, which starts with "converged" only if `converged` is true.
     - `deviations`: standard deviations by name, of the same shapes, from the residuals' Jacobian at the solution.
         Without `sigma`, or with a robust loss, the noise is estimated from the residuals; a robust loss gives the
-        deviations of Huber's M-estimate, valid for any distribution of the noise. Infinite for parameters that the data
-        do not determine. NaN if meaningless: the iteration did not converge; the residuals are not noise of the size of
-        `sigma`; the estimate is at an end of its range; or the noise is unknown and there are no more residuals than
-        parameters.
+        deviations of Huber's M-estimate, valid for any distribution of the noise. Deviations are infinite for
+        parameters that the data do not determine, and NaN if meaningless: the iteration did not converge; the residuals
+        are not noise of the size of `sigma`; the estimate is at an end of its range; or the noise is unknown and there
+        are no more residuals than parameters.
     - `covariance` of the problem linearised at the solution, also if meaningless, in the order of `components`, the
         names of all scalar components.
     - `undetermined`: names of components that can change, alone or together, without changing the residuals;

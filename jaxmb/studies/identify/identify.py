@@ -79,8 +79,8 @@ def identify(
     - `free`: the unknowns: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the system's
         values. All experiments share a value, unless an experiment has the name in its `own`: this experiment's unknown
         is then `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it,
-        `"encoder.bias"`. Each is one number, or one for each component of the quantity if its start is. Noise levels
-        are estimated by maximum likelihood.
+        `"encoder.bias"`. These unknowns are single numbers, or arrays of the quantity's shape if their starts are.
+        Noise levels are estimated by maximum likelihood.
 
     **The initial state**, at `t0`, is recomputed for every value of the parameters by `assemble(guess=state, fix=fix,
     rates=rates)`; a `state` that satisfies the constraints for all values of the free parameters is therefore

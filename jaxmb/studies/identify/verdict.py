@@ -1,7 +1,7 @@
 """Tests of a fit: of the residuals, the estimates, and the ends of several starts.
 
-Every test of residuals rejects a correct fit with normal noise with a probability of about one in a million. It also
-rejects only if the misfit is not small compared with the noise: a significant difference may not matter.
+Every test of residuals rejects a correct fit with normal noise with a probability of about one in a million. A test
+rejects only if the misfit is also not small compared with the noise: a significant difference may not matter.
 
 Source: L. Ljung, "System Identification: Theory for the User", 2nd ed., Prentice Hall 1999, chapter 16; J. D. Gibbons
 and S. Chakraborti, "Nonparametric Statistical Inference", 5th ed., CRC Press 2011, chapter 3 (runs); R. Leipnik,

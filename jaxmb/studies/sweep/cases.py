@@ -83,10 +83,10 @@ def table(columns: Any = None, /, **more: ArrayLike) -> Cases:
     """Members that are listed one by one.
 
     **Arguments:** columns of equal length by the parameter's name, as a dictionary or as keyword arguments: shape
-    (members,) for numbers, (members, 2) for points; a single number is the same for all members. Also a pandas
-    `DataFrame`, whose columns are the parameters; an xarray `Dataset` or named `DataArray`. The data variables of a
-    `Dataset`, or without any its dimension coordinates, are the parameters. They are broadcast over all dimensions,
-    which the result of the sweep has again.
+    (members,) for numbers, (members, 2) for points; a single number is the same for all members. Also accepted are a
+    pandas `DataFrame`, whose columns are the parameters, and an xarray `Dataset` or named `DataArray`. The parameters
+    are the data variables of a `Dataset`, or without any its dimension coordinates. They are broadcast over all
+    dimensions, which the result of the sweep has again.
 
     **Raises:** `ValueError` that names the column, for lengths that differ, repeated names, and values that are not
     finite real numbers.

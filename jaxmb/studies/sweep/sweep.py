@@ -79,9 +79,9 @@ def sweep(
         its `result`, without steps. The function is pure and traced by JAX: use `jnp.where` or `jax.lax.cond` for `if`.
     - `cases`: from `jaxmb.cases.grid`, `table` or `sobol`; or an argument of `table`: columns of equal length by name,
         a pandas DataFrame, an xarray Dataset.
-    - `store`: a folder to write to, in zarr format 3, which all processes can reach. Without it the result is in memory
-        only. Where it holds a part of this sweep, only the missing part is computed: after an interruption, the same
-        call goes on, to a result with the same bits. `load_sweep` reads it at any time.
+    - `store`: a folder to write to, in zarr format 3, which all processes can reach. Without a store the result is in
+        memory only. Where the store holds a part of this sweep, only the missing part is computed: after an
+        interruption, the same call goes on, to a result with the same bits. `load_sweep` reads it at any time.
     - `dims`: names of the dimensions of an output by its name, default `angle_0`, `angle_1`, …
     - `coords`: values along a dimension by its name.
     - `units`: units by the name of a parameter, output or dimension.
@@ -167,7 +167,7 @@ def _marks(cases: Cases, variables: Mapping[str, Variable], program: bytes, vers
     """The marks by which a store identifies a sweep."""
     digest = lambda value: digest_of(value, rules=False).value.hex()
     columns = {name: own for name, own in variables.items() if name in cases.columns}
-    # Without the number of members, which the cases tell.
+    # The number of members is left out; the cases tell it.
     others = {name: own._replace(shape=own.shape[1:]) for name, own in variables.items() if name not in columns}
     return {
         "jaxmb_version": __version__,
