@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.command(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of a pipe, such as head, has closed it; nothing must remain to be written when the process ends.
+        # The reader of a pipe, such as head, has closed it; no output must be left to write when the process ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, RuntimeError, OSError) as error:

@@ -79,13 +79,13 @@ for name, body, joints, solver in machines:
 import json
 print(json.dumps([after - before for before, after in zip(times, times[1:])]))
 """
-# The durations of the table, among all that it prints.
+# The indices of the table's rows among the printed durations.
 _SHOWN = {"import jax, diffrax": 0, "import jaxmb": 1} | {
     f"{name}: {call}": 3 + 5 * k + place
     for k, name in enumerate(("four_bar", "spatial_slider_crank", "slider_crank with a stop", "stiff_four_bar"))
     for call, place in {"first value": 0, "first gradient": 2, "another value": 1, "another gradient": 3}.items()
 }
-# The format of facts: names and paths are for copying.
+# The format of facts. Names and paths are not broken, so that they can be copied.
 _INDENT = 18
 _FILLED = textwrap.TextWrapper(80, subsequent_indent=" " * _INDENT, break_long_words=False, break_on_hyphens=False)
 
@@ -143,7 +143,7 @@ def _version(package: str) -> str | None:
 
 
 def _processor() -> str:
-    """The processor's name, which Linux has in a file."""
+    """The processor's name, on Linux from a file."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -190,7 +190,7 @@ def _durations(environment: dict[str, str]) -> list[float]:
 
 
 def _steps() -> list[list[str]]:
-    """Numbers of steps of some motions, and the time of a step."""
+    """The number of steps of some motions, and the time of a step."""
     motions = [mechanisms.get(name) for name in _STEPPED]
     runs = [functools.partial(_motion, single.system, single.state, single.t1) for single in motions]
     rows = [["", "bodies", "t1 [s]", "steps", "run [ms]", "step [µs]"]]

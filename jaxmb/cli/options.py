@@ -17,7 +17,7 @@ def add_parameters(command: argparse.ArgumentParser) -> None:
 
 
 def assignment(text: str) -> tuple[str, object]:
-    """A name and a Python literal, or a word."""
+    """A name, and its value as a Python literal or a word."""
     name, equals, value = text.partition("=")
     if not equals or not name.isidentifier():
         raise argparse.ArgumentTypeError(f"expected NAME=VALUE, got {text!r}")

@@ -18,7 +18,7 @@ from ..states.assembly import assemble
 
 
 def mechanism_of(arguments: argparse.Namespace) -> Mechanism:
-    """The mechanism, with end and reference values limited to `--t1`."""
+    """The mechanism, with its end and its reference values limited to `--t1`."""
     parameters = dict(arguments.set)
     function = _function(arguments.mechanism) if ":" in arguments.mechanism else None
     try:
@@ -62,7 +62,7 @@ def _function(where: str) -> Callable[..., Any]:
 
 
 def _made(function: Callable[..., Any], arguments: argparse.Namespace) -> Mechanism:
-    """The motion of a user's function: a scene, a mechanism, or system, state and perhaps t1."""
+    """The motion of a user's function, which returns a scene, a mechanism, or a system, a state and perhaps t1."""
     try:
         inspect.signature(function).bind(**dict(arguments.set))
     except TypeError as error:

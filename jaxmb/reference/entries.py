@@ -46,7 +46,7 @@ class Entry:
 
     @property
     def is_part(self) -> bool:
-        """Whether it is a class of parts for scenes, not a base class of parts."""
+        """Whether the entry is a class of parts for scenes, not a base class of parts."""
         return self.kind == "class" and issubclass(self.thing, AbstractPart) and not self.short.startswith("Abstract")
 
     @property
@@ -56,7 +56,7 @@ class Entry:
 
     @property
     def text(self) -> str:
-        """Its docstring, with the arguments from the docstring of a class's `__init__`."""
+        """The docstring; for a class, with the arguments from the docstring of `__init__`."""
         docstring = self.thing.__doc__ if self.kind != "field" else f"A field; see `{self.name.rpartition('.')[0]}`."
         texts = [docstring, vars(self.thing)["__init__"].__doc__] if _explains_arguments(self.thing) else [docstring]
         return "\n\n".join(inspect.cleandoc(text) for text in texts if text)
@@ -74,7 +74,7 @@ class Subject:
     """Public names that belong together.
 
     **Fields:** `title`; `module`, the entry of their module, None for names of the package itself; `groups` of entries
-    by their headings; `others`, entries elsewhere for names that the module has as well.
+    by their headings; `others`, entries of other modules whose names the module has as well.
     """
 
     title: str
@@ -185,7 +185,7 @@ def other_names() -> dict[str, Entry]:
 
 @functools.cache
 def members(entry: Entry) -> tuple[Entry, ...]:
-    """The methods and properties of a class with a docstring that no public base class has."""
+    """The documented methods and properties of a class, and of its private bases those that no public base has."""
     inherited = {name for base in bases(entry) for name in _documented(_of_package(base.thing))}
     itself, *others = _of_package(entry.thing)
     public = {id(base.thing) for base in bases(entry)}
@@ -291,7 +291,7 @@ def _of_package(cls: type) -> list[type]:
 
 
 def _documented(classes: Iterable[type]) -> dict[str, Any]:
-    """The public methods and properties with docstrings that some classes define; the first for each name."""
+    """The public methods and properties with docstrings in some classes, for each name from the first class."""
     documented = {}
     for base in classes:
         for name, raw in vars(base).items():
@@ -328,7 +328,7 @@ def find(name: str) -> Entry:
 
 
 def _speaking_of(word: str) -> list[str]:
-    """Names whose docstrings have an argument or a quantity with this name; a few of the shortest docstrings."""
+    """At most six names with an argument or quantity of this name in their docstrings, shortest docstrings first."""
     code = re.compile(rf"[`(, ]{re.escape(word)}(=|`)")
     matches = [entry for entry in entries().values() if entry.kind != "module" and code.search(entry.text)]
     return [entry.name for entry in sorted(matches, key=lambda entry: len(entry.text))[:6]]
@@ -360,7 +360,7 @@ def _shortest_names() -> list[str]:
 
 
 def _every_member(entry: Entry) -> tuple[Entry, ...]:
-    """All members, first from base classes, so that a dictionary keeps the nearest."""
+    """All members, those of base classes first, so that a dictionary keeps the nearest."""
     return tuple(member for base in (*reversed(bases(entry)), entry) for member in members(base))
 
 

@@ -44,7 +44,7 @@ def listed(width: int = 80, styled: bool = False) -> str:
     pages = _rows(((name, topic.summary) for name, topic in topics().items()), width)
     parts = [_hanging(_HOW, 0, 0, width), "**Topics**", pages]
     for subject in subjects():
-        # All names of some modules belong to other modules.
+        # Some modules have only names of other modules.
         if subject.entries:
             parts += [f"**{subject.title}**", _table(subject.entries, width)]
     return "\n\n".join(_styled(part, styled) for part in parts)
@@ -111,7 +111,7 @@ def _hanging(text: str, first: int, other: int, width: int) -> str:
 
 
 def _filled(text: str, width: int) -> Iterable[tuple[str, bool]]:
-    """The paragraphs of a docstring, filled, and whether they are code; code and tables stay as they are."""
+    """The filled paragraphs of a docstring, each with whether it is code; code and tables stay as they are."""
     for block in _blocks(text):
         first = block[0]
         if _FENCE.match(first):

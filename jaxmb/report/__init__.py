@@ -1,7 +1,6 @@
 """Reports about a machine: error against run time, and stiff and extreme variants. Each is a `Table`.
 
-- `work_precision(system, state, t1=)`: error against run time and evaluations, for solvers and tolerances, against two
-  methods that agree.
+- `work_precision(system, state, t1=)`: error against run time and evaluations, for solvers and tolerances.
 - `stress_test(system, state, t1=)`: the true error, or the refusal, of stiff and extreme variants: springs, masses,
   lengths, speeds, redundant joints, tolerances.
 - `check_elements(system, state)`: whether the elementary constraints that joints declare agree with their residuals.

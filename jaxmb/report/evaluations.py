@@ -11,8 +11,8 @@ def evaluations(solver: diffrax.AbstractSolver, stats: Mapping[str, Any]) -> int
 
     Rejected steps count like accepted ones. The first stage of a Runge–Kutta method that is the last stage of the
     previous step counts once. Evaluations for the choice of these methods' first step, and its repetition after a
-    rejection, are not counted, which favours them by one or two. The trial of a `MultistepController` is counted. None
-    for implicit Runge–Kutta methods, which do not report their iterations.
+    rejection, are not counted, which favours them by one or two. The trial of a `MultistepController` is counted. The
+    result is None for implicit Runge–Kutta methods, which do not report their iterations.
     """
     if "num_evaluations" in stats:
         return int(stats["num_evaluations"])

@@ -1,4 +1,4 @@
-"""Reference values that the errors of a report are relative to."""
+"""Reference values for the errors of a report."""
 
 import diffrax
 import numpy as np
@@ -17,7 +17,7 @@ _TIMES = 21
 
 
 def reference(mechanism: Mechanism, tolerance: float) -> References:
-    """Values at the end of a mechanism's motion: published values, or a run two orders tighter than `tolerance`.
+    """Values at the end of a mechanism's motion: published values, or a run a hundred times tighter than `tolerance`.
 
     The run is checked by a second method, Dormand–Prince 8, with projection if there are constraints; the largest
     relative difference of the two is the `tolerance` of the result. Sizes are the largest values along the motion.

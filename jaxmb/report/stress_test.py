@@ -41,7 +41,7 @@ _COLUMNS = {"variant": "", "": "", "error": ".1e", "known to": ".0e", "steps": "
 
 
 class _Case(NamedTuple):
-    """A variant: its error, or a word instead; the accuracy of the reference; the reason of a refusal."""
+    """A variant: its error, or a word instead; the accuracy of the reference; the reason why it is refused, or ""."""
 
     kind: str
     case: str
@@ -54,7 +54,7 @@ class _Case(NamedTuple):
 class _Trial(NamedTuple):
     """A variant: `build()` returns system, state and t1.
 
-    `truth`: the result of `_truth` in a tuple, if the exact motion is the given system's.
+    `truth`: the given system's `_truth` in a tuple, if its exact motion is also the variant's.
     """
 
     case: str
@@ -82,7 +82,7 @@ def stress_test(
 
     For other tolerances, other lengths (by dimensional analysis) and doubled joints, the reference is the motion of the
     given system. For other variants, two of the methods `Adams`, `Dopri8` and `Hermite` at a tight tolerance give a
-    reference; errors below ten times their difference are unknown. Variants that differ in numbers only share a
+    reference; errors below ten times their difference are "small". Variants that differ only in numbers share a
     compiled program.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`, or a mechanism of the library alone; `rtol`; `solver`,
@@ -91,8 +91,9 @@ def stress_test(
     "alternating masses", "lengths", "initial speed", "near-singular", "doubled joint".
 
     **Returns:** a `Table` of variants. `error` is the largest error at the end of coordinates, velocities and internal
-    states, each relative to their largest value; or "small" if less than the accuracy of the reference ("known to"),
-    "unknown", or "refused" if the variant cannot be built or its run fails. Notes give the reasons.
+    states, each relative to their largest value. Words replace it: "small" if it is below the accuracy of the reference
+    ("known to"), "unknown" without a reference, "refused" if the variant cannot be built or its run fails. Notes give
+    the reasons.
     """
     mechanism = subject(system, state, t1)
     solver = Adams() if solver is None else solver

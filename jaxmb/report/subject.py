@@ -1,4 +1,4 @@
-"""Subjects of reports: a mechanism of the library, or a system and a state of a user's."""
+"""Subjects of reports: a mechanism of the library, or a user's system and state."""
 
 import dataclasses
 from typing import Any

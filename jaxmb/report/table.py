@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Table(Printed):
     """The results of a report; `print` and notebooks show them, and `table["error"]` is a column.
 
-    **Fields:** `title`; `columns`: their names, each with the format of its numbers, `".1e"`, or "" for words; `rows`
-    of numbers, words, and None for an unknown number; `notes`: lines below; `draw(table)`: its matplotlib figure.
+    **Fields:** `title`; `columns`: the format of each column's numbers by its name, `".1e"`, or "" for words; `rows` of
+    numbers, words, and None for an unknown number; `notes`: lines below; `draw(table)`: returns a matplotlib figure.
     """
 
     title: str

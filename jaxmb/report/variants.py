@@ -20,8 +20,8 @@ from ..system import AbstractSystem, parameters, with_parameters
 
 
 def units(system: Any) -> dict[str, str | None]:
-    """The units of all parameters by name, `"N/m, N m/rad"` for components with different units; None if undeclared, or
-    defined by a user's function.
+    """The units of all parameters by name, `"N/m, N m/rad"` for components with different units; None for a unit that
+    is undeclared, or defined by a user's function.
     """
     out: dict[str, str | None] = dict.fromkeys(parameters(system))
     for g in _groups(system):

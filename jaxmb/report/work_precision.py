@@ -66,9 +66,9 @@ def work_precision(
 
     Errors of a mechanism are errors of the quantities that it observes, relative to their sizes. Errors of other
     systems are errors of all coordinates and of all velocities, each relative to the largest, in units of the system's
-    size or radians. Reference values are published values of a mechanism, or computed by two methods. Every run is
-    compiled before it is timed; then all run in turns `repeats` times. Only the end of the motion is saved, so that no
-    run includes interpolation.
+    size or radians. Reference values are published values of a mechanism, or computed by two methods. All runs are
+    compiled before they are timed, in turns, `repeats` times. Only the end of the motion is saved, so that no run
+    includes interpolation.
 
     **Arguments:** `system`, `state`, `t1` [s]: as in `simulate`; or a mechanism of the library alone; `solvers` by
     name, default `Adams`, and `Tsit5` and `Dopri8` of diffrax with projection; `tolerances`: values of `rtol`, default
@@ -76,8 +76,8 @@ def work_precision(
 
     **Returns:** a `Table` with a row for each solver and tolerance. `error` is the largest error, "small" if it is
     below the accuracy of the reference, and "failed" for a failed run, with a note on the reason. Times are the
-    shortest and the median of warm runs, and the time to compile the solver's program (or read it from disk), which
-    serves all tolerances. `steps` includes rejected steps; `evaluations` of the accelerations are None if unknown.
+    shortest and the median of warm runs, and the time to compile the solver's program (or to read it from disk), which
+    all tolerances share. `steps` includes rejected steps; `evaluations` of the accelerations are None if unknown.
 
     **Raises:** `ValueError` for no solvers, no tolerances or no repeats, and for a system without state or `t1`.
     """

@@ -24,10 +24,10 @@ _CARRIED, _MOST = 2**20, 64
 # Ratio of the bytes that the equations of a loop body write to the bytes that its fused kernels read and write (rule of
 # thumb).
 _FUSED = 3
-# Members side by side fill a vector register with their numbers in double precision. Loops that carry more than these
-# bytes for a member, such as Bricard's mechanism, would compile for minutes.
+# The number of members side by side, which fill a vector register in double precision; and the most bytes that their
+# loop carries for one: larger loops, such as of Bricard's mechanism, would compile for minutes.
 _SIDE_BY_SIDE, _MOST_SIDE_BY_SIDE = 8, 2**14
-# Least number of rows of an array of several axes that counts as a table, of which a step writes one row.
+# Arrays of several axes with at least this number of rows count as tables, of which a step writes one row.
 _LONG = 1024
 
 
@@ -41,29 +41,29 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
     ```
 
     The members of a block go through the loop of a simulation together, until the slowest member has ended. Each
-    operation acts on the numbers of all members. The caches hold the numbers of some tens of simulations. So
-    `jax.vmap` of a few hundred takes longer than blocks, or even than one run after the other. Use `jax.vmap` for
-    functions without loops. Use it on a GPU as well, where it pays from some hundred members on: a step of a four-bar
-    takes 0.2 ms there, and a step of 65 536 four-bars 2 ms (H100; on a core, a step of a four-bar takes 0.01 ms).
+    operation acts on the numbers of all members. The caches hold the numbers of some tens of simulations. So `jax.vmap`
+    of a few hundred takes longer than blocks, or even than one run after the other. Use `jax.vmap` for functions
+    without loops. Use it on a GPU as well, where it pays from some hundred members on: on an H100, a step of a four-bar
+    takes 0.2 ms, and of 65 536 four-bars 2 ms; on a core, a step of one takes 0.01 ms.
 
     **Arguments:**
 
-    - `function`: of any arguments by position, pytrees of arrays, to a pytree of arrays; it is traced by JAX.
-    - `size`: the most members of a block; 1 for one after the other, without `vmap`. By default a power of two for
-        which the numbers carried by the function's largest loop stay in the cache of a core. It is 1 if that loop
-        becomes one kernel, by `setup(compile="for speed")`: this is as fast, and no member waits for another. It is 8
-        by `setup(compile="for batches")`, with members side by side in the registers of a processor. A function without
-        loops has one block, and so have all functions on other devices than a CPU.
+    - `function`: takes pytrees of arrays by position and returns a pytree of arrays. JAX traces it.
+    - `size`: the most members of a block; 1 computes one after the other, without `vmap`. The default is a power of two
+        for which the numbers carried by the function's largest loop stay in the cache of a core. The default is 1 if
+        that loop becomes one kernel by `setup(compile="for speed")`: this is as fast, and no member waits for another.
+        The default is 8 with `setup(compile="for batches")`, with members side by side in the registers of a processor.
+        Functions without loops have one block, and so have all functions on other devices than a CPU.
 
     **Returns:** a function of the same arguments with members along axis 0 of each array. Its results have members
-    along axis 0 as well. It is compiled at its first call. Values other than arrays, such as names, are the same for
-    all members, and so are values that the function refers to. The last block is filled up with copies of the last
-    member, which costs time and does not change results. The function has derivatives in all modes; reverse mode keeps
-    the values that it needs from all blocks at once.
+    along axis 0 as well. The function is compiled at its first call. Values other than arrays, such as names, are the
+    same for all members, and so are values that the function refers to. The last block is filled up with copies of the
+    last member, which costs time and does not change results. The function has derivatives in all modes; reverse mode
+    keeps the values that it needs from all blocks at once.
 
     **Raises:** `ValueError` for a size that is not an integer of at least 1; for arguments without members or of
-    different numbers of members; for a function that needs an argument as a number; and for an operation without a rule
-    for batches, which `size=1` does not need.
+    different numbers of members; for a function that needs an argument as a number; and, unless `size=1`, for an
+    operation without a rule for batches.
     """
     if not callable(function):
         raise ValueError(f"batch needs a function, got {function!r}.")
@@ -86,7 +86,7 @@ def batch(function: Callable[..., Any], size: int | None = None) -> Callable[...
 class Member:
     """A function of one member, traced once for an example of its arguments. The example may be traced itself.
 
-    **Raises:** `ValueError` for a function that needs the number of an argument.
+    **Raises:** `ValueError` for a function that needs an argument as a number.
     """
 
     def __init__(self, function: Callable[..., Any], example: PyTree):
@@ -96,7 +96,7 @@ class Member:
             self._program = self._function.trace(self._like).jaxpr
         except NEED_NUMBERS as error:
             raise ValueError(
-                "The function cannot be batched: it needs the number of an argument, which differs between members. "
+                "The function cannot be batched: it needs an argument as a number, which differs between members. "
                 f"Use jnp.where or jax.lax.cond for `if`, and jax.numpy for NumPy. ({error})"
             ) from error
 
@@ -124,7 +124,7 @@ class Member:
         return min(2 ** int(math.log2(max(_CARRIED / self._carried, 1))), _MOST)
 
     def block(self, size: int) -> Callable[..., Any]:
-        """The function of several members at once; of one, without `vmap`."""
+        """The function of `size` members at once; without `vmap` for one member."""
         if size == 1:
             alone = lambda x: jax.tree.map(lambda x: x[0], x)
             return lambda own: jax.tree.map(lambda x: x[None], self._function(alone(own)))
@@ -146,7 +146,7 @@ class Member:
 
 
 def _loops(program: Any) -> Iterator[tuple[int, int]]:
-    """The bytes that each loop of a program carries from step to step, and the bytes that its equations write."""
+    """For each loop of a program, the bytes carried from step to step and the bytes that the loop's equations write."""
     for equation in getattr(program, "jaxpr", program).eqns:
         inner = _inner(equation)
         if equation.primitive.name in ("while", "scan"):
@@ -163,7 +163,7 @@ def _loop_values(equation: Any) -> int:
 
 
 def _written(program: Any) -> int:
-    """The bytes that the equations of a program write, with one turn of each loop."""
+    """The bytes that the equations of a program write, in one pass of each loop."""
     pairs = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
     return sum(sum(map(_written, inner)) if inner else _bytes(equation.outvars) for equation, inner in pairs)
 

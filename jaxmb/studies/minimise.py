@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt: residuals made small, also under equations, and from several starts at once."""
+"""Levenberg–Marquardt's method, also with equality constraints, and from several starts at once."""
 
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 # Damping of the first step, and its smallest value.
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
-# The largest gap that counts as closed, and the smallest fraction of a step towards closed gaps.
+# The largest gap that counts as closed, and the smallest fraction to which a step is halved.
 _CLOSED, _LEAST_SHARE = 1e-9, 2.0**-5
 
 
@@ -33,8 +33,8 @@ class Linearised(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """The end of an iteration: `z`, the number of trials except halved steps, whether it converged, and the
-    objective.
+    """The end of an iteration: its last point `z`, the number of trials except halved steps, whether the iteration
+    converged, and the objective.
     """
 
     z: Any
@@ -64,17 +64,17 @@ def levenberg_marquardt(
 
     A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt), subject to `c + C s =
     0` for gaps c. With gaps the merit function is `f + ν |c|₁`, and a rejected step is halved first. The damping μ
-    follows the gain, the ratio of the actual decrease to the linear model's.
+    follows the gain, the ratio of the actual decrease to the decrease of the linear model.
 
-    If the model promises a decrease of less than `tol` times the objective, the varying errors of the motions exceed
-    it, and the objective cannot judge a step. Such steps are taken without it, as long as each is less than a tenth of
-    the previous step.
+    A decrease of less than `tol` times the objective is below the varying errors of the motions, so that the objective
+    cannot judge it. If the model promises no more, steps are taken without a test, as long as each is less than a tenth
+    of the previous step.
 
     Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
 
     **Arguments:** `linearised`: residuals and their Jacobian, or a `Linearised`; `tol`: change of the unknowns and of
-    the objective at which to stop, absolute and relative; `limit`: largest number of evaluations of `linearised`;
-    `held`: a mask of the fixed unknowns; `move(z, step)`: the point after a step, and `size(z, step)` of a step, for
+    the objective at which to stop, absolute and relative; `limit`: largest number of trials, except halved steps;
+    `held`: a mask of the fixed unknowns; `move(z, step)`: the point after a step, and `size(z, step)`: its length, for
     points that are not vectors.
     """
     return minimise_together(lambda zs: [linearised(zs[0])], [z], tol, limit, held, move, size)[0]
@@ -105,7 +105,7 @@ def minimise_together(
 
 
 def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size) -> Generator[Any, Linearised, Minimum]:
-    """The iteration: it yields trials, and is sent the model of the objective there."""
+    """The iteration, which yields trial points and is sent the linearised objective at each."""
     model = _numbers((yield z), held)
     if not np.isfinite(model.value):
         return Minimum(z, 1, False, np.inf)
@@ -125,7 +125,7 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
         predicted = weight * share * gap - model.residuals @ change - 0.5 * change @ change
         gain = decrease / predicted if predicted > 0 else 0.0
         settled = predicted <= tol * (1 + abs(objective)) and abs(decrease) <= np.sqrt(tol) * (1 + abs(objective))
-        # More damping may make the promise small far from the minimum.
+        # More damping may make the promised decrease small far from the minimum.
         hidden = settled and damping <= _FIRST_DAMPING and predicted <= tol * abs(objective) and _closed(model)
         length = size(z, whole)
         if hidden and length > 0.1 * last:
@@ -148,7 +148,7 @@ def _trials(z: Any, tol: float, limit: int, held: np.ndarray | None, move, size)
 
 
 def _numbers(model: Linearised, held: np.ndarray | None) -> Linearised:
-    """A model for NumPy, of the unknowns that change; its objective is infinite if a part is not finite."""
+    """A model in NumPy arrays, for the free unknowns only; its objective is infinite if a part is not finite."""
     free = slice(None) if held is None else ~held
     residuals, jacobian = np.asarray(model.residuals), np.asarray(model.jacobian)[:, free]
     gaps = np.zeros(0) if model.gaps is None else np.asarray(model.gaps)
@@ -175,7 +175,7 @@ def _step(model: Linearised, damping: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def null_basis(matrix: Float[np.ndarray, "m n"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bases of the row space and of the null space of a matrix of full row rank, and its triangular factor."""
+    """For a matrix of full row rank: bases of its row and null spaces, and the triangular factor of its transpose."""
     whole, upper = np.linalg.qr(matrix.T, mode="complete")
     m = matrix.shape[0]
     return whole[:, :m], upper[:m], whole[:, m:]

@@ -21,8 +21,8 @@ else:
 
 Bounds = tuple[ArrayLike | None, ArrayLike | None]
 
-# An estimate is at an end of its range if its distance from it is below this fraction of the start's distance, and
-# below `_INDISTINCT` standard deviations.
+# An estimate is at a bound if its distance from the bound is below this fraction of the start's distance, and below
+# `_INDISTINCT` standard deviations.
 _NEAR, _INDISTINCT = 1e-3, 0.1
 
 
@@ -48,9 +48,9 @@ class AbstractRange(eqx.Module):
     def at_end(self, z: Float[Array, "n"], deviations: np.ndarray) -> np.ndarray:
         """Whether each component of the value is at an end of the range, a bound or infinity, as far as the data tell.
 
-        Its distance from the end has shrunk to a thousandth of the start's (to a thousandth of the width between two
-        bounds), and is small against its standard `deviations`. A component close to a bound, but distinguishable from
-        it by the data, is not at the bound.
+        At a bound, the distance from it is below a thousandth of the start's distance (of the width between two
+        bounds), and below a tenth of the standard deviation in `deviations`. Towards infinity, the distance has grown a
+        thousandfold and is below the standard deviation.
         """
 
     @property
@@ -101,8 +101,8 @@ class WholeLine(AbstractRange):
 
 
 class Box(WholeLine):
-    """Values between bounds that the method keeps, infinite if missing: `start + scale z`, never out of bounds by
-    rounding.
+    """Values `start + scale z` between bounds that the method keeps, infinite if missing. Rounding never leads out of
+    bounds.
     """
 
     low: Array
@@ -169,9 +169,9 @@ class Interval(AbstractRange):
 class Inertia(AbstractRange):
     """Inertia matrices of mass distributions: their principal moments satisfy the triangle inequalities.
 
-    `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite: `Σ = C T Tᵀ Cᵀ`, with `C Cᵀ`
-    the start's, and T lower triangular with `exp z` on its diagonal. About the mass centre the pseudo-inertia matrix is
-    block diagonal, with blocks Σ and the mass; it is positive definite if both are.
+    `I = tr(Σ) 1 − Σ` with the second moments of mass `Σ = ∫ r rᵀ dm` positive definite: `Σ = C T Tᵀ Cᵀ`, where `C Cᵀ`
+    is the start's Σ and T is lower triangular with `exp z` on its diagonal. About the mass centre the pseudo-inertia
+    matrix is block diagonal, with blocks Σ and the mass; it is positive definite if both blocks are.
 
     Source: C. Rucker and P. M. Wensing, "Smooth Parameterization of Rigid-Body Inertia", IEEE Robotics and Automation
     Letters 7(2), 2022.
@@ -286,8 +286,8 @@ def range_of(
 ) -> AbstractRange:
     """The range of one parameter.
 
-    **Arguments:** `own`: an array of the parameter's shape and type; `positive`: whether it stays positive, or an
-    inertia matrix; `scale`: a typical change, default the size of the start.
+    **Arguments:** `own`: an array of the parameter's shape and type; `positive`: whether the parameter stays positive,
+    or a matrix an inertia matrix; `scale`: a typical change, default the size of the start.
     """
     if isinstance(start, eqx.Module):
         raise ValueError(
@@ -320,7 +320,7 @@ def typical_change(value: Array) -> Array:
 
 def range_between(start: Array, low: Array, high: Array, scale: Array) -> AbstractRange:
     """The values between two bounds, each finite for all components or for none; `scale`: a typical change if neither
-    is.
+    bound is finite.
     """
     below, above = (bool(np.all(np.isfinite(bound))) for bound in (low, high))
     if below and above:

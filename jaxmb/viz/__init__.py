@@ -3,8 +3,8 @@
 `show` and `plot_mechanism` draw wheels, pins, springs, tracks and terrain; other bodies are bars from the mass centre
 to the points where parts act. `show` also takes other shapes: `shapes={"crank": jaxmb.shapes.Box((1.0, 0.1, 0.1))}`, or
 `shapes.Mesh.read(file)`; a user-defined part defines them by its methods `shapes` and `path`. A picture shows the saved
-states only. It takes about 0.9 MB, including 0.82 MB for viser's viewer, needs no network, and also plays in notebooks
-exported to HTML.
+states only. A moving picture takes about 0.9 MB, including 0.82 MB for viser's viewer, needs no network, and also plays
+in notebooks exported to HTML.
 
 Figures need the extra `jaxmb[plot]`, moving pictures `jaxmb[view]`; matplotlib and viser are imported when needed.
 """

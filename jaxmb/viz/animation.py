@@ -22,7 +22,7 @@ Shapes = Mapping[str, AbstractShape | Sequence[AbstractShape]]
 
 # Shortest and longest motion [s] that is shown in real time.
 _SHORTEST, _LONGEST = 2.0, 60.0
-# The time of playing [s] for which an event is named, and the largest number of simultaneous names.
+# The playing time [s] for which an event's name is shown, and the largest number of simultaneous names.
 _SEEN, _AT_ONCE = 0.5, 3
 
 
@@ -63,15 +63,15 @@ def show(
     overlay: bool = False,
     height: int = 480,
 ) -> MovingPicture:
-    """A moving picture of one or several motions, for a notebook or saved as a page.
+    """Make a moving picture of one or several motions, for a notebook or saved as a page.
 
     ```python
     picture = jaxmb.viz.show(motion, points="bar", reactions="pin")  # In a notebook it is seen.
     ```
 
-    It has a time slider, a button that plays and pauses, a choice of speeds, and a list of the objects; the mouse
-    turns, shifts and zooms it. It shows the saved states at their times only: save the motion at 30 or more times a
-    second, by `saveat=`.
+    The picture has a time slider, a button that plays and pauses, a choice of speeds, and a list of the objects; the
+    mouse turns, shifts and zooms it. Only the saved states are shown, at their times: save the motion at 30 or more
+    times a second, by `saveat=`.
 
     Bodies are drawn in the shapes of their parts, such as wheels, or as bars from the mass centre to the points where
     parts act. Without such points a body is the cuboid with its inertia. Springs, rods and tracks are drawn between
@@ -84,11 +84,11 @@ def show(
     - `points`: the names of bodies (mass centres), frames or joints that leave a trail, or a single name.
     - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale.
         Arrows act on the last body of a joint, and on each body of a force element.
-    - `shapes`: shapes of bodies by name, instead of the default, one or several from `jaxmb.shapes`, each placed in the
-        frame of its body; also of the `"ground"`.
+    - `shapes`: by name of a body, or `"ground"`, one or several shapes from `jaxmb.shapes` instead of the default, each
+        placed in the frame of the body.
     - `frames`: the largest number of saved times that are shown.
     - `speed` of playing, 1 for real time. By default motions play in real time, but for at least 2 s and at most a
-        minute. The slider shows the time of playing, the picture the time of the motion.
+        minute. The slider shows the playing time, the picture the time of the motion.
     - `overlay`: show several motions in one place, each in a colour, instead of side by side.
     - `height` [pixels], in a notebook.
 

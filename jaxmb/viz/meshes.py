@@ -21,8 +21,8 @@ class Triangles(NamedTuple):
 
 @functools.cache
 def unit_mesh(kind: str) -> Triangles:
-    """`"box"` with edges, `"sphere"` with a radius, and `"cylinder"` along z with a radius and a length of 1, centred;
-    `"coil"`, a helix along z from 0 to 1 with a radius of about 1.
+    """`"box"` with edges of 1, `"sphere"` of radius 1, `"cylinder"` along z of radius and length 1, all centred;
+    `"coil"`, a helix along z from 0 to 1 of radius about 1.
     """
     if kind == "coil":
         return _coil()

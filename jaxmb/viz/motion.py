@@ -46,7 +46,7 @@ _CHECKS = ("energy", "residuals")
 
 
 class _Line(NamedTuple):
-    """A component of a quantity of the part or coordinate `name` along a motion, numbered or the only component."""
+    """A component of a quantity of the part or coordinate `name` along a motion; `component` None for the only one."""
 
     name: str
     component: int | None
@@ -61,11 +61,14 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
     jaxmb.viz.plot_motion(motion, ["bar.angle", "pin.force", "energy"]).savefig("motion.png")
     ```
 
-    By default all moving quantities are shown: positions and velocities of mass centres; angles and angular velocities,
-    of bodies in the plane and of joints in space; displacements of sliding joints; the coordinates of a system without
-    bodies and their rates q̇; with the energy and the residuals of constraints. A constant component, such as the
-    height of a trolley on a level rail, is left out. Events of contacts and dry friction are vertical lines, solid at
-    impacts, dotted without an impulse.
+    By default the energy, the residuals of constraints and all moving quantities are shown:
+
+    - positions and velocities of mass centres; displacements of sliding joints;
+    - angles and angular velocities, of bodies in the plane and of joints in space;
+    - the coordinates of a system without bodies and their rates q̇.
+
+    A constant component, such as the height of a trolley on a level rail, is left out. Events of contacts and dry
+    friction are vertical lines, solid at impacts, dotted without an impulse.
 
     **Arguments:**
 
@@ -115,7 +118,7 @@ def _default(system) -> list[str]:
 
 
 def _quantities(system, names: Iterable[str]) -> list[str]:
-    """The quantities selected by names."""
+    """The quantities that names select."""
     quantities = system.quantities()
     out: dict[str, None] = {}
     for name in names:

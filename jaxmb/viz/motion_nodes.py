@@ -30,7 +30,7 @@ class Motion:
     """A motion to be shown.
 
     **Fields:** `name`, "" for a single motion; `trajectory`, with the shown states; `picture` of it; `solids`: shapes
-    with their bodies; `tint`: a colour for all bodies, None for one each.
+    with their bodies; `tint`: a colour for all bodies, None for a colour each.
     """
 
     name: str
@@ -238,7 +238,7 @@ def _reach(shape):
 
 
 def _trail(points):
-    """Segments of the path so far; later segments have zero length. Shape (times, times − 1, 2, 3)."""
+    """Segments of the path up to each time, shape (times, times − 1, 2, 3); later segments have zero length."""
     n = len(points)
     ends = np.minimum(np.arange(n)[None, :], np.arange(n)[:, None])
     return np.stack([points[ends[:, :-1]], points[ends[:, 1:]]], axis=2)

@@ -20,7 +20,7 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     """Draw real and imaginary parts of all eigenvalues against the parameter, and in the complex plane.
 
     ```python
-    jaxmb.viz.plot_root_locus(locus, labels=["swing"]).savefig("locus.png")  # `locus` is that of `jaxmb.root_locus`.
+    jaxmb.viz.plot_root_locus(locus, labels=["swing"]).savefig("locus.png")  # `locus` from `jaxmb.root_locus`.
     ```
 
     Each mode has a colour; a pair of conjugate eigenvalues is one mode, and modes that stay at zero are left out.

@@ -22,8 +22,8 @@ _ASPECT = 1.6
 class View:
     """The places of motions and the view of them.
 
-    **Fields:** `offsets` [m] of the motions; `low` and `high`: corners [m] of the region that all reach; `size` [m] of
-    one motion; `camera`; `cell` [m] of grids.
+    **Fields:** `offsets` [m] of the motions; `low` and `high`: corners [m] of the region that all motions reach; `size`
+    [m] of one motion; `camera`; `cell` [m] of grids.
     """
 
     offsets: list[Float[np.ndarray, "3"]]
@@ -63,7 +63,7 @@ class View:
 
 
 def round_number(size: float) -> float:
-    """The next lower number of the kind 1, 2, 5, 10, …"""
+    """The largest of the numbers …, 1, 2, 5, 10, … that is not above a size."""
     power = 10.0 ** np.floor(np.log10(size))
     return float(max(digit * power for digit in (1, 2, 5) if digit * power <= size * (1 + 1e-9)))
 
@@ -76,7 +76,7 @@ def _across(planar, up):
 
 
 def _columns(n, width, height):
-    """The number of columns with which rows and columns are nearest to the picture's shape."""
+    """The number of columns for which the shape of the arrangement is nearest to the picture's."""
     shape = lambda columns: columns * width / (np.ceil(n / columns) * height)
     return min(range(1, n + 1), key=lambda columns: abs(np.log(shape(columns) / _ASPECT)))
 
@@ -193,7 +193,9 @@ def _surface(name, mesh, position, orientation):
 
 
 def _grid(name, view, position, orientation, *, share=1.7, solid=False):
-    """Squares of the view's cell in a plane through a position; `share`: its side over the reach of the motions."""
+    """Squares of the view's cell in a plane through a position; `share`: the plane's side over the reach of the
+    motions.
+    """
     normal, middle = rotation_matrix(orientation)[:, 2], (view.low + view.high) / 2
     shift = middle - position - ((middle - position) @ normal) * normal
     section = 5 * view.cell

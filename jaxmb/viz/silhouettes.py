@@ -29,7 +29,7 @@ def area(shape: AbstractShape) -> Float[np.ndarray, "corners 3"]:
 
 
 def edges(shape: AbstractShape) -> list[Float[np.ndarray, "points 3"]]:
-    """The edges [m] of a shape in the axes of its body; the middle line of a bar, none of a surface of triangles."""
+    """The edges [m] of a shape in the axes of its body; a bar has only its middle line, a surface of triangles none."""
     if shape.primitive == "cylinder" and shape.scale[2] > 3 * shape.scale[0]:
         return [_placed(shape, np.stack([-_UP, _UP]))]
     return [_placed(shape, line) for line in _EDGES.get(shape.primitive, [])]

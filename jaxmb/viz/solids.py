@@ -1,6 +1,4 @@
-"""The shapes by which a picture shows bodies: given shapes, shapes of their parts, or bars to the points where parts
-act.
-"""
+"""Shapes that show bodies in a picture: given shapes, shapes of parts, or bars to the points where parts act."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -34,7 +32,7 @@ def solids(
     """All shapes with the names of their bodies.
 
     **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies,
-    default one for each.
+    default a colour each.
     """
     points, width = _attachments(picture), picture.width
     of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}

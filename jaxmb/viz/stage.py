@@ -14,7 +14,7 @@ from .meshes import Triangles
 if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
 
-# All threads share the console, which is quiet while a picture is recorded.
+# One picture is recorded at a time, since all threads share the console that a recording makes quiet.
 _RECORDS = threading.Lock()
 
 
@@ -23,7 +23,7 @@ class SceneNode:
     """An object of the scene that is added once and then changes.
 
     **Fields:** `add(scene, **first)`: adds it with its properties at the first time and returns viser's handle;
-    `varying`: properties by name, a sequence over the times of its motion.
+    `varying`: for each property by name, its values at the times of the motion.
     """
 
     add: Callable[..., Any]
@@ -44,7 +44,7 @@ def viser() -> Any:
 
 
 def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[SceneNode]]], camera: "Camera") -> str:
-    """A page that plays some nodes, each with the times [s] of its motion, from 0 on."""
+    """A page that plays groups of nodes, each group with the times [s] of its motion, from 0 on."""
     with _server() as server:
         scene = server.scene
         scene.set_up_direction(camera.up)
@@ -104,7 +104,7 @@ class Camera:
 @contextmanager
 def _server() -> "Iterator[ViserServer]":
     """A server that records a scene; it listens on this machine only, and nobody connects to it."""
-    # The server announces its address, which is useless here.
+    # Otherwise the server would announce its address.
     import rich
 
     with _RECORDS:

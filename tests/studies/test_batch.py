@@ -154,7 +154,7 @@ def test_arguments_that_are_no_members_are_refused(arguments, message):
 def test_functions_that_cannot_be_batched_are_refused():
     with pytest.raises(ValueError, match="batch needs a function, got 3"):
         mb.batch(3)
-    with pytest.raises(ValueError, match="cannot be batched: it needs the number of an argument"):
+    with pytest.raises(ValueError, match="cannot be batched: it needs an argument as a number"):
         mb.batch(lambda x: x if x > 0 else -x)(np.ones(4))
     known = jax.extend.core.Primitive("no_rule_for_batches")
     known.def_abstract_eval(lambda x: x)

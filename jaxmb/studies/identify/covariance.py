@@ -8,10 +8,10 @@ from jaxtyping import Float
 # A direction of unknowns is undetermined if the residuals are less sensitive to it than this, relative to the strongest
 # direction.
 _UNDETERMINED = 1e-6
-# It is also undetermined if the data's sensitivity is below this multiple of the motions' relative tolerance, the
-# accuracy of derivatives.
+# A direction is also undetermined if the data's sensitivity is below this multiple of the motions' relative tolerance,
+# the accuracy of derivatives.
 _TOLERANCES = 100.0
-# Least share of a named component in such a direction.
+# Least share in an undetermined direction that makes a component undetermined.
 _SHARE = 0.1
 
 
@@ -20,8 +20,8 @@ class Covariance(NamedTuple):
 
     **Fields:** `matrix`: covariance of the components, infinite on the diagonal for undetermined components; `root`:
     its factor along the determined directions, components × directions; `lost`: the undetermined directions, components
-    × directions; `undetermined`: mask of the components with a share in these; `noise`: the factor of the standard
-    deviations, estimated from the residuals, or 1 if known.
+    × directions; `undetermined`: mask of the components with a share in these directions; `noise`: the factor of the
+    standard deviations, estimated from the residuals, or 1 for known noise.
     """
 
     matrix: Float[np.ndarray, "components components"]
@@ -47,10 +47,10 @@ def covariance(
     """The covariance of a fit.
 
     **Arguments:** `jacobian` of the residuals along n directions, starting with the `count` residuals of data;
-    `changes` of the components along them; `squares`: sum of the squared residuals of data, which estimates unknown
-    noise. For a robust loss it is the sum of the squares of `ψ = r ρ'(r²)`, and `slope` is the mean of `ψ'`: the
-    covariance of Huber's M-estimate, as for noise of the variance `mean ψ² / (mean ψ')²`. `rtol`: the relative
-    tolerance of the motions.
+    `changes` of the components along these directions; `squares`: sum of the squared residuals of data, which estimates
+    unknown noise; None for known noise and a linear loss. For a robust loss, `squares` is the sum of the squares of
+    `ψ`, and `slope` the mean of `ψ'`, with `ψ = r ρ'(r²)`. The result is then the covariance of Huber's M-estimate, as
+    for noise of the variance `mean ψ² / (mean ψ')²`. `rtol`: the relative tolerance of the motions.
     """
     noise = 1.0
     if squares is not None:

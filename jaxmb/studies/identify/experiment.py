@@ -110,11 +110,11 @@ class ExperimentModel(eqx.Module):
 
     @property
     def size(self) -> float:
-        """The size of the data, in units of the noise."""
+        """One plus the largest reading, in units of the noise."""
         return 1 + max((channel.size for channel in self.channels), default=0.0)
 
     def named(self, flat: Float[Array, "values"]) -> dict[str, Array]:
-        """Unknowns by name, from all of them one after the other."""
+        """Unknowns by name, from a vector of all their values."""
         ends = np.cumsum([int(np.prod(shape)) for _, shape in self.unknowns])
         parts = jnp.split(flat, ends)[:-1]
         return {name: part.reshape(shape) for (name, shape), part in zip(self.unknowns, parts, strict=True)}
@@ -126,8 +126,8 @@ class ExperimentModel(eqx.Module):
     def start(
         self, system: AbstractSystem, theta: Mapping[str, Array], throw: bool | None = False
     ) -> tuple[AbstractSystem, State]:
-        """The system with these unknowns, and its initial state; NaN if there is none, or as `throw` of `assemble`
-        specifies.
+        """The system with these unknowns, and its initial state; NaN if it cannot be assembled, unless `throw`, as in
+        `assemble`.
         """
         system = self.changed_system(system, theta)
         if self.assembled:
@@ -228,7 +228,7 @@ def times_of(experiment: Experiment) -> tuple[Float[Array, "times"], dict[str, n
 
 
 def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "times"]:
-    """Measured times, of all or of one name, or a `ValueError` that explains the mistake."""
+    """The times of all data, or of the quantity `name`, as an array; `ValueError` unless they increase from `t0` on."""
     label = f"ts[{name!r}]" if name else "ts"
     times = np.asarray(ts, dtype=float)
     if times.ndim != 1 or times.size == 0:
@@ -245,7 +245,9 @@ def measured_times(ts: ArrayLike, t0: Scalar, name: str = "") -> Float[Array, "t
             f"{times[place]:g}; sort the samples, one at each time."
         )
     if times[0] < t0 or times[-1] <= t0:
-        raise ValueError(f"{label} must lie after t0 = {t0}, got times from {times[0]:g} to {times[-1]:g}.")
+        raise ValueError(
+            f"{label} must begin at or after t0 = {t0} and end after it, got {times[0]:g} to {times[-1]:g}."
+        )
     return jnp.asarray(times, dtype=jnp.result_type(float))
 
 

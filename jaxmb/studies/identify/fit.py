@@ -22,9 +22,9 @@ class Fit:
 
     **Fields:** `z`: the vector of the unknowns; `objective`: minus the logarithm of likelihood and prior; `ends`:
     objective and unknowns of every start, the best first; `residuals` of the data, in units of the noise; `jacobian` of
-    all rows, along the columns of `along`, the free directions of z (None for its components); `readings`: predictions
-    by experiment and sensor; `iterations`: the number of trials; `success`: whether the iteration converged; `segments`
-    and `continuity` of multiple shooting.
+    all rows, along the columns of `along`, the free directions of z (None: the components of z); `readings`:
+    predictions by experiment and sensor; `iterations`: the number of trials; `success`: whether the iteration
+    converged; `segments` and `continuity` of multiple shooting.
     """
 
     problem: Problem

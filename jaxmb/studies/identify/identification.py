@@ -33,22 +33,23 @@ class Identification(Printed, Fit):
 
     - `parameters`: estimates by name; `start`: their starting values.
     - `converged`: whether the iteration converged and all tests of the fit passed; otherwise `warnings` give reasons
-        and remedies. `message`: the same in one sentence, which starts with "converged" only if true.
+        and remedies. `message`: the verdict in one sentence, which starts with "converged" only if `converged` is true.
     - `deviations`: standard deviations by name, of the same shapes, from the residuals' Jacobian at the solution.
         Without `sigma`, or with a robust loss, the noise is estimated from the residuals; a robust loss gives the
-        deviations of Huber's M-estimate, valid for any distribution of the noise. Infinite for parameters that the data
-        do not determine. NaN if meaningless: the iteration did not converge; the residuals are not noise of the size of
-        `sigma`; the estimate is at an end of its range; or unknown noise has no more residuals than parameters.
-    - `covariance` of all components, in the order of `components`, the names of all scalar components; from the problem
-        linearised at the solution, also if meaningless.
+        deviations of Huber's M-estimate, valid for any distribution of the noise. Deviations are infinite for
+        parameters that the data do not determine, and NaN if meaningless: the iteration did not converge; the residuals
+        are not noise of the size of `sigma`; the estimate is at an end of its range; or the noise is unknown and there
+        are no more residuals than parameters.
+    - `covariance` of the problem linearised at the solution, also if meaningless, in the order of `components`, the
+        names of all scalar components.
     - `undetermined`: names of components that can change, alone or together, without changing the residuals;
         `combinations`: these joint changes, relative to the estimates.
     - `residuals`: of the data at the solution, predicted minus measured, in units of the noise (of the readings' range
         if it is unknown); `rms`: their root mean square; `outliers`: residuals beyond five standard deviations of the
         noise, each an `Outlier`.
-    - `iterations`: the number of simulated trials; in multiple shooting without halved steps.
+    - `iterations`: the number of simulated trials; halved steps of multiple shooting do not count.
     - `system`, `state`: with the estimated parameters, ready for `simulate`; of the first experiment.
-    - `systems`, `states`: the same by experiment.
+    - `systems`, `states`: of all experiments, by name.
     - `objectives` of all starts, the smallest first: minus the logarithm of likelihood and prior.
     - `continuity`: the largest gap between segments in multiple shooting.
     - `reasons` for missing standard deviations, in a few words, by component.
@@ -106,8 +107,8 @@ class Identification(Printed, Fit):
         steps of half a standard deviation from the estimate, until beyond the ends of the interval.
 
         **Returns:** a `Profile`. Without known noise levels, the ratios are likelihood ratios with the most likely
-        noise level for each value. With a robust loss, twice the differences of the objective are divided by the mean
-        square of its slopes over its mean curvature, which makes them χ² distributed.
+        noise level for each value. With a robust loss, twice the difference of the objective is divided by the mean
+        squared slope of the loss over its mean curvature; this quotient is χ² distributed.
 
         **Raises:** `ValueError` for an unknown component, a level that is not between 0 and 1, values out of bounds,
         and after multiple shooting.

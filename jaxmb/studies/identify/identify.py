@@ -72,15 +72,15 @@ def identify(
         `orientation`, `angular_velocity`) and of reactions (`"A.force"`, `"A.moment"`). A `LagrangianSystem` has
         coordinates and their rates q̇, `"theta"` and `"theta_rate"`, shape (times,), and generalized forces of its
         constraints, `"A.force"`, shape (times, nu). NaN marks a missing sample. Angles are compared without wrapping.
-        Or `Measurements` with their times, from files and tables by `read_measurements`; or one or a list of
-        `Experiment`, each with its own data, times and initial state.
+        Also accepted are `Measurements`, which `read_measurements` reads with their times from files and tables; and
+        one `Experiment` or a list, each with its own data, times and initial state.
     - `ts`: times [s], shape (times,), increasing, from `t0` on. Different times of sensors are given by measured name:
         `ts={"encoder": (times1,), "gyro": (times2,)}`.
     - `free`: the unknowns: starting values by name, `{"crank.mass": 1.0}`, or names alone, starting from the system's
-        values. All experiments share a value, unless an experiment has the name in its `own`: its unknown is then
-        `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it, `"encoder.bias"`.
-        Each is a single number, or has a component for each of the quantity if its start has; noise levels are
-        estimated by maximum likelihood.
+        values. All experiments share a value, unless an experiment has the name in its `own`: this experiment's unknown
+        is then `"exp2/crank.mass"`. The `bias`, `gain`, `delay` and `sigma` of a sensor are named after it,
+        `"encoder.bias"`. These unknowns are single numbers, or arrays of the quantity's shape if their starts are.
+        Noise levels are estimated by maximum likelihood.
 
     **The initial state**, at `t0`, is recomputed for every value of the parameters by `assemble(guess=state, fix=fix,
     rates=rates)`; a `state` that satisfies the constraints for all values of the free parameters is therefore
@@ -90,13 +90,13 @@ def identify(
     **Other arguments:**
 
     - `sensors`: instruments between quantities and data.
-    - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the data. Without it every
-        quantity is weighted by its range, and the noise is estimated from the residuals.
+    - `sigma`: standard deviation of the noise by name, numbers or arrays that broadcast to the data. Without `sigma`
+        every quantity is weighted by its range, and the noise is estimated from the residuals.
     - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Parameters that parts declare
         to be positive, such as masses and moments of inertia, stay positive without bounds. Inertia matrices stay
         positive definite, with principal moments that satisfy the triangle inequalities. The parameters of a
         `LagrangianSystem` have no such declaration. Unbounded parameters are scaled by their start.
-    - `prior`: `(mean, deviation)` by name, of a normal distribution. Needs the noise levels, known or free.
+    - `prior`: `(mean, deviation)` by name, of a normal distribution. A prior needs noise levels that are known or free.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of residuals in units of
         their noise, with time as axis 0.
     - `loss`: the weight of residuals r, in units of σ. The fit minimises `½ Σ ρ(r²)`, as in
@@ -106,22 +106,24 @@ def identify(
         from the residuals (Huber's M-estimate).
     - `starts`: the number of starting points. The first is `free`; the others are drawn with `seed`: between two
         bounds, or from a normal distribution of the size of the start (log-normal for positive parameters and a single
-        bound). Or further starting values, one mapping for each start. They are simulated in one batch, and the best
-        minimum is returned.
+        bound). A list gives the other starts instead, one mapping for each. All starts are simulated in one batch, and
+        the best minimum is returned.
     - `segments`: more than one is multiple shooting, for chaotic or unstable motions that a simulation over the whole
         time does not follow. Each experiment is cut into this number of segments of nearly equal numbers of samples.
         They are simulated in one batch from separate initial states, which the iteration joins.
-    - `max_iterations` of Levenberg–Marquardt, whose derivatives are in forward mode, best up to some dozens of
-        parameters; `tol`: change of unknowns and residuals, absolute and relative, at which to stop.
+    - `max_iterations` of Levenberg–Marquardt's method, with derivatives in forward mode, best up to some dozens of
+        parameters; `tol`: change of unknowns and objective, absolute and relative, at which to stop.
     - `options`: passed on to `simulate`: `rtol`, `solver`, `manifold`, `max_steps`, …
 
     A trial is rejected, and a smaller step tried, if the mechanism cannot be assembled or the simulation fails.
 
     **Returns:** an `Identification`. It is `converged` only if the iteration converged and all tests passed. The tests
-    object to residuals far beyond `sigma`, or without `sigma` no closer to the data than a constant; to residuals that
-    are not noise by their signs, their autocorrelation or their correlation with the prediction; to estimates at an end
-    of their range, or not determined by the data; and to another of the `starts` with an equal fit elsewhere.
-    `warnings` give the reasons and remedies.
+    object, and `warnings` give the reasons and remedies, to
+
+    - residuals far beyond `sigma`, or without `sigma` no closer to the data than a constant;
+    - residuals that are not noise by their signs, their autocorrelation or their correlation with the prediction;
+    - estimates at an end of their range, or not determined by the data;
+    - another of the `starts` with an equal fit elsewhere.
 
     **Raises:** `ValueError` for unknown names, wrong shapes, starting values out of bounds, fewer data than unknowns,
     and if the simulation with the starting values fails or a free parameter has no effect on the residuals there.

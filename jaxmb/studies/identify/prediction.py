@@ -95,8 +95,8 @@ def _predicted(system, trial, options, names, ts, flat) -> Any:
 class HeldOut:
     """The quality of prediction of data that were not fitted.
 
-    **Fields:** `residuals` of the samples, predicted minus measured, weighted by the noise level (by the range of the
-    readings if it is unknown); `rms`: their root mean square; `readings`: predicted, by sensor, at its times.
+    **Fields:** `residuals` of the samples, predicted minus measured, in units of the noise level (of the readings'
+    range if the noise is unknown); `rms`: their root mean square; `readings`: predicted, by sensor, at its times.
     """
 
     residuals: np.ndarray

@@ -26,9 +26,9 @@ from .unknowns import Priors
 class Problem(eqx.Module):
     """Experiments that share unknowns.
 
-    **Fields:** `names` of the experiments; `sources`: for each the names of its unknowns among all; `fitted`: for each
-    whether it is fitted, otherwise it is held out; `known_noise`: whether the noise level of every reading is known, or
-    an unknown.
+    **Fields:** `names` of the experiments; `sources`: for each experiment the names of its unknowns among all;
+    `fitted`: whether each experiment is fitted, not held out; `known_noise`: whether the noise level of every reading
+    is known, or an unknown.
     """
 
     system: AbstractSystem
@@ -103,7 +103,7 @@ def linearise(problem: Problem, z: Float[Array, "n"]) -> Model:
 
 
 def linearise_batch(problem: Problem, zs: Sequence[Float[Array, "n"]]) -> list[Model]:
-    """The same at several points, simulated as one batch."""
+    """`linearise` at several points, simulated as one batch."""
     charts = [values_and_derivatives(problem, z) for z in zs]
     outcomes = {}
     for number, trial in enumerate(problem.trials):
@@ -149,7 +149,7 @@ def _with_jacobian(system, trial, options, flat):
 
 
 def jacobian_and_value(fn: Callable[[Array], tuple[Any, Any]], flat: Float[Array, "n"]) -> tuple[Any, Any]:
-    """The derivatives of the first of two results, also without unknowns, and the second result."""
+    """The derivatives of the first result of `fn`, also without unknowns, and its second result."""
     if flat.size:
         return jax.jacfwd(fn, has_aux=True)(flat)
     out, value = fn(flat)

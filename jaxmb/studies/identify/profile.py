@@ -23,10 +23,13 @@ _MOST = 24
 class Profile:
     """The likelihood of one parameter, with all others refitted for each of its values.
 
-    **Fields:** `component`; `values`, in order; `ratios`: twice the logarithm of the ratio of the largest likelihood to
-    the likelihood with each value; `interval`: the values within `level`, by the χ² distribution with one degree of
-    freedom, infinite on a side where the data exclude no value; `fits`: whether each fit converged; `parameters`: the
-    values of all parameters, by name, along the first axis.
+    **Fields:**
+
+    - `component`: its name; `values` of the component, in ascending order.
+    - `ratios`: twice the logarithm of the ratio of the largest likelihood to the likelihood with each value.
+    - `interval`: the values within `level`, by the χ² distribution with one degree of freedom; infinite on a side where
+        the data exclude no value.
+    - `fits`: whether each fit converged; `parameters`: the values of all parameters, by name, along the first axis.
     """
 
     component: str
@@ -129,7 +132,7 @@ class _Held:
 
 
 def _end(values, ratios, best, limit, sign) -> float:
-    """The value at which the ratio reaches a limit on one side, by the signed root of the ratio, which is nearly
+    """The value at which the ratio reaches a limit on one side, by interpolating the root of the ratio, which is nearly
     linear.
     """
     side = (values - best) * sign >= 0

@@ -14,7 +14,7 @@ from .sensors import Channel
 _SMALL, _SMALL_OF_RANGE = 0.5, 1e-3
 # Outliers are residuals beyond this number of standard deviations: one in two million of normal noise.
 _FAR = 5.0
-# Least number of samples whose median, which outliers do not change, estimates the noise.
+# With at least this number of samples, their median, which outliers do not change, estimates the noise.
 _MANY = 20
 
 
@@ -29,8 +29,8 @@ class Bias(NamedTuple):
 class Series(NamedTuple):
     """The residuals of one component of a sensor in order of time, predicted minus measured.
 
-    **Fields:** `label`; `experiment`, `sensor` and `component`, an index; `residuals` in units of `sigma` (one each),
-    or of the range for unknown noise; `known`: whether the noise was known before the fit; `small`: the size of
+    **Fields:** `label`; `experiment`, `sensor` and `component`, an index; `residuals` in units of `sigma`, an array
+    like them, for unknown noise the range; `known`: whether the noise was known before the fit; `small`: the size of
     residuals that do not matter; `predicted`: readings; `ts` [s] and `samples`: indices in the data; `bias` of the
     sensor. With a residual function, `predicted` and `ts` are empty.
     """
@@ -130,7 +130,7 @@ def _of_channel(
 
 
 def _of_user(experiment: str, trial: ExperimentModel, residuals: np.ndarray) -> Iterator[Series]:
-    """Columns of one row for each time, or else one series."""
+    """One series for each column if there is a row for each time; otherwise one series."""
     rows = trial.ts.size if residuals.ndim and residuals.shape[0] == trial.ts.size else residuals.size
     label = " ".join(filter(None, (experiment, "what residual returns")))
     columns = residuals.reshape(rows, -1).T

@@ -41,8 +41,8 @@ class Place(NamedTuple):
         return self.z.size + sum(onto[..., 0].size for *_, onto in self.charts)
 
     def split(self, vector: Any) -> list[Any]:
-        """The coordinates of the charts in a vector of all, for each experiment in the shape (segments,
-        coordinates).
+        """The charts' coordinates in a vector of unknowns and coordinates, shape (segments, coordinates) for each
+        experiment.
         """
         ends = np.cumsum([self.z.size, *(onto[..., 0].size for *_, onto in self.charts)])
         each = zip(self.charts, ends[:-1], ends[1:], strict=True)
@@ -171,7 +171,7 @@ def _on_constraints(system, trial, flat, ts, states, tangents, moves) -> State:
 
 
 def _near(system, t, state, tangents, w) -> State:
-    """The state closest to a chart's point; the chart's coordinates are first of q, then of u."""
+    """The state closest to the chart's point w, which has coordinates first of q, then of u."""
     positions, velocities = tangents
     split = positions.shape[1]
     guess = State(state.q + positions @ w[:split], state.u + velocities @ w[split:])

@@ -28,7 +28,7 @@ class Sensor:
     **Arguments:**
 
     - `quantity`: the name of x for `Trajectory.quantity`: `"rod.angle"`, `"A.force"`.
-    - `name` of the sensor, in measured data and as prefix of its unknowns, `"encoder.bias"`; default the quantity's.
+    - `name` of the sensor, in measured data and as prefix of its unknowns, `"encoder.bias"`; default `quantity`.
     - `bias`, in the unit of the readings, and `gain`: numbers, or one for each component of the quantity.
     - `delay` [s] of the reading.
     - `sigma`: standard deviation of the noise in the unit of the readings, a number or one for each component; None if
@@ -65,9 +65,9 @@ class Rows(eqx.Module):
 class Channel(eqx.Module):
     """The readings of one sensor in one experiment, with its known numbers.
 
-    **Fields:** `values` and `present`, shape (times, …), at the times of all sensors of the experiment, absent at times
-    of other sensors only; `sigma` broadcasts to them; `places`: the indices of the sensor's times; `delayed`: whether
-    it sees the motion at other times.
+    **Fields:** `values` and `present`, shape (times, …), at the times of all sensors of the experiment; samples are
+    absent at times of other sensors only; `sigma` broadcasts to `values`; `places`: the indices of the sensor's times;
+    `delayed`: whether the sensor shows the motion at other times.
     """
 
     name: str = eqx.field(static=True)
@@ -123,7 +123,7 @@ class Channel(eqx.Module):
 
     @property
     def size(self) -> float:
-        """The largest of the readings in units of the noise."""
+        """The largest magnitude of the readings, in units of the noise."""
         return float(np.max(np.abs(np.where(self.present, self.values / self.sigma, 0.0))))
 
     @property
@@ -147,7 +147,8 @@ def readings_of(
     """The readings of a sensor, checked.
 
     **Arguments:** `sigma`: standard deviation of the noise; None if unknown, readings are then weighted by their range;
-    `shape` of the quantity at one time; `places` of the sensor's times among all; `times`: their number.
+    `shape` of the quantity at one time; `places`: indices of the sensor's times among all times; `times`: the number of
+    all times.
     """
     name = sensor.label
     try:

@@ -85,7 +85,7 @@ def shoot(problem: Problem, z: Float[Array, "n"], segments: int, tol: float, lim
 def _each_to_its_data(evaluate, move, place: Place) -> Place:
     """The states from which each segment alone fits its data, with unchanged parameters.
 
-    They only start the joint iteration, and are fitted by least squares.
+    These states only start the joint iteration, and are fitted by least squares.
     """
 
     def alone(place):

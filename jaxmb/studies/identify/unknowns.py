@@ -49,7 +49,7 @@ class Priors(eqx.Module):
 
 
 class Unknowns(NamedTuple):
-    """Unknowns, the experiments as functions of theirs, and for each experiment the names of its unknowns among all."""
+    """All unknowns, the experiments as functions of their unknowns, the names of these among all, and the priors."""
 
     free: FreeParameters
     trials: tuple[ExperimentModel, ...]
@@ -58,7 +58,7 @@ class Unknowns(NamedTuple):
 
 
 class _Unknown(NamedTuple):
-    """One unknown before it has a range: its start, a typical change, whether it is positive, and its bounds."""
+    """An unknown without a range: start, an array like it, whether it is positive, a typical change, an upper bound."""
 
     start: Any
     like: Array
@@ -257,11 +257,11 @@ def _trial(
             vector, size = (state.u, sizes[1]) if what.is_rate else (state.q, sizes[0])
             start = start_of(name, vector[index] if chosen is None else chosen)
             unknown_here[name] = label(name), _Unknown(start, vector[index], False, size[index])
-    # Coordinates of joints have parameters of their own_names.
+    # Coordinates of joints depend on the joints' parameters.
     of_bodies = fix.keys() <= system.coordinate_names().keys() and rates.keys() <= known_rates.keys()
     assembled = not initial and of_bodies and not constraints_depend_on(same, experiment.t0, guess, changed)
     if assembled:
-        # Values that are the same for all trials are computed, and differentiated, once.
+        # A state that is the same for all trials is computed, and differentiated, once.
         guess = _assembled(prefix, same, guess, fix=fix, rates=rates, t=experiment.t0)
     if not experiment.held_out:
         for source, what in unknown_here.values():
@@ -321,7 +321,7 @@ def _range(name: str, what: _Unknown, bounds: Bounds | None):
 
 
 def _for_each(what: str, given: Mapping[str, Any] | None, names: Sequence[str]) -> dict[str, Any]:
-    """Values for unknowns, also by the common name of the unknowns of several experiments."""
+    """Values by full names of unknowns; a name without prefix stands for the unknowns of all experiments."""
     out = {}
     for name, value in (given or {}).items():
         full_names = [full for full in names if name in (full, full.split("/", 1)[-1])]

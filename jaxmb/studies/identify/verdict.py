@@ -1,7 +1,7 @@
 """Tests of a fit: of the residuals, the estimates, and the ends of several starts.
 
-Every test of residuals rejects a correct fit with normal noise with a probability of about one in a million. It also
-rejects only if the misfit is not small compared with the noise: a significant difference may not matter.
+Every test of residuals rejects a correct fit with normal noise with a probability of about one in a million. A test
+rejects only if the misfit is also not small compared with the noise: a significant difference may not matter.
 
 Source: L. Ljung, "System Identification: Theory for the User", 2nd ed., Prentice Hall 1999, chapter 16; J. D. Gibbons
 and S. Chakraborti, "Nonparametric Statistical Inference", 5th ed., CRC Press 2011, chapter 3 (runs); R. Leipnik,
@@ -214,10 +214,10 @@ def _not_noise(series: Sequence[Series], directions: int, loss: Loss) -> Iterato
 
 
 def dependences(series: Series, r: np.ndarray, directions: int) -> Iterator[tuple[str, float, float]]:
-    """How residuals depend on others, the dependent fraction of their mean square, and the probability under noise."""
+    """By test: how residuals depend on others, the predictable share of their mean square, and its chance in noise."""
     n = r.size
     changes = int(np.sum(np.signbit(r[1:]) != np.signbit(r[:-1])))
-    # For normal noise, which the fitted directions may have made slightly smoother.
+    # The probability for normal noise, which the fitted directions may have made slightly smoother.
     yield (
         f"change their sign {changes} times in {n} samples",
         float(np.cos(np.pi * changes / (n - 1))),

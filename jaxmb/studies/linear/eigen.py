@@ -16,8 +16,8 @@ def eigen(
     """Eigenvalues and right eigenvectors of a block of a matrix.
 
     Derivatives of a simple eigenvalue and of its eigenvector follow from the equation `A v = λ v` with one component of
-    v held; the derivative of λ is `wᵀ dA v / wᵀ v`, with the left eigenvector w. For a repeated eigenvalue they do not
-    exist and are not finite.
+    v held; the derivative of λ is `wᵀ dA v / wᵀ v`, with the left eigenvector w. For a repeated eigenvalue the
+    derivatives do not exist; the results are not finite.
 
     **Arguments:** `A`; `kept`: the rows and columns of the block. The others have eigenvalues zero.
 

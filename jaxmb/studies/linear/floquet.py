@@ -26,8 +26,8 @@ from .linearise import state_labels
 from .perturbations import check_state_names, perturbations
 from .quantities import checked_names
 
-# The largest distance between the ends of a periodic motion, in units of the system's size, radians and the period; at
-# least this multiple of the tolerance of integration.
+# The largest distance between the ends of a periodic motion, in units of the system's size, radians and the period; or,
+# if larger, the second number times the tolerance of integration.
 _CLOSED, _OF_TOLERANCE = 1e-6, 1e4
 
 
@@ -39,9 +39,9 @@ class Floquet(eqx.Module):
     periodic.multipliers, periodic.monodromy, periodic.states
     ```
 
-    **Fields:** `monodromy` (k, k): the map of perturbations over a period; `states`, their names, first `coordinates`
-    coordinates, then rates; `basis` (nq + nu, k): the changes of all coordinates and velocities with them; `period`
-    [s].
+    **Fields:** `monodromy` (k, k): the map of perturbations over a period; `states`: names of the perturbations, first
+    `coordinates` coordinates, then rates; `basis` (nq + nu, k): the changes of all coordinates and velocities with each
+    of `states`; `period` [s].
     """
 
     monodromy: Float[Array, "k k"]
@@ -117,8 +117,8 @@ def floquet(
     **Returns:** a `Floquet`; differentiable with respect to the parameters, the state and the period in forward mode.
 
     **Raises:** `ValueError` for unknown names, a period that is not positive, a state that violates the constraints,
-    and a motion that does not return after the period, with the coordinates that differ. Under a trace the result is
-    NaN instead.
+    and a motion that does not return after the period; the message lists the coordinates that differ. Under a trace the
+    result is NaN instead.
     """
     check_system("floquet", system)
     check_no_states("floquet", system)

@@ -38,8 +38,8 @@ _SAME = 1e-6
 def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State, Array]:
     """q̇, u̇ and ż of a state, and the multipliers.
 
-    In independent accelerations: with multipliers, derivatives for light and heavy bodies together lose as many digits
-    as the ratio of their masses has.
+    The unknowns are independent accelerations. With multipliers, derivatives for light and heavy bodies together would
+    lose as many digits as the ratio of their masses has.
     """
     at = Instant.of(system, t, state)
     udot, multipliers = accelerations_at(at, Partitioned())
@@ -49,9 +49,9 @@ def vector_field(system: AbstractSystem, t: Scalar, state: State) -> tuple[State
 class LinearEquations(NamedTuple):
     """The linear equations and their tests.
 
-    `residual`: X − S at the state, (n,); `steady`: whether it vanishes; `moving`: whether the state has velocities;
-    `constant`: whether A, B of every input and C, D of every output are the same a little later, (1 + inputs +
-    outputs,); `bound`: the mask of inputs that move constraints.
+    `residual`: X − S at the state, (n,); `steady`: whether the residual vanishes; `moving`: whether the state has
+    velocities; `constant`: whether A, B of every input and C, D of every output are the same a little later, (1 +
+    inputs + outputs,); `bound`: the mask of inputs that move constraints.
     """
 
     A: Float[Array, "k k"]
@@ -132,7 +132,7 @@ def linear_equations(
         return residual, largest, largest <= allowed, constant
 
     residuals, largest, steady, constant = jax.vmap(judge)(moves, jax.tree.map(lambda x: x[1:], values))
-    # The first displacement with the motion's field that leaves the equations unchanged; otherwise the nearest.
+    # The first displacement whose field is the motion's and that leaves the equations unchanged; otherwise the nearest.
     good = steady & constant[:, 0]
     nearest = jnp.where(jnp.any(steady), jnp.argmax(steady), jnp.argmin(largest))
     best = jnp.where(jnp.any(good), jnp.argmax(good), nearest)
@@ -193,7 +193,7 @@ def fastest(system, state, field):
 
 
 def _applied(system, t, state):
-    """The largest acceleration by applied forces without constraints, in the same units."""
+    """The largest acceleration by applied forces without constraints [1/s²], lengths in units of the system's size."""
     if not system.positive_definite_mass:
         return jnp.zeros((), state.q.dtype)
     at = Instant.of(system, t, state)

@@ -26,9 +26,8 @@ _ROUNDING = 10
 class Mode(eqx.Module):
     """A mode of a linearised motion: `x(t) = x₀ + Re(amplitude e^{λ t} shape)`.
 
-    **Fields:** `eigenvalue` λ [1/s]; `q`, `u` and `z`, the shape in all coordinates, velocities and internal states,
-    complex, (nq,), (nu,) and (nz,), with largest displacement one in units of the system's size; `system`, `state`,
-    `t`.
+    **Fields:** `eigenvalue` λ [1/s]; `q`, `u` and `z`: the complex shape in all coordinates (nq,), velocities (nu,) and
+    internal states (nz,), with a largest displacement of one in units of the system's size; `system`, `state`, `t`.
     """
 
     eigenvalue: Complex[Array, ""]
@@ -55,9 +54,9 @@ class Mode(eqx.Module):
 class Linearisation(eqx.Module):
     """`ż = A z + B w`, `y = C z + D w`: small changes of states z, inputs w and outputs y. `print` shows its modes.
 
-    It shows the real or imaginary part of an eigenvalue as 0 if rounding explains it: ten units of rounding of A, in
-    units of the states' sizes, times the eigenvalue's condition. The condition is large for a coordinate without
-    restoring force, whose two zero eigenvalues are computed as about 1e-8 of the largest; more than ten times that is
+    `print` shows the real or imaginary part of an eigenvalue as 0 if it is below ten units of rounding of A, in units
+    of the states' sizes, times the eigenvalue's condition. The condition is large for the two zero eigenvalues of a
+    coordinate without restoring force, which are computed as about 1e-8 of the largest; parts above ten times this are
     never shown as 0. `eigenvalues` are the computed values.
 
     ```python
@@ -71,7 +70,7 @@ class Linearisation(eqx.Module):
     - `A` (k, k), `B` (k, inputs), `C` (outputs, k), `D` (outputs, inputs), in SI units.
     - `states`, `inputs`, `outputs`: their names. The states are first `coordinates` coordinates, then rates, then
         internal states.
-    - `basis` (nq + nu + nz, k): the changes of all coordinates, velocities and internal states with the states;
+    - `basis` (nq + nu + nz, k): the changes of all coordinates, velocities and internal states with each of `states`;
         `system`, `state`, `t`.
     """
 
@@ -114,7 +113,7 @@ class Linearisation(eqx.Module):
 
     @property
     def ignorable(self) -> Bool[Array, "k"]:
-        """Ignorable states, which have no effect except on other ignorable states. Their eigenvalues are zero."""
+        """Whether each state is ignorable: without effect except on ignorable states. Their eigenvalues are zero."""
         return ~_effective(self)
 
     def mode(self, k: int) -> Mode:
@@ -157,7 +156,7 @@ class Linearisation(eqx.Module):
         return jax.vmap(lambda t: jax.scipy.linalg.expm(self.A * t) @ start)(times)
 
     def to_scipy(self) -> Any:
-        """The same as a `scipy.signal.StateSpace`, without names.
+        """These equations as a `scipy.signal.StateSpace`, without names.
 
         **Raises:** `ImportError` without SciPy.
         """
@@ -168,8 +167,7 @@ class Linearisation(eqx.Module):
         return StateSpace(*map(np.asarray, (self.A, self.B, self.C, self.D)))
 
     def to_control(self) -> Any:
-        """The same as a `control.StateSpace` of python-control, with all names, with underscores for dots:
-        `motor_torque`.
+        """These equations as a `control.StateSpace` of python-control; names have underscores for dots: `motor_torque`.
 
         **Raises:** `ImportError` without python-control.
         """
@@ -224,8 +222,8 @@ def _without_rounding(linear):
 
 
 def _widths(linear):
-    """The sizes of the changes of the whole state by each state, in units of the system's size and radians, and these
-    times the fastest rate.
+    """For each state, the size of its change of all coordinates in units of the system's size and radians, or of all
+    velocities in these units times the fastest rate.
     """
     system, R, kq = linear.system, jnp.abs(linear.basis), linear.coordinates
     nq, last = system.nq, len(linear.states) - system.nz

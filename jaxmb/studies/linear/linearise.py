@@ -50,7 +50,8 @@ def linearise(
     on level ground.
 
     In a steady motion bodies travel and turn together, uniformly, and wheels may spin in addition. States are then seen
-    from a frame that moves with each body, in which A is constant; this is verified a little later along the motion.
+    from a frame that moves with each body, in which A is constant; a comparison a little later along the motion
+    verifies this.
 
     **Arguments:**
 
@@ -63,16 +64,16 @@ def linearise(
         small turns about body axes, `"frame.y"`, `"frame.rotation_x"`; any scalar quantity that is a smooth function of
         q. Pivoting chooses further states if they are too few.
     - `rates`: likewise names of rates, `"crank.angle_rate"`, `"hip.angle_rate"`, `"frame.wx"`, or of coordinates, for
-        their rates; default the rates of the coordinates, as far as they are independent.
+        their rates; default the rates of `coordinates`, as far as these rates are independent.
 
     **Returns:** a `Linearisation`. Under `jit` and `vmap` chosen states have numbers instead of names, since the choice
     depends on values; name `coordinates` and `rates` there to know their meaning. Derivatives with respect to
     parameters and the state are exact; derivatives of A hold the choice of states fixed.
 
-    **Raises:** `ValueError` for unknown names, too many of them and dependent ones; for a state that violates the
-    constraints, is singular, or is not an equilibrium or steady motion, with the remaining accelerations; for a motion
-    whose linear equations change with time; for closed contacts and dry friction; and for inputs that move joints.
-    Under a trace the result is NaN instead.
+    **Raises:** `ValueError` for unknown, too many or dependent names; for a state that violates the constraints, is
+    singular, or is not an equilibrium or steady motion, with the remaining accelerations; for a motion whose linear
+    equations change with time; for closed contacts and dry friction; and for inputs that move joints. Under a trace the
+    result is NaN instead.
     """
     check_system("linearise", system)
     state = checked_guess("linearise", system, state)
@@ -84,7 +85,9 @@ def linearise(
     state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
     if system.contacts.m:
         names = ", ".join(system.contacts.friction_names)
-        raise ValueError(f"linearise: {names} may stick or slip, which no linear equation describes. Remove it.")
+        raise ValueError(
+            f"linearise: {names} may stick or slip, which no linear equation describes. Remove the friction."
+        )
     opens = system.contacts.modes(state.q).open
     if not is_traced(opens) and not np.all(opens):
         closed = [name for name, is_open in zip(system.contacts.contact_names, opens, strict=True) if not is_open]

@@ -30,8 +30,8 @@ _TURN, _CHOSEN, _NAMED = 4.0, 4.0, 64.0
 
 
 class StateNames(NamedTuple):
-    """The states that the user names; static. `rates` None: the rates of the named coordinates, as far as they are
-    independent.
+    """The states that the user names; static. With `rates` None: the rates of the named coordinates, as far as these
+    rates are independent.
     """
 
     coordinates: tuple[str, ...]
@@ -67,7 +67,7 @@ def parted(system: AbstractSystem, x: Array) -> State:
 
 
 def counts(system: AbstractSystem) -> tuple[int, int]:
-    """Numbers of independent coordinates and of independent velocities."""
+    """The number of independent coordinates, and of independent velocities."""
     return system.nq - system.coordinate_rank, system.nu - system.velocity_rank
 
 

@@ -14,8 +14,8 @@ from ...system.quantities import Solved, component_names
 
 
 def components(kind: str, names: Sequence[str], shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
-    """The components with these names, each as the name of its array and its place in it; an array's name means all its
-    components.
+    """The components with these names, each as the name of its array and its index in the raveled array; an array's
+    name means all its components.
 
     **Raises:** `ValueError` for unknown or repeated names, and for a single text instead of a sequence.
     """
@@ -40,7 +40,7 @@ def checked_names(kind: str, names: Iterable[str]) -> tuple[str, ...]:
     **Raises:** `ValueError` for a single text, for names that are not text, and for repeated names.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
-        raise ValueError(f"Names are given in a sequence, ({names!r},), also a single {kind}.")
+        raise ValueError(f"Give names in a sequence, ({names!r},), even for a single {kind}.")
     names = tuple(names)
     for name in names:
         if not isinstance(name, str):

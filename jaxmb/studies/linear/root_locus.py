@@ -23,9 +23,13 @@ class RootLocus(eqx.Module):
     locus.eigenvalues[-1], locus.states
     ```
 
-    **Fields:** `name` and `values` of the parameter, (values,); `eigenvalues` [1/s], (values, k): column j is one mode,
-    tracked; `shapes`, (values, nq + nu, k), of the modes in all coordinates and velocities, each of norm one in units
-    of the system's size; `states`, names of the states.
+    **Fields:**
+
+    - `name` and `values` of the parameter, (values,).
+    - `eigenvalues` [1/s], (values, k): each column is one tracked mode.
+    - `shapes` of the modes in all coordinates and velocities, (values, nq + nu, k), each of norm one in units of the
+        system's size.
+    - `states`: names of the states.
     """
 
     name: str = eqx.field(static=True)
@@ -35,7 +39,7 @@ class RootLocus(eqx.Module):
     states: tuple[str, ...] = eqx.field(static=True)
 
     def stable(self, least: float = 1e-6) -> np.ndarray:
-        """Whether no eigenvalue at a value has a positive real part, above this fraction of the largest eigenvalue."""
+        """At each value, whether no eigenvalue has a real part above `least` times the largest eigenvalue's size."""
         sizes = np.max(np.abs(self.eigenvalues), axis=1)
         return np.all(np.real(self.eigenvalues) <= least * sizes[:, None], axis=1)
 
@@ -69,7 +73,7 @@ def root_locus(
     ```
 
     Modes at neighbouring values are matched, all at once, by the overlap of their shapes and the distance of their
-    eigenvalues, so that they keep their columns if eigenvalues cross.
+    eigenvalues. So modes keep their columns if eigenvalues cross.
 
     **Arguments:**
 

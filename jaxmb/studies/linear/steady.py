@@ -56,8 +56,8 @@ def steady_motion(
 
     All bodies travel and turn together, uniformly, and may spin about separate axes in addition: a vehicle that runs
     straight or in a circle, a governor, a top that precesses. With `ignorable` only these coordinates change,
-    uniformly, and all velocities are constant. Steady motions form families; the result is the nearest in the scales of
-    coordinates and velocities, and `fix` and `rates` select another.
+    uniformly, and all velocities are constant. Steady motions form families; the result is the nearest to the guess in
+    the scales of coordinates and velocities, and `fix` and `rates` select another.
 
     **Arguments:**
 
@@ -84,8 +84,8 @@ def steady_motion(
     if system.contacts.m:
         names = ", ".join(system.contacts.friction_names)
         raise ValueError(
-            f"steady_motion: {names} may stick or slip, which the search does not support. Remove it, or use smooth "
-            "`Friction`."
+            f"steady_motion: {names} may stick or slip, which the search does not support. Remove the friction, or use "
+            "smooth `Friction`."
         )
     guess = checked_guess("steady_motion", system, guess)
     t = jnp.asarray(checked_time("steady_motion", t, guess.q.dtype))
@@ -104,8 +104,9 @@ def steady_motion(
 
 
 class _Found(NamedTuple):
-    """A state, its remaining rates (n,), the residuals of all equations, with the conditions last, whether all vanish
-    there, and also a little later; masks of overlapped and of pulling contacts, None without contacts.
+    """A state, its `remaining` rates (n,), and the residuals `left` of all equations, conditions last. `met`: whether
+    these vanish; `ok`: whether they also vanish a little later; `against`: masks of overlapped and of pulling contacts,
+    None without contacts.
     """
 
     state: State

@@ -1,6 +1,6 @@
 """Optimisation with constraints by SciPy's SLSQP, on trials that may fail.
 
-A failed trial gets an objective far above all others, and the other values of the last good trial, so that the line
+A failed trial gets an objective far above all others, and its other values from the last good trial, so that the line
 search shortens the step.
 """
 
@@ -19,7 +19,7 @@ _FAILED = 1e10
 # Largest number of runs, each with an objective of unit size and a fresh Hessian.
 _RUNS = 10
 
-# The distance from the last point at which a stalled method restarts, in units of the scales of parameters.
+# The distances from the last point at which a stalled run restarts, in turn, in units of the scales of parameters.
 _ASIDE = (0.0, 0.1)
 
 # A gain reduces the violation of constraints at least to this fraction; a smaller reduction may be errors of
@@ -145,8 +145,9 @@ def balance_at(trials: Trials, trial: Trial) -> Balance:
 
 
 def _one_sided(trials: Trials, unit: float):
-    """The constraints for SciPy, relative to the sizes of their sides: functions of z in a unit, non-negative, or zero
-    for equations; their derivatives; and a mask of the equations.
+    """One-sided constraints for SciPy, relative to the sizes of their sides: their values and derivatives as functions
+    of z / `unit`, and a mask of the equations. Values are zero for an equation that holds, and non-negative for an
+    inequality.
     """
     limits = trials.limits
     equal = limits.low == limits.high
@@ -186,7 +187,7 @@ def objective_size(trial: Trial) -> float:
 def _unit(trials: Trials, here: Trial, size: float, tol: float) -> float:
     """The unit of parameters' changes for SLSQP, whose first Hessian is one. SLSQP ends if its first step promises less
     than the tolerance, for example with a large constant part of the objective. The unit then makes the first step
-    promise ten times the tolerance, but not longer than one.
+    promise ten times the tolerance, with a length of one at most.
 
     A power of two, without rounding.
     """

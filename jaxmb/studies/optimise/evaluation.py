@@ -78,7 +78,9 @@ def rows_of_batch(program: Program, z: Float[Array, "starts n"]) -> Float[Array,
 
 @dataclasses.dataclass(frozen=True)
 class Told:
-    """A function that equals others with the same program: the values that it reads may change between two calls."""
+    """A function that compares equal to others with the same program: the values that it reads may change between
+    calls.
+    """
 
     function: Callable[..., Any] = dataclasses.field(compare=False)
     digest: Digest
@@ -142,7 +144,7 @@ def output_shapes(program: Program) -> dict[str, tuple[int, ...]]:
 def chosen_objective(objective: str | None, shapes: Mapping[str, tuple[int, ...]], constraints: Any) -> str:
     """The name of the objective among the outputs.
 
-    **Raises:** `ValueError` for an unknown output, a NaN, and a missing name.
+    **Raises:** `ValueError` for an unknown output, an objective that is not a number, and a missing name.
     """
     if objective is None:
         left = [name for name in shapes if name not in (constraints or {})]
@@ -165,7 +167,7 @@ def limits(constraints: Mapping[str, Any] | None, shapes: Mapping[str, tuple[int
     for name, given in (constraints or {}).items():
         if name not in shapes:
             raise unknown("output", name, shapes)
-        # A list is an array that the output equals; for a number it is two bounds.
+        # A list is an array that the output equals, or, for an output that is a number, two bounds.
         pair = isinstance(given, tuple) or (isinstance(given, list) and shapes[name] == ())
         sides = given if pair else (given, given)
         if all(side is None for side in sides):
@@ -197,6 +199,6 @@ def with_derivatives(program: Program, rows: int) -> Program:
             continue
         return trial
     raise ValueError(
-        "The function has no derivatives in either mode. A jax.custom_vjp rules out forward mode, a loop such as "
-        "jax.lax.while_loop reverse mode; a simulation has the mode of its adjoint."
+        "The function has no derivatives in either mode. A jax.custom_vjp rules out forward mode; a loop such as "
+        "jax.lax.while_loop rules out reverse mode; a simulation has the mode of its adjoint."
     ) from first

@@ -36,9 +36,12 @@ _FIRST, _LAST = 3, 9
 class ConstrainedOutput:
     """A component of a constrained output at the optimum.
 
-    **Fields:** its bounds `low` and `high`; the values `before` and `after`; whether a bound is `active`; `multiplier`
-    ≥ 0, the gain in the objective per unit by which the active bound is relaxed; `tolerance`, by which the value may be
-    out of bounds, in the output's unit.
+    **Fields:**
+
+    - `name`; `low` and `high`: its bounds; `before` and `after`: its values at the start and at the optimum.
+    - `active`: whether the value is at a bound.
+    - `multiplier` ≥ 0: the gain in the objective per unit by which the active bound is relaxed.
+    - `tolerance`: by how much the value may be out of bounds, in the output's unit.
     """
 
     name: str
@@ -86,8 +89,8 @@ class Optimum(Printed):
         derivatives; `failed`: the number of rejected trials.
     - `attempts`: all local optimisations, the best first, if there were several.
     - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. A maximum,
-        a saddle and steps of the objective are not minima, nor an edge beyond which trials fail or the objective leaps
-        up; `message`: the reason of the end.
+        a saddle, a step of the objective, and an edge beyond which trials fail or the objective leaps up are not
+        minima; `message`: why the method ended.
     - `derivatives`: the mode, `"forward"` or `"reverse"`.
     """
 
@@ -195,18 +198,19 @@ def optimise(
     - `max_iterations`, of each local optimisation; `tol`: the method's tolerance, of the objective relative to its size
         (SLSQP), or of a step (optax).
 
-    One program computes all values and derivatives, in forward mode, cheaper for few parameters, or in reverse mode,
-    for many parameters and few outputs.
+    One program computes all values and derivatives: in forward mode for few parameters, in reverse mode for many
+    parameters and few outputs.
 
-    **A trial fails** if the mechanism cannot be assembled, the simulation fails or an output is NaN; it is rejected,
-    and the step shortened. **A start that fails** needs an output that measures its distance from a feasible start,
-    such as `"gap": jaxmb.assembly_gap(…)`, with a constraint, `{"gap": (None, 0)}`. Violations of finite constraints
-    are reduced first, until all outputs are finite. A gap is zero up to the edge of feasible designs, without a
-    warning: if the best designs lie there, constrain a margin as well, such as the sine of the transmission angle.
+    **A trial fails** if the mechanism cannot be assembled, the simulation fails or an output is NaN; the trial is
+    rejected, and the step shortened. **A start that fails** needs an output that measures its distance from a feasible
+    start, such as `"gap": jaxmb.assembly_gap(…)`, with a constraint, `{"gap": (None, 0)}`. Violations of finite
+    constraints are reduced first, until all outputs are finite. A gap is zero up to the edge of feasible designs,
+    without a warning: if the best designs lie there, constrain a margin as well, such as the sine of the transmission
+    angle.
 
-    **Constraints hold** to a millionth of their bound, or of the distance of both bounds if smaller. For a bound of
-    zero it is a millionth of the output at the start, or if larger of its change when a parameter changes by its scale.
-    `Optimum.constraints` has the tolerances.
+    **Constraints hold** to a millionth of their bound, or of the distance of both bounds if smaller. To a bound of
+    zero, they hold to a millionth of the output at the start or, if larger, of its change when a parameter changes by
+    its scale. `Optimum.constraints` has the tolerances.
 
     **A minimum** is distinguished from a maximum, a saddle and a flat objective by some trials beside the result, which
     `trials` does not count.
@@ -261,8 +265,8 @@ def _check(method: Any, limited: Limits, starts: Any, max_iterations: Any, tol: 
 
 
 def _optimum(first: Trial, shapes: Mapping[str, tuple[int, ...]], runs: list[_Run], spent: int) -> Optimum:
-    """The result, from the trial at the start, the shapes of outputs, all runs, the best first, and the number of
-    trials that led from a failed start.
+    """The result. `first`: the trial at the start; `runs`: the best first; `spent`: the number of trials that led from
+    a failed start.
     """
     trials, ok, message = runs[0]
     best, program = trials.best, trials.program

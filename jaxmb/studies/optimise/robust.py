@@ -45,7 +45,7 @@ def robust(
     arrays = {name: real_array(f"Samples of {name!r}", x, jnp.result_type(float), None) for name, x in samples.items()}
     counts = {name: x.shape[0] if x.ndim else 0 for name, x in arrays.items()}
     if len(set(counts.values())) > 1 or min(counts.values()) < 2:
-        raise ValueError(f"samples need the same number for every name, at least two; got {counts}.")
+        raise ValueError(f"samples must be equally many for every name, at least two; got {counts}.")
     if weight is not None and not np.isfinite(weight):
         raise ValueError(f"weight must be a finite number, got {weight!r}.")
 
@@ -54,8 +54,8 @@ def robust(
         for name, drawn in arrays.items():
             if name in values and jnp.shape(values[name]) != drawn.shape[1:]:
                 raise ValueError(
-                    f"Samples of {name!r} have shape {drawn.shape[1:]} each, but the parameter "
-                    f"{jnp.shape(values[name])}."
+                    f"Samples of {name!r} have shape {drawn.shape[1:]} each, but the parameter has "
+                    f"shape {jnp.shape(values[name])}."
                 )
 
         def of_sample(sample):

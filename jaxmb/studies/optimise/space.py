@@ -48,7 +48,9 @@ class Space(FreeParameters):
             if any(side.any() and not side.all() for side in sides):
                 raise ValueError(f"This method needs bounds for all components of {name!r}, or for none.")
             if np.any(start <= bounds.low) or np.any(start >= bounds.high):
-                raise ValueError(f"This method keeps bounds by a change of variables: start {name!r} strictly within.")
+                raise ValueError(
+                    f"This method keeps bounds by a change of variables: start {name!r} strictly within them."
+                )
             ranges.append(range_between(start, bounds.low, bounds.high, bounds.scale))
         return FreeParameters(self.names, tuple(ranges))
 

@@ -71,7 +71,7 @@ class Trials:
     def __call__(self, z: np.ndarray) -> Trial:
         z = np.clip(np.asarray(z, float), *self.box)
         trial = self._kept.get(z.tobytes())
-        # A failed line search begins again with the same points.
+        # After a failure, a line search begins again with the same points.
         if trial is None:
             trial = evaluate(self.program, z)
             self.count += 1
@@ -125,11 +125,12 @@ def evaluate(program: Program, z: np.ndarray) -> Trial:
 
 
 def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
-    """Sizes of the lower and the upper side of constraints: each side's bound, so that a far bound does not loosen the
-    other, or the distance of both if smaller.
+    """Sizes of the lower and the upper side of constraints: the size of each side's bound, so that a far bound does not
+    loosen the other side, or the distance of both bounds if smaller.
 
-    For a bound of zero, the first value, or if larger its change when a parameter changes by its scale, but at most the
-    other bound. A bound of almost zero has a size far above rounding errors of these.
+    A bound of zero has the size of the output's first value or, if larger, of its change when a parameter changes by
+    its scale; but at most the size of the other bound. A bound of almost zero has a size far above rounding errors of
+    these values.
     """
     or_infinite = lambda size: np.where((size > 0) & np.isfinite(size), size, np.inf)
     of_bounds = or_infinite(np.abs([limits.low, limits.high]))
@@ -142,7 +143,7 @@ def constraint_scales(limits: Limits, start: Trial) -> np.ndarray:
 
 def nearer(trials: Trials, here: Trial, aside: float, most: int) -> Trial:
     """A more feasible trial, by least squares of violations within the box. Contradictory linearised constraints do not
-    stop it, nor, with `aside`, a slope of zero.
+    stop the search; nor does a slope of zero, with `aside`.
 
     **Arguments:** `aside`: the distance of the start from `here`, in a random direction; `most`: largest number of
     trials.

@@ -16,8 +16,8 @@ from .trials import Trial, Trials
 def first_order(
     optimiser: optax.GradientTransformation, trials: Trials, start: Trial, tol: float, limit: int
 ) -> tuple[bool, str]:
-    """Steps of an optax optimiser in a change of variables that keeps bounds. A failed trial halves its step. It ends
-    with a step below `tol`.
+    """Steps of an optax optimiser in a change of variables that keeps bounds. A failed trial halves its step. A step
+    below `tol` ends the method.
     """
     free = trials.program.space.unbounded(jnp.asarray(start.z, jnp.result_type(float)))
     y = jnp.zeros(free.size)

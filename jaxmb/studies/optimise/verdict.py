@@ -101,7 +101,7 @@ def _unstable(at, trials: Trials, balance: Balance, components: list[str]) -> st
     way = direction if lower[0] >= lower[1] else -direction
     k = int(np.argmax(np.abs(way)))
     what = "a saddle" if largest > 0 else "a maximum"
-    what = f"{what} of the objective, and no minimum" if both else "no minimum of the objective"
+    what = f"{what} of the objective, not a minimum" if both else "not a minimum of the objective"
     side = "increases" if way[k] > 0 else "decreases"
     return f"the result is {what}: the objective decreases where {components[k]!r} {side}. Start there"
 

@@ -33,7 +33,7 @@ class Cases:
     - `columns`: parameters by name, each an array with the members along axis 0.
     - `grid`: names and lengths of the dimensions whose product the members are, the last one running fastest; empty for
         a plain list of members.
-    - `labels`: values along dimensions of the grid that are no parameters, by the dimension's name.
+    - `labels`: values along dimensions of the grid that are not parameters, by the dimension's name.
     - `units`: units by the name of a parameter or dimension.
     """
 
@@ -65,9 +65,10 @@ class Cases:
 def grid(axes: Mapping[str, ArrayLike] | None = None, /, **more: ArrayLike) -> Cases:
     """All combinations of the values of each parameter, the last parameter running fastest.
 
-    **Arguments:** values by the parameter's name, as a dictionary or as keyword arguments: along axis 0, so that shape
-    (k,) gives k numbers and shape (k, 2) gives k points. `grid(speed=[1.0, 2.0], height=np.linspace(0, 0.2, 5))` has
-    ten members, and the result of its sweep has the dimensions `speed` and `height`.
+    **Arguments:** values by the parameter's name, as a dictionary or as keyword arguments. Axis 0 runs along the
+    values: shape (k,) gives k numbers, and (k, 2) gives k points.
+    `grid(speed=[1.0, 2.0], height=np.linspace(0, 0.2, 5))` has ten members, and the result of its sweep has the
+    dimensions `speed` and `height`.
 
     **Raises:** `ValueError` for values that are not finite real numbers, and for no values at all.
     """
@@ -82,10 +83,10 @@ def table(columns: Any = None, /, **more: ArrayLike) -> Cases:
     """Members that are listed one by one.
 
     **Arguments:** columns of equal length by the parameter's name, as a dictionary or as keyword arguments: shape
-    (members,) for numbers, (members, 2) for points; a single number is the same for all members. Or a pandas
-    `DataFrame`, whose columns are the parameters. Or an xarray `Dataset` or named `DataArray`: its data variables are
-    the parameters (its dimension coordinates, if it has no data variables), broadcast over all its dimensions, which
-    the result of the sweep has again.
+    (members,) for numbers, (members, 2) for points; a single number is the same for all members. Also accepted are a
+    pandas `DataFrame`, whose columns are the parameters, and an xarray `Dataset` or named `DataArray`. The parameters
+    are the data variables of a `Dataset`, or without any its dimension coordinates. They are broadcast over all
+    dimensions, which the result of the sweep has again.
 
     **Raises:** `ValueError` that names the column, for lengths that differ, repeated names, and values that are not
     finite real numbers.
@@ -114,9 +115,9 @@ def sobol(
 ) -> Cases:
     """A scrambled Sobol sample, which fills a box more evenly than random numbers; from `scipy.stats.qmc`.
 
-    **Arguments:** `members`, best a power of two, which fills the box most evenly; the lowest and the highest value of
-    each parameter by its name, as a dictionary or as keyword arguments, numbers or arrays of one shape; `log`, the
-    names of parameters whose logarithm is sampled evenly; `seed` of the scrambling.
+    **Arguments:** `members`: best a power of two, which fills the box most evenly; `ranges`: the lowest and the highest
+    value of each parameter by its name, as a dictionary or as keyword arguments, numbers or arrays of one shape; `log`:
+    the names of parameters whose logarithm is sampled evenly; `seed` of the scrambling.
 
     **Raises:** `ValueError` that names the parameter, for ranges that are empty or not finite.
     """
@@ -154,7 +155,7 @@ def _numbers(name: str, given: Any) -> np.ndarray:
     try:
         values = np.asarray(given)
     except ValueError as error:
-        raise ValueError(f"The values of {name!r} are no array of numbers: {error}") from None
+        raise ValueError(f"The values of {name!r} are not an array of numbers: {error}") from None
     if values.dtype.kind not in "biuf":
         raise ValueError(f"The values of {name!r} must be real numbers, got {values.dtype}.")
     if values.ndim == 0 or values.shape[0] == 0:

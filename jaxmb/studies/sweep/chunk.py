@@ -15,7 +15,7 @@ from ..batch import Member
 from .outputs import Outputs, Returned, check_same, outputs_of, returned, statuses
 from .store import Store
 
-# The members in a call of the program where they are computed one after the other.
+# The members in a call of the program that computes members one after the other.
 _ALONE = 8
 
 
@@ -27,11 +27,11 @@ class Task(NamedTuple):
 
 
 class Job(NamedTuple):
-    """What a process needs to compute chunks: the same everywhere, so that the bits are the same.
+    """What a process needs to compute chunks; equal for all processes, so that the bits are the same.
 
-    **Fields:** the `function` and its `outputs`; members of a `chunk`; the folder of the `store`, if there is one;
-    `on_cores`: whether a process computes blocks on all its cores. Workers of a user's executor do not, since there may
-    be a worker for each core.
+    **Fields:** the `function` and its `outputs`; `chunk`: the number of members of each; the folder of the `store`, if
+    there is one; `on_cores`: whether a process computes blocks on all its cores. Workers of a user's executor do not,
+    since there may be a worker for each core.
     """
 
     function: Callable[..., Any]
@@ -42,7 +42,7 @@ class Job(NamedTuple):
 
 
 class Work:
-    """Computes and keeps chunks in one process, by a program that is compiled for members like those of a first one."""
+    """Computes and keeps chunks in one process, by a program compiled for members like those of a first task."""
 
     def __init__(self, job: Job, first: Task):
         def of_parameters(parameters):

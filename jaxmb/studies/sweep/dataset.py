@@ -13,7 +13,7 @@ from .outputs import Outputs
 
 
 class Variable(NamedTuple):
-    """A variable of the result; `values`: those of a coordinate, and the type of an output, which is computed."""
+    """A variable of the result; `values`: the values of a coordinate, or the type of an output, which is computed."""
 
     dims: tuple[str, ...]
     values: np.ndarray | np.dtype
@@ -61,7 +61,7 @@ def variables(cases: Cases, outputs: Outputs, dims: Any, coords: Any, units: Any
     if outputs.steps:
         steps = {"long_name": "steps of the integration"}
         found["num_steps"] = Variable((MEMBER,), np.dtype(np.int64), (len(cases),), steps)
-    # The words that the conventions for climate and forecast metadata have for a status.
+    # The attributes of a status by the conventions for climate and forecast metadata (CF).
     status = {
         "flag_values": list(range(len(outputs.statuses))),
         "flag_meanings": " ".join(name for name, _ in outputs.statuses),
@@ -113,13 +113,13 @@ def unstacked(dataset: Any) -> Any:
     """A result with the messages of its members, and with the dimensions of its grid instead of `member`."""
     (xarray,) = packages("xarray")
     messages = json.loads(dataset["status"].attrs.pop("messages"))
-    # As long as the longest message that occurs, not the longest one there is.
+    # The type has the length of the longest message that occurs, not of the longest possible message.
     dataset["message"] = (MEMBER, np.array([messages[code] for code in dataset["status"].to_numpy()]))
     dataset.attrs.pop("coordinates", None)
     grid = dict(json.loads(dataset.attrs.pop("grid")))
     if not grid:
         return dataset
-    # A coordinate of more than one dimension cannot have the name of one of them.
+    # A coordinate of more than one dimension cannot have the name of one of its dimensions.
     several = {name for name in grid if name in dataset.coords and dataset[name].ndim > 1}
     axes = {name: f"{name}_index" if name in several else name for name in grid}
     sizes = {axes[name]: size for name, size in grid.items()}

@@ -28,7 +28,7 @@ _SETTINGS = (
 )
 # A pool whose workers die this often, without a chunk done in between, is given up.
 _BREAKS = 3
-# Chunks that are handed to an executor of unknown size, and to each of our own processes, at a time.
+# Chunks in progress at a time on an executor of unknown size, and on each of our own processes.
 _IN_FLIGHT, _PER_WORKER = 256, 2
 
 
@@ -37,7 +37,7 @@ Chunks = Iterator[tuple[int, dict[str, np.ndarray]]]
 
 
 def here(job: Job, tasks: list[Task], tell: Callable[[int], object]) -> Chunks:
-    """Compute chunks one after another in this process; `tell` of members that are done, and of 0 after compiling."""
+    """Compute chunks in turn in this process; `tell` gets the number of members done, and 0 after compiling."""
     if not tasks:
         return
     work = Work(job, tasks[0])
@@ -76,7 +76,7 @@ def on_executor(job: Job, tasks: list[Task], executor: futures.Executor, in_flig
 
 
 def on_processes(job: Job, tasks: list[Task], processes: int) -> Chunks:
-    """Compute chunks on a pool of processes of this machine, and on a new one for what is left if one of them dies."""
+    """Compute chunks on a pool of processes of this machine; if a process dies, a new pool computes what is left."""
     left, breaks = {task.place: task for task in tasks}, 0
     while left:
         pool = futures.ProcessPoolExecutor(
@@ -134,7 +134,7 @@ def _start_worker(threads: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """A worker of a session that was killed would wait for ever for its next task."""
+    """End this worker with its session. If the session was killed, it would wait for ever for its next task."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -19,8 +19,8 @@ def load_sweep(store: str | Path) -> Any:
 
     **Returns:** an `xarray.Dataset` like the result of `sweep`. Members that are not computed yet have status 0 and are
     NaN, or zero in an output of integers. A sweep over a grid has a dimension for each parameter and is read as a
-    whole. A list of members is read where it is looked at. `xarray.open_zarr(store)` gives the same variables along the
-    one dimension `member`.
+    whole. A list of members is read on access. `xarray.open_zarr(store)` gives the same variables along the one
+    dimension `member`.
 
     **Raises:** `ValueError` for a folder that holds no sweep, and for a store that cannot be read or has lost files of
     computed members; `ImportError` without the packages of `jaxmb[studies]`.
@@ -34,7 +34,9 @@ def load_sweep(store: str | Path) -> Any:
 
 
 def opened(path: Path, read: bool = False) -> Any:
-    """A store as a dataset along the dimension `member`, after a check of its files, which are `read` for that."""
+    """A store as a dataset along the dimension `member`, after a check of its files; `read`: whether the check reads
+    them.
+    """
     (xarray,) = packages("xarray")
     dataset = xarray.open_zarr(path, chunks=None)
     stores.check_files(path, dataset["status"].to_numpy(), read)

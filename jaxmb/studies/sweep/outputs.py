@@ -78,7 +78,7 @@ def check_parameters(function: Callable[..., Any], names: Any) -> None:
     try:
         arguments = inspect.signature(function).parameters
     except (TypeError, ValueError):
-        return  # A callable without a signature tells at its first call.
+        return  # Without a signature, the first call raises the error.
     kinds = inspect.Parameter
     named = {n: a for n, a in arguments.items() if a.kind in (kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY)}
     if not any(a.kind == kinds.VAR_KEYWORD for a in arguments.values()):
@@ -94,8 +94,8 @@ def check_parameters(function: Callable[..., Any], names: Any) -> None:
 def declared(function: Callable[..., Any], example: Mapping[str, np.ndarray]) -> tuple[Outputs, Digest]:
     """Trace the function twice with the parameters of one member: its outputs, and the hash of its program.
 
-    **Raises:** `ValueError` for a result that is no dictionary of arrays, and for a function that is not pure: traced
-    again, it has another program.
+    **Raises:** `ValueError` for a result that is not a dictionary of arrays, and for a function that is not pure:
+    traced again, it has another program.
     """
     abstract = {k: jax.ShapeDtypeStruct(np.shape(v), canonical(v.dtype)) for k, v in example.items()}
     # A new lambda each time, since JAX remembers what it has traced.

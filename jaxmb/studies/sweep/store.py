@@ -60,7 +60,7 @@ def create(path: Path, described: Mapping[str, Variable], attributes: Mapping[st
         try:
             os.replace(made, path)
         except OSError as error:
-            # A folder takes the place of nothing, or of an empty folder.
+            # A folder can only be moved to where there is nothing, or an empty folder.
             raise _in_use(path) if (path / "zarr.json").exists() else error from None
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
@@ -125,7 +125,7 @@ def readable(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def alone(path: Path) -> Iterator[None]:
-    """Keep other processes from writing a store; the death of this process ends that as well.
+    """Keep other processes from writing a store, by a lock that ends with this process at the latest.
 
     **Raises:** `RuntimeError` if another process writes it.
     """
@@ -139,14 +139,15 @@ def alone(path: Path) -> Iterator[None]:
         except BlockingIOError:
             raise _in_use(path) from None
         except (ImportError, OSError):
-            pass  # A system, or a file system, that has no locks.
+            pass  # Some systems and file systems have no locks.
         yield
 
 
 def study_of(path: Path) -> dict[str, Any] | None:
     """The attributes of a store; None if there is nothing at its path.
 
-    **Raises:** `ValueError` for a file, for a folder that is no store of a sweep, and for attributes that were changed.
+    **Raises:** `ValueError` for a file, for a folder that is not the store of a sweep, and for attributes that were
+    changed.
     """
     if not path.exists():
         return None

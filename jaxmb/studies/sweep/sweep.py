@@ -25,8 +25,9 @@ from .engine import here, on_executor, on_processes
 from .load import load_sweep, opened
 from .outputs import OK, PENDING, RESERVED, check_parameters, declared
 
-# Large enough that the cost of a chunk besides its members, 5 ms, does not count and that each core has two blocks at
-# least; small enough that little is lost. A graphics processor computes thousands of members in the time of a few.
+# Default chunks are so large that the cost of a chunk besides its members, 5 ms, is negligible and that each core has
+# at least two blocks; and so small that an interruption loses little. A graphics processor computes thousands of
+# members in the time of a few.
 _CHUNK, _OF_THREAD, _OF_ACCELERATOR = 512, 128, 8192
 # The marks of a sweep, where the name of the attribute does not say them.
 _WORDS = {"jaxmb_version": "version of jaxmb", "jax_version": "version of JAX", "version": "argument version"}
@@ -73,22 +74,23 @@ def sweep(
     **Main arguments:**
 
     - `function`: gets the parameters of one member by keyword, as JAX arrays, and returns a dictionary of outputs:
-        arrays of any shape by name. A dictionary within it gives `outer.inner`. Under the name `result` it may return a
-        `Trajectory` (of `simulate(..., throw=False)`) or the `result` of one: they give the member's status, message
-        and number of steps. The function is pure and traced by JAX: use `jnp.where` or `jax.lax.cond` for `if`.
+        arrays of any shape by name. A nested dictionary gives `outer.inner`. The output named `result` may be a
+        `Trajectory` (of `simulate(..., throw=False)`), which gives the member's status, message and number of steps, or
+        its `result`, without steps. The function is pure and traced by JAX: use `jnp.where` or `jax.lax.cond` for `if`.
     - `cases`: from `jaxmb.cases.grid`, `table` or `sobol`; or an argument of `table`: columns of equal length by name,
         a pandas DataFrame, an xarray Dataset.
-    - `store`: a folder to write to, in zarr format 3, which all processes can reach. Without it the result is in memory
-        only. Where it holds a part of this sweep, only the missing part is computed: after an interruption, the same
-        call goes on, and ends with the same bits. `load_sweep` reads it at any time.
+    - `store`: a folder to write to, in zarr format 3, which all processes can reach. Without a store the result is in
+        memory only. Where the store holds a part of this sweep, only the missing part is computed: after an
+        interruption, the same call goes on, to a result with the same bits. `load_sweep` reads it at any time.
     - `dims`: names of the dimensions of an output by its name, default `angle_0`, `angle_1`, …
     - `coords`: values along a dimension by its name.
     - `units`: units by the name of a parameter, output or dimension.
 
     **Other arguments:**
 
-    - `chunk`: members that are written together, which are lost when a process is killed. Default 512, or 128 for each
-        core if that is more; 8192 on a GPU. The store keeps it. Members are computed in blocks as by `jaxmb.batch`.
+    - `chunk`: the number of members that are written together; a killed process loses an unfinished chunk. Default 512,
+        or 128 for each core if that is more; 8192 on a GPU. The store keeps it. Members are computed in blocks as by
+        `jaxmb.batch`.
     - `processes`: on this machine, each with its share of the cores, default one. One process computes a block of
         members on each core, or on `NPROC` cores where the environment has this variable. Several processes compile
         each for itself, and survive a crash: a process that dies is replaced. The bits are the same.
@@ -97,22 +99,26 @@ def sweep(
         an executor with a worker for each of them.
     - `progress`: whether one line shows that the function is compiled, then the members that are done and the time that
         is left.
-    - `overwrite`: whether to replace a store that holds another sweep. A sweep is known by a hash of its cases, its
-        outputs, and the program that JAX traces of the function, with all numbers in it; and by the versions of jaxmb
-        and JAX. Names, comments and docstrings in the function make no difference.
-    - `version`: a text or number, by which the sweep is known besides. It stands for functions that the program calls
-        from Python, as by `jax.pure_callback`: change it when these functions change.
+    - `overwrite`: whether to replace a store that holds another sweep. A sweep is identified by a hash of its cases,
+        its outputs, and the program that JAX traces of the function, with all numbers in it; and by the versions of
+        jaxmb and JAX. Names, comments and docstrings in the function make no difference.
+    - `version`: a text or integer that also identifies the sweep. It stands for functions that the program calls from
+        Python, as by `jax.pure_callback`: change it when these functions change.
 
     **Returns:** an `xarray.Dataset`. It has a dimension for each parameter of a grid, or else the dimension `member`;
     parameters are coordinates. Besides the outputs it has `status`: 0 pending, 1 ok, 2 an output is not finite, and
     further numbers by `flag_meanings` of its attributes; `message`, empty if ok; and `num_steps` if it is known. A
-    member that fails leaves the others unchanged. With a store, a list of members is read where it is looked at.
+    member that fails leaves the others unchanged. With a store, a list of members is read on access.
 
-    **Raises:** `ValueError` for names that are unknown, missing or repeated; for values that do not fit; for a function
-    that returns no dictionary of arrays, is not pure, or needs a parameter as a number; for a store of another sweep,
-    or one that is damaged; and, with a store, for a function that calls Python without `version`. `OSError` if the
-    store cannot be written, as on a full disk: the same call again goes on. `RuntimeError` if processes die again and
-    again, and if another process writes the store. `ImportError` without the packages of `jaxmb[studies]`.
+    **Raises:**
+
+    - `ValueError` for names that are unknown, missing or repeated, and for values that do not fit; for a function that
+        does not return a dictionary of arrays, is not pure, needs a parameter as a number, or, with a store, calls
+        Python without `version`; and for a store that is damaged or holds another sweep.
+    - `OSError` if the store cannot be written, as on a full disk: the same call again goes on.
+    - `RuntimeError` if processes die again and again, and if another process writes the store.
+    - `ImportError` without the packages of `jaxmb[studies]`.
+
 
     The bits of a result are the same for one kind of processor, one version of the packages and one `chunk`, however
     often a sweep is interrupted, and also between processes and executors.
@@ -158,10 +164,10 @@ def sweep(
 
 
 def _marks(cases: Cases, variables: Mapping[str, Variable], program: bytes, version: Any) -> dict[str, str]:
-    """The marks by which a store knows a sweep."""
+    """The marks by which a store identifies a sweep."""
     digest = lambda value: digest_of(value, rules=False).value.hex()
     columns = {name: own for name, own in variables.items() if name in cases.columns}
-    # Without the number of members, which the cases tell.
+    # The number of members is left out; the cases tell it.
     others = {name: own._replace(shape=own.shape[1:]) for name, own in variables.items() if name not in columns}
     return {
         "jaxmb_version": __version__,
@@ -230,7 +236,7 @@ def _chunk(given: Any, members: int, processes: int) -> int:
 
 
 def _check_version(version: Any, unknown: Sequence[Any]) -> None:
-    """Refuse what a store cannot know again, unless a version stands for it."""
+    """Refuse a program that a store cannot identify, unless a version stands for it."""
     if isinstance(version, bool) or not isinstance(version, str | int | np.integer | None):
         raise ValueError(f"version must be a text or an integer, got {version!r}.")
     if unknown and version is None:
@@ -238,7 +244,7 @@ def _check_version(version: Any, unknown: Sequence[Any]) -> None:
         more = f" (and {len(unknown) - 1} more like it)" if len(unknown) > 1 else ""
         raise ValueError(
             f"The program of the sweep calls {name}{more} from Python, and a store cannot tell whether that has "
-            "changed. Give version=, a text or number that you change when it changes, or leave out the store."
+            "changed. Give version=, a text or integer that you change when it changes, or leave out the store."
         )
 
 
@@ -252,7 +258,7 @@ def _check_same_study(path: Any, before: Mapping[str, Any], known: Mapping[str, 
     differing = [_WORDS.get(name, name) for name in known if before.get(name) != known[name]]
     if differing:
         raise ValueError(
-            f"The store {path} holds another sweep: the {' and '.join(differing)} differ. Give another path, or "
+            f"The store {path} holds another sweep: it differs in the {' and '.join(differing)}. Give another path, or "
             "overwrite=True to replace it."
         )
     if chunk not in (None, before["chunk"]):
@@ -263,7 +269,7 @@ def _check_same_study(path: Any, before: Mapping[str, Any], known: Mapping[str, 
 
 @contextlib.contextmanager
 def _clear_errors(path: Path) -> Iterator[None]:
-    """Say of a write that failed that nothing is lost."""
+    """Add to the error of a failed write that nothing is lost."""
     try:
         yield
     except OSError as error:

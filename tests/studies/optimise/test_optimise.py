@@ -318,7 +318,7 @@ SADDLE = lambda v: v["x"] ** 2 - v["y"] ** 2 + v["y"] ** 4
     [
         pytest.param(lambda v: -(v["x"] ** 2), {"x": 0.0}, "a maximum.*decreases where 'x'", id="maximum"),
         pytest.param(lambda v: 1e5 - v["x"] ** 2, {"x": 0.0}, "a maximum", id="maximum beside a constant"),
-        pytest.param(lambda v: v["x"] ** 3, {"x": 0.0}, "no minimum.*'x' decreases", id="inflection"),
+        pytest.param(lambda v: v["x"] ** 3, {"x": 0.0}, "not a minimum.*'x' decreases", id="inflection"),
         pytest.param(SADDLE, {"x": 0.0, "y": 0.0}, "a saddle.*decreases where 'y'", id="saddle"),
         pytest.param(SADDLE, {"x": 0.3, "y": 0.0}, "a saddle.*decreases where 'y'", id="saddle from its ridge"),
         pytest.param(lambda v: jnp.floor(5 * v["x"]), {"x": 1.3}, "exactly zero.*in steps", id="steps"),
