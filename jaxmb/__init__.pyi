@@ -84,6 +84,9 @@ from .studies.linear import (
     Floquet as Floquet,
 )
 
+## Inverse dynamics
+from .studies.inverse import required_forces as required_forces, RequiredForces as RequiredForces
+
 ## Sweeps
 from .studies.sweep import sweep as sweep, load_sweep as load_sweep
 
