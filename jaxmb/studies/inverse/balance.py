@@ -164,8 +164,8 @@ def _with_friction(at: Instant, balance: Callable[[Array], tuple[Array, Array]])
     pushes = np.isin(rows, contacts.rows[: contacts.n])
     near, _, failed = find_multipliers(law, lax.stop_gradient(influence), reactions(fixed.force), pushes)
     solved = lambda memory: balance(laws.applied(at, memory))
-    memory = root(lambda memory: memory - laws.remembered(at, solved(memory)[1]), near, lambda _, start: start)
-    return *solved(memory), failed
+    residual: Any = lambda memory: memory - laws.remembered(at, solved(memory)[1])
+    return *solved(root(residual, near, lambda _, start: start)), failed
 
 
 def _is_proportional(at: Instant, drives: Drives, B, tau) -> Bool[Array, ""]:
@@ -175,7 +175,8 @@ def _is_proportional(at: Instant, drives: Drives, B, tau) -> Bool[Array, ""]:
     chosen = [(drive, force, rows) for drive, force, rows in values if drive.of == "parameter"]
     if not chosen:
         return jnp.array(True)
-    system = with_parameters(at.system, {drive.where: force.reshape(drive.shape) for drive, force, _ in chosen})
+    rest: Any = at.system
+    system = with_parameters(rest, {drive.where: force.reshape(drive.shape) for drive, force, _ in chosen})
     expected = sum((force @ rows for _, force, rows in chosen), start=at.force)
     off = jnp.max(jnp.abs(system.force(at.t, at.q, at.u) - expected))
     return off <= _PROPORTIONAL * (jnp.max(jnp.abs(expected)) + jnp.max(jnp.abs(at.force)))

@@ -60,7 +60,8 @@ class Drive(NamedTuple):
             case "velocity":
                 return jnp.eye(at.system.nu, dtype=at.u.dtype)[np.array(self.where)]
             case "parameter":
-                force = lambda value: with_parameters(at.system, {self.where: value}).force(at.t, at.q, at.u)
+                rest: Any = at.system
+                force = lambda value: with_parameters(rest, {self.where: value}).force(at.t, at.q, at.u)
                 by_value = jax.jacfwd(force)(jnp.zeros(self.shape, at.u.dtype))
                 return by_value.reshape(-1, self.size).T
             case "joint":

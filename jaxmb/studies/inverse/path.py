@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..._arguments import real_array
 from ..._types import Coordinates, Scalar, State, Velocities
 from ...linalg.arrays import is_traced
-from ...linalg.elimination import PivotSearch, eliminate, full_pivot
+from ...linalg.elimination import Factor, PivotSearch, eliminate, full_pivot
 from ...linalg.jitted import jitted
 from ...parts.coordinate_parts import shortest
 from ...parts.names import unknown
@@ -75,23 +75,27 @@ def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Path:
             f"required_forces: positions do not determine {', '.join(system.state_names())}. Give a Trajectory, or "
             "name the part among the actuators."
         )
-    times = [value.ts for value in motion.values() if isinstance(value, AbstractSignal) and value.of_arrays]
-    if ts is None and not times:
+    series = [value for value in motion.values() if isinstance(value, AbstractSignal) and value.of_arrays]
+    if ts is None and not series:
         raise ValueError("required_forces: ts is missing, the times of the motion.")
-    ts = jnp.asarray(real_array("required_forces: ts", times[0] if ts is None else ts, guess.q.dtype, None))
+    ts = series[0].samples(0.0, 0.0) if ts is None else real_array("required_forces: ts", ts, guess.q.dtype, None)
+    ts = jnp.asarray(ts)
+    if ts.ndim != 1 or not ts.size:
+        raise ValueError(f"required_forces: ts must be a vector of times, got shape {ts.shape}.")
     signals = {name: _signal(system, name, value, ts) for name, value in motion.items()}
     _check_freedoms(system, signals, guess, ts)
     q, u, udot, off, met = _followed(system, signals, guess, ts)
     return Path(ts, State(q, u), udot, off, met, _components(system, signals))
 
 
-def _signal(system, name, value, ts) -> AbstractSignal:
+def _signal(system, name, value: Any, ts) -> AbstractSignal:
     """A coordinate as a function of time with two derivatives."""
     joints, names = system.joint_coordinates(), system.coordinate_names()
     if name not in joints and name not in names:
         raise unknown("coordinate", name, [*joints, *names], "required_forces")
+    positions: Any = value
     is_function = isinstance(value, AbstractSignal) or callable(value)
-    signal = as_signal(name, value) if is_function else Series(ts, value, "cubic")
+    signal = as_signal(name, value) if is_function else Series(ts, positions, "cubic")
     if signal.break_times(of_rates=True).size:
         raise ValueError(
             f"required_forces: {name!r} has no accelerations, since its rate jumps; give Series(ts, values, 'cubic')."
@@ -156,17 +160,19 @@ class _Kinematics(NamedTuple):
         level = jnp.asarray(np.arange(jacobian.shape[0]) >= self.system.velocity_rows, int)
         return jacobian, full_pivot(jacobian, scale=self.system.velocity_scale(), level=level)
 
+    def corrected(self, u) -> tuple[Velocities, Factor, PivotSearch]:
+        """Velocities after a correction, with the factor and pivots before it."""
+        jacobian, search = self.searched(u)
+        factor = eliminate(jacobian, search.order, u.size)
+        return u - factor.right_inverse @ self.of_velocities(u), factor, search
+
     def solved(self, near: Velocities) -> tuple[Array, Array, Bool[Array, ""]]:
         """u, u̇, and whether they are determined; `near` counts for constraints that are not linear in velocities."""
-        still, linear = jnp.zeros_like(near), self.system.linear
-        u, count = (still, 1) if linear else (near, _CORRECTIONS)
-        for _ in range(count):
-            jacobian, search = self.searched(u)
-            factor = eliminate(jacobian, search.order, near.size)
-            u = u - factor.right_inverse @ self.of_velocities(u)
-        if not linear:
-            jacobian, search = self.searched(u)
-            factor = eliminate(jacobian, search.order, near.size)
+        still = jnp.zeros_like(near)
+        u = still if self.system.linear else near
+        for _ in range(0 if self.system.linear else _CORRECTIONS):
+            u, *_ = self.corrected(u)
+        u, factor, search = self.corrected(u)
         return u, -(factor.right_inverse @ self.of_accelerations(u, still)), search.rank == near.size
 
 
@@ -225,7 +231,7 @@ def have_pivots(search: PivotSearch) -> tuple[Bool[Array, "m"], Bool[Array, "n"]
     return order.row_place < rank, order.column_place < rank
 
 
-def free_names(system: AbstractSystem, columns: Bool[np.ndarray, "nu"]) -> str:
+def free_names(system: AbstractSystem, columns: Any) -> str:
     """The names of some velocities as directions, for messages."""
     known = directions(system.rate_names())
     return ", ".join(known.get(int(k), f"velocity {k}") for k in np.flatnonzero(columns))

@@ -176,8 +176,8 @@ def _check_count(system, rest, drives: Drives, path: Path, weights):
         free = ""
         if not is_traced((system, path)):
             y = jax.tree.map(lambda x: x[0], path.ys)
-            bound = searched(system, rest, drives, path.ts[0], y).bound
-            free = f", so {free_names(rest, ~np.asarray(bound))} is free"
+            bound = np.asarray(searched(system, rest, drives, path.ts[0], y).bound)
+            free = f", so {free_names(rest, np.logical_not(bound))} is free"
         raise ValueError(
             f"required_forces: {names} have {forces} components for {freedoms} freedoms{free}. Name an actuator or a "
             "coordinate for each freedom."
