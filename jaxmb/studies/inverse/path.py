@@ -82,7 +82,8 @@ def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Path:
     ts = jnp.asarray(ts)
     if ts.ndim != 1 or not ts.size:
         raise ValueError(f"required_forces: ts must be a vector of times, got shape {ts.shape}.")
-    signals = {name: _signal(system, name, value, ts) for name, value in motion.items()}
+    # In the order that compiled functions see.
+    signals = {name: _signal(system, name, motion[name], ts) for name in sorted(motion, key=str)}
     _check_freedoms(system, signals, guess, ts)
     q, u, udot, off, met = _followed(system, signals, guess, ts)
     return Path(ts, State(q, u), udot, off, met, _components(system, signals))
