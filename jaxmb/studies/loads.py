@@ -177,7 +177,11 @@ def loads(trajectory: Trajectory, body: str) -> Loads:
         motion.multipliers,
     )
     gravity = () if system.forces.gravity is None else (system.forces.gravity_name,)
-    kinds = *(_kind(system, entries[0]) for entries in parts.values()), *("gravity" for _ in gravity), "inertia"
+    kinds = (
+        *(_kind(system, name, entries[0]) for name, entries in parts.items()),
+        *("gravity" for _ in gravity),
+        "inertia",
+    )
     shared = {name for row in system.implied for name in (row.name, *row.by)}
     names = *parts, *gravity, "inertia"
     undetermined = tuple(name for name in parts if name in shared)
@@ -202,10 +206,10 @@ def _parts_on(system, number: int) -> dict[str, list[_Entry]]:
     return out
 
 
-def _kind(system, entry: _Entry) -> str:
-    group = _sets(system)[entry.of][entry.number]
-    part, velocities = group.group.part, range(len(system.constraints.position), len(system.constraints.groups))
-    if entry.of == "laws" or (entry.of == "constraints" and entry.number in velocities and group.joints):
+def _kind(system, name: str, entry: _Entry) -> str:
+    constraints, part = system.constraints, _sets(system)[entry.of][entry.number].group.part
+    rubbing = {name for group in constraints.frictions for name in group.group.names}
+    if entry.of == "laws" or (entry.of == "constraints" and name in rubbing):
         return "friction"
     if isinstance(part, AbstractUnilateralConstraint) or (isinstance(part, AbstractForce) and part.has_gaps):
         return "contact"
