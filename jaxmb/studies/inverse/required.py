@@ -16,6 +16,7 @@ from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_system, checked_guess
 from ...states.consistency import listed
 from ...system import AbstractSystem
+from ...system.description import counted
 from ...system.quantities import Reaction
 from ...trajectory import Trajectory
 from .balance import Drives, Found, balanced, searched
@@ -167,10 +168,11 @@ def _check_count(system, rest, drives: Drives, path: Path, weights):
     names = ", ".join(drive.name for drive in drives)
     if freedoms == 0:
         raise ValueError(f"required_forces: the machine has no freedom without {names}, so their forces do nothing.")
+    count = f"the machine has {counted(freedoms, 'freedom')} and {counted(forces, 'force')}, {names}"
     if forces > freedoms and weights is None:
         raise ValueError(
-            f"required_forces: {names} have {forces} components for {freedoms} freedoms, so they are not determined. "
-            "Leave some out, or ask for the least forces by weights={'name': 1.0, …}."
+            f"required_forces: {count}, so they are not determined. Leave some out, or ask for the least forces by "
+            "weights={'name': 1.0, …}."
         )
     if forces < freedoms:
         free = ""
@@ -178,10 +180,7 @@ def _check_count(system, rest, drives: Drives, path: Path, weights):
             y = jax.tree.map(lambda x: x[0], path.ys)
             bound = np.asarray(searched(system, rest, drives, path.ts[0], y).bound)
             free = f", so {free_names(rest, np.logical_not(bound))} is free"
-        raise ValueError(
-            f"required_forces: {names} have {forces} components for {freedoms} freedoms{free}. Name an actuator or a "
-            "coordinate for each freedom."
-        )
+        raise ValueError(f"required_forces: {count}{free}. Name an actuator or a coordinate for each freedom.")
 
 
 def _checked(values, found: Found, given, tolerance, throw):
