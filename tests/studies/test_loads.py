@@ -71,7 +71,7 @@ def test_worst_instants_and_files(tmp_path):
     np.testing.assert_array_equal(crank.worst(count=3).ts, np.argsort(-sizes))
     by_moment = lambda loads: jnp.abs(loads["inertia"].moment[:, 2])
     worst = crank.worst(by_moment)
-    assert float(worst.ts[0]) == np.argmax(by_moment(crank))
+    assert float(worst.ts[0]) == int(np.argmax(by_moment(crank)))
     crank.to_csv(tmp_path / "crank.csv")
     with (tmp_path / "crank.csv").open() as file:
         rows = list(csv.DictReader(file))
