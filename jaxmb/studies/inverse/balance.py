@@ -31,8 +31,8 @@ from ...linalg.rotations import norm
 from ...linalg.sums import unchecked_take
 from ...system import AbstractSystem, with_parameters
 from ...system.instant import Instant
+from .course import Course, have_pivots
 from .drives import Drive
-from .path import Path, have_pivots
 
 # An actuator moves nothing if its rate is below this part of the rate of free bodies.
 _HELD = 1e-8
@@ -61,7 +61,7 @@ class Found(NamedTuple):
     failed: Bool[Array, "*times"]
     proportional: Bool[Array, "*times"]
 
-    def against(self, path: Path, tolerance: float) -> Bool[Array, "times"]:
+    def against(self, path: Course, tolerance: float) -> Bool[Array, "times"]:
         """At which times there is no solution."""
         within = lambda x: jnp.all(jnp.abs(x) <= tolerance, axis=1)
         made = within(self.positions) & within(self.velocities) & within(self.accelerations) & within(path.off)
@@ -71,7 +71,7 @@ class Found(NamedTuple):
 
 @jitted
 def balanced(
-    system: AbstractSystem, rest: AbstractSystem, drives: Drives, spread: Float[Array, "k"], path: Path
+    system: AbstractSystem, rest: AbstractSystem, drives: Drives, spread: Float[Array, "k"], path: Course
 ) -> tuple[Float[Array, "times k"], Float[Array, "times k"], Float[Array, "times rows"], Found]:
     """Forces of actuators, their powers and multipliers along a motion, and what was found out about it.
 

@@ -20,8 +20,8 @@ from ...system.description import counted
 from ...system.quantities import Reaction
 from ...trajectory import Trajectory
 from .balance import Drives, Found, balanced, searched
+from .course import Course, free_names, planned, recorded
 from .drives import drives_of, without_drives
-from .path import Path, free_names, planned, recorded
 
 
 class RequiredForces(eqx.Module):
@@ -162,7 +162,7 @@ def _spread(drives: Drives, weights, dtype) -> Float[Array, "k"]:
     return jnp.concatenate(out)
 
 
-def _check_count(system, rest, drives: Drives, path: Path, weights):
+def _check_count(system, rest, drives: Drives, path: Course, weights):
     """Raise a `ValueError` unless there are as many forces as freedoms, or weights for more forces."""
     freedoms, forces = rest.nu - rest.acceleration_rank, sum(drive.size for drive in drives)
     names = ", ".join(drive.name for drive in drives)
@@ -197,7 +197,7 @@ def _checked(values, found: Found, given, tolerance, throw):
     return [jnp.where(bad[:, None], jnp.nan, x) for x in values]
 
 
-def _refusal(rest, drives: Drives, path: Path, found: Found, k: int, tolerance: float) -> str:
+def _refusal(rest, drives: Drives, path: Course, found: Found, k: int, tolerance: float) -> str:
     """The reason why there is no solution at a time."""
     here: Found = jax.tree.map(lambda x: np.asarray(x[k]), found)
     lead = f"required_forces: at t = {float(path.ts[k]):g}"

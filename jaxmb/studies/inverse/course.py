@@ -28,7 +28,7 @@ from ..identify.measurements import have_times
 _CORRECTIONS = 8
 
 
-class Path(NamedTuple):
+class Course(NamedTuple):
     """A motion: times, states and accelerations; `off`: the remaining distance from prescribed coordinates with these
     `names`; `met`: whether a state was found.
     """
@@ -41,7 +41,7 @@ class Path(NamedTuple):
     names: tuple[str, ...]
 
 
-def recorded(system: AbstractSystem, motion: Trajectory) -> Path:
+def recorded(system: AbstractSystem, motion: Trajectory) -> Course:
     """The motion of a trajectory, with the internal states of the `system`."""
     if motion.ts.ndim != 1:
         raise ValueError(
@@ -58,10 +58,10 @@ def recorded(system: AbstractSystem, motion: Trajectory) -> Path:
         z = motion.ys.z[:, np.concatenate([known[name] for name in system.state_names()])]
     ys = State(motion.ys.q, motion.ys.u, z)
     nothing = jnp.zeros((motion.ts.size, 0), ys.q.dtype)
-    return Path(motion.ts, ys, motion.accelerations, nothing, jnp.ones(motion.ts.size, bool), ())
+    return Course(motion.ts, ys, motion.accelerations, nothing, jnp.ones(motion.ts.size, bool), ())
 
 
-def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Path:
+def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Course:
     """The motion that coordinates determine as functions of time."""
     if have_times(motion):
         motion, ts = motion.values, motion.ts if ts is None else ts
@@ -86,7 +86,7 @@ def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Path:
     signals = {name: _signal(system, name, motion[name], ts) for name in sorted(motion, key=str)}
     _check_freedoms(system, signals, guess, ts)
     q, u, udot, off, met = _followed(system, signals, guess, ts)
-    return Path(ts, State(q, u), udot, off, met, _components(system, signals))
+    return Course(ts, State(q, u), udot, off, met, _components(system, signals))
 
 
 def _signal(system, name, value: Any, ts) -> AbstractSignal:
