@@ -129,7 +129,10 @@ DRIVEN = {
 }
 LONG = {
     "slider_crank": (lambda: with_motor("slider_crank", "A.angle"), {"motor": 3.0}),
-    "slider_crank by the slide": (lambda: with_motor("slider_crank", "A.angle", angle=1.0), {"slide.displacement": 0.0}),
+    "slider_crank by the slide": (
+        lambda: with_motor("slider_crank", "A.angle", angle=1.0),
+        {"slide.displacement": 0.0},
+    ),
     "andrews": (lambda: mechanisms.andrews().system, {"drive.torque": 0.033}),
     "bricard": (lambda: with_motor("bricard", "P2.angle"), {"motor": 3.0}),
     "bennett": (lambda: with_motor("bennett", "hinge3.angle"), {"motor": 3.0}),
