@@ -106,15 +106,16 @@ class Driver(AbstractPair, AbstractDriver):
             raise ValueError(f"{self.label}: give axis_a (fixed in {self.body_a!r}) or axis (world).")
         return self if d == 2 else measured_from_given_poses(self, space, poses)
 
-    def measured(self, space, poses):
+    def _value(self, space, poses):
         """The driven quantity; an angle in space in (−π, π]."""
         if self.quantity == "angle":
-            value = relative_angle(poses) if space.dimension == 2 else angle(space, self, poses)
-        elif self.quantity == "distance":
-            value = norm(separation(space, self, poses))
-        else:
-            value = offset_in_a(space, self, poses)["xyz".index(self.quantity)]
-        return jnp.reshape(value, (1,))
+            return relative_angle(poses) if space.dimension == 2 else angle(space, self, poses)
+        if self.quantity == "distance":
+            return norm(separation(space, self, poses))
+        return offset_in_a(space, self, poses)["xyz".index(self.quantity)]
+
+    def measured(self, space, poses):
+        return jnp.reshape(self._value(space, poses), (1,))
 
     def prescribed(self, t):
         return self.motion(t, self.parameters)
@@ -128,4 +129,4 @@ class Driver(AbstractPair, AbstractDriver):
             c, s = cosine_sine(space, self, poses)
             sine, cosine = s * jnp.cos(value) - c * jnp.sin(value), c * jnp.cos(value) + s * jnp.sin(value)
             return half_sine(jnp.reshape(sine, (1,)), jnp.reshape(cosine, ()))
-        return self.measured(space, poses) - jnp.reshape(value, (1,))
+        return jnp.reshape(self._value(space, poses) - value, (1,))
