@@ -84,6 +84,10 @@ from .studies.linear import (
     Floquet as Floquet,
 )
 
+## Inverse dynamics and loads
+from .studies.inverse import required_forces as required_forces, RequiredForces as RequiredForces
+from .studies.loads import loads as loads, Loads as Loads
+
 ## Sweeps
 from .studies.sweep import sweep as sweep, load_sweep as load_sweep
 

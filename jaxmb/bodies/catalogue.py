@@ -3,10 +3,14 @@
 import itertools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..parts.coordinate_parts import AbstractCoordinatePart
+from ..parts.drivers import AbstractDriver
 from ..system.catalogue import Catalogue
+from ..system.quantities import Measure, entries_along, view_of_motion
 from ..system.structures import of_structure
 from .joint_coordinates import joint_coordinates, joint_measures
 from .motion import body_measures, body_motion, frame_measures, scalar_measures
@@ -28,7 +32,8 @@ class SceneCatalogue(Catalogue):
         system = self.system
         out = body_measures(system.layout, system.body_names) | system.forces.state_measures()
         out |= reaction_measures(system, self.joint_names()) | scalar_measures(system.layout)
-        return out | joint_measures(self.joint_coordinates()) | frame_measures(system.frames, system.layout)
+        out |= joint_measures(self.joint_coordinates()) | frame_measures(system.frames, system.layout)
+        return out | _drive_measures(system)
 
     @of_structure
     def joint_coordinates(self):
@@ -67,6 +72,44 @@ class SceneCatalogue(Catalogue):
             if not np.all(np.isfinite(value))
         ]
         return tuple(dict.fromkeys(names))
+
+
+def _drive_measures(system):
+    """The forces of drives along the quantities that they drive, `"turn.drive_force"`."""
+    out, constraints = {}, system.constraints
+    first_servo = len(constraints.position) + len(constraints.velocity)
+    for number, g in enumerate(constraints.groups):
+        if number >= first_servo or isinstance(g.group.part, AbstractDriver):
+            shape = () if g.rows == 1 else (g.rows,)
+            for k, name in enumerate(g.group.names):
+                place = number, np.array(k), shape
+                out[f"{name}.drive_force"] = Measure(shape, _drive_force, place, of_forces=True)
+    for state in system.forces.states:
+        part = system.forces.groups[state.group].group.part
+        if isinstance(part, AbstractCoordinatePart) and part.drives_by == state.name:
+            for k, name in enumerate(state.members):
+                place = "z", np.array(state.start + k * state.size), state.shape
+                out[f"{name}.drive_force"] = Measure(state.shape, entries_along, place)
+    return out
+
+
+@view_of_motion
+def _drive_force(system, place, ts, ys, solved):
+    number, member, shape = place
+
+    def single(t, y, multipliers):
+        group, values = system.constraints.of_groups(multipliers)[number]
+        now, alone = system.kinematics(t, y.q, y.u), group.group.only(member)
+        if not isinstance(alone.part, AbstractDriver):
+            return values[member].reshape(shape)
+
+        def of_part(at, poses, values):
+            part = at(now.t)
+            return part.drive_force(alone.layout.space, part.seen_poses(alone.layout.space, poses), now.t, values)
+
+        return alone.map(of_part, alone.gather(now.poses), values[member][None]).reshape(shape)
+
+    return jax.vmap(single)(ts, ys, solved.multipliers)
 
 
 def _values_of_parts(system, t, q, u):

@@ -4,7 +4,7 @@ A `Motor` regulates a force, a speed or a position, and its force lags behind th
 which may lag, and a force that is affine in the coordinate and its rate.
 """
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +36,8 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     `"motor.command"` is a function of time; `gain` ≥ 0, force per unit of the command, needed by the modes `"speed"`
     and `"position"`; `damping` ≥ 0, force per speed; `lag` [s] > 0; `limit` [N m, N] > 0 of the demand, default none;
     `force` [N m, N], its initial value. A positive force increases the coordinate; the joint's other body bears the
-    reaction.
+    reaction. `motion["motor"].drive_force` is the force along a motion: force × rate is the power that the motor puts
+    into the machine.
     """
 
     mode: Literal["force", "speed", "position"] = fields.choice("force", "speed", "position", default="force")
@@ -46,6 +47,7 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
     damping: fields.Number = fields.parameter(unit=("N m s/rad", "N s/m"), sign="non-negative", default=0.0)
     limit: fields.Number = fields.parameter(unit=("N m", "N"), sign="positive", optional=True)
     force: fields.Number = fields.internal_state(shape=None, unit=("N m", "N"))
+    drives_by: ClassVar[str | None] = "force"
 
     def validate(self):
         if self.mode == "force" and (np.any(self.gain) or np.any(self.damping)):

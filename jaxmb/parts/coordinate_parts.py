@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from . import fields
 from .base import (
-    AbstractConstraint,
     AbstractForce,
     AbstractLink,
     AbstractPart,
@@ -23,6 +22,7 @@ from .base import (
     KnownParts,
     Wrenches,
 )
+from .drivers import AbstractDriver
 from .forces import generalized_force
 from .names import unknown
 from .smooth import ramp
@@ -142,6 +142,8 @@ class AbstractCoordinatePart(AbstractOfCoordinates):
     """
 
     coordinate: str = fields.name()
+    # The internal state that is the force of a drive along the coordinate; None for other parts.
+    drives_by: ClassVar[str | None] = None
 
     @property
     def combined(self):
@@ -272,7 +274,7 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
         return self.force_along(space, poses, velocities, law)
 
 
-class JointDriver(AbstractCoordinatePart, AbstractConstraint):
+class JointDriver(AbstractCoordinatePart, AbstractDriver):
     """A coordinate that is prescribed, `value + rate t`. Rows: one for each of its components.
 
     ```python
@@ -282,12 +284,15 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
 
     **Arguments:** `value` [rad, m], default from the given poses; `rate` [rad/s, m/s], default zero; both of the
     coordinate's shape. As an input of `simulate`, `"drive.value"` is any function of time.
+
+    `motion["turn"].drive_force` is the force along the coordinate [N, of an angle N m], a number at each time, or a
+    vector of its components. It is positive where it increases the coordinate: force × rate is the power that the
+    driver puts into the machine.
     """
 
     value: fields.Number = fields.parameter(shape=None, unit=("rad", "m"), optional=True)
     rate: fields.Number = fields.parameter(shape=None, unit=("rad/s", "m/s"), optional=True)
     rows: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
-    rheonomic: ClassVar[bool] = True
 
     def with_numbers(self, given):
         part = self.filled(value=given, rate=np.zeros_like(given))
@@ -295,8 +300,11 @@ class JointDriver(AbstractCoordinatePart, AbstractConstraint):
         part._check_shape("rate", given)
         return part.with_fields(rows=given.size)
 
-    def residual(self, space, poses, t):
-        return self.difference(self.measured(space, poses), self.value + self.rate * t)
+    def prescribed(self, t):
+        return self.value + self.rate * t
+
+    def unmet(self, space, poses, value):
+        return self.difference(self.measured(space, poses), value)
 
 
 class AbstractScalarPart(AbstractCoordinatePart):

@@ -1,24 +1,54 @@
 """Motions prescribed as functions of time."""
 
+import abc
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._types import Scalar
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractConstraint, AbstractPair
+from .base import AbstractConstraint, AbstractPair, Poses
 from .planar.joints import relative_angle
-from .space import separation
+from .space import AbstractSpace, separation
 from .spatial.axes import angle, cosine_sine, half_sine, measured_from_given_poses, offset_in_a
 
 _OF_ANGLE, _OF_LENGTH = ("axis_a", "axis", "x_a", "x_b"), ("point_a", "point_b")
 
 
-class Driver(AbstractPair, AbstractConstraint):
+class AbstractDriver(AbstractConstraint):
+    """A position constraint by which a quantity follows a function of time."""
+
+    rheonomic: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def measured(self, space: AbstractSpace, poses: Poses) -> Float[Array, "rows"]:
+        """The driven quantity."""
+
+    @abc.abstractmethod
+    def prescribed(self, t: Scalar) -> Any:
+        """The value of the quantity at a time."""
+
+    @abc.abstractmethod
+    def unmet(self, space: AbstractSpace, poses: Poses, value: Any) -> Float[Array, "rows"]:
+        """The residual for a prescribed value."""
+
+    def residual(self, space, poses, t):
+        return self.unmet(space, poses, self.prescribed(t))
+
+    def drive_force(
+        self, space: AbstractSpace, poses: Poses, t: Scalar, multipliers: Float[Array, "rows"]
+    ) -> Float[Array, "rows"]:
+        """The forces [N, of an angle N m] that do the power of the multipliers on the driven quantity."""
+        _, pull = jax.vjp(lambda value: self.unmet(space, poses, value), jnp.asarray(self.prescribed(t)))
+        return -pull(multipliers)[0].reshape(-1)
+
+
+class Driver(AbstractPair, AbstractDriver):
     """A coordinate prescribed in time. Rows 1: `quantity = motion(t, parameters)`.
 
     ```python
@@ -32,6 +62,9 @@ class Driver(AbstractPair, AbstractConstraint):
     In space an angle is prescribed as `2 sin(ψ/2) = 0` with ψ = angle − motion in (−π, π], for any number of turns. The
     joint should let B turn about the axis only; otherwise the angle is measured between projections perpendicular to
     the axis. The driver has no coordinates.
+
+    `motion["turn"].drive_force` is the force along the quantity [N, of an angle N m], shape (times,). It is positive
+    where it increases the quantity: force × rate is the power that the driver puts into the machine.
 
     **Arguments:**
 
@@ -56,7 +89,6 @@ class Driver(AbstractPair, AbstractConstraint):
     x_a: fields.Number = fields.axis(body=0, optional=True, dimension=3)
     x_b: fields.Number = fields.axis(body=1, optional=True, dimension=3)
     rows: ClassVar[int] = 1
-    rheonomic: ClassVar[bool] = True
     of_time: ClassVar[bool] = True
 
     def __check_init__(self):
@@ -74,22 +106,27 @@ class Driver(AbstractPair, AbstractConstraint):
             raise ValueError(f"{self.label}: give axis_a (fixed in {self.body_a!r}) or axis (world).")
         return self if d == 2 else measured_from_given_poses(self, space, poses)
 
-    def value(self, space, poses):
-        """The driven quantity at given poses; an angle in space in (−π, π]."""
+    def _value(self, space, poses):
+        """The driven quantity; an angle in space in (−π, π]."""
         if self.quantity == "angle":
             return relative_angle(poses) if space.dimension == 2 else angle(space, self, poses)
         if self.quantity == "distance":
             return norm(separation(space, self, poses))
         return offset_in_a(space, self, poses)["xyz".index(self.quantity)]
 
+    def measured(self, space, poses):
+        return jnp.reshape(self._value(space, poses), (1,))
+
+    def prescribed(self, t):
+        return self.motion(t, self.parameters)
+
     def given_in_time(self, space, poses, velocities, t):
         del space, poses, velocities
-        return jnp.asarray(self.motion(t, self.parameters))
+        return jnp.asarray(self.prescribed(t))
 
-    def residual(self, space, poses, t):
-        motion = self.motion(t, self.parameters)
+    def unmet(self, space, poses, value):
         if self.quantity == "angle" and space.dimension == 3:
             c, s = cosine_sine(space, self, poses)
-            sine, cosine = s * jnp.cos(motion) - c * jnp.sin(motion), c * jnp.cos(motion) + s * jnp.sin(motion)
+            sine, cosine = s * jnp.cos(value) - c * jnp.sin(value), c * jnp.cos(value) + s * jnp.sin(value)
             return half_sine(jnp.reshape(sine, (1,)), jnp.reshape(cosine, ()))
-        return jnp.reshape(self.value(space, poses) - motion, (1,))
+        return jnp.reshape(self._value(space, poses) - value, (1,))

@@ -21,6 +21,9 @@ class Servo(AbstractLink):
     The reaction of the servo is the exact control force, the smallest one in the metric of M⁻¹. The servo has the name
     of its program; the numbers of the program and the gains are parameters under that name.
 
+    `motion["turn"].drive_force` is the control force along the quantity of a `Driver` [N, of an angle N m]: force ×
+    rate is the power that the servo puts into the machine. For another program it is the force along each residual.
+
     **Arguments:** `program`: a position constraint between bodies, such as a `Driver` or a `Constraint`, not on the
     coordinate of a joint; `damping` [1/s] and `stiffness` [1/s²] ≥ 0, default zero: the motion stays on the program but
     is not brought to it.

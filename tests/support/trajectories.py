@@ -10,9 +10,9 @@ from jaxmb import planar, terrain
 from jaxmb.contacts.events import FoundEvents
 
 
-def motion_of(system, ts, q, u):
+def motion_of(system, ts, q, u, z=None):
     """A trajectory through given states."""
-    ys = mb.State(jnp.asarray(q), jnp.asarray(u))
+    ys = mb.State(jnp.asarray(q), jnp.asarray(u), z)
     formulation = mb.formulations.Partitioned()
     return mb.Trajectory(system, formulation, jnp.asarray(ts), ys, {}, mb.RESULTS.successful, None, None)
 

@@ -329,13 +329,13 @@ def test_angle_driver_passes_many_turns():
     part = driver("angle", lambda t, p: p["speed"] * t, axis=axis).resolve(SPACE, poses)
     hinge = spatial.Revolute("hinge", "a", "b", point=point, axis=axis).resolve(SPACE, poses)
     assert part.rheonomic
-    assert float(part.value(SPACE, poses)) == pytest.approx(0.0, abs=1e-15)
+    assert float(part.measured(SPACE, poses)[0]) == pytest.approx(0.0, abs=1e-15)
     for t in (0.0, 0.4, 1.0, 5.0, 50.0):
         turned = poses.at[1].set(move(poses[1], turn(axis, jnp.array(3.0 * t)), point, STILL))
         np.testing.assert_allclose(hinge.residual(SPACE, turned, t), 0.0, atol=1e-12)
         np.testing.assert_allclose(part.residual(SPACE, turned, jnp.array(t)), [0.0], rtol=0, atol=1e-12)
         wrapped = np.angle(np.exp(3.0j * t))
-        np.testing.assert_allclose(part.value(SPACE, turned), wrapped, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(part.measured(SPACE, turned), [wrapped], rtol=0, atol=1e-12)
         # The row is the error of the angle, so its multiplier is the driving moment.
         jacobian = velocity_jacobian(lambda q, t=t: part.residual(SPACE, q, jnp.array(t)), turned)
         np.testing.assert_allclose(jacobian[0, 9:], rot.unrotate(turned[1, 3:], axis), rtol=0, atol=1e-12)

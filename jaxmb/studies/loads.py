@@ -1,0 +1,302 @@
+"""Loads of a body along a motion: all forces on it in body axes, for strength and fatigue."""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._arguments import check_kind
+from .._printed import Printed
+from ..linalg.arrays import add_up, is_traced
+from ..linalg.jitted import jitted
+from ..linalg.rotations import cross, norm
+from ..parts.base import AbstractForce
+from ..parts.names import unknown
+from ..parts.unilateral import AbstractUnilateralConstraint
+from ..trajectory import Trajectory
+
+_COLUMNS = ("time", "part", *(f"{what}_{axis}" for what in ("point", "force", "moment") for axis in "xyz"))
+
+
+class Load(NamedTuple):
+    """A force on a body along a motion, in body axes, each of shape (times, 3).
+
+    **Fields:** the `point` of application [m], in the body's frame; the `force` [N]; the `moment` [N m] about the
+    point.
+    """
+
+    point: Float[Array, "times 3"]
+    force: Float[Array, "times 3"]
+    moment: Float[Array, "times 3"]
+
+
+class Loads(Printed, eqx.Module):
+    """All forces on a body along a motion, from `loads`; `print` shows a table.
+
+    ```python
+    on_bar = jaxmb.loads(motion, "bar")
+    pin = on_bar["pin"]
+    largest = jnp.max(jaxmb.rotations.norm(pin.force))
+    worst = on_bar.worst(lambda on_bar: jaxmb.rotations.norm(on_bar["pin"].force), count=3)
+    worst.to_csv("bar.csv")
+    ```
+
+    **Fields:** the `body`; `names` and `kinds` of its loads: "joint", "contact", "friction", "force", "gravity" and
+    "inertia"; `undetermined`: names of joints and contacts with redundant rows, which share the force of the others;
+    `ts` [s], shape (times,); `points` [m], `forces` [N] and `moments` [N m] about the points, in body axes, shape
+    (times, loads, 3); the `mass_centre` [m] in the body's frame, shape (3,). The plane is z = 0.
+    """
+
+    body: str = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    undetermined: tuple[str, ...] = eqx.field(static=True)
+    ts: Float[Array, "times"]
+    points: Float[Array, "times loads 3"]
+    forces: Float[Array, "times loads 3"]
+    moments: Float[Array, "times loads 3"]
+    mass_centre: Float[Array, "3"]
+
+    def __getitem__(self, name: str) -> Load:
+        if name not in self.names:
+            raise unknown("load", name, self.names)
+        k = self.names.index(name)
+        return Load(self.points[:, k], self.forces[:, k], self.moments[:, k])
+
+    @property
+    def balance(self) -> tuple[Float[Array, "times 3"], Float[Array, "times 3"]]:
+        """The sums of all forces [N], and of all moments about the mass centre [N m]: zero up to rounding errors."""
+        arms = self.points - self.mass_centre[None, None]
+        return jnp.sum(self.forces, axis=1), jnp.sum(self.moments + jnp.cross(arms, self.forces), axis=1)
+
+    def worst(self, measure: "Callable[[Loads], Array] | None" = None, count: int = 1) -> "Loads":
+        """The loads at the worst instants, the worst first.
+
+        **Arguments:** `measure(loads)`: a number at each time, shape (times,), the larger the worse; default the
+        largest force but for gravity and inertia; `count` of instants.
+        """
+        values = jnp.asarray(self._largest() if measure is None else measure(self))
+        if values.shape != self.ts.shape:
+            raise ValueError(
+                f"The measure must return shape {self.ts.shape}, a number at each time; got {values.shape}."
+            )
+        chosen = jnp.argsort(-values)[:count]
+        at = lambda loads: (loads.ts, loads.points, loads.forces, loads.moments)
+        return eqx.tree_at(at, self, tuple(x[chosen] for x in at(self)))
+
+    def _largest(self):
+        acting = np.array([kind not in ("gravity", "inertia") for kind in self.kinds])
+        return jnp.max(jnp.where(acting, norm(self.forces), 0.0), axis=1)
+
+    def to_csv(self, file: str | Path) -> None:
+        """Write a CSV file, as finite-element programs read it, with a row for each time and load.
+
+        The columns are time [s], part, point_x, point_y, point_z [m], force_x, force_y, force_z [N], moment_x, moment_y
+        and moment_z [N m]. All vectors are in body axes; points are in the body's frame, and moments about the point.
+        """
+        rows = np.concatenate([self.points, self.forces, self.moments], axis=2)
+        with Path(file).open("w", newline="", encoding="utf-8") as opened:
+            writer = csv.writer(opened)
+            writer.writerow(_COLUMNS)
+            for t, of_time in zip(np.asarray(self.ts), rows, strict=True):
+                writer.writerows(
+                    [float(t), name, *map(float, row)] for name, row in zip(self.names, of_time, strict=True)
+                )
+
+    def __str__(self) -> str:
+        if is_traced((self.ts, self.forces)) or not self.ts.size:
+            return f"Loads of {self.body!r}: {', '.join(self.names)}"
+        sizes, turns = np.asarray(norm(self.forces)), np.asarray(norm(self.moments))
+        lines = [("load", "kind", "largest force [N]", "at t [s]", "largest moment [N m]")]
+        for k, (name, kind) in enumerate(zip(self.names, self.kinds, strict=True)):
+            worst = int(np.argmax(sizes[:, k]))
+            numbers = f"{sizes[worst, k]:.5g}", f"{float(self.ts[worst]):.5g}", f"{np.max(turns[:, k]):.5g}"
+            lines.append((name, kind, *numbers))
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        cell = lambda text, width, k: text.ljust(width) if k < 2 else text.rjust(width)
+        table = ["  ".join(cell(x, w, k) for k, (x, w) in enumerate(zip(line, widths, strict=True))) for line in lines]
+        title = f"Loads of {self.body!r} at {self.ts.size} times, moments about the points of application"
+        shared = f"Shares are not determined, since rows are redundant: {', '.join(self.undetermined)}."
+        return "\n".join([title, *table, *([shared] if self.undetermined else [])])
+
+
+class _Entry(NamedTuple):
+    """A part on a body: the set of its group, the numbers of the group, of the part in it and of the body in the part.
+
+    The set is "constraints", "laws" or "forces".
+    """
+
+    of: str
+    number: int
+    member: int
+    place: int
+
+
+def loads(trajectory: Trajectory, body: str) -> Loads:
+    """All forces on a body along a motion: of joints, contacts and friction, applied forces, gravity and inertia.
+
+    ```python
+    on_bar = jaxmb.loads(motion, "bar")
+    print(on_bar)
+    on_bar["pin"].force, on_bar["inertia"].force, on_bar.balance
+    ```
+
+    A load acts at the point of its part on the body; without such a point, as in a contact, at the mass centre. The
+    load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Shares of redundant
+    joints depend on the rows that were dropped, and `undetermined` names these joints. The loads are differentiable, so
+    that a design can bound them.
+
+    **Arguments:** the `trajectory` of bodies; the name of the `body`.
+
+    **Returns:** `Loads`, in body axes.
+
+    **Raises:** `ValueError` for an unknown body, for a system without bodies and for a batch, whose members `jax.vmap`
+    takes.
+    """
+    check_kind("loads: trajectory", trajectory, Trajectory, "a Trajectory", "jaxmb.simulate returns one")
+    system = trajectory.system
+    if body not in system.body_names:
+        raise unknown("body", body, system.body_names, "loads")
+    if trajectory.ts.ndim != 1:
+        raise ValueError("loads takes a single motion; jax.vmap(lambda motion: …)(motions) takes each of a batch.")
+    motion, number = trajectory.trimmed(), system.body_names.index(body)
+    parts = _parts_on(system, number)
+    points, forces, moments, centre = _along(
+        system,
+        tuple(map(tuple, parts.values())),
+        number,
+        motion.ts,
+        motion.ys,
+        motion.accelerations,
+        motion.multipliers,
+    )
+    gravity = () if system.forces.gravity is None else (system.forces.gravity_name,)
+    kinds = (
+        *(_kind(system, name, entries[0]) for name, entries in parts.items()),
+        *("gravity" for _ in gravity),
+        "inertia",
+    )
+    shared = {name for row in system.implied for name in (row.name, *row.by)}
+    names = *parts, *gravity, "inertia"
+    undetermined = tuple(name for name in parts if name in shared)
+    return Loads(body, names, kinds, undetermined, motion.ts, points, forces, moments, centre)
+
+
+def _sets(system) -> dict[str, tuple[Any, ...]]:
+    """The groups of all parts that act on bodies."""
+    constraints = system.constraints
+    return {"constraints": constraints.groups, "laws": constraints.laws, "forces": system.forces.groups}
+
+
+def _parts_on(system, number: int) -> dict[str, list[_Entry]]:
+    """The parts on a body by name."""
+    out: dict[str, list[_Entry]] = {}
+    for of, groups in _sets(system).items():
+        for g, group in enumerate(groups):
+            for k, (name, bodies) in enumerate(zip(group.group.names, group.group.bodies, strict=True)):
+                for place, other in enumerate(bodies):
+                    if other == number:
+                        out.setdefault(name, []).append(_Entry(of, g, k, place))
+    return out
+
+
+def _kind(system, name: str, entry: _Entry) -> str:
+    constraints, part = system.constraints, _sets(system)[entry.of][entry.number].group.part
+    rubbing = {name for group in constraints.frictions for name in group.group.names}
+    if entry.of == "laws" or (entry.of == "constraints" and name in rubbing):
+        return "friction"
+    if isinstance(part, AbstractUnilateralConstraint) or (isinstance(part, AbstractForce) and part.has_gaps):
+        return "contact"
+    return "force" if entry.of == "forces" else "joint"
+
+
+@jitted
+def _along(system, parts, number, ts, ys, accelerations, multipliers):
+    """Points, forces and moments in body axes along a motion, and the mass centre."""
+    space = system.layout.space
+    centre = space.in_space(_mass_centre(system, number))
+
+    def single(t, y, udot, multipliers):
+        here = system.at(y)
+        now = here.kinematics(t, y.q, y.u)
+        wrenches = _wrenches(here, parts, now, multipliers)
+        points = [_point(here, entries, now.t) for entries in parts]
+        own = _of_body(here, number, now, udot)
+        turns = [_in_body_axes(space, now.poses[number], wrench) for wrench in (*wrenches, *own)]
+        forces, moments = (jnp.stack(x) for x in zip(*turns, strict=True))
+        if not system.layout.rotates[number]:
+            moments = jnp.zeros_like(moments)
+        none = jnp.zeros_like(centre)
+        points = jnp.stack([*(none if x is None else space.in_space(x) for x in points), *(none for _ in own)])
+        return points + centre[None], forces, moments - jnp.cross(points, forces)
+
+    return *jax.vmap(single)(ts, ys, accelerations, multipliers), centre
+
+
+def _wrenches(system, parts, now, multipliers) -> list[Array]:
+    """The wrenches of parts on the body, about the mass centre."""
+    constraints, found = system.constraints, {}
+    of_groups = constraints.of_groups(multipliers)
+
+    def of_group(of, number):
+        if (of, number) not in found:
+            if of == "constraints":
+                group, values = of_groups[number]
+                wrenches = group.wrenches(now, values)
+            elif of == "laws":
+                ((wrenches, _),) = constraints.nonideal_wrenches([constraints.laws[number]], now, multipliers)
+            else:
+                wrenches = system.forces.groups[number].wrenches(now)
+            found[of, number] = wrenches
+        return found[of, number]
+
+    on_body = lambda entry: of_group(entry.of, entry.number)[entry.member, entry.place]
+    return [add_up(map(on_body, entries)) for entries in parts]
+
+
+def _point(system, entries, t) -> Array | None:
+    """The point of a part on the body, in the axes at its mass centre; of friction the point of the joint."""
+    sets = _sets(system)
+    for of, number, member, place in entries:
+        group = sets[of][number]
+        holders = [(group, member)]
+        if of == "laws":
+            joint = group.joints[member]
+            holders = [(g, g.group.names.index(joint)) for g in sets["constraints"] if joint in g.group.names]
+        for holder, k in holders:
+            point = holder.group.single(k, t).anchor(place)
+            if point is not None:
+                return point
+    return None
+
+
+def _of_body(system, number: int, now, udot) -> list[Array]:
+    """The wrenches of gravity, if any, and of inertia."""
+    mass, J, gravity = system.mass[number], system.moments_of_inertia[number], system.forces.gravity
+    space, d = system.layout.space, system.layout.space.dimension
+    rates = jnp.append(udot, jnp.zeros((), udot.dtype))[system.layout.velocity_index[number]]
+    turning, omega = rates[d:], now.velocities[number, d:]
+    moment = J * turning if d == 2 else J @ turning + cross(omega, J @ omega)
+    inertia = -jnp.concatenate([mass * rates[:d], moment])
+    return [inertia] if gravity is None else [jnp.pad(mass * gravity, (0, space.velocity_size - d)), inertia]
+
+
+def _in_body_axes(space, pose, wrench) -> tuple[Array, Array]:
+    """Force and moment about the mass centre, from a wrench with the force in world axes."""
+    d, force = space.dimension, space.in_space(space.body_direction(pose, wrench[: space.dimension]))
+    return force, jnp.pad(wrench[d:], (3 - wrench[d:].size, 0))
+
+
+def _mass_centre(system, number: int) -> Array:
+    """The mass centre in the body's frame."""
+    for group in system.bodies.groups:
+        places = np.flatnonzero(group.group.body_index[:, 0] == number)
+        if places.size and group.group.part.mass_centre is not None:
+            return group.group.part.mass_centre[places[0]]
+    return jnp.zeros(system.layout.space.dimension, system.length.dtype)

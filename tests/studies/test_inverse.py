@@ -1,0 +1,314 @@
+"""Inverse dynamics: the forces of actuators from a motion."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import four_bar_forces
+from trajectories import motion_of
+
+import jaxmb as mb
+from jaxmb import mechanisms, planar, spatial
+
+LENGTHS, BASE, MASSES, GRAVITY = (1.0, 3.0, 2.5), 2.5, (1.0, 3.0, 2.5), 9.81
+TS = np.linspace(0.0, 1.0, 5)
+
+
+def crank(t):
+    return 0.4 + 2.0 * t + 0.3 * jnp.sin(3.0 * t)
+
+
+CRANK = 0.4 + 2.0 * TS + 0.3 * np.sin(3.0 * TS), 2.0 + 0.9 * np.cos(3.0 * TS), -2.7 * np.sin(3.0 * TS)
+
+
+@functools.cache
+def four_bar():
+    """The linkage with a motor on the crank."""
+    scene = mechanisms.four_bar(lengths=LENGTHS, base=BASE, masses=MASSES, gravity=GRAVITY).scene
+    return scene.extended(forces=[mb.JointForce("motor", "A.angle", force=3.0)]).compile()
+
+
+@functools.cache
+def needed(*by):
+    return mb.required_forces(four_bar(), {"crank.angle": crank}, ts=TS, by=by)
+
+
+def by_hand(driven):
+    torques, pins = zip(
+        *(four_bar_forces.forces(LENGTHS, BASE, MASSES, GRAVITY, *at, driven) for at in zip(*CRANK, strict=True)),
+        strict=True,
+    )
+    return np.array(torques), np.array(pins)
+
+
+def test_a_crank_and_its_pins_as_by_newton_and_euler():
+    torques, pins = by_hand("crank")
+    found = needed("motor")
+    np.testing.assert_allclose(found["motor"], torques, rtol=1e-12)
+    np.testing.assert_allclose(found.power["motor"], torques * CRANK[1], rtol=1e-12)
+    for k, name in enumerate("ABCD"):
+        np.testing.assert_allclose(found.reaction(name).force, pins[:, k], rtol=1e-11, atol=1e-11)
+
+
+def test_a_rocker_that_drives_has_the_same_power():
+    torques, _ = by_hand("rocker")
+    # The motor on the crank stays, with its torque of 3 N m.
+    rates = np.array([four_bar_forces.motion(LENGTHS, BASE, *at)[1] for at in zip(*CRANK, strict=True)])
+    expected = torques - 3.0 * rates[:, 0] / rates[:, 2]
+    np.testing.assert_allclose(needed("D.angle")["D.angle"], expected, rtol=1e-12)
+    work = needed("motor").power["motor"] - 3.0 * CRANK[1]
+    np.testing.assert_allclose(needed("D.angle").power["D.angle"], work, rtol=1e-12)
+
+
+def test_a_coordinate_adds_to_the_forces_of_the_machine():
+    np.testing.assert_allclose(needed("A.angle")["A.angle"], needed("motor")["motor"] - 3.0, rtol=1e-12)
+    np.testing.assert_allclose(needed("crank.angle")["crank.angle"], needed("A.angle")["A.angle"], rtol=1e-12)
+    np.testing.assert_allclose(needed("motor.force")["motor.force"], needed("motor")["motor"], rtol=1e-12)
+
+
+def test_weights_choose_the_least_of_more_forces():
+    weights = {"motor": 1.0, "D.angle": 4.0}
+    found = mb.required_forces(four_bar(), {"crank.angle": crank}, ts=TS, by=["motor", "D.angle"], weights=weights)
+    rates = np.array([four_bar_forces.motion(LENGTHS, BASE, *at)[1] for at in zip(*CRANK, strict=True)])
+    # The least norm with one freedom: each force as its rate over its weight.
+    power = by_hand("crank")[0] * CRANK[1]
+    share = power / (rates[:, 0] ** 2 + rates[:, 2] ** 2 / 4.0)
+    np.testing.assert_allclose(found["motor"], share * rates[:, 0], rtol=1e-11)
+    np.testing.assert_allclose(found["D.angle"], share * rates[:, 2] / 4.0, rtol=1e-11)
+
+
+@pytest.mark.long
+def test_measured_positions_and_series():
+    """A cubic spline has second derivatives with errors of the square of the interval."""
+    errors = []
+    for count in (41, 81):
+        ts = np.linspace(0.0, 1.0, count)
+        measured = mb.Measurements(ts, {"A.angle": np.asarray(crank(ts))})
+        found = mb.required_forces(four_bar(), measured, by=["motor"])
+        at = np.searchsorted(ts, TS[1:-1])
+        errors.append(np.max(np.abs(found["motor"][at] - by_hand("crank")[0][1:-1])))
+        series = {"A.angle": mb.Series(ts, crank(ts), "cubic")}
+        same = mb.required_forces(four_bar(), series, by=["motor"])
+        np.testing.assert_allclose(same["motor"], found["motor"], rtol=1e-12)
+    assert 3.5 < errors[0] / errors[1] < 4.5 and errors[1] < 0.05
+
+
+def swung(system, speed=2.0):
+    """A trajectory through a state with some velocities, whose accelerations are those of the system."""
+    u = jnp.asarray(np.random.default_rng(0).normal(size=system.nu) * speed)
+    state = mb.assemble(system, mb.State(system.guess.q, u, system.guess.z), throw=False)
+    return motion_of(system, [0.0], state.q[None], state.u[None], None if state.z is None else state.z[None])
+
+
+def with_motor(name, coordinate, **parameters):
+    scene = mechanisms.get(name, **parameters).scene
+    return scene.extended(forces=[mb.JointForce("motor", coordinate, force=3.0)]).compile()
+
+
+def rolling_disc():
+    """Three freedoms, two of which are free of forces."""
+    engine = spatial.Torque("engine", "disc", torque=(0.0, 2.0, 0.0), frame="body")
+    return mechanisms.rolling_disc().scene.extended(forces=[engine]).compile()
+
+
+def rough_slider():
+    """A hinge and a slide that rub."""
+    scene = mechanisms.slider_crank().scene
+    rub = [planar.Friction("rub", "A", coefficient=0.3, radius=0.05, transition_speed=0.01)]
+    return scene.extended(forces=[*rub, mb.JointForce("motor", "A.angle", force=3.0)]).compile()
+
+
+# Machines, and the forces of their actuators, with weights of all that are more than the freedoms.
+DRIVEN = {
+    "rockers": (lambda: with_motor("parallelogram", "foot1.angle"), {"motor": 3.0}),
+    "rolling": (rolling_disc, {"engine.torque": (0.0, 2.0, 0.0)}),
+    "rolling by coordinates": (rolling_disc, {"disc.wx": 0.0, "disc.wy": 0.0, "disc.wz": 0.0}),
+    "rough": (rough_slider, {"motor": 3.0}),
+}
+LONG = {
+    "slider_crank": (lambda: with_motor("slider_crank", "A.angle"), {"motor": 3.0}),
+    "slider_crank by the slide": (
+        lambda: with_motor("slider_crank", "A.angle", angle=1.0),
+        {"slide.displacement": 0.0},
+    ),
+    "andrews": (lambda: mechanisms.andrews().system, {"drive.torque": 0.033}),
+    "bricard": (lambda: with_motor("bricard", "P2.angle"), {"motor": 3.0}),
+    "bennett": (lambda: with_motor("bennett", "hinge3.angle"), {"motor": 3.0}),
+    "swash_plate": (lambda: with_motor("swash_plate", "bearing.angle"), {"motor": 3.0}),
+    "spherical_four_bar": (
+        lambda: mechanisms.spherical_four_bar(model="rigid_bodies", torque=2.0).system,
+        {"drive.torque": (0.0, 0.0, 2.0)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", [*DRIVEN, *(pytest.param(name, marks=pytest.mark.long) for name in LONG)])
+def test_forces_come_back(name):
+    make, expected = (DRIVEN | LONG)[name]
+    system = make()
+    motion = swung(system)
+    several = sum(np.size(force) for force in expected.values()) > system.nu - system.acceleration_rank
+    weights = dict.fromkeys(expected, 1.0) if several else None
+    found = mb.required_forces(system, motion, by=list(expected), weights=weights)
+    for actuator, force in expected.items():
+        np.testing.assert_allclose(found[actuator][0], force, rtol=1e-9, atol=1e-9)
+
+
+def test_a_lagrangian_system_with_rolling():
+    machine = mechanisms.roller_racer()
+    motion = motion_of(machine.system, [0.0], machine.state.q[None], machine.state.u[None])
+    found = mb.required_forces(machine.system, motion, by=["u0", "u1"])
+    np.testing.assert_allclose([found["u0"][0], found["u1"][0]], [0.0, 0.0], atol=1e-11)
+
+
+def driven_bar(*drives, **forces):
+    bar = spatial.Body("bar", mass=2.0, inertia=(0.1, 1.0 / 6.0, 1.0 / 6.0), position=(0.5, 0.0, 0.0))
+    pin = spatial.Revolute("pin", "ground", "bar", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    return mb.Scene([bar], joints=[pin, *drives], forces=[mb.Gravity((0.0, 0.0, -9.81)), *forces.values()]).compile()
+
+
+RAMP = {"motion": lambda t, p: p["rate"] * t**2, "parameters": {"rate": 0.5}}
+DRIVERS = {
+    "Driver": lambda: spatial.Driver("turn", "ground", "bar", quantity="angle", axis=(0.0, 1.0, 0.0), **RAMP),
+    "JointDriver": lambda: mb.JointDriver("turn", "pin.angle"),
+    "Servo": lambda: mb.Servo(
+        spatial.Driver("turn", "ground", "bar", quantity="angle", axis=(0.0, 1.0, 0.0), **RAMP), 3.0, 40.0
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", DRIVERS)
+def test_force_and_rate_of_a_drive_are_its_power(kind):
+    """Also of a servo that is off its program: there the force along the angle is less than its multiplier."""
+    system = driven_bar(DRIVERS[kind]())
+    if kind == "JointDriver":
+        system = mb.with_inputs(system, {"turn.value": lambda t: 0.5 * t**2})
+    free = {"fix": {"pin.angle": 0.9}, "rates": {"pin.angle": 0.4}} if kind == "Servo" else {}
+    state = mb.assemble(system, t=0.3, **free)
+    motion = motion_of(system, [0.3], state.q[None], state.u[None])
+    rate, acceleration = motion["pin"].angle_rate[0], motion["pin"].angle_acceleration[0]
+    angle = motion["pin"].angle[0]
+    # About the axis y a positive turn lowers the bar.
+    torque = 2.0 / 3.0 * acceleration - 2.0 * 9.81 * 0.5 * jnp.cos(angle)
+    np.testing.assert_allclose(motion["turn"].drive_force, [torque], rtol=1e-10)
+    found = mb.required_forces(system, motion, by=["turn"])
+    np.testing.assert_allclose(found["turn"], [torque], rtol=1e-10)
+    np.testing.assert_allclose(found.power["turn"], [torque * rate], rtol=1e-10)
+
+
+@pytest.mark.long
+def test_a_motor_and_its_force():
+    motor = mb.Motor("motor", "pin.angle", command=2.0, lag=0.1, force=1.5)
+    system = driven_bar(motor=motor)
+    motion = swung(system)
+    np.testing.assert_allclose(motion["motor"].drive_force, [1.5])
+    np.testing.assert_allclose(mb.required_forces(system, motion, by=["motor"])["motor"], [1.5], rtol=1e-10)
+    # Without its motor the bar has no internal states, so positions are enough.
+    still = mb.required_forces(system, {"pin.angle": lambda t: 0.2 + 0.0 * t}, ts=[0.0, 1.0], by=["motor"])
+    np.testing.assert_allclose(still["motor"], -9.81 * np.cos(0.2) * np.ones(2), rtol=1e-10)
+    with pytest.raises(ValueError, match="do not determine motor"):
+        mb.required_forces(system, {"pin.angle": lambda t: 0.2}, ts=[0.0, 1.0], by=["pin.angle"])
+
+
+def torque_of(parameters, values):
+    system = mb.with_parameters(four_bar(), parameters)
+    motion = {"crank.angle": mb.Series(np.linspace(0.0, 1.0, 9), values, "cubic")}
+    return jnp.sum(mb.required_forces(system, motion, by=["motor"], ts=TS)["motor"] ** 2)
+
+
+@pytest.mark.long
+def test_derivatives_by_parameters_and_motion():
+    numbers = {"coupler.mass": jnp.asarray(3.0), "B.point_b": jnp.asarray([-1.5, 0.0])}
+    values = jnp.asarray(crank(np.linspace(0.0, 1.0, 9)))
+    along = {"coupler.mass": jnp.asarray(0.3), "B.point_b": jnp.asarray([0.2, -0.1])}
+    move = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=9))
+    loss = jax.jit(torque_of)
+    slopes = jax.jit(jax.grad(torque_of, argnums=(0, 1)))(numbers, values)
+    reverse = sum(jnp.vdot(slopes[0][name], along[name]) for name in along) + jnp.vdot(slopes[1], move)
+    _, forward = jax.jit(lambda a, b: jax.jvp(torque_of, (numbers, values), (a, b)))(along, move)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+    at = lambda h: loss({name: numbers[name] + h * along[name] for name in along}, values + h * move)
+    differences = (8 * (at(1e-3) - at(-1e-3)) - (at(2e-3) - at(-2e-3))) / 12e-3
+    np.testing.assert_allclose(forward, differences, rtol=1e-7)
+
+
+@pytest.mark.long
+def test_batches_are_their_members():
+    masses = jnp.array([1.0, 2.0, 4.0])
+    torque = lambda mass: torque_of({"coupler.mass": mass}, crank(jnp.linspace(0.0, 1.0, 9)))
+    np.testing.assert_allclose(jax.vmap(torque)(masses), [jax.jit(torque)(mass) for mass in masses], rtol=1e-12)
+
+
+@functools.cache
+def two_bars():
+    """An arm of two bars, and a cart that a driver holds."""
+    place = {"arm": 0.5, "rod": 1.5, "cart": 5.0}
+    bodies = [planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0)) for name, x in place.items()]
+    joints = [
+        planar.Revolute("shoulder", "ground", "arm", point=(0.0, 0.0)),
+        planar.Revolute("elbow", "arm", "rod", point=(1.0, 0.0)),
+        planar.Prismatic("rail", "ground", "cart", point=(5.0, 0.0), axis=(1.0, 0.0)),
+        mb.JointDriver("push", "rail.displacement"),
+    ]
+    spring = mb.JointSpring("spring", "elbow.angle", stiffness=2.0)
+    wind = planar.PointForce("wind", "rod", force=(1.0, 0.0))
+    return mb.Scene(bodies, joints=joints, forces=[spring, wind]).compile()
+
+
+REFUSED: dict[str, tuple[dict, str]] = {
+    "by names one actuator each": ({"by": "shoulder.angle"}, "in a sequence"),
+    "unknown": ({"by": ["sholder.angle"]}, "did you mean 'shoulder.angle'"),
+    "twice": ({"by": ["elbow.angle", "elbow.angle"]}, "each actuator once"),
+    "a joint": (
+        {"by": ["elbow", "shoulder.angle"]},
+        "a Revolute, which drives nothing; name its coordinate 'elbow.angle'",
+    ),
+    "a force": ({"by": ["wind", "shoulder.angle"]}, "PointForce.*'wind.force'"),
+    "too few": ({"by": ["shoulder.angle"]}, r"2 freedoms and 1 force, shoulder\.angle, so .* is free"),
+    "too many": ({"by": ["shoulder.angle", "elbow.angle", "rod.angle"]}, "not determined"),
+    "held": ({"by": ["shoulder.angle", "cart.x"]}, "the constraints hold cart.x"),
+    "dependent": ({"by": ["shoulder.angle", "arm.angle"]}, "the motion of .*: arm.angle adds nothing"),
+    "few coordinates": ({"motion": {"elbow.angle": jnp.cos}}, "leave .* free"),
+    "held coordinate": (
+        {"motion": {"elbow.angle": jnp.cos, "shoulder.angle": jnp.sin, "cart.x": jnp.cos}},
+        "cart.x is not a freedom",
+    ),
+    "unknown coordinate": ({"motion": {"elbow": jnp.cos}}, "'elbow.angle'"),
+    "linear": ({"motion": {"elbow.angle": mb.Series([0.0, 1.0], [0.0, 1.0])}}, "'cubic'"),
+    "no times": ({"ts": None}, "ts is missing"),
+    "shape": ({"motion": {"elbow.angle": lambda t: jnp.ones(2) * t}}, "shape"),
+    "weights": ({"weights": {"elbow.angle": 1.0}}, "missing for shoulder.angle"),
+}
+
+
+SOLVED = ("too few", "held", "dependent")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.long) if case in SOLVED else case for case in REFUSED]
+)
+def test_refused(case):
+    given, text = REFUSED[case]
+    swing = {"elbow.angle": jnp.cos, "shoulder.angle": jnp.sin}
+    given = {"motion": swing, "by": ["elbow.angle", "shoulder.angle"], "ts": [0.0, 0.5]} | given
+    with pytest.raises(ValueError, match=text):
+        mb.required_forces(two_bars(), **given)
+
+
+@pytest.mark.long
+def test_a_motion_that_the_machine_cannot_make():
+    system = four_bar()
+    (q,), (u,) = (x for x in (needed("motor").ys.q[:1], needed("motor").ys.u[:1]))
+    bent = motion_of(system, [0.0, 1.0], jnp.stack([q, q.at[1].add(1e-3)]), jnp.stack([u, u]))
+    with pytest.raises(ValueError, match=r"at t = 1 .* its positions violate [A-D] .*"):
+        mb.required_forces(system, bent, by=["motor"])
+    fast = motion_of(system, [0.0, 1.0], jnp.stack([q, q]), jnp.stack([u, u.at[0].add(1e-3)]))
+    with pytest.raises(ValueError, match=r"at t = 1 .* its velocities violate [A-D] .*"):
+        mb.required_forces(system, fast, by=["motor"])
+    with pytest.raises(ValueError, match=r"cannot reach the position.*D.angle"):
+        mb.required_forces(system, {"D.angle": lambda t: 3.0 * t}, ts=[0.0, 1.0], by=["motor"])
+    traced = jax.jit(lambda y: mb.required_forces(system, motion_of(system, [0.0, 1.0], *y), by=["motor"])["motor"])
+    assert np.all(np.isnan(traced((bent.ys.q, bent.ys.u))))
+    assert np.all(np.isfinite(mb.required_forces(system, bent, by=["motor"], tolerance=0.1)["motor"]))

@@ -1,0 +1,164 @@
+"""Loads of bodies along motions."""
+
+import csv
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import four_bar_forces
+from trajectories import motion_of
+
+import jaxmb as mb
+from jaxmb import mechanisms, planar
+
+LENGTHS, BASE, MASSES, GRAVITY = (1.0, 3.0, 2.5), 2.5, (1.0, 3.0, 2.5), 9.81
+
+
+def through(system, count=1):
+    """A trajectory through states with random velocities."""
+    random, states = np.random.default_rng(0), []
+    for _ in range(count):
+        u = jnp.asarray(random.normal(size=system.nu))
+        states.append(mb.assemble(system, mb.State(system.guess.q, u, system.guess.z), throw=False))
+    ys = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    return motion_of(system, np.arange(float(count)), ys.q, ys.u, ys.z)
+
+
+@functools.cache
+def four_bar():
+    """The linkage at three instants."""
+    machine = mechanisms.four_bar(lengths=LENGTHS, base=BASE, masses=MASSES, gravity=GRAVITY)
+    return through(machine.system, 3)
+
+
+def body_axes(angle, vector):
+    turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) @ vector
+    return np.append(turned, 0.0)
+
+
+def check_balance(motion, names=None):
+    for name in motion.system.body_names if names is None else names:
+        on_body = mb.loads(motion, name)
+        force, moment = on_body.balance
+        size = np.max(np.abs(on_body.forces))
+        arm = max(np.max(np.abs(on_body.points)), float(motion.system.length))
+        np.testing.assert_allclose(force, 0.0, atol=1e-12 * size)
+        np.testing.assert_allclose(moment, 0.0, atol=1e-12 * max(size * arm, np.max(np.abs(on_body.moments))))
+
+
+def test_pins_as_by_newton_and_euler():
+    motion = four_bar()
+    coupler, angles = mb.loads(motion, "coupler"), motion["coupler"].angle
+    assert coupler.names == ("B", "C", "gravity", "inertia")
+    assert coupler.kinds == ("joint", "joint", "gravity", "inertia") and not coupler.undetermined
+    np.testing.assert_allclose(coupler["B"].point, np.tile([-1.5, 0.0, 0.0], (3, 1)), atol=1e-15)
+    for k in range(3):
+        crank = motion["crank"]
+        at = crank.angle[k], crank.angular_velocity[k], motion.quantity("crank.angular_acceleration")[k]
+        torque, pins = four_bar_forces.forces(LENGTHS, BASE, MASSES, GRAVITY, *map(float, at))
+        assert abs(torque) < 1e-10
+        np.testing.assert_allclose(coupler["B"].force[k], body_axes(angles[k], pins[1]), atol=1e-10)
+        np.testing.assert_allclose(coupler["C"].force[k], body_axes(angles[k], -pins[2]), atol=1e-10)
+        np.testing.assert_allclose(coupler["B"].moment[k], 0.0, atol=1e-11)
+    check_balance(motion, ["coupler"])
+
+
+def test_worst_instants_and_files(tmp_path):
+    crank = mb.loads(four_bar(), "crank")
+    sizes = np.max(np.linalg.norm(np.asarray(crank.forces), axis=2)[:, :2], axis=1)
+    np.testing.assert_array_equal(crank.worst(count=3).ts, np.argsort(-sizes))
+    by_moment = lambda loads: jnp.abs(loads["inertia"].moment[:, 2])
+    worst = crank.worst(by_moment)
+    assert float(worst.ts[0]) == int(np.argmax(by_moment(crank)))
+    crank.to_csv(tmp_path / "crank.csv")
+    with (tmp_path / "crank.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 12 and rows[0]["part"] == "A" and len(rows[0]) == 11
+    np.testing.assert_array_equal([float(rows[5][f"force_{axis}"]) for axis in "xyz"], crank["B"].force[1])
+    assert float(rows[5]["time"]) == 1.0 and "largest force [N]" in str(crank)
+    with pytest.raises(ValueError, match="a number at each time"):
+        crank.worst(lambda loads: loads.forces)
+
+
+def test_names_that_are_unknown():
+    with pytest.raises(ValueError, match="did you mean 'coupler'"):
+        mb.loads(four_bar(), "couplr")
+    with pytest.raises(ValueError, match="Unknown load 'D'"):
+        mb.loads(four_bar(), "coupler")["D"]
+    machine = mechanisms.roller_racer()
+    with pytest.raises(ValueError, match="there are none"):
+        mb.loads(motion_of(machine.system, [0.0], machine.state.q[None], machine.state.u[None]), "racer")
+
+
+@pytest.mark.long
+def test_a_body_with_friction_a_stop_a_motor_and_its_frame_elsewhere():
+    rod = planar.Body("rod", mass=2.0, inertia=0.3, position=(0.0, 0.0), centre=(0.5, 0.1))
+    pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
+    forces = [
+        mb.Gravity((0.0, -9.81)),
+        planar.Friction("rub", "pin", coefficient=0.3, radius=0.1, transition_speed=0.1),
+        mb.JointStop("stop", "pin.angle", lower=0.5, upper=1.0, stiffness=50.0),
+        mb.Motor("motor", "pin.angle", command=2.0, lag=0.1, force=1.5),
+        planar.PointForce("wind", "rod", force=(3.0, 1.0), point=(1.0, 0.2)),
+    ]
+    motion = through(mb.Scene([rod], joints=[pin], forces=forces).compile())
+    on_rod = mb.loads(motion, "rod")
+    kinds = dict(zip(on_rod.names, on_rod.kinds, strict=True))
+    assert kinds["rub"] == "friction" and kinds["stop"] == "contact" and kinds["motor"] == "force"
+    np.testing.assert_allclose(on_rod.mass_centre, [0.5, 0.1, 0.0])
+    np.testing.assert_allclose(on_rod["wind"].point, [[1.0, 0.2, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(on_rod["wind"].force, [body_axes(float(motion["rod"].angle[0]), [3.0, 1.0])], rtol=1e-12)
+    np.testing.assert_allclose(on_rod["wind"].moment, 0.0, atol=1e-13)
+    np.testing.assert_allclose(on_rod["motor"].moment, [[0.0, 0.0, 1.5]], atol=1e-12)
+    check_balance(motion)
+
+
+LIBRARY = (
+    "pendulum",
+    "slider_crank",
+    "parallelogram",
+    "knife_edge",
+    "chaplygin_sleigh",
+    "heavy_top",
+    "free_body",
+    "rolling_disc",
+    "spatial_slider_crank",
+    "bennett",
+    "swash_plate",
+    "car_axis",
+)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", LIBRARY)
+def test_loads_balance(name):
+    check_balance(through(mechanisms.get(name).system, 2))
+
+
+@pytest.mark.long
+def test_shares_of_redundant_joints_are_named():
+    on_coupler = mb.loads(through(mechanisms.parallelogram().system), "coupler")
+    assert on_coupler.undetermined == ("head1", "head2", "head3")
+    assert "not determined" in str(on_coupler)
+
+
+@pytest.mark.long
+def test_derivatives_of_the_largest_force():
+    """Of a pin force along a simulated motion, by a mass and a length."""
+    machine = mechanisms.four_bar()
+
+    def largest(x):
+        changed = mb.with_parameters(machine.system, {"coupler.mass": x[0], "B.point_b": jnp.stack([x[1], 0.0 * x[1]])})
+        state = mb.assemble(changed, machine.state, fix=machine.fix, rates=machine.rates)
+        motion = mb.simulate(changed, state, t1=0.3, saveat=jnp.linspace(0.0, 0.3, 7), rtol=1e-10, atol=1e-12)
+        return jnp.max(mb.rotations.norm(mb.loads(motion, "coupler")["C"].force))
+
+    x, along = jnp.array([3.0, -1.5]), jnp.array([0.3, 0.1])
+    reverse = jnp.vdot(jax.jit(jax.grad(largest))(x), along)
+    _, forward = jax.jit(lambda v: jax.jvp(largest, (x,), (v,)))(along)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    at = jax.jit(lambda h: largest(x + h * along))
+    differences = (8 * (at(1e-3) - at(-1e-3)) - (at(2e-3) - at(-2e-3))) / 12e-3
+    np.testing.assert_allclose(forward, differences, rtol=1e-5)
