@@ -302,6 +302,9 @@ class AbstractLink(AbstractActor):
     of_time: ClassVar[bool] = False
     # What its coordinates are; not known without an entry.
     quantities: ClassVar[Quantities] = {}
+    # Whether it pulls with a tension [N]: the multiplier of each of its rows, or what the kernel `tension` of a force
+    # gives, for each of its `spans`.
+    has_tension: ClassVar[bool] = False
     # Names of the coordinates that measure how the bodies slide over each other, where they do in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
 
@@ -341,6 +344,12 @@ class AbstractLink(AbstractActor):
         if part is not self:
             cls.check(part, space.dimension)
         return part
+
+    @classmethod
+    def declares(cls, hook: str, *laws: str) -> bool:
+        """Whether the class defines a hook, and neither its `residual` nor other laws of the hook are newer."""
+        where = lambda name: next((k for k, kind in enumerate(cls.__mro__) if name in vars(kind)), len(cls.__mro__))
+        return all(where(hook) <= where(law) for law in ("residual", *laws))
 
     @classmethod
     def distinct(cls, bodies: Sequence[Any]) -> list[Any]:
@@ -467,12 +476,6 @@ class AbstractConstraint(AbstractLink):
         """
         del space, poses
         return None
-
-    @classmethod
-    def declares(cls, hook: str, *laws: str) -> bool:
-        """Whether the class defines a hook, and neither its `residual` nor other laws of the hook are newer."""
-        where = lambda name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind))
-        return all(where(hook) <= where(law) for law in ("residual", *laws))
 
 
 class AbstractInertialConstraint(AbstractConstraint):
