@@ -35,6 +35,8 @@ from .unilateral import AbstractGeometricContact
 
 # Neighbouring pulleys in space have axes that are parallel to this sine.
 _PARALLEL = 1e-6
+# In the plane angles that are not counted change by no more than this [rad], in both directions.
+_FARTHEST = 0.9 * np.pi
 # Lengths that differ by no more than this share are equal.
 _ROUNDING = 1e-9
 # Of a point none.
@@ -82,7 +84,7 @@ class AbstractRope(AbstractLink):
     - `bodies`, each once. For each place of the path: `owners`, the index of its body among them; `points` [m], the
         centre of a pulley; `senses`, 1 for a pulley on which the rope turns left, -1 right, 0 for a point; `grips`.
     - For each pulley: `radii` [m]; `axes`, in space.
-    - `bearings` [rad]: the angles that are counted, at the given poses; see `_angles`.
+    - `counts`: whether full turns are counted; `bearings` [rad]: the `_angles` at the given poses.
     - `marks` [rad]: of pulleys that hold the rope (drums, and those that grip), the bearing without rope on a drum, and
         at the given poses.
     """
@@ -92,6 +94,7 @@ class AbstractRope(AbstractLink):
     owners: tuple[int, ...] = eqx.field(static=True)
     senses: tuple[int, ...] = eqx.field(static=True)
     grips: tuple[bool, ...] = eqx.field(static=True)
+    counts: bool = eqx.field(static=True)
     points: fields.Number = fields.parameter(shape=(None, "d"), unit="m")
     radii: fields.Number = fields.length(shape=(None,), sign="positive", optional=True)
     axes: fields.Number = fields.axis(body=None, shape=(None, 3), optional=True, dimension=3)
@@ -122,8 +125,8 @@ class AbstractRope(AbstractLink):
         return np.array([k for k in self._pulleys if self.grips[k] or k in (0, len(self.senses) - 1)], int)
 
     @property
-    def counted(self) -> int:
-        """The number of angles that are counted."""
+    def size(self) -> int:
+        """The number of angles of the rope."""
         return len(self._passed) + len(self._holding)
 
     def _span(self, part: Any) -> np.ndarray:
@@ -175,7 +178,7 @@ class AbstractRope(AbstractLink):
         return _each(space.direction, poses[np.array(self.owners)[self._pulleys]], self.axes)
 
     def _angles(self, space, poses, along) -> Any:
-        """Angles [rad] up to full turns, shape (counted,), positive as the rope turns: by which it turns on pulleys
+        """Angles [rad] up to full turns, shape (size,), positive as the rope turns: by which it turns on pulleys
         that it passes; then the bearings of the straight parts before pulleys that hold it, of a drum at the start
         after it, in the axes of the body, in the plane in those of the world.
         """
@@ -192,16 +195,20 @@ class AbstractRope(AbstractLink):
         turned = xp.concatenate([xp.arctan2(sine, xp.sum(before * after, axis=1)), xp.arctan2(y, x)])
         return np.array(self.senses)[np.concatenate([k, holding])] * turned
 
-    def _continued(self, space, poses, along) -> Float[Array, "counted"]:
-        """The angles with the full turns that are counted."""
-        if not self.counted:
+    def _continued(self, space, poses, along) -> Float[Array, "size"]:
+        """The angles with their full turns."""
+        if not self.size:
             return jnp.zeros(0, along.dtype)
         angles = self._angles(space, poses, along)
-        return angles + turns(self._counts(poses) + self.bearings - angles)
+        if self.counts:
+            return angles + turns(self._counted(poses) + self.bearings - angles)
+        away = shortest(angles - self.bearings)
+        # No step passes from here to the other side, where the angle would jump by a turn.
+        return self.bearings + jnp.where(jnp.abs(away) < _FARTHEST, away, jnp.nan)
 
-    def _counts(self, poses):
+    def _counted(self, poses):
         first = len(self.bodies)
-        return poses[first : first + self.counted, 0]
+        return poses[first : first + self.size, 0]
 
     def _wound(self, space, poses, angles) -> tuple[Any, Any]:
         """Angles [rad] of rope, from those that are counted: on pulleys that it passes; and from the mark of each
@@ -220,10 +227,10 @@ class AbstractRope(AbstractLink):
         return self._measured(space, poses, straight, self._continued(space, poses, along))
 
     def _measured(self, space, poses, straight, angles) -> Any:
-        """Lengths of the spans, from those of the straight parts and the angles that are counted."""
+        """Lengths of the spans, from those of the straight parts and the angles of `_angles`."""
         parts, spans = [straight], [self._span(np.arange(len(straight)))]
         xp = namespace(straight, angles)
-        if self.counted:
+        if self.size:
             wraps, held = self._wound(space, poses, angles)
             holding = self._holding
             after, before = np.flatnonzero(holding < len(straight)), np.flatnonzero(holding > 0)
@@ -237,7 +244,7 @@ class AbstractRope(AbstractLink):
 
     def coordinates(self, space, poses):
         out = {"length": jnp.sum(self.lengths(space, poses))}
-        return out | ({"wrap": self._wraps(space, poses)} if self.counted else {})
+        return out | ({"wrap": self._wraps(space, poses)} if self.size else {})
 
     def _wraps(self, space, poses) -> Float[Array, "pulleys"]:
         """Angles [rad] of rope on the pulleys."""
@@ -254,7 +261,7 @@ class AbstractRope(AbstractLink):
     def path(self, space, poses):
         _, along = self._straight(space, poses)
         centres = jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
-        angles = iter(self._wraps(space, poses)) if self.counted else iter(())
+        angles = iter(self._wraps(space, poses)) if self.size else iter(())
         axes = iter(self._axes(space, poses)) if self.axes is not None else itertools.repeat(None)
         radii, out = iter(() if self.radii is None else self.radii), []
         for k, sense in enumerate(self.senses):
@@ -299,11 +306,13 @@ class RopePath(AbstractRope, AbstractTendon):
 
     @property
     def rows(self):
-        return self.counted
+        return self.size if self.counts else 0
 
     def residual(self, space, poses, t):
+        if not self.rows:
+            return super().residual(space, poses, t)
         angles = self._angles(space, poses, self._straight(space, poses)[1])
-        return shortest(self._counts(poses) + self.bearings - angles)
+        return shortest(self._counted(poses) + self.bearings - angles)
 
     def length(self, space, poses):
         return jnp.sum(self.lengths(space, poses))
@@ -353,7 +362,8 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
 
     def _tension(self, stretch, rate):
         pull = jnp.maximum(self.stiffness * stretch + self.damping * rate, 0.0)
-        return jnp.where(stretch > 0, pull, 0.0)
+        # Not the other way round: a path without tangents is not slack.
+        return jnp.where(stretch <= 0, 0.0, pull)
 
     def tension(self, space, poses, velocities, t):
         """The tension of each span [N]."""
@@ -393,8 +403,12 @@ class Rope(AbstractRope, AbstractCompound):
     winch is a drum that a motor, `JointDriver` or `Driver` turns, or a `length` that is an input of `simulate`.
 
     The tension `"rope.tension"` [N], of several spans one each, is positive where the rope pulls. Its coordinates are
-    `length` [m], of all spans, and `wrap` [rad], the angles of rope on the pulleys. Angles count on through full turns:
-    for each the scene has a coordinate more, which no force acts on, next to zero at the given poses.
+    `length` [m], of all spans, and `wrap` [rad], the angles of rope on the pulleys.
+
+    In the plane drums wind up any number of turns, since angles of bodies count them. Straight parts turn about drums,
+    and angles on other pulleys change, by less than 0.9 half turns from the given poses; a run that goes on fails. In
+    space, and with `count_turns=True`, there is no limit: for each angle the scene has a coordinate more, which no
+    force acts on and which is next to zero at the given poses.
 
     A rope of constant length pulls and pushes, so that its tension may be negative. With `slack=True` it only pulls: it
     goes slack and tightens with an impact, both at times that `simulate` finds, and its coordinate `gap` [m] is how
@@ -413,6 +427,8 @@ class Rope(AbstractRope, AbstractCompound):
     - `stiffness` [N/m] > 0 and `damping` [N s/m] ≥ 0, default none, of each span of an elastic rope.
     - `slack`: whether a rope of constant length may go slack; it has one span. `restitution`, as of a `Slack`, default
         0: the rate after an impact over that before.
+    - `count_turns`: whether in the plane, too, full turns are counted about pulleys, as of a ball on a rope that winds
+        up around a pole.
     """
 
     length: fields.Number = fields.parameter(shape=None, unit="m", sign="positive", optional=True)
@@ -432,6 +448,7 @@ class Rope(AbstractRope, AbstractCompound):
         damping: Any = None,
         slack: bool = False,
         restitution: Any = None,
+        count_turns: bool = False,
     ):
         places = [_place(f"Rope {name!r}: path[{k}]", place) for k, place in enumerate(path)]
         pulleys = [place for place in places if place.radius is not None]
@@ -448,7 +465,7 @@ class Rope(AbstractRope, AbstractCompound):
         self.axes = [pulley.axis for pulley in pulleys] if dimension == 3 and pulleys else None
         self.bearings = self.marks = None
         self.length, self.stiffness, self.damping = length, stiffness, damping
-        self.slack, self.restitution = slack, restitution
+        self.slack, self.restitution, self.counts = slack, restitution, count_turns
 
     def __check_init__(self):
         if len(self.owners) < 2:
@@ -474,16 +491,21 @@ class Rope(AbstractRope, AbstractCompound):
             raise ValueError(f"{self.label}: length must have shape ({self.spans},), one for each span.")
 
     def scalar_coordinates(self, space, parts):
-        counts = [ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k in range(self.counted)]
-        return (*counts, *(ScalarCoordinate(f"{self.name}.mode", moves=True) for _ in range(self.slack)))
+        counts = self.size if self._is_counted(space) else 0
+        out = [ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k in range(counts)]
+        return (*out, *([ScalarCoordinate(f"{self.name}.mode", moves=True)] if self.slack else []))
+
+    def _is_counted(self, space):
+        # In space the angles of drums are known up to full turns.
+        return self.counts or space.dimension == 3
 
     def complete(self, space, poses):
         if space.dimension == 3:
             self._check_axes(space, poses)
         straight, along = self._straight(space, poses)
         self._check_tangents(straight)
-        part, angles = self, np.zeros(0)
-        if self.counted:
+        part, angles = self.with_fields(counts=self._is_counted(space)), np.zeros(0)
+        if self.size:
             passed, number = len(self._passed), np.array(self.turns)
             angles = np.array(self._angles(space, poses, along))
             # A rope that passes a pulley turns back by less than a quarter of a turn.
@@ -491,7 +513,7 @@ class Rope(AbstractRope, AbstractCompound):
             _, marks = self._wound(space, poses, angles)
             # The rope leaves the mark of a drum at the start, and goes to that of one at the end.
             sides = np.where(self._holding == 0, -1, self._holding == len(straight))
-            part = self.filled(bearings=angles, marks=marks + 2 * np.pi * sides * number[self._holding])
+            part = part.filled(bearings=angles, marks=marks + 2 * np.pi * sides * number[self._holding])
         lengths = part._measured(space, poses, straight, angles)
         self._check_length(lengths, part._measured(space, poses, 0 * straight, angles))
         return part.filled(length=lengths[0] if self.spans == 1 else lengths)
