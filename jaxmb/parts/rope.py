@@ -178,22 +178,33 @@ class AbstractRope(AbstractLink):
         return _each(space.direction, poses[np.array(self.owners)[self._pulleys]], self.axes)
 
     def _angles(self, space, poses, along) -> Any:
-        """Angles [rad] up to full turns, shape (size,), positive as the rope turns: by which it turns on pulleys
-        that it passes; then the bearings of the straight parts before pulleys that hold it, of a drum at the start
-        after it, in the axes of the body, in the plane in those of the world.
+        """Angles [rad] up to full turns, shape (size,), positive as the rope turns: those by which it turns on pulleys
+        that it passes, and the bearings at pulleys that hold it.
         """
-        k, holding, xp = self._passed, self._holding, namespace(along)
-        before, after, lines = along[k - 1], along[k], along[np.maximum(holding - 1, 0)]
+        k, xp = self._passed, namespace(along)
+        before, after = along[k - 1], along[k]
         if space.dimension == 2:
             sine = xp.sum(_quarter_turn(before) * after, axis=1)
-            x, y = lines[:, 0], lines[:, 1]
         else:
-            sine = xp.sum(self._of_pulleys(k, self._axes(space, poses)) * xp.cross(before, after), axis=1)
-            lines = _each(space.body_direction, poses[np.array(self.owners)[holding]], lines)
-            across = _each(perpendiculars, self._of_pulleys(holding, self.axes))
+            axes = self._of_pulleys(k, self._axes(space, poses))
+            sine = xp.sum(axes * xp.cross(before, after), axis=1)
+        turned = np.array(self.senses)[k] * xp.arctan2(sine, xp.sum(before * after, axis=1))
+        if not len(self._holding):
+            return turned
+        return xp.concatenate([turned, self._bearings(space, poses, along)])
+
+    def _bearings(self, space, poses, along) -> Any:
+        """Angles [rad], positive as the rope turns, of the straight parts before the pulleys that hold it, of a drum at
+        the start after it: in the plane from the x axis of the world, in space from an axis of the pulley's body.
+        """
+        k, xp = self._holding, namespace(along)
+        lines = along[np.maximum(k - 1, 0)]
+        x, y = lines[:, 0], lines[:, 1]
+        if space.dimension == 3:
+            lines = _each(space.body_direction, poses[np.array(self.owners)[k]], lines)
+            across = _each(perpendiculars, self._of_pulleys(k, self.axes))
             x, y = (xp.sum(across[:, i] * lines, axis=1) for i in (0, 1))
-        turned = xp.concatenate([xp.arctan2(sine, xp.sum(before * after, axis=1)), xp.arctan2(y, x)])
-        return np.array(self.senses)[np.concatenate([k, holding])] * turned
+        return np.array(self.senses)[k] * xp.arctan2(y, x)
 
     def _continued(self, space, poses, along) -> Float[Array, "size"]:
         """The angles with their full turns."""
@@ -211,7 +222,7 @@ class AbstractRope(AbstractLink):
         return poses[first : first + self.size, 0]
 
     def _wound(self, space, poses, angles) -> tuple[Any, Any]:
-        """Angles [rad] of rope, from those that are counted: on pulleys that it passes; and from the mark of each
+        """Angles [rad] of rope, from those of `_angles`: on pulleys that it passes; and from the mark of each
         pulley that holds it to the straight part.
         """
         holding, passed = self._holding, len(self._passed)
@@ -297,7 +308,7 @@ def _quarter_turn(v):
 def _each(function, *rows):
     """A function of each row of some arrays."""
     if namespace(*rows) is np:
-        return np.stack([function(*row) for row in zip(*rows, strict=True)]) if len(rows[0]) else rows[-1]
+        return np.stack([function(*row) for row in zip(*rows, strict=True)])
     return jax.vmap(function)(*rows)
 
 
@@ -462,12 +473,15 @@ class Rope(AbstractRope, AbstractCompound):
         self.grips = tuple(place.grips for place in places)
         self.turns = tuple(float(place.turns) for place in places)
         self.radii = [pulley.radius for pulley in pulleys] or None
-        self.axes = [pulley.axis for pulley in pulleys] if dimension == 3 and pulleys else None
+        axes = [pulley.axis for pulley in pulleys]
+        self.axes = None if all(axis is None for axis in axes) else axes
         self.bearings = self.marks = None
         self.length, self.stiffness, self.damping = length, stiffness, damping
         self.slack, self.restitution, self.counts = slack, restitution, count_turns
 
     def __check_init__(self):
+        if isinstance(self.axes, list):
+            raise ValueError(f"{self.label}: give the axis of every pulley, shape (3,), or in the plane of none.")
         if len(self.owners) < 2:
             raise ValueError(f"{self.label}: path must hold at least two places, got {len(self.owners)}.")
         if self.slack and self.spans > 1:
@@ -487,8 +501,11 @@ class Rope(AbstractRope, AbstractCompound):
                 )
 
     def validate(self):
-        if self.length is not None and self.length.shape not in [(self.spans,), ()][: 1 + (self.spans == 1)]:
-            raise ValueError(f"{self.label}: length must have shape ({self.spans},), one for each span.")
+        shape = () if self.spans == 1 else (self.spans,)
+        if self.length is not None and self.length.shape != shape:
+            raise ValueError(
+                f"{self.label}: length must have shape {shape}, one for each of its spans, got {self.length.shape}."
+            )
 
     def scalar_coordinates(self, space, parts):
         counts = self.size if self._is_counted(space) else 0
