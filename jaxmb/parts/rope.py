@@ -91,10 +91,10 @@ class AbstractRope(AbstractLink):
 
     name: str = fields.name()
     bodies: fields.Names = fields.body_names()
-    owners: tuple[int, ...] = eqx.field(static=True)
-    senses: tuple[int, ...] = eqx.field(static=True)
-    grips: tuple[bool, ...] = eqx.field(static=True)
-    counts: bool = eqx.field(static=True)
+    owners: tuple[int, ...] = eqx.field(static=True, default=())
+    senses: tuple[int, ...] = eqx.field(static=True, default=())
+    grips: tuple[bool, ...] = eqx.field(static=True, default=())
+    counts: bool = eqx.field(static=True, default=False)
     points: fields.Number = fields.parameter(shape=(None, "d"), unit="m")
     radii: fields.Number = fields.length(shape=(None,), sign="positive", optional=True)
     axes: fields.Number = fields.axis(body=None, shape=(None, 3), optional=True, dimension=3)
@@ -149,7 +149,7 @@ class AbstractRope(AbstractLink):
         """Of the straight parts: lengths [m], and unit vectors along them in the planes of their pulleys."""
         centres = _each(space.point, poses[np.array(self.owners)], self.points)
         xp = namespace(centres)
-        d = centres[1:] - centres[:-1]
+        d: Any = centres[1:] - centres[:-1]
         if not len(self._pulleys):
             length = norm(d)
             return length, d / xp.where(length > 0, length, 1.0)[:, None]
@@ -348,7 +348,7 @@ class SlackRope(AbstractRope, AbstractGeometricContact):
     """A rope of constant length that may go slack."""
 
     length: fields.Number = fields.parameter(shape=None, unit="m", sign="positive")
-    quantities: ClassVar[Quantities] = AbstractRope.quantities | {"gap": "length"}
+    quantities: ClassVar[Quantities] = {"length": "length", "wrap": "angle", "gap": "length"}
     has_tension: ClassVar[bool] = True
 
     def gap(self, space, poses):
@@ -445,9 +445,9 @@ class Rope(AbstractRope, AbstractCompound):
     length: fields.Number = fields.parameter(shape=None, unit="m", sign="positive", optional=True)
     stiffness: fields.Number = fields.parameter(unit="N/m", sign="positive", optional=True)
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", optional=True)
-    slack: bool = eqx.field(static=True)
+    slack: bool = eqx.field(static=True, default=False)
     restitution: fields.Number = fields.parameter(unit="1", sign="non-negative", optional=True)
-    turns: tuple[float, ...] = eqx.field(static=True)
+    turns: tuple[float, ...] = eqx.field(static=True, default=())
 
     def __init__(
         self,

@@ -177,6 +177,18 @@ def test_a_rope_that_stands_twice_is_implied():
     np.testing.assert_allclose(motions[1], motions[0], rtol=1e-12)
 
 
+def test_counts_of_turns_in_the_plane():
+    """They are coordinates without a velocity, and change nothing but what happens after a turn."""
+    plain, counting = atwood(), atwood(count_turns=True)
+    assert (counting.nq, counting.nu) == (plain.nq + 2, plain.nu)
+    state = mb.assemble(counting, fix={"wheel.angle": 0.4})
+    expected = jax.jacfwd(lambda q: counting.coordinate_residual(0.0, q))(state.q)
+    found = counting.prepared().coordinate_jacobian(0.0, state.q)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    motions = [instant(own, mb.assemble(own))("left.acceleration") for own in (plain, counting)]
+    np.testing.assert_allclose(motions[1], motions[0], rtol=1e-12)
+
+
 # Bad input
 
 
