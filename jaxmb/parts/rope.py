@@ -143,6 +143,10 @@ class AbstractRope(AbstractLink):
         """Values of pulleys, one for each of some places."""
         return unchecked_take(values, np.searchsorted(self._pulleys, places))
 
+    def _signed(self, places: np.ndarray, values: Any) -> Any:
+        """Values of some places, positive where the rope turns left."""
+        return np.array(self.senses)[places].astype(values.dtype) * values
+
     # Geometry
 
     def _straight(self, space, poses) -> tuple[Any, Any]:
@@ -153,11 +157,11 @@ class AbstractRope(AbstractLink):
         if not len(self._pulleys):
             length = norm(d)
             return length, d / xp.where(length > 0, length, 1.0)[:, None]
-        senses = np.array(self.senses)
-        number = np.where(senses != 0, np.cumsum(senses != 0) - 1, len(self._pulleys))
+        places = np.arange(len(self.senses))
+        number = np.where(np.isin(places, self._pulleys), np.searchsorted(self._pulleys, places), len(self._pulleys))
         at = lambda values, index: unchecked_take(xp.concatenate([values, xp.zeros_like(values[:1])]), index)
         # The rope is to the right of the centre of a pulley on which it turns left.
-        offset = senses * at(self.radii, number)
+        offset = self._signed(places, at(self.radii, number))
         more, beside = (offset[1:] - offset[:-1])[:, None], 0.0
         if space.dimension == 2:
             across = _quarter_turn(d)
@@ -188,7 +192,7 @@ class AbstractRope(AbstractLink):
         else:
             axes = self._of_pulleys(k, self._axes(space, poses))
             sine = xp.sum(axes * xp.cross(before, after), axis=1)
-        turned = np.array(self.senses)[k] * xp.arctan2(sine, xp.sum(before * after, axis=1))
+        turned = self._signed(k, xp.arctan2(sine, xp.sum(before * after, axis=1)))
         if not len(self._holding):
             return turned
         return xp.concatenate([turned, self._bearings(space, poses, along)])
@@ -204,7 +208,7 @@ class AbstractRope(AbstractLink):
             lines = _each(space.body_direction, poses[np.array(self.owners)[k]], lines)
             across = _each(perpendiculars, self._of_pulleys(k, self.axes))
             x, y = (xp.sum(across[:, i] * lines, axis=1) for i in (0, 1))
-        return np.array(self.senses)[k] * xp.arctan2(y, x)
+        return self._signed(k, xp.arctan2(y, x))
 
     def _continued(self, space, poses, along) -> Float[Array, "size"]:
         """The angles with their full turns."""
@@ -229,7 +233,7 @@ class AbstractRope(AbstractLink):
         bearings = angles[passed:]
         if space.dimension == 2 and len(holding):
             # Angles of bodies count full turns.
-            bearings = bearings - np.array(self.senses)[holding] * poses[np.array(self.owners)[holding], 2]
+            bearings = bearings - self._signed(holding, poses[np.array(self.owners)[holding], 2])
         return angles[:passed], bearings if self.marks is None else bearings - self.marks
 
     def lengths(self, space, poses) -> Float[Array, "spans"]:
@@ -426,10 +430,11 @@ class Rope(AbstractRope, AbstractCompound):
     much longer it is than its path. An elastic rope, with a `stiffness`, only pulls: the tension of a span is
     `stiffness (l − length) + damping l̇`, zero where that is negative or the span is not stretched.
 
-    A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative. In space a
-    pulley has a groove in the plane through its centre: the rope leaves the groove where in this plane its projection
-    is a tangent, which is exact where the rope runs in the plane. Neighbouring pulleys there need parallel axes, also
-    as they move; otherwise put a point between them.
+    A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative. In space the
+    rope lies in the plane of a pulley, through its centre, and leaves it where its projection on this plane is a
+    tangent. That is exact for a rope in the plane; a straight part at an angle α to it, of length l in it, has a force
+    that differs from its line by the share (1 − cos α) R / l. Neighbouring pulleys need parallel axes, also as they
+    move; otherwise put a point between them.
 
     **Arguments:**
 
