@@ -286,8 +286,8 @@ class AbstractRope(AbstractLink):
             axis, turned = next(axes), sense * next(angles) * jnp.linspace(0.0, 1.0, 17)
             e = along[max(k - 1, 0)][None]
             turned = turned[:, None] - turned[-1] * (k == 0)
-            side = _quarter_turn(e) if axis is None else jnp.cross(axis, e)
-            out.append(centres[k] - sense * next(radii) * (jnp.cos(turned) * side - jnp.sin(turned) * e))
+            side = _quarter_turn(e) if axis is None else jnp.cross(axis[None], e)
+            out.append(centres[k][None] - sense * next(radii) * (jnp.cos(turned) * side - jnp.sin(turned) * e))
         # There and back, since a belt is a closed line.
         there = jnp.concatenate(out)
         return jnp.concatenate([there, there[-2:0:-1]])
