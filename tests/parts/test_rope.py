@@ -442,7 +442,7 @@ def test_derivatives(rope):
 
     forward, reverse = jax.jit(jax.jacfwd(end))(values), jax.jit(jax.jacrev(end))(values)
     h = 1e-5
-    moved = lambda sign: jax.tree.map(lambda x: x + sign * h * jnp.eye(x.size).reshape(-1, *x.shape), values)
+    moved = lambda sign: jax.tree.map(lambda x: x[None] + sign * h * jnp.eye(x.size).reshape(-1, *x.shape), values)
     tight = jax.jit(jax.vmap(lambda values: end(values, rtol=1e-12)))
     for name in names:
         np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-9)
