@@ -430,11 +430,12 @@ class Rope(AbstractRope, AbstractCompound):
     much longer it is than its path. An elastic rope, with a `stiffness`, only pulls: the tension of a span is
     `stiffness (l − length) + damping l̇`, zero where that is negative or the span is not stretched.
 
-    A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative. In space the
-    rope lies in the plane of a pulley, through its centre, and leaves it where its projection on this plane is a
-    tangent. That is exact for a rope in the plane; a straight part at an angle α to it, of length l in it, has a force
-    that differs from its line by the share (1 − cos α) R / l. Neighbouring pulleys need parallel axes, also as they
-    move; otherwise put a point between them.
+    A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative.
+
+    In space the rope lies in the plane of a pulley, through its centre, and leaves it where its projection on this
+    plane is a tangent. That is exact for a rope in the plane; a straight part at an angle α to it, of length l in it,
+    has a force that differs from its line by the share (1 − cos α) R / l. Neighbouring pulleys need parallel axes, also
+    as they move; otherwise put a point between them.
 
     **Arguments:**
 
