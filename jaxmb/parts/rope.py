@@ -595,6 +595,7 @@ class Rope(AbstractRope, AbstractCompound):
 
 def _place(label: str, place: Any) -> Pulley:
     """A place of a path as a pulley, a point as one without a radius."""
+    # A concrete class: a pulley is a tuple too, and a place of its own kind.
     if not isinstance(place, Pulley):
         if not isinstance(place, Sequence) or len(place) != 2 or not isinstance(place[0], str):
             raise ValueError(f"{label} must be a pair (body, point) or a Pulley, got {place!r}.")
