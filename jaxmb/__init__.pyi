@@ -32,6 +32,7 @@ from .parts.controller import Controller as Controller
 from .parts.servo import Servo as Servo
 from .parts.series import Series as Series
 from .parts.combinations import Tendon as Tendon, FixedTendon as FixedTendon
+from .parts.rope import Rope as Rope, Pulley as Pulley
 from .parts.coordinate_parts import (
     JointSpring as JointSpring,
     JointForce as JointForce,

@@ -90,14 +90,14 @@ class BodySet(eqx.Module):
         return raveled if self.layout.uniform else unchecked_take(raveled, self.layout.coordinate_place)
 
     def rates(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nq"]:
-        """Rates of the coordinates of bodies in space."""
+        """Rates of the coordinates."""
         rates = self._pack(jax.vmap(self.layout.space.rates)(self._poses(q), self._velocities(u)))
         for g in self.turn_counts:
             rates = rates.at[self._places(g)].set(-g.velocity(self.kinematics(t, q, u)))
         return rates
 
     def normalize(self, q: Coordinates) -> Float[Array, "nq"]:
-        """Coordinates in space with Euler parameters of length one, and with exact counts of turns."""
+        """Coordinates with Euler parameters of length one, and with exact counts of turns."""
         q = self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
         for g in self.turn_counts:
             # A count of turns does not depend on the time.
@@ -112,7 +112,9 @@ class BodySet(eqx.Module):
 
     def _places(self, group):
         """Indices in q of the counts of turns of stacked tendons, shape (parts, rows)."""
-        return self.layout.pose_index[group.group.body_index[:, -group.rows :], 0]
+        # They follow the bodies.
+        first = int(np.sum(self.layout.is_place(group.group.bodies[0])))
+        return self.layout.pose_index[group.group.body_index[:, first : first + group.rows], 0]
 
     # Invariants of the coordinates: counts of turns, and Euler parameters of length one
 
@@ -122,8 +124,8 @@ class BodySet(eqx.Module):
         return sum(g.row_count for g in self.turn_counts) + len(self.layout.turning)
 
     def invariants(self, t: Scalar, q: Coordinates) -> list[Float[Array, "_"]]:
-        """Residuals of the invariants in space, as consecutive pieces."""
-        p, poses = self.poses(q)[self.layout.turning, 3:], self.prepared_poses(q)
+        """Residuals of the invariants, as consecutive pieces."""
+        p, poses = self.poses(q)[np.array(self.layout.turning, int), 3:], self.prepared_poses(q)
         counts = [g.residual(t, poses).reshape(-1) for g in self.turn_counts]
         return [*counts, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)]
 
@@ -141,13 +143,15 @@ class BodySet(eqx.Module):
         return q, len(whole)
 
     def held_velocities(self, held: np.ndarray) -> np.ndarray | None:
-        """The velocities in space that leave held coordinates unchanged; None where a rotation is held in part."""
+        """The velocities that leave held coordinates unchanged; None where a rotation is held in part."""
         d = self.layout.space.dimension
         of_pose = np.append(held, np.ones(self.layout.space.pose_size, bool))[self.layout.pose_index[:-1]]
         turns = of_pose[:, d:]
         if np.any(np.any(turns, axis=1) & ~np.all(turns, axis=1)):
             return None
-        of_bodies = np.concatenate([of_pose[:, :d], np.repeat(turns[:, :1], d, axis=1)], axis=1)
+        of_bodies = np.concatenate(
+            [of_pose[:, :d], np.repeat(turns[:, :1], self.layout.space.velocity_size - d, axis=1)], axis=1
+        )
         return of_bodies.reshape(-1)[self.layout.velocity_place]
 
     def shifted(self, guess: State, moved: Sequence[tuple[BodyGroup, Float[Array, "parts d"]]]) -> State:

@@ -135,7 +135,11 @@ class ConstraintSet(eqx.Module):
         if self.elements is None or not all(map(is_elementary, groups)):
             moves = jax.vmap(along)(poses[:, : space.pose_size])
         of_group: Any = lambda g: g.along(t, poses, moves)
-        blocks = self._pieces(groups, lambda elements: elements.jacobian_of_poses(poses), of_group)
+        # In the plane rates of poses are velocities.
+        of_rows = lambda elements: (
+            elements.jacobian_of_poses(poses) if space.dimension == 3 else elements.jacobian(poses)
+        )
+        blocks = self._pieces(groups, of_rows, of_group)
         return self._assembled(joined([*blocks, jnp.zeros(1, poses.dtype)], poses.dtype), groups, of_poses=True)
 
     def _assembled(self, blocks, groups, *, of_poses):

@@ -536,6 +536,10 @@ class ForceGroup(AbstractGroup):
 
         return self._map(single, now.poses, now.velocities)
 
+    def tension(self, now: Kinematics) -> Float[Array, "parts spans"]:
+        """Tensions of the spans of ropes."""
+        return self._of_motion("tension", now)
+
     def energy(self, t: Scalar, poses: BodyPoses) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)

@@ -48,15 +48,39 @@ def joint_places(constraints: ConstraintSet, name: str) -> tuple[tuple[Place, ..
 
 
 def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
-    """The forces and moments of joints."""
+    """The forces and moments of joints, and the tensions of ropes."""
     d = system.layout.space.dimension
     fields = {"force": (d,), "moment": () if d == 2 else (3,)}
     joints = {name: joint_places(system.constraints, name) for name in names}
-    return {
+    of_joints = {
         f"{name}.{field}": Measure(shape, _field_of_reaction, (field, joint), of_forces=True)
         for name, joint in joints.items()
         for field, shape in fields.items()
     }
+    return of_joints | _tension_measures(system)
+
+
+def _tension_measures(system) -> dict[str, Measure]:
+    out = {}
+    for of_forces, groups in ((True, system.constraints.groups), (False, system.forces.groups)):
+        for g, group in enumerate(groups):
+            if group.group.part.has_tension:
+                spans = group.group.part.spans
+                shape = () if spans == 1 else (spans,)
+                for k, name in enumerate(group.group.names):
+                    out[f"{name}.tension"] = Measure(shape, _tension, (g, of_forces, shape, np.array(k)), of_forces)
+    return out
+
+
+@view_of_motion
+def _tension(system, place, ts, ys, solved):
+    group, of_rows, shape, member = place
+    if of_rows:
+        pulls = jax.vmap(lambda multipliers: system.constraints.of_groups(multipliers)[group][1][member])
+        return pulls(solved.multipliers).reshape(-1, *shape)
+    alone = system.forces.groups[group].only(member)
+    pull = lambda t, y: alone.tension(system.kinematics(t, y.q, y.u))[0].reshape(shape)
+    return jax.vmap(pull)(ts, ys)
 
 
 @view_of_motion

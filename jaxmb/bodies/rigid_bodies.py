@@ -152,7 +152,7 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def rates_are_velocities(self) -> bool:
-        return not self.spatial
+        return not self.spatial and not self.bodies.turn_counts
 
     def rates(self, t, q, u):
         return u if self.rates_are_velocities else self.bodies.rates(t, q, u)
@@ -229,7 +229,7 @@ class RigidBodySystem(AbstractSystem):
 
     def coordinate_residual(self, t, q):
         residual = self.position_residual(t, q)
-        return jnp.concatenate([residual, *self.bodies.invariants(t, q)]) if self.spatial else residual
+        return residual if self.rates_are_velocities else jnp.concatenate([residual, *self.bodies.invariants(t, q)])
 
     @eqx.filter_jit
     def coordinate_jacobian(self, t, q):

@@ -307,6 +307,9 @@ class AbstractLink(AbstractActor):
     of_time: ClassVar[bool] = False
     # The quantities of its coordinates; unknown without an entry.
     quantities: ClassVar[Quantities] = {}
+    # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or the value of the kernel
+    # `tension` of a force.
+    has_tension: ClassVar[bool] = False
     # Names of the coordinates whose rates are the slip, if the bodies slide over each other in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
 
@@ -346,6 +349,12 @@ class AbstractLink(AbstractActor):
         if part is not self:
             cls.check(part, space.dimension)
         return part
+
+    @classmethod
+    def declares(cls, hook: str, *laws: str) -> bool:
+        """Whether the class defines a hook, and no subclass of that class has redefined `residual` or the `laws`."""
+        where = lambda name: next((k for k, kind in enumerate(cls.__mro__) if name in vars(kind)), len(cls.__mro__))
+        return all(where(hook) <= where(law) for law in ("residual", *laws))
 
     @classmethod
     def distinct(cls, bodies: Sequence[Any]) -> list[Any]:
@@ -475,12 +484,6 @@ class AbstractConstraint(AbstractLink):
         """
         del space, poses
         return None
-
-    @classmethod
-    def declares(cls, hook: str, *laws: str) -> bool:
-        """Whether the class defines a hook, and no subclass of that class has redefined `residual` or the `laws`."""
-        where = lambda name: next(k for k, kind in enumerate(cls.__mro__) if name in vars(kind))
-        return all(where(hook) <= where(law) for law in ("residual", *laws))
 
 
 class AbstractInertialConstraint(AbstractConstraint):

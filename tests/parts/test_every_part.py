@@ -4,8 +4,6 @@ when it stands twice. Every method of integration gives the same motion.
 Each stands in a small scene of its own, where gravity and a spring move it.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -99,7 +97,7 @@ def test_reverse_derivative(programs):
 
 
 def twin(part):
-    return dataclasses.replace(part, name=f"{part.name} twin")
+    return part.named(f"{part.name} twin")
 
 
 @pytest.mark.slow(

@@ -109,6 +109,14 @@ def test_a_hinge_that_is_driven_through_two_turns_in_space():
     np.testing.assert_allclose(motion["hip"].angle, 0.1 + 8.0 * motion.ts, rtol=0, atol=1e-11)
 
 
+def test_turns_are_counted_beside_joints_of_elements():
+    """The derivatives of all rows by the coordinates, of the count of turns as well."""
+    system = hinged(joints=[mb.FixedTendon("cord", "hip.angle", coefficients=(0.3,))])
+    q = mb.assemble(system, fix={"hip.angle": 0.7}).q
+    expected = jax.jacfwd(lambda q: system.coordinate_residual(0.0, q))(q)
+    np.testing.assert_allclose(system.prepared().coordinate_jacobian(0.0, q), expected, rtol=0, atol=1e-14)
+
+
 @pytest.mark.slow
 def test_derivatives_by_all_numbers_of_parts_of_joints():
     parts = [

@@ -79,7 +79,7 @@ def test_weights_choose_the_least_of_more_forces():
     np.testing.assert_allclose(found["D.angle"], share * rates[:, 2] / 4.0, rtol=1e-11)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_measured_positions_and_series():
     """A cubic spline has second derivatives with errors of the square of the interval."""
     errors = []
@@ -144,7 +144,7 @@ LONG = {
 }
 
 
-@pytest.mark.parametrize("name", [*DRIVEN, *(pytest.param(name, marks=pytest.mark.long) for name in LONG)])
+@pytest.mark.parametrize("name", [*DRIVEN, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)])
 def test_forces_come_back(name):
     make, expected = (DRIVEN | LONG)[name]
     system = make()
@@ -198,7 +198,7 @@ def test_force_and_rate_of_a_drive_are_its_power(kind):
     np.testing.assert_allclose(found.power["turn"], [torque * rate], rtol=1e-10)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_motor_and_its_force():
     motor = mb.Motor("motor", "pin.angle", command=2.0, lag=0.1, force=1.5)
     system = driven_bar(motor=motor)
@@ -218,7 +218,7 @@ def torque_of(parameters, values):
     return jnp.sum(mb.required_forces(system, motion, by=["motor"], ts=TS)["motor"] ** 2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_by_parameters_and_motion():
     numbers = {"coupler.mass": jnp.asarray(3.0), "B.point_b": jnp.asarray([-1.5, 0.0])}
     values = jnp.asarray(crank(np.linspace(0.0, 1.0, 9)))
@@ -234,7 +234,7 @@ def test_derivatives_by_parameters_and_motion():
     np.testing.assert_allclose(forward, differences, rtol=1e-7)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_batches_are_their_members():
     masses = jnp.array([1.0, 2.0, 4.0])
     torque = lambda mass: torque_of({"coupler.mass": mass}, crank(jnp.linspace(0.0, 1.0, 9)))
@@ -287,7 +287,7 @@ SOLVED = ("too few", "held", "dependent")
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.long) if case in SOLVED else case for case in REFUSED]
+    "case", [pytest.param(case, marks=pytest.mark.slow) if case in SOLVED else case for case in REFUSED]
 )
 def test_refused(case):
     given, text = REFUSED[case]
@@ -297,7 +297,7 @@ def test_refused(case):
         mb.required_forces(two_bars(), **given)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_motion_that_the_machine_cannot_make():
     system = four_bar()
     (q,), (u,) = (x for x in (needed("motor").ys.q[:1], needed("motor").ys.u[:1]))

@@ -28,7 +28,7 @@ TREE = """
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_forces_of_a_tree_as_in_mujoco(tmp_path):
     (tmp_path / "tree.xml").write_text(TREE)
     imported = importers.mjcf(tmp_path / "tree.xml", ignore="collisions")

@@ -92,7 +92,7 @@ def test_names_that_are_unknown():
         mb.loads(motion_of(machine.system, [0.0], machine.state.q[None], machine.state.u[None]), "racer")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_body_with_friction_a_stop_a_motor_and_its_frame_elsewhere():
     rod = planar.Body("rod", mass=2.0, inertia=0.3, position=(0.0, 0.0), centre=(0.5, 0.1))
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
@@ -131,20 +131,20 @@ LIBRARY = (
 )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LIBRARY)
 def test_loads_balance(name):
     check_balance(through(mechanisms.get(name).system, 2))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_shares_of_redundant_joints_are_named():
     on_coupler = mb.loads(through(mechanisms.parallelogram().system), "coupler")
     assert on_coupler.undetermined == ("head1", "head2", "head3")
     assert "not determined" in str(on_coupler)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_the_largest_force():
     """Of a pin force along a simulated motion, by a mass and a length."""
     machine = mechanisms.four_bar()

@@ -85,6 +85,23 @@ CONTACTS = {
     ),
     "Slack": (mb.Slack("c", "a", "b", length=2.0, point_a=(0.1, 0.2)), [_body_2d("a"), _body_2d("b", x=1.5)], []),
     "Slack in space": (mb.Slack("c", "ground", "a", length=2.0), [_body_3d("a")], []),
+    "Rope": (
+        mb.Rope(
+            "c", [("ground", (-1.0, 0.4)), mb.Pulley("a", 0.1, "right"), ("b", (0.1, 0.0))], length=3.0, slack=True
+        ),
+        [_body_2d("a"), _body_2d("b", x=1.5)],
+        [],
+    ),
+    "Rope in space": (
+        mb.Rope(
+            "c",
+            [mb.Pulley("a", 0.1, "right", (0.1, 0.0, 0.0), (0.0, -1.0, 0.0)), ("ground", (1.5, 0.0, 0.2))],
+            length=2.0,
+            slack=True,
+        ),
+        [_body_3d("a")],
+        [],
+    ),
     "a contact of a user": (InsideBowl("c", "a", radius=3.0, point=(0.1, 0.0)), [_body_2d("a")], []),
 }
 

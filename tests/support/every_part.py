@@ -248,6 +248,14 @@ def coupled():
     return Example(part, bodies, "coefficients", pins, (hold_2d(bodies[1]),))
 
 
+def roped():
+    """A body that hangs in a rope from a reel, with a pulley that grips it."""
+    own, reel = body_2d("Rope body"), planar.Body("reel", mass=1.0, inertia=0.1, position=(0.0, 0.9))
+    under = mb.Pulley(own.name, 0.1, "left", centre=(0.1, -0.1), grips=True)
+    part = mb.Rope("Rope", [mb.Pulley("reel", 0.15, "right", turns=1.0), under, ("ground", (1.0, 0.8))])
+    return Example(part, [own, reel], "radii", (pin_2d(reel, (0.0, 0.9)),), (hold_2d(own),))
+
+
 FUNCTIONS = [
     of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1, smoothing=0.05),
     of_joint(
@@ -274,6 +282,7 @@ FUNCTIONS = [
     coupled(),
     of_tendon(mb.FixedTendon("FixedTendon", "FixedTendon body pin.angle", coefficients=(0.4,)), "coefficients"),
     of_tendon(mb.Tendon("Tendon", [("ground", (0.0, 1.0)), ("Tendon body", (0.2, 0.1))]), "points"),
+    roped(),
     of_joint(mb.JointSpring, "stiffness", stiffness=5.0, damping=0.1, free=0.4),
     of_joint(mb.JointForce, "force", force=0.8),
     of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
@@ -370,6 +379,17 @@ def tendon_3d():
     return Example(mb.Tendon("Tendon", path), [own], "points", (joint,), (hold_3d(own), spring))
 
 
+def roped_3d():
+    """A body that hangs in a rope from a reel, on a pulley without friction."""
+    own, axis = body_3d("Rope body"), (0.0, -1.0, 0.0)
+    reel = spatial.Body("reel", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.9))
+    pin = spatial.Revolute("reel pin", "ground", "reel", point=reel.position, axis=axis)
+    drum = mb.Pulley("reel", 0.15, "right", axis=axis, turns=1.0)
+    under = mb.Pulley(own.name, 0.1, "left", centre=(0.1, 0.0, -0.1), axis=axis)
+    part = mb.Rope("Rope", [drum, ("ground", (0.3, 0.1, 0.9)), under, ("ground", (1.0, 0.2, 0.9))])
+    return Example(part, [own, reel], "radii", (pin,), (hold_3d(own),))
+
+
 O = (0.0, 0.0, 0.0)
 POINT_MASS_3D = spatial.PointMass("PointMass", mass=1.2, position=(0.4, 0.2, 0.1))
 BODY_3D = body_3d("Body", angular_velocity=(1.0, 2.0, 0.5))
@@ -414,6 +434,7 @@ SPATIAL = [
         lambda angles: [mb.JointInertia("JointInertia on a gimbal", angles[1], inertia=0.2)],
     ),
     tendon_3d(),
+    roped_3d(),
     of_ground_3d(spatial.Cylindrical, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.Screw, "pitch", point=O, axis=AXIS, pitch=0.4),
     of_ground_3d(spatial.Prismatic, "point_b", point=O, axis=AXIS),

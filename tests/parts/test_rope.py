@@ -1,0 +1,453 @@
+"""Ropes over pulleys: tangents, tensions and motions against closed forms and equations of motion by hand."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.optimize
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.system.quantities import Solved
+
+G = 9.81
+GRAVITY = mb.Gravity((0.0, -G))
+# Compiled sooner than the default; any method will do.
+METHOD = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection(), "max_steps": 4096}
+
+
+def instant(system, state, t=0.0):
+    """Quantities by name at one state, in the plane and in space."""
+    udot, multipliers = accelerations(system.at(state), Multipliers(), t, state.q, state.u)
+    along = jnp.full(1, t), jax.tree.map(lambda x: x[None], state), Solved(udot[None], multipliers[None])
+    return lambda name: np.asarray(system.quantities()[name].value(*along)[0])
+
+
+def point(name, mass, *position, **state):
+    return planar.PointMass(name, mass=mass, position=position, **state)
+
+
+def disc(name, mass, radius, *position):
+    position = position or (0.0, 0.0)
+    return planar.Body(name, mass=mass, inertia=planar.disc(mass, radius), position=position)
+
+
+def atwood(left=1.0, right=2.0, wheel=0.5, radius=0.1, *, grips=True, **rope):
+    over = mb.Pulley("wheel", radius=radius, turn="right", grips=grips)
+    bodies = [disc("wheel", wheel, radius), point("left", left, -radius, -1.0), point("right", right, radius, -1.2)]
+    path = [("left", (0.0, 0.0)), over, ("right", (0.0, 0.0))]
+    joints = [planar.Revolute("axle", "ground", "wheel", point=(0.0, 0.0)), mb.Rope("rope", path, **rope)]
+    return mb.Scene(bodies, joints=joints, forces=[GRAVITY]).compile()
+
+
+# Geometry
+
+
+def length_of_path(angles, points, centres, radii, senses):
+    """From a point over two circles to another point, by the places where the rope meets and leaves the circles."""
+    on = lambda k, angle: centres[k] + radii[k] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    arcs = sum(radii[k] * senses[k] * (angles[2 * k + 1] - angles[2 * k]) for k in (0, 1))
+    places = [points[0], on(0, angles[0]), on(0, angles[1]), on(1, angles[2]), on(1, angles[3]), points[1]]
+    return arcs + sum(jnp.linalg.norm(places[k + 1] - places[k]) for k in (0, 2, 4))
+
+
+@pytest.mark.parametrize("senses", [(1, 1), (1, -1), (-1, 1)])
+def test_the_length_of_a_path_is_stationary(senses):
+    """Of all ropes over the two circles the path is that which a tight rope takes."""
+    points, centres = np.array([(-2.0, 0.3), (2.2, -0.4)]), np.array([(-0.7, 0.1), (0.6, -0.2)])
+    radii, words = np.array([0.3, 0.5]), {1: "left", -1: "right"}
+    pulleys = [
+        mb.Pulley("ground", radius=r, turn=words[s], centre=c) for r, s, c in zip(radii, senses, centres, strict=True)
+    ]
+    load = point("load", 1.0, *points[1])
+    rope = mb.Rope("rope", [("ground", points[0]), *pulleys, ("load", (0.0, 0.0))])
+    system = mb.Scene([load], joints=[rope]).compile()
+    own = instant(system, mb.assemble(system))
+
+    length = jax.jit(lambda x: length_of_path(x, points, centres, radii, senses))
+    # A rope that turns left has its pulley on the left.
+    below = -0.5 * np.pi * np.repeat(senses, 2)
+    found = scipy.optimize.root(jax.jit(jax.grad(length)), below, tol=1e-13)
+    assert own("rope.length") == pytest.approx(float(length(found.x)), rel=1e-12)
+    wraps = np.array(senses) * (found.x[1::2] - found.x[::2])
+    # The angles are double roots.
+    np.testing.assert_allclose(own("rope.wrap"), wraps, rtol=0, atol=1e-7)
+
+
+def test_the_force_of_a_rope_is_along_its_straight_parts():
+    """The wrench on each body is the tension along the straight parts at it, also where the pulley moves."""
+    bodies = [disc("wheel", 1.0, 0.2, 0.1, 0.2), point("end", 1.0, 0.9, -0.4)]
+    path = [("ground", (-1.0, 0.0)), mb.Pulley("wheel", radius=0.2, turn="right"), ("end", (0.0, 0.0))]
+    system = mb.Scene(bodies, joints=[mb.Rope("rope", path, stiffness=100.0, length=2.0)]).compile()
+    state = mb.assemble(system)
+    tension = float(instant(system, state)("rope.tension"))
+    expected = 100.0 * (instant(system, state)("rope.length") - 2.0)
+    assert tension == pytest.approx(expected, rel=1e-12) and tension > 0
+
+    def tangent(a, c, turn):
+        """The unit vector from a point along its tangent to the circle."""
+        d = np.array(c) - a
+        angle = turn * np.arcsin(0.2 / np.linalg.norm(d))
+        turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ d
+        return turned / np.linalg.norm(d)
+
+    first = tangent(np.array([-1.0, 0.0]), (0.1, 0.2), 1)
+    last = tangent(np.array([0.9, -0.4]), (0.1, 0.2), -1)
+    force = system.force(0.0, state.q, state.u)
+    np.testing.assert_allclose(force[:3], tension * np.append(-first - last, 0.0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(force[3:], tension * last, rtol=0, atol=1e-12)
+
+
+# Tensions and accelerations
+
+
+@pytest.mark.parametrize("grips", [True, False])
+def test_atwoods_machine(grips):
+    """A wheel that turns with the rope has inertia; a wheel without friction has none."""
+    system = atwood(grips=grips)
+    own, rolling = instant(system, mb.assemble(system)), 0.25 * grips
+    acceleration = G / (3.0 + rolling)
+    assert own("left.acceleration")[1] == pytest.approx(acceleration, rel=1e-12)
+    assert own("wheel.angular_acceleration") == pytest.approx(-10.0 * acceleration * grips, rel=1e-12)
+    tensions = np.array([G + acceleration, 2.0 * (G - acceleration)])
+    np.testing.assert_allclose(own("rope.tension"), tensions if grips else tensions[0], rtol=1e-12)
+
+
+def test_block_and_tackle():
+    """Four parts carry the lower block: it moves a quarter as far as the free end."""
+    r, lower = 0.1, [-0.15, 0.15]
+    block, weight = disc("block", 6.0, r, 0.0, -2.0), point("weight", 1.0, 0.65, -1.0)
+    rail = planar.Prismatic("rail", "ground", "block", point=(0.0, 0.0), axis=(0.0, 1.0))
+    pulley = lambda body, x, turn: mb.Pulley(body, radius=r, turn=turn, centre=(x, 0.0))
+    path = [
+        ("ground", (lower[0] - r, 0.0)),
+        pulley("block", lower[0], "left"),
+        mb.Pulley("ground", radius=0.05, turn="right", centre=(0.0, 0.0)),
+        pulley("block", lower[1], "left"),
+        mb.Pulley("ground", radius=0.2, turn="right", centre=(0.45, 0.0)),
+        ("weight", (0.0, 0.0)),
+    ]
+    system = mb.Scene([block, weight], joints=[rail, mb.Rope("rope", path)], forces=[GRAVITY]).compile()
+    own = instant(system, mb.assemble(system))
+    up = G * (4.0 - 6.0) / (6.0 + 16.0)
+    assert own("block.acceleration")[1] == pytest.approx(up, rel=1e-12)
+    assert own("weight.acceleration")[1] == pytest.approx(-4.0 * up, rel=1e-12)
+    assert own("rope.tension") == pytest.approx(G - 4.0 * up, rel=1e-12)
+
+
+def test_a_drum_and_a_belt():
+    """A crossed rope from drum to drum holds their angles in the ratio of the radii, of opposite sign."""
+    bodies = [disc("small", 1.0, 0.1, 0.0, 0.0), disc("large", 4.0, 0.3, 1.0, 0.0)]
+    pins = [planar.Revolute(f"{body.name} pin", "ground", body.name, point=body.position) for body in bodies]
+    ends = mb.Pulley("small", 0.1, "right", turns=2.5), mb.Pulley("large", 0.3, "left", turns=1.5)
+    push = mb.JointForce("push", "small pin.angle", force=1.0)
+    system = mb.Scene(bodies, joints=[*pins, mb.Rope("rope", ends)], forces=[push]).compile()
+    own = instant(system, mb.assemble(system, fix={"small.angle": -3.0}))
+    np.testing.assert_allclose(own("large.angle"), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(own("rope.wrap"), [5 * np.pi - 3.0, 3 * np.pi + 1.0], rtol=1e-12)
+    # The small drum winds up, and the rope turns the large one, which unwinds.
+    spin = own("large.angular_acceleration")
+    assert own("rope.tension") == pytest.approx(-0.18 * spin / 0.3, rel=1e-12) and spin < 0
+    assert own("small.angular_acceleration") == pytest.approx(-3.0 * spin, rel=1e-12)
+
+
+def test_an_elastic_rope_only_pulls():
+    for below, speed, expected in ((1.3, 0.0, 30.0), (1.3, -2.0, 10.0), (1.3, -4.0, 0.0), (0.9, 3.0, 0.0)):
+        # The rope runs a quarter of a turn about the pulley, of length π/20, and 0.5 m before it.
+        load = point("load", 1.0, 0.1, -below, velocity=(0.0, -speed))
+        path = [("ground", (-0.5, 0.1)), mb.Pulley("ground", 0.1, "right"), ("load", (0.0, 0.0))]
+        rope = mb.Rope("rope", path, stiffness=100.0, damping=10.0, length=1.5 + 0.05 * np.pi)
+        system = mb.Scene([load], joints=[rope]).compile()
+        own = instant(system, mb.assemble(system))
+        assert own("rope.tension") == pytest.approx(expected, abs=1e-10)
+        energy = system.potential_energy(0.0, mb.assemble(system).q)
+        assert energy == pytest.approx(50.0 * max(below - 1.0, 0.0) ** 2, abs=1e-12)
+
+
+def test_a_rope_that_stands_twice_is_implied():
+    system = atwood(grips=False)
+    again = mb.Rope("again", [("left", (0.0, 0.0)), mb.Pulley("wheel", 0.1, "right"), ("right", (0.0, 0.0))])
+    joints = [planar.Revolute("axle", "ground", "wheel", point=(0.0, 0.0))]
+    bodies = [disc("wheel", 0.5, 0.1), point("left", 1.0, -0.1, -1.0), point("right", 2.0, 0.1, -1.2)]
+    rope = mb.Rope("rope", [("left", (0.0, 0.0)), mb.Pulley("wheel", 0.1, "right"), ("right", (0.0, 0.0))])
+    twice = mb.Scene(bodies, joints=[*joints, rope, again], forces=[GRAVITY]).compile()
+    assert [(item.name, item.by) for item in twice.implied] in ([("again", ("rope",))], [("rope", ("again",))])
+    motions = [instant(own, mb.assemble(own))("left.acceleration") for own in (system, twice)]
+    np.testing.assert_allclose(motions[1], motions[0], rtol=1e-12)
+
+
+def test_counts_of_turns_in_the_plane():
+    """They are coordinates without a velocity, and change nothing but what happens after a turn."""
+    plain, counting = atwood(), atwood(count_turns=True)
+    assert (counting.nq, counting.nu) == (plain.nq + 2, plain.nu)
+    state = mb.assemble(counting, fix={"wheel.angle": 0.4})
+    expected = jax.jacfwd(lambda q: counting.coordinate_residual(0.0, q))(state.q)
+    found = counting.prepared().coordinate_jacobian(0.0, state.q)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    motions = [instant(own, mb.assemble(own))("left.acceleration") for own in (plain, counting)]
+    np.testing.assert_allclose(motions[1], motions[0], rtol=1e-12)
+
+
+# Bad input
+
+
+def of_path(*path, **options):
+    body = disc("wheel", 1.0, 0.2, 1.0, 0.0)
+    return mb.Scene([body], joints=[mb.Rope("rope", path, **options)]).compile()
+
+
+END, WHEEL, OVER = ("ground", (0.0, 0.0)), ("wheel", (0.0, 0.0)), mb.Pulley("wheel", 0.2, "left")
+MESSAGES = {
+    "one place": ((END,), {}, r"Rope 'rope': path must hold at least two places, got 1"),
+    "no pair": ((END, "wheel"), {}, r"Rope 'rope': path\[1\] must be a pair \(body, point\) or a Pulley, got 'wheel'"),
+    "no side": (
+        (END, mb.Pulley("wheel", 0.2, "up"), WHEEL),
+        {},
+        r"path\[1\]: turn must be 'left' or 'right', got 'up'",
+    ),
+    "no body": ((END, ("whel", (0.0, 0.0))), {}, r"Rope 'rope': Unknown body 'whel'; did you mean 'wheel'"),
+    "no radius": ((END, mb.Pulley("wheel", 0.0, "left")), {}, r"Rope 'rope': radii must be positive"),
+    "in the circle": (
+        (("ground", (0.9, 0.0)), OVER),
+        {},
+        r"the point path\[0\] lies in the circle of the pulley path\[1\].* move the point out",
+    ),
+    "crossing": (
+        (END, mb.Pulley("ground", 0.2, "right", centre=(0.7, 0.0)), OVER),
+        {},
+        r"the pulleys path\[1\] and path\[2\] overlap, and the rope crosses between them",
+    ),
+    "one in another": (
+        (END, mb.Pulley("ground", 0.5, "left", centre=(0.9, 0.0)), OVER),
+        {},
+        r"of the pulleys path\[1\] and path\[2\] one lies in the other",
+    ),
+    "coincident": ((("ground", (1.0, 0.0)), WHEEL), {}, r"the neighbours path\[0\] and path\[1\] coincide"),
+    "an axis in the plane": (
+        (END, mb.Pulley("wheel", 0.2, "left", (0.0, 0.0), axis=(0.0, 0.0, 1.0))),
+        {},
+        r"Rope 'rope': (axes belongs to spatial scenes|points must have shape)",
+    ),
+    "too short": ((END, WHEEL), {"length": 0.9, "slack": True}, r"length \[0.9\] m is less than that of its path"),
+    "shorter than on the drum": (
+        (END, mb.Pulley("wheel", 0.2, "left", turns=3.0)),
+        {"length": 3.0},
+        r"length \[3.0\] m is less than that of the rope on its pulleys .* \[3.76",
+    ),
+    "turns of a pulley": (
+        (END, mb.Pulley("wheel", 0.2, "left", turns=0.5), ("ground", (2.0, 0.0))),
+        {},
+        r"turns of path\[1\], which is no drum, must be a whole number",
+    ),
+    "slack spans": (
+        (END, mb.Pulley("wheel", 0.2, "left", grips=True), ("ground", (2.0, 0.0))),
+        {"slack": True},
+        "with slack it has one span",
+    ),
+    "lengths": ((END, WHEEL), {"length": (1.0, 1.0)}, r"length must have shape \(\), one for each of its spans"),
+    "slack and elastic": ((END, WHEEL), {"slack": True, "stiffness": 1.0}, "an elastic rope goes slack by itself"),
+    "damping alone": ((END, WHEEL), {"damping": 1.0}, "damping belongs to an elastic rope"),
+    "restitution alone": ((END, WHEEL), {"restitution": 0.5}, "restitution belongs to a rope with slack=True"),
+}
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_bad_input(name):
+    path, options, message = MESSAGES[name]
+    with pytest.raises(ValueError, match=message):
+        of_path(*path, **options)
+
+
+def test_axes_in_space():
+    wheel = spatial.Body("wheel", mass=1.0, inertia=spatial.disc(1.0, 0.2, "y"), position=(1.0, 0.0, 0.0))
+
+    def compiled(*axes):
+        first, second = (
+            mb.Pulley(name, 0.2, "left", (0.0, 0.0, 0.0), axis)
+            for name, axis in zip(("ground", "wheel"), axes, strict=True)
+        )
+        return mb.Scene([wheel], joints=[mb.Rope("rope", [first, second])]).compile()
+
+    with pytest.raises(ValueError, match="in space give the axis of every pulley"):
+        compiled(None, None)
+    with pytest.raises(ValueError, match=r"the axes of the neighbours path\[0\] and path\[1\] must be parallel"):
+        compiled((0.0, 1.0, 0.0), (0.0, 0.6, 0.8))
+
+
+# In space
+
+
+UP_3D = mb.Gravity((0.0, 0.0, -G))
+# Seen against it x points to the right and z up, as x and y do in the plane.
+AXIS = (0.0, -1.0, 0.0)
+
+
+def test_a_rope_leaves_the_plane_of_a_pulley():
+    """The load swings sideways: the straight part is the hypotenuse of the part in the plane, of length 1 m. It pulls
+    along itself, but for a share (1 − cos α) R / l.
+    """
+    load = spatial.PointMass("load", mass=2.0, position=(0.1, 0.3, -1.0))
+    path = [("ground", (-0.5, 0.0, 0.1)), mb.Pulley("ground", 0.1, "right", axis=AXIS), ("load", (0.0, 0.0, 0.0))]
+    system = mb.Scene([load], joints=[mb.Rope("rope", path, stiffness=50.0, length=1.0)]).compile()
+    state = mb.assemble(system)
+    own = instant(system, state)
+    straight = np.hypot(1.0, 0.3)
+    assert own("rope.length") == pytest.approx(0.5 + 0.05 * np.pi + straight, rel=1e-12)
+    tension = 50.0 * (own("rope.length") - 1.0)
+    pull = tension * np.array([0.1 * (1.0 - 1.0 / straight), -0.3 / straight, 1.0 / straight])
+    np.testing.assert_allclose(system.force(0.0, state.q, state.u), pull, rtol=0, atol=1e-11)
+
+
+def crane(dimension, **rope):
+    """A load that swings under a pulley, on a rope from a drum with a motor."""
+    own, axis = (planar, {}) if dimension == 2 else (spatial, {"axis": AXIS})
+    at = lambda x, z: (x, z) if dimension == 2 else (x, 0.0, z)
+    inertia = planar.disc if dimension == 2 else lambda m, r: spatial.disc(m, r, "y")
+    wheel = lambda name, m, r, *x: own.Body(name, mass=m, inertia=inertia(m, r), position=at(*x))
+    bodies = [
+        wheel("drum", 5.0, 0.2, -1.0, 0.5),
+        wheel("sheave", 1.0, 0.1, 0.0, 0.0),
+        own.PointMass("load", mass=2.0, position=at(0.6, -1.2)),
+    ]
+    axles = [own.Revolute(f"{x.name} axle", "ground", x.name, point=x.position, **axis) for x in bodies[:2]]
+    sheave = mb.Pulley("sheave", 0.1, "right", grips=not rope, **axis)
+    path = [mb.Pulley("drum", 0.2, "right", turns=3.0, **axis), sheave, ("load", at(0.0, 0.0))]
+    motor = mb.JointForce("motor", "drum axle.angle", force=2.0)
+    gravity = GRAVITY if dimension == 2 else UP_3D
+    return mb.Scene(bodies, joints=[*axles, mb.Rope("rope", path, **rope)], forces=[motor, gravity]).compile()
+
+
+ELASTIC = {"stiffness": 400.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rope", [{}, ELASTIC], ids=["gripping", "elastic"])
+def test_a_planar_scene_in_space(rope):
+    """The drum turns more than once. The motor does all the work."""
+    found, ts = [], np.linspace(0.0, 1.6, 9)
+    for dimension in (2, 3):
+        system = crane(dimension, **rope)
+        start = mb.assemble(system)
+        motion = mb.simulate(system, start, t1=ts[-1], saveat=ts, rtol=1e-9, **METHOD)
+        work = 2.0 * motion["drum axle"].angle
+        np.testing.assert_allclose(motion.energy - work, motion.energy[0] - work[0], rtol=0, atol=1e-6)
+        assert np.ptp(motion["rope"].wrap[:, 0]) > 2 * np.pi
+        x = motion["load"].position
+        found.append([x[:, 0], x[:, -1], motion["rope"].wrap, motion["rope"].length, motion["rope"].tension])
+    for plane, space in zip(*found, strict=True):
+        np.testing.assert_allclose(space, plane, rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_ball_on_a_rope_that_winds_up_around_a_pole(dimension):
+    """Its speed is constant, and its path the involute of the circle: l² = l₀² − 2 R v t."""
+    r, speed = 0.05, 1.0
+    if dimension == 2:
+        ball, pole = point("ball", 1.0, 1.0, -r, velocity=(0.0, speed)), mb.Pulley("ground", r, "left")
+    else:
+        ball = spatial.PointMass("ball", mass=1.0, position=(1.0, -r, 0.0), velocity=(0.0, speed, 0.0))
+        pole = mb.Pulley("ground", r, "left", axis=(0.0, 0.0, 1.0))
+    rope = mb.Rope("rope", [pole, ("ball", np.zeros(dimension))], count_turns=True)
+    system = mb.Scene([ball], joints=[rope]).compile()
+    ts = np.linspace(0.0, 9.1, 8)
+    motion = mb.simulate(system, mb.assemble(system), t1=ts[-1], saveat=ts, rtol=1e-10)
+    free = np.sqrt(1.0 - 2 * r * speed * ts)
+    angle = (1.0 - free) / r
+    np.testing.assert_allclose(motion["rope"].wrap[:, 0], angle, rtol=0, atol=1e-6)
+    e = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    expected = free[:, None] * e + r * np.stack([e[:, 1], -e[:, 0]], axis=1)
+    np.testing.assert_allclose(motion["ball"].position[:, :2], expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(motion["rope"].tension, speed**2 / free, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_run_fails_where_turns_are_not_counted():
+    ball = point("ball", 1.0, 1.0, -0.05, velocity=(0.0, 1.0))
+    system = mb.Scene([ball], joints=[mb.Rope("rope", [mb.Pulley("ground", 0.05, "left"), ("ball", (0.0, 0.0))])])
+    system = system.compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=9.1, throw=False, **METHOD)
+    assert motion.result != mb.RESULTS.successful
+
+
+# Winches, slack ropes, derivatives
+
+
+@pytest.mark.slow
+def test_a_crane_that_swings_while_it_hoists():
+    """Lagrange's equation by hand, l θ̈ + 2 V θ̇ + R θ̇² + g sin θ = 0 with the free length l, l̇ = R θ̇ + V, of a rope
+    that passes a pulley of radius R and is paid out at the rate V.
+    """
+    r, rate, angle, free, speed, mass = 0.2, -0.6, 0.4, 1.5, 0.8, 3.0
+    axes = lambda x: (np.array([np.cos(x), np.sin(x)]), np.array([np.sin(x), -np.cos(x)]))
+    normal, along = axes(angle)
+    load = point("load", mass, *(r * normal + free * along))
+    path = [("ground", (-2.0, r)), mb.Pulley("ground", r, "right"), ("load", (0.0, 0.0))]
+    system = mb.Scene([load], joints=[mb.Rope("rope", path)], forces=[GRAVITY]).compile()
+    length = float(mb.parameters(system)["rope.length"])
+    inputs, ts = {"rope.length": lambda t: length + rate * t}, np.linspace(0.0, 1.5, 16)
+    first = float((rate * along + free * speed * normal)[0])
+    start = mb.assemble(mb.with_inputs(system, inputs), rates={"load.x": first})
+    motion = mb.simulate(system, start, t1=ts[-1], saveat=ts, inputs=inputs, rtol=1e-11, **METHOD)
+
+    def field(t, y):
+        x, v, l = y
+        return v, -(2 * rate * v + r * v**2 + G * np.sin(x)) / l, r * v + rate
+
+    own = scipy.integrate.solve_ivp(
+        field, (0.0, ts[-1]), (angle, speed, free), t_eval=ts, method="DOP853", rtol=1e-12, atol=1e-13
+    )
+    x, v, l = own.y
+    normal, along = (values.T for values in axes(x))
+    np.testing.assert_allclose(motion["load"].position, r * normal + l[:, None] * along, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(motion["rope"].wrap[:, 0], np.pi / 2 - x, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(motion["rope"].tension, mass * (G * np.cos(x) + l * v**2), rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_slack_rope_tightens_and_goes_slack():
+    """A load falls 0.8 m until the rope is tight, and rebounds."""
+    load = point("load", 1.0, 0.1, -0.2)
+    path = [("ground", (-0.5, 0.1)), mb.Pulley("ground", 0.1, "right"), ("load", (0.0, 0.0))]
+    rope = mb.Rope("rope", path, length=1.5 + 0.05 * np.pi, slack=True, restitution=0.5)
+    system = mb.Scene([load], joints=[rope], forces=[GRAVITY]).compile()
+    ts = np.array([0.1, 0.5])
+    motion = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=ts, rtol=1e-10)
+    fall = np.sqrt(1.6 / G)
+    (event,) = motion.events
+    assert event.time == pytest.approx(fall, rel=1e-9) and event.part == "rope"
+    after = 0.5 - fall
+    heights = [-0.2 - 0.5 * G * 0.01, -1.0 + 0.5 * G * fall * after - 0.5 * G * after**2]
+    np.testing.assert_allclose(motion["load"].position[:, 1], heights, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(motion["rope"].gap, np.array(heights) + 1.0, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(motion["rope"].tension, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rope", [{}, ELASTIC], ids=["gripping", "elastic"])
+def test_derivatives(rope):
+    """By radii, length, mass and stiffness: forwards, backwards and differences of a tighter solution, in a batch."""
+    system = crane(2, **rope)
+    known = mb.parameters(system)
+    names = ["rope.radii", "rope.length", "load.mass", *(f"rope.{name}" for name in rope)]
+    values = {name: known[name] for name in names}
+
+    def end(values, rtol=1e-9):
+        changed = mb.with_parameters(system, values)
+        motion = mb.simulate(changed, mb.assemble(changed), t1=0.6, rtol=rtol, **METHOD)
+        return jnp.append(motion["load"].position[-1], jnp.ravel(motion["rope"].tension[-1])[-1])
+
+    forward, reverse = jax.jit(jax.jacfwd(end))(values), jax.jit(jax.jacrev(end))(values)
+    h = 1e-5
+    moved = lambda sign: jax.tree.map(lambda x: x[None] + sign * h * jnp.eye(x.size).reshape(-1, *x.shape), values)
+    tight = jax.jit(jax.vmap(lambda values: end(values, rtol=1e-12)))
+    for name in names:
+        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-9)
+        size = values[name].size
+        rest = {other: jnp.broadcast_to(x, (size, *x.shape)) for other, x in values.items()}
+        ends = [tight(rest | {name: moved(sign)[name]}) for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * h)
+        np.testing.assert_allclose(forward[name].reshape(3, -1).T, difference, rtol=1e-5, atol=1e-6)
