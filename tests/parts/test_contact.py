@@ -97,7 +97,7 @@ def test_wheels_of_the_tracked_vehicle():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow("plane", "space")
 @pytest.mark.parametrize(
     "space, kind, law",
     [(PLANE, planar.Contact, "soft soil"), (PLANE, WheelContact, "linear"), (SPACE, spatial.Contact, "hertz")],
