@@ -224,7 +224,7 @@ def test_driver(quantity):
         "distance": np.linalg.norm(d),
     }[quantity]
     assert part.rheonomic
-    np.testing.assert_allclose(part.value(PLANE, poses), expected, rtol=1e-13)
+    np.testing.assert_allclose(part.measured(PLANE, poses), [expected], rtol=1e-13)
     np.testing.assert_allclose(part.residual(PLANE, poses, jnp.array(expected / 3.0)), [0.0], rtol=0, atol=1e-14)
     row = jax.jacfwd(lambda q: part.residual(PLANE, q, 0.0))(poses)
     assert rank(row.reshape(1, 6)) == 1

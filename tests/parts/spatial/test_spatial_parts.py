@@ -349,7 +349,7 @@ def test_length_driver(quantity):
     expected = (
         np.linalg.norm(d) if quantity == "distance" else rot.rotation_matrix(poses[0, 3:])[:, "xyz".index(quantity)] @ d
     )
-    np.testing.assert_allclose(part.value(SPACE, poses), expected, rtol=1e-13)
+    np.testing.assert_allclose(part.measured(SPACE, poses), [expected], rtol=1e-13)
     np.testing.assert_allclose(part.residual(SPACE, poses, jnp.array(expected / 3.0)), [0.0], rtol=0, atol=1e-14)
 
 
