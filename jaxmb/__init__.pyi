@@ -30,7 +30,7 @@ from .parts.forces import Gravity as Gravity
 from .parts.actuators import Motor as Motor, Actuator as Actuator
 from .parts.controller import Controller as Controller
 from .parts.servo import Servo as Servo
-from .parts.series import Series as Series
+from .parts.series import Series as Series, smooth_step as smooth_step
 from .parts.combinations import Tendon as Tendon, FixedTendon as FixedTendon
 from .parts.coordinate_parts import (
     JointSpring as JointSpring,
