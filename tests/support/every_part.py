@@ -155,6 +155,16 @@ PLANAR = [
     of_ground_2d(planar.RotationalDamper, "damping", damping=0.3),
     of_ground_2d(planar.Bushing, "stiffness", stiffness=(30.0, 20.0, 3.0), damping=(1.0, 1.0, 0.1), point=(0.0, 0.0)),
     of_ground_2d(
+        planar.Cylinder,
+        "bore_area",
+        bore_area=2e-3,
+        pressure=8e3,
+        rod_area=1.5e-3,
+        rod_pressure=2e3,
+        point_a=(0.1, -0.6),
+        point_b=(0.1, 0.2),
+    ),
+    of_ground_2d(
         planar.DraftGear,
         "preload",
         stiffness=300.0,
@@ -442,6 +452,7 @@ SPATIAL = [
     of_ground_3d(
         spatial.Bushing, "stiffness", stiffness=(30.0, 20.0, 25.0, 3.0, 4.0, 5.0), damping=np.full(6, 0.3), point=O
     ),
+    of_ground_3d(spatial.Cylinder, "pressure", bore_area=2e-3, pressure=8e3, point_a=(0.1, 0.0, -0.6)),
     on_body_3d(spatial.Contact, "normal.stiffness", **GROUND_2D),
     on_body_3d(spatial.Tyre, "slip_stiffness", **TYRE_2D),
 ]
