@@ -38,6 +38,7 @@ from .parts.coordinate_parts import (
     JointStop as JointStop,
     JointFriction as JointFriction,
 )
+from .parts.tables import TableSpring as TableSpring, TableDamper as TableDamper, TableMotor as TableMotor
 from .parts.dry_friction import DryFriction as DryFriction
 from .parts.coordinate_parts import JointDriver as JointDriver
 from .parts.combinations import JointInertia as JointInertia, JointCoupling as JointCoupling
