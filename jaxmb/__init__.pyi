@@ -30,7 +30,7 @@ from .parts.forces import Gravity as Gravity
 from .parts.actuators import Motor as Motor, Actuator as Actuator
 from .parts.controller import Controller as Controller
 from .parts.servo import Servo as Servo
-from .parts.series import Series as Series
+from .parts.series import Series as Series, smooth_step as smooth_step
 from .parts.combinations import Tendon as Tendon, FixedTendon as FixedTendon
 from .parts.rope import Rope as Rope, Pulley as Pulley
 from .parts.coordinate_parts import (
@@ -39,6 +39,7 @@ from .parts.coordinate_parts import (
     JointStop as JointStop,
     JointFriction as JointFriction,
 )
+from .parts.tables import TableSpring as TableSpring, TableDamper as TableDamper, TableMotor as TableMotor
 from .parts.dry_friction import DryFriction as DryFriction
 from .parts.coordinate_parts import JointDriver as JointDriver
 from .parts.combinations import JointInertia as JointInertia, JointCoupling as JointCoupling

@@ -429,7 +429,7 @@ def _loaded(part):
         value = values_of(part)[name]
         if isinstance(value, Mapping):
             ones[name] = {key: filled(x) for key, x in value.items()}
-        elif declared.unit in ("N", "N m") and value is not None:
+        elif declared.unit in ("N", "N m", "Pa") and value is not None:
             ones[name] = filled(value)
     return _call(part, "with_fields", **ones) if ones else part
 

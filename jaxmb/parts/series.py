@@ -2,21 +2,22 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._captured import CapturedModule
 from .._types import Scalar, VectorLike
 from ..linalg.arrays import is_traced
 from .fields import as_jax, as_parameter
+from .smooth import step
 
-Interpolation = Literal["linear", "cubic", "held"]
+Interpolation = Literal["linear", "cubic", "clamped", "held"]
 # The number of times at which a function is sampled.
 _SAMPLES = 513
 
@@ -76,6 +77,7 @@ class Series(AbstractSignal):
 
     - `ts` [s], shape (n,), ascending, n ≥ 2; `values`, shape (n, …): numbers, vectors or matrices, in SI units.
     - `interpolation`: `"linear"`; `"cubic"`, the not-a-knot spline, whose first two derivatives are continuous;
+        `"clamped"`, the spline that starts and ends at rest, with the rate zero at the first and the last time;
         `"held"`, each value until the next time.
 
     A call before the first or after the last time returns the first or the last value; as an input of a motion a series
@@ -94,8 +96,10 @@ class Series(AbstractSignal):
     of_arrays: ClassVar[bool] = True
 
     def __init__(self, ts: VectorLike, values: VectorLike, interpolation: Interpolation = "linear"):
-        if interpolation not in ("linear", "cubic", "held"):
-            raise ValueError(f"Series: interpolation must be 'linear', 'cubic' or 'held', got {interpolation!r}.")
+        if interpolation not in get_args(Interpolation):
+            raise ValueError(
+                f"Series: interpolation must be 'linear', 'cubic', 'clamped' or 'held', got {interpolation!r}."
+            )
         try:
             # Times stay numbers in a function that JAX traces: a motion is restarted at each jump.
             self.ts, self.values = as_parameter(ts), as_jax(values)
@@ -122,7 +126,8 @@ class Series(AbstractSignal):
                 f"Series: values must be finite, got a non-finite value at t = {missing[0]:g}; leave such samples out."
             )
         self.interpolation = interpolation
-        self.slopes = _spline_slopes(jnp.asarray(self.ts), self.values) if interpolation == "cubic" else None
+        slopes = {"cubic": _spline_slopes, "clamped": _clamped_slopes}.get(interpolation)
+        self.slopes = None if slopes is None else slopes(jnp.asarray(self.ts), self.values)
 
     def __call__(self, t):
         ts, values = jnp.asarray(self.ts), self.values
@@ -144,7 +149,7 @@ class Series(AbstractSignal):
         return self.values.shape[1:]
 
     def break_times(self, *, of_rates):
-        if self.interpolation == "cubic" or (self.interpolation == "linear" and not of_rates):
+        if self.slopes is not None or (self.interpolation == "linear" and not of_rates):
             return np.zeros(0)
         if is_traced(self.ts):
             raise ValueError(
@@ -252,14 +257,56 @@ def _spline_slopes(ts, values):
         middle = (chords[0] * h[1] + chords[1] * h[0]) / (h[0] + h[1])
         return jnp.stack([2 * chords[0] - middle, middle, 2 * chords[1] - middle]).reshape(values.shape)
     first, last = h[0] + h[1], h[-1] + h[-2]
-    diagonal = jnp.concatenate([h[1], 2 * (h[:-1] + h[1:])[:, 0], h[-2]])
-    upper = jnp.concatenate([first, h[:-1, 0], jnp.zeros(1)])
-    lower = jnp.concatenate([jnp.zeros(1), h[1:, 0], last])
-    right = jnp.concatenate(
-        [
-            (((h[0] + 2 * first) * h[1] * chords[0] + h[0] ** 2 * chords[1]) / first)[None],
-            3 * (h[1:] * chords[:-1] + h[:-1] * chords[1:]),
-            ((h[-1] ** 2 * chords[-2] + (2 * last + h[-1]) * h[-2] * chords[-1]) / last)[None],
-        ]
-    )
-    return lax.linalg.tridiagonal_solve(lower, diagonal, upper, right).reshape(values.shape)
+    right_first = ((h[0] + 2 * first) * h[1] * chords[0] + h[0] ** 2 * chords[1]) / first
+    right_last = (h[-1] ** 2 * chords[-2] + (2 * last + h[-1]) * h[-2] * chords[-1]) / last
+    slopes = _solved_slopes(h, chords, (h[1], first, right_first), (last, h[-2], right_last))
+    return slopes.reshape(values.shape)
+
+
+def _clamped_slopes(ts, values):
+    """Slopes at the knots of the spline whose slope is zero at the first and the last time."""
+    if ts.shape[0] == 2:
+        return jnp.zeros_like(values)
+    h = jnp.diff(ts)[:, None]
+    chords = jnp.diff(values.reshape(ts.shape[0], -1), axis=0) / h
+    one, zero, none = jnp.ones(1, ts.dtype), jnp.zeros(1, ts.dtype), jnp.zeros_like(chords[0])
+    return _solved_slopes(h, chords, (one, zero, none), (zero, one, none)).reshape(values.shape)
+
+
+def _solved_slopes(h, chords, first, last):
+    """Slopes at which the second derivative is continuous at the inner knots.
+
+    **Arguments:** `h`, shape (n − 1, 1), and `chords`, shape (n − 1, m), of the intervals; `first` and `last`: the
+    equation at either end, its two coefficients in the order of the knots, and its right-hand side.
+    """
+    diagonal = jnp.concatenate([first[0], 2 * (h[:-1] + h[1:])[:, 0], last[1]])
+    upper = jnp.concatenate([first[1], h[:-1, 0], jnp.zeros(1)])
+    lower = jnp.concatenate([jnp.zeros(1), h[1:, 0], last[0]])
+    inner = 3 * (h[1:] * chords[:-1] + h[:-1] * chords[1:])
+    right = jnp.concatenate([first[2][None], inner, last[2][None]])
+    return lax.linalg.tridiagonal_solve(lower, diagonal, upper, right)
+
+
+def smooth_step(t: Scalar, start: ArrayLike, end: ArrayLike, duration: Scalar) -> Array:
+    """A move from rest to rest: `start` for t ≤ 0, `end` for t ≥ duration, a polynomial of degree five in between.
+
+    ```python
+    ramp = lambda t: jaxmb.smooth_step(t - 0.5, 0.0, 1.2, 2.0)  # From 0.5 to 2.5 s.
+    lift = {"motion": lambda t, p: jaxmb.smooth_step(t, 0.0, p["rise"], 2.0), "parameters": {"rise": 1.2}}
+    turn = planar.Driver("turn", "ground", "bar", quantity="angle", **lift)
+    system = jaxmb.Scene([bar], joints=[pin, turn]).compile()
+    ```
+
+    Rate and acceleration are continuous, and zero at both ends. With the `distance` from start to end the largest rate
+    is `1.875 distance / duration`, and the largest acceleration nearly `5.774 distance / duration²`. For a move through
+    further values see `Series` with `"clamped"`.
+
+    **Arguments:** `t` [s], since the start of the move; `start` and `end`, numbers or arrays of one shape; `duration`
+    [s] > 0.
+
+    **Raises:** `ValueError` for a duration that is not positive, unless it is traced.
+    """
+    if not is_traced(duration) and not (np.ndim(duration) == 0 and duration > 0):
+        raise ValueError(f"smooth_step: duration must be a positive number, got {duration!r}.")
+    start, end = jnp.asarray(start), jnp.asarray(end)
+    return start + (end - start) * step(t / duration)

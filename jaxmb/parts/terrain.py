@@ -18,13 +18,11 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import is_traced
 from ..linalg.rotations import norm
-from . import fields
+from . import fields, local_spline
 from .base import AbstractLaw
 from .smooth import step
 
@@ -169,51 +167,13 @@ class Spline(AbstractTerrain):
     heights: fields.Number = fields.parameter(shape=None, unit="m", converter=fields.as_jax)
 
     def __check_init__(self):
-        if self.x.ndim != 1 or self.x.shape[0] < 3 or self.heights.shape != self.x.shape:
-            raise ValueError(
-                f"Spline: x and heights must be vectors of the same length, at least 3, got shapes {self.x.shape} and "
-                f"{self.heights.shape}."
-            )
-        if not isinstance(self.x, Tracer) and np.any(np.diff(self.x) <= 0):
-            raise ValueError("Spline: x must ascend; sort the points and remove repeated ones.")
+        local_spline.check("Spline", ("x", "heights"), self.x, self.heights)
 
     def height(self, place):
-        n = self.x.shape[0]
-        x = jnp.clip(place[0], self.x[0], self.x[-1])
-        k = jnp.clip(jnp.searchsorted(self.x, x, side="right") - 1, 0, n - 2)
-        h = self.x[k + 1] - self.x[k]
-        (y0, m0, c0), (y1, m1, c1) = self._at_point(k), self._at_point(k + 1)
-        # The difference from the straight line through both points, from slopes and curvatures at either.
-        chord = (y1 - y0) / h
-        a, b = (m0 - chord) * h, (chord - m1) * h
-        c, d = 0.5 * c0 * h * h, 0.5 * c1 * h * h
-        s = (x - self.x[k]) / h
-        r = 1 - s
-        inside = y0 + (y1 - y0) * s
-        inside += a * s * r**3 * (1 + 3 * s) + b * s**3 * r * (1 + 3 * r) + c * s**2 * r**3 + d * s**3 * r**2
-        before, after = place[0] - self.x[0], place[0] - self.x[-1]
-        first = (self.heights[1] - self.heights[0]) / (self.x[1] - self.x[0])
-        last = (self.heights[-1] - self.heights[-2]) / (self.x[-1] - self.x[-2])
-        return inside + jnp.minimum(before, 0.0) * first + jnp.maximum(after, 0.0) * last
+        return local_spline.value(self.x, self.heights, place[0])
 
     def detail(self, place):
         return _beyond(place, self.x[0], self.x[-1]) + jnp.min(jnp.diff(self.x))
-
-    def _at_point(self, k):
-        """Height, slope and curvature at a point; at the ends of the straight continuation."""
-        n = self.x.shape[0]
-        i = jnp.clip(k, 1, n - 2)
-        left, right = self.x[i] - self.x[i - 1], self.x[i + 1] - self.x[i]
-        back = (self.heights[i] - self.heights[i - 1]) / left
-        ahead = (self.heights[i + 1] - self.heights[i]) / right
-        slope = (back * right + ahead * left) / (left + right)
-        curvature = 2 * (ahead - back) / (left + right)
-        end = (k == 0) | (k == n - 1)
-        return (
-            self.heights[k],
-            jnp.where(end, jnp.where(k == 0, back, ahead), slope),
-            jnp.where(end, 0.0, curvature),
-        )
 
 
 class Surface(AbstractTerrain):

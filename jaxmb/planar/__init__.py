@@ -35,6 +35,7 @@ from ..parts.forces import SpringDamper as SpringDamper, Damper as Damper, Point
 from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torque
 from ..parts.planar.torsion import TorsionalSpringDamper as TorsionalSpringDamper
 from ..parts.bushing import Bushing as Bushing
+from ..parts.cylinder import Cylinder as Cylinder
 from ..parts.planar.draft_gear import DraftGear as DraftGear
 from ..parts.friction import Friction as Friction
 

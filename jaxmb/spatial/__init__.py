@@ -47,6 +47,7 @@ from ..parts.drivers import Driver as Driver
 from ..parts.forces import SpringDamper as SpringDamper, Damper as Damper, PointForce as PointForce
 from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torque
 from ..parts.bushing import Bushing as Bushing
+from ..parts.cylinder import Cylinder as Cylinder
 from ..parts.friction import Friction as Friction
 
 ## Ground and contact

@@ -155,6 +155,16 @@ PLANAR = [
     of_ground_2d(planar.RotationalDamper, "damping", damping=0.3),
     of_ground_2d(planar.Bushing, "stiffness", stiffness=(30.0, 20.0, 3.0), damping=(1.0, 1.0, 0.1), point=(0.0, 0.0)),
     of_ground_2d(
+        planar.Cylinder,
+        "bore_area",
+        bore_area=2e-3,
+        pressure=8e3,
+        rod_area=1.5e-3,
+        rod_pressure=2e3,
+        point_a=(0.1, -0.6),
+        point_b=(0.1, 0.2),
+    ),
+    of_ground_2d(
         planar.DraftGear,
         "preload",
         stiffness=300.0,
@@ -285,6 +295,18 @@ FUNCTIONS = [
     roped(),
     of_joint(mb.JointSpring, "stiffness", stiffness=5.0, damping=0.1, free=0.4),
     of_joint(mb.JointForce, "force", force=0.8),
+    of_joint(mb.TableSpring, "forces", values=(-0.4, 0.1, 0.3, 0.8), forces=(-4.0, -1.0, 1.0, 3.0)),
+    of_joint(mb.TableDamper, "forces", rates=(-2.0, -0.5, 0.5, 3.0), forces=(-3.0, -1.0, 0.8, 2.0)),
+    of_joint(
+        mb.TableMotor,
+        "torques",
+        speeds=(-3.0, 0.0, 3.0, 9.0),
+        torques=(0.2, 0.2, 0.15, 0.0),
+        control=0.7,
+        gear=5.0,
+        lag=0.05,
+        rests=False,
+    ),
     of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
     of_joint(mb.JointInertia, "inertia", inertia=0.4),
     of_joint(mb.Motor, "gain", mode="position", command=0.6, gain=9.0, damping=0.5, lag=0.05, limit=5.0, rests=False),
@@ -463,6 +485,7 @@ SPATIAL = [
     of_ground_3d(
         spatial.Bushing, "stiffness", stiffness=(30.0, 20.0, 25.0, 3.0, 4.0, 5.0), damping=np.full(6, 0.3), point=O
     ),
+    of_ground_3d(spatial.Cylinder, "pressure", bore_area=2e-3, pressure=8e3, point_a=(0.1, 0.0, -0.6)),
     on_body_3d(spatial.Contact, "normal.stiffness", **GROUND_2D),
     on_body_3d(spatial.Tyre, "slip_stiffness", **TYRE_2D),
 ]

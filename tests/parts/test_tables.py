@@ -1,0 +1,140 @@
+"""Springs, dampers and motors by tables, against the spline in NumPy and against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.parts import local_spline
+
+MASS, INERTIA = 1.5, 0.4
+SPACES = pytest.mark.parametrize("space", [planar, spatial])
+X, Y = np.array([-0.7, 0.1, 0.4, 1.0, 1.1]), np.array([0.3, -1.0, 0.8, 0.5, 2.0])
+value = jax.jit(jax.vmap(local_spline.value, in_axes=(None, None, 0)))
+
+
+def test_the_integral_of_the_spline():
+    """Inside and beyond the table; its derivative is the spline, and the spline has two continuous derivatives."""
+    x, y = jnp.asarray(X), jnp.asarray(Y)
+    at = np.array([-2.0, -0.7, -0.2, 0.1, 0.37, 0.4, 1.05, 1.1, 3.0])
+    integral, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda s: local_spline.integral(x, y, s))))(at)
+    one = jax.jit(lambda s: local_spline.value(x, y, s))
+    expected = [quad(one, X[0], s, points=[v for v in X[1:] if v < s] or None, epsabs=1e-12)[0] for s in at]
+    np.testing.assert_allclose(integral, expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(slope, value(x, y, at), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(value(x, y, X), Y, rtol=0, atol=1e-14)
+    rates = jax.jit(jax.vmap(lambda s: jnp.stack([jax.grad(one)(s), jax.grad(jax.grad(one))(s)])))
+    np.testing.assert_allclose(rates(X - 1e-9), rates(X + 1e-9), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(value(x, y, np.array([-1.7, 2.1])), [Y[0] - np.diff(Y)[0] / 0.8, 17.0], rtol=1e-12)
+
+
+def wheel(space, *forces, rate=0.0, angle=0.0):
+    """A wheel that turns about its centre."""
+    if space is planar:
+        body = planar.Body("wheel", mass=MASS, inertia=INERTIA, angle=angle, angular_velocity=rate)
+        pin = planar.Revolute("pin", "ground", "wheel", point=(0.0, 0.0))
+    else:
+        turned = mb.rotations.from_axis_angle((0.0, 0.0, 1.0), angle)
+        state = {"orientation": turned, "angular_velocity": (0.0, 0.0, rate)}
+        body = spatial.Body("wheel", mass=MASS, inertia=(0.3, 0.3, INERTIA), **state)
+        axes = {"x_a": (1.0, 0.0, 0.0), "x_b": (1.0, 0.0, 0.0)}
+        pin = spatial.Revolute("pin", "ground", "wheel", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), **axes)
+    return mb.Scene([body], joints=[pin], forces=forces).compile()
+
+
+def moment(system):
+    return np.asarray(system.force(0.0, system.guess.q, system.guess.u))[-1]
+
+
+def at(s):
+    return float(value(jnp.asarray(X), jnp.asarray(Y), np.array([s]))[0])
+
+
+@SPACES
+def test_forces_by_tables(space):
+    spring = mb.TableSpring("part", "pin.angle", values=X, forces=Y)
+    damper = mb.TableDamper("part", "pin.angle", rates=X, forces=Y)
+    np.testing.assert_allclose(moment(wheel(space, spring, angle=0.3)), -at(0.3), rtol=1e-12)
+    np.testing.assert_allclose(moment(wheel(space, damper, rate=0.3)), -at(0.3), rtol=1e-12)
+    motor = lambda control: mb.TableMotor("part", "pin.angle", speeds=X, torques=Y, gear=3.0, control=control)
+    for control, factor, speed in ((0.5, 0.5, 0.9), (-0.25, -0.25, -0.9), (-7.0, -1.0, -0.9)):
+        np.testing.assert_allclose(moment(wheel(space, motor(control), rate=0.3)), 3 * factor * at(speed), rtol=1e-12)
+
+
+def test_an_angle_in_space_counts_from_the_middle_of_the_table():
+    table = mb.TableSpring("part", "pin.angle", values=X + 3.0, forces=Y)
+    for angle in (3.0, 3.5 - 2 * np.pi):
+        expected = -at(angle % (2 * np.pi) - 3.0)
+        np.testing.assert_allclose(moment(wheel(spatial, table, angle=angle)), expected, rtol=1e-11)
+
+
+@pytest.mark.slow
+@SPACES
+def test_a_spring_and_a_damper_move_a_wheel(space):
+    """The motion by SciPy; energy is lost to the damper alone."""
+    rates, forces = np.array([-3.0, -0.5, 0.0, 0.5, 3.0]), np.array([-0.4, -0.2, 0.0, 0.1, 0.3])
+    parts = (
+        mb.TableSpring("spring", "pin.angle", values=X, forces=5 * Y + 3),
+        mb.TableDamper("damper", "pin.angle", rates=rates, forces=forces),
+    )
+    system = wheel(space, *parts, angle=0.3, rate=0.5)
+    ts = np.linspace(0.0, 0.8, 5)
+    motion = mb.simulate(system, mb.assemble(system), t1=ts[-1], saveat=ts, rtol=1e-10, atol=1e-12)
+    pull = jax.jit(lambda s: local_spline.value(jnp.asarray(X), jnp.asarray(5 * Y + 3), s))
+    drag = jax.jit(lambda v: local_spline.value(jnp.asarray(rates), jnp.asarray(forces), v))
+    moves = lambda t, y: [y[1], -float(pull(y[0]) + drag(y[1])) / INERTIA, -y[1] * float(drag(y[1]))]
+    start = [0.3, 0.5, float(motion.energy[0])]
+    expected = solve_ivp(moves, (0.0, ts[-1]), start, t_eval=ts, rtol=1e-9, atol=1e-11).y
+    found = motion["pin"].angle, motion["pin"].angle_rate, motion.energy
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_motor_of_a_straight_curve_that_lags():
+    """Torque `T (1 − speed / n)` at full control: linear equations, in the plane and in space, in a batch."""
+    top, n, lag, t1 = 2.0, 9.0, 0.1, 0.7
+    speeds = np.array([0.0, 2.0, 5.0])
+    curve = {"speeds": speeds, "torques": top * (1 - speeds / n)}
+    ends = []
+    for space in (planar, spatial):
+        system = wheel(space, mb.TableMotor("motor", "pin.angle", control=1.0, lag=lag, activation=0.2, **curve))
+
+        def end(control, system=system):
+            changed = mb.with_parameters(system, {"motor.control": control})
+            motion = mb.simulate(changed, mb.assemble(changed), t1=t1, rtol=1e-10, atol=1e-12)
+            return motion["pin"].angle_rate[-1], motion["motor"].activation[-1]
+
+        ends.append(jax.jit(jax.vmap(end))(jnp.array([0.6, 0.9])))
+    for control, rate, activation in zip((0.6, 0.9), *ends[0], strict=True):
+        level = lambda t, control=control: control + (0.2 - control) * np.exp(-t / lag)
+        law = lambda t, v, level=level: level(t) * top * (1 - v / n) / INERTIA
+        expected = solve_ivp(law, (0.0, t1), [0.0], rtol=1e-10, atol=1e-12).y[0, -1]
+        np.testing.assert_allclose((rate, activation), (expected, level(t1)), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "build, message",
+    [
+        (lambda: mb.TableSpring("part", "pin.angle", values=X[:2], forces=Y[:2]), "at least 3, got shapes"),
+        (lambda: mb.TableSpring("part", "pin.angle", values=X, forces=Y[:3]), "vectors of the same length"),
+        (lambda: mb.TableSpring("part", "pin.angle", values=X[::-1], forces=Y), "values must ascend; sort the points"),
+        (lambda: mb.TableDamper("part", "pin.angle", rates=0 * X, forces=Y), "rates must ascend"),
+        (lambda: mb.TableMotor("part", "pin.angle", speeds=0 * X, torques=Y), "speeds must ascend"),
+        (lambda: mb.TableMotor("part", "pin.angle", speeds=X, torques=np.nan * Y), "torques must be finite"),
+        (lambda: mb.TableMotor("part", "pin.angle", speeds=X, torques=Y, activation=0.1), "an activation needs a lag"),
+        (lambda: mb.TableMotor("part", "pin.angle", speeds=X, torques=Y, lag=0.0), "lag must be positive"),
+    ],
+)
+def test_tables_that_are_refused(build, message):
+    with pytest.raises(ValueError, match=f"'part': .*{message}"):
+        wheel(planar, build())
+
+
+def test_a_table_that_is_changed_to_descend():
+    system = wheel(planar, mb.TableSpring("part", "pin.angle", values=X, forces=Y))
+    with pytest.raises(ValueError, match="must ascend"):
+        mb.with_parameters(system, {"part.values": X[::-1].copy()})
