@@ -7,14 +7,10 @@ q = rotations.multiply(rotations.from_axis_angle((1.0, 0.0, 0.0), 0.3), p)  # Th
 R, x = rotations.rotation_matrix(p), jnp.array([1.0, 0.0, 0.0])
 rotations.rotate(p, x), R @ x  # To world components, both (0, 1, 0).
 rotations.unrotate(p, x), rotations.rotate(rotations.conjugate(p), x)  # Both (0, -1, 0).
-rotations.from_matrix(R), rotations.from_xyzw(rotations.to_xyzw(p)), rotations.normalize(2.0 * p)  # All p.
+rotations.from_matrix(R), rotations.from_xyzw(rotations.to_xyzw(p))  # Both p.
 omega = jnp.array([0.0, 0.0, 2.0])
 rotations.angular_velocity(p, rotations.rates(p, omega))  # omega.
 rotations.norm(rotations.cross(x, omega))  # 2.
-rotations.dot(x, R @ x)  # 0.
-# The moment of a potential V(p), in the body frame, is minus the gradient, pulled back.
-V = lambda p: 9.81 * rotations.rotation_matrix(p)[2, 0]
-rotations.pull_back(p, jax.grad(V)(p))
 ```
 
 Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
@@ -41,14 +37,11 @@ __all__ = [
     "angular_velocity",
     "conjugate",
     "cross",
-    "dot",
     "from_axis_angle",
     "from_matrix",
     "from_xyzw",
     "multiply",
     "norm",
-    "normalize",
-    "pull_back",
     "rates",
     "rotate",
     "rotation_matrix",

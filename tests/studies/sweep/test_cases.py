@@ -80,7 +80,7 @@ def test_a_frame_and_a_dataset():
         (lambda: grid(a=["x"]), "'a' must be real numbers"),
         (lambda: table(a=[1.0, np.nan]), "'a' is not finite in member 1"),
         (lambda: table(a=[1.0, 2.0], b=[1.0, 2.0, 3.0]), "one length, got 2 of 'a', 3 of 'b'"),
-        (lambda: table(a=[[1.0], [1.0, 2.0]]), "'a' are no array"),
+        (lambda: table(a=[[1.0], [1.0, 2.0]]), "'a' are not an array"),
         (lambda: table([1.0, 2.0]), "values by the parameter's name"),
         (lambda: table(pd.DataFrame([[1.0, 2.0]], columns=["a", "a"])), "'a' of the cases is there more than once"),
         (lambda: table(pd.DataFrame({"a": [1.0]}, index=[5])), "reset_index"),
