@@ -160,6 +160,7 @@ PLANAR_FORCES = named(
     "TorsionalSpringDamper",
     "RotationalDamper",
     "Bushing",
+    "Cylinder",
     "DraftGear",
     "Track",
     "Contact",
@@ -177,6 +178,7 @@ SPATIAL_FORCES = named(
     "Torque",
     "RotationalDamper",
     "Bushing",
+    "Cylinder",
     "Contact",
     "Tyre",
 )

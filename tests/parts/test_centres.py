@@ -143,7 +143,7 @@ def test_a_point_that_is_left_out_is_the_origin_of_the_frame(name):
     for found, expected in zip(
         evaluated(left_out, space, frames, *at), evaluated(by_hand, space, {}, *at), strict=True
     ):
-        scale = 1.0 + np.max(np.abs(expected))
+        scale = 1.0 + np.max(np.abs(expected), initial=0.0)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * scale)
     assert not any(isinstance(part, AbstractBody) for part in (left_out, by_hand))
 

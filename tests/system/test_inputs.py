@@ -215,7 +215,7 @@ def test_inputs_that_cannot_be(pendulum, inputs, message):
         (([0.0], [1.0]), "at least two times"),
         (([0.0, 1.0], [1.0, 2.0, 3.0]), r"got shapes \(2,\) and \(3,\)"),
         (([0.0, 1.0], ["a", "b"]), "expected a real number"),
-        (([0.0, 1.0], [1.0, 2.0], "spline"), "'linear', 'cubic' or 'held'"),
+        (([0.0, 1.0], [1.0, 2.0], "spline"), "'linear', 'cubic', 'clamped' or 'held'"),
     ],
 )
 def test_series_that_cannot_be(arguments, message):
