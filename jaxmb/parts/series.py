@@ -287,7 +287,7 @@ def _solved_slopes(h, chords, first, last):
     return lax.linalg.tridiagonal_solve(lower, diagonal, upper, right)
 
 
-def smooth_step(t: Scalar, start: ArrayLike, end: ArrayLike, duration: Scalar) -> Array:
+def smooth_step(t: Scalar, start: ArrayLike, end: ArrayLike, duration: Any) -> Array:
     """A move from rest to rest: `start` for t ≤ 0, `end` for t ≥ duration, a polynomial of degree five in between.
 
     ```python
@@ -306,7 +306,7 @@ def smooth_step(t: Scalar, start: ArrayLike, end: ArrayLike, duration: Scalar) -
 
     **Raises:** `ValueError` for a duration that is not positive, unless it is traced.
     """
-    if not is_traced(duration) and not (np.ndim(duration) == 0 and np.real(duration) > 0):
+    if not is_traced(duration) and not (np.ndim(duration) == 0 and duration > 0):
         raise ValueError(f"smooth_step: duration must be a positive number, got {duration!r}.")
     start, end = jnp.asarray(start), jnp.asarray(end)
-    return start + (end - start) * step(jnp.asarray(t / duration))
+    return start + (end - start) * step(jnp.asarray(t) / duration)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivative_checks import central_differences
 from scipy.integrate import quad, solve_ivp
 
 import jaxmb as mb
@@ -14,6 +15,20 @@ MASS, INERTIA = 1.5, 0.4
 SPACES = pytest.mark.parametrize("space", [planar, spatial])
 X, Y = np.array([-0.7, 0.1, 0.4, 1.0, 1.1]), np.array([0.3, -1.0, 0.8, 0.5, 2.0])
 value = jax.jit(jax.vmap(local_spline.value, in_axes=(None, None, 0)))
+
+
+def test_derivatives_by_the_points_of_a_table():
+    """Forwards, backwards and by differences, inside and beyond the table; of the spline and its integral."""
+
+    def seen(points):
+        x, y = points[: X.size], points[X.size :]
+        at = (-1.0, -0.2, 0.37, 1.05, 1.4)
+        return jnp.stack([function(x, y, s) for function in (local_spline.value, local_spline.integral) for s in at])
+
+    points, compiled = jnp.concatenate([X, Y]), jax.jit(seen)
+    forward, reverse = jax.jit(jax.jacfwd(seen))(points), jax.jit(jax.jacrev(seen))(points)
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(forward, central_differences(compiled, points), rtol=1e-7, atol=1e-7)
 
 
 def test_the_integral_of_the_spline():
