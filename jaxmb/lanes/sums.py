@@ -77,39 +77,46 @@ def _position(lanes, equation, values):
 @rule("dot_general")
 def _dot_general(lanes, equation, values):
     (contracted, batched), dtype = equation.params["dimension_numbers"], equation.params["preferred_element_type"]
-    sides = [
-        _ordered(lanes, value, atom.aval.shape, inner, batch, dtype)
-        for value, atom, inner, batch in zip(values, equation.invars, contracted, batched, strict=True)
-    ]
-    (a, batch, free_a), (b, _, free_b) = sides
-    shape, k = (*batch, *free_a, *free_b, lanes.size), a.shape[len(batch)]
+    arrays = [jnp.asarray(value.array) if dtype is None else jnp.asarray(value.array, dtype) for value in values]
+    shapes, axes = [atom.aval.shape for atom in equation.invars], list(zip(contracted, batched, strict=True))
+    sides = [_sizes(*side) for side in zip(shapes, axes, strict=True)]
+    (batch, k, free_a), (_, _, free_b) = sides
+    shape = (*batch, *free_a, *free_b, lanes.size)
     if k == 0:
-        return jnp.zeros(shape, a.dtype)
+        return jnp.zeros(shape, arrays[0].dtype)
     last = len(shape) - 1
     axes_a = [*range(len(batch) + len(free_a)), *([last] if values[0].varies else [])]
     axes_b = [*range(len(batch)), *range(len(batch) + len(free_a), last), *([last] if values[1].varies else [])]
 
-    def added(total, a, b):
-        for x, y in zip(_entries(a, len(batch)), _entries(b, len(batch)), strict=True):
+    def added(total, *arrays, first, end):
+        # Copies of parts would take as long as the sum, so the parts are taken within it.
+        a, b = (_ordered(*side) for side in zip(arrays, values, shapes, axes, strict=True))
+        for x, y in zip(_entries(a, len(batch))[first:end], _entries(b, len(batch))[first:end], strict=True):
             product = lax.broadcast_in_dim(x, shape, axes_a) * lax.broadcast_in_dim(y, shape, axes_b)
             total = product if total is None else total + product
         return total
 
-    # Entries of the factors are read many times.
-    if k > 1 and math.prod(free_a) * math.prod(free_b) > 1:
-        added = apart(added)
     parts, total = -(-k // _TERMS), None
     for part in range(parts):
-        first, end = part * k // parts, (part + 1) * k // parts
-        total = added(total, *[lax.slice_in_dim(x, first, end, axis=len(batch)) for x in (a, b)])
+        add = functools.partial(added, first=part * k // parts, end=(part + 1) * k // parts)
+        # Entries of the factors are read many times.
+        if k > 1 and math.prod(free_a) * math.prod(free_b) > 1:
+            add = apart(add)
+        total = add(total, *arrays)
     return total
 
 
-def _ordered(lanes, value, shape, inner, batch, dtype):
-    """A factor with batched axes first, then one contracted axis, then free axes; sizes of batched and of free axes."""
-    array = jnp.asarray(value.array) if dtype is None else jnp.asarray(value.array, dtype)
+def _sizes(shape, axes):
+    """The sizes of batched axes, the number of terms, and the sizes of free axes of a factor."""
+    inner, batch = axes
+    free = [n for axis, n in enumerate(shape) if axis not in inner and axis not in batch]
+    return [shape[axis] for axis in batch], math.prod(shape[axis] for axis in inner), free
+
+
+def _ordered(array, value, shape, axes):
+    """A factor with batched axes first, then one contracted axis, then free axes."""
+    inner, batch = axes
     free = [axis for axis in range(len(shape)) if axis not in inner and axis not in batch]
     array = lax.transpose(array, [*batch, *inner, *free, *([len(shape)] if value.varies else [])])
-    sizes = [[shape[axis] for axis in axes] for axes in (batch, free)]
-    size = math.prod(shape[axis] for axis in inner)
-    return array.reshape(*sizes[0], size, *sizes[1], *([lanes.size] if value.varies else [])), *sizes
+    sizes, k, rest = _sizes(shape, axes)
+    return array.reshape(*sizes, k, *rest, *array.shape[len(shape) :])

@@ -59,9 +59,20 @@ def basis(mesh: Float[Array, " length"], t: Float[Array, " points"]) -> Float[Ar
     """The Newton basis of a mesh at given times."""
     length = mesh.shape[0]
     factors = (t[None, :] - mesh[:-1, None]) / spans(mesh)[:, None]
+    one = jnp.ones((), factors.dtype)
+    if length % 2:
+        return _products_before(factors, one)
+    # By pairs of rows there is a fourth of the work.
+    firsts = factors[::2]
+    pairs = _products_before(firsts[:-1] * factors[1::2], one)
+    return jnp.stack([pairs, pairs * firsts], axis=1).reshape(length, -1)
+
+
+def _products_before(factors, one):
+    """For each row, and for a row after the last, the product of all rows before it."""
     # XLA compiles a product over a mask to one kernel, a cumulative product to a dozen.
-    factors_of = np.tril(np.ones((length, length - 1), dtype=bool), -1)
-    return jnp.prod(jnp.where(factors_of[:, :, None], factors[None], jnp.ones((), factors.dtype)), axis=1)
+    before = np.tril(np.ones((len(factors) + 1, len(factors)), dtype=bool), -1)
+    return jnp.prod(jnp.where(before[:, :, None], factors[None], one), axis=1)
 
 
 def basis_means(
@@ -73,6 +84,15 @@ def basis_means(
     # Written as a sum of terms: in a batch, XLA's reduction over a short axis is ten times as expensive.
     means = sum(jnp.asarray(weight, dtype) * table[:, k] for k, weight in enumerate(WEIGHTS))
     return jnp.asarray(means), table[:, -1]
+
+
+def sums_before(terms: Float[Array, "length n"]) -> tuple[Float[Array, "length n"], Float[Array, " n"]]:
+    """For each row, the sum of all rows before it; and the sum of all rows."""
+    # By pairs of rows: a fourth of the work of a product with a triangular matrix.
+    pairs = terms.reshape(LENGTH // 2, 2, -1)
+    sums = np.tril(np.ones((LENGTH // 2 + 1, LENGTH // 2)), -1).astype(terms.dtype) @ (pairs[:, 0] + pairs[:, 1])
+    both = jnp.stack([sums[:-1], sums[:-1] + pairs[:, 0]], axis=1)
+    return both.reshape(terms.shape), sums[-1]
 
 
 def before_each(length: int) -> np.ndarray:

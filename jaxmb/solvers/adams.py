@@ -231,15 +231,16 @@ class Adams(AbstractMultistep):
         history, order, chart = state.history, state.order, state.chart
         of = coefficients(history.mesh, order, t1, before.dtype)
         starts = history.known == 0
-        sums = of.sums(history.differences)
-        predicted = before + of.h * sums[2]
+        mean = of.mean(history.differences)
+        predicted = before + of.h * mean
         first = evaluate(terms, jnp.where(starts, history.mesh[0], t1), predicted, like, chart, args)
         # At a start there is no history to predict from: it begins with this derivative.
-        f = jnp.where(starts, first.f, jnp.zeros((), before.dtype))
-        partial_sums, neighbours, mean = of.with_first(sums, f)
+        latest = jnp.where(starts, first.f, history.differences[0])
+        differences = jnp.concatenate([latest[None], history.differences[1:]])
+        partial_sums, neighbours = of.sums(differences)
         history = eqx.tree_at(lambda history: history.known, history, jnp.maximum(history.known, 1))
 
-        explicit = before + of.h * mean
+        explicit = before + of.h * jnp.where(starts, first.f, mean)
         corrected = explicit + of.h * of.last * (first.f - neighbours[1])
         second = project_near(terms, t1, corrected, like, first, args)
         errors = of.h * of.differences[:, None] * (jnp.where(starts, second.f, first.f)[None] - neighbours)

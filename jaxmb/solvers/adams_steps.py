@@ -12,11 +12,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ._history import INDEX, LENGTH, basis_means, known_differences, start, step_end
+from ._history import INDEX, basis_means, known_differences, start, step_end, sums_before
 from ._interpolation import RateInterpolation
 from .evaluation import at_solution, guards_of, kept_of_chart, ravel, unravel_like
 from .restarts import AtRestart, Jump, restarts
@@ -26,28 +25,29 @@ from .steps import AbstractSteps, LinearStep
 class Coefficients(eqx.Module):
     """The coefficients of a step.
 
-    **Fields:** its length `h` and its `end`; `products` with the divided differences, see `sums`; `last`: the integral
-    that multiplies a new derivative in the corrector; `differences` of such integrals for three orders.
+    **Fields:** its length `h` and its `end`; for each divided difference, `means` of its term over the step in the
+    polynomial through the last k derivatives, and `values` of its term at the end; `order` k; `last`: the integral that
+    multiplies a new derivative in the corrector; `differences` of such integrals for three orders.
     """
 
     h: Float[Array, ""]
     end: Any
-    products: Float[Array, "rows length"]
+    means: Float[Array, " length"]
+    values: Float[Array, " length"]
+    order: Int[Array, ""]
     last: Float[Array, ""]
     differences: Float[Array, "3"]
 
-    def sums(self, differences: Float[Array, "length n"]) -> tuple[Array, Array, Array]:
-        """Values at the end of the step of two sets of polynomials, and a mean over the step. The first set goes
-        through the last 0, 1, 2, ... derivatives, the second through the last k - 1, k and k + 1; the mean is of the
-        polynomial through the last k.
-        """
-        sums = self.products @ differences
-        return sums[:LENGTH], sums[LENGTH:-1], sums[-1]
+    def mean(self, differences: Float[Array, "length n"]) -> Float[Array, " n"]:
+        """The mean over the step of the polynomial through the last k derivatives."""
+        return self.means @ differences
 
-    def with_first(self, sums: tuple[Array, Array, Array], f: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """The `sums` for a latest derivative that is larger by `f`."""
-        every, near, mean = (weights * f[None] for weights in jnp.split(self.products[:, :1], [LENGTH, LENGTH + 3]))
-        return sums[0] + every, sums[1] + near, sums[2] + mean[0]
+    def sums(self, differences: Float[Array, "length n"]) -> tuple[Array, Array]:
+        """Values at the end of the step of the polynomials through the last 0, 1, 2, ... derivatives, and through the
+        last k - 1, k and k + 1.
+        """
+        every, total = sums_before(self.values[:, None] * differences)
+        return every, lax.dynamic_slice_in_dim(jnp.concatenate([every, total[None]]), self.order - 1, 3)
 
 
 def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, dtype: Any) -> Coefficients:
@@ -56,16 +56,12 @@ def coefficients(mesh: Float[Array, " length"], order: Int[Array, ""], t1: Any, 
     end = step_end(mesh, t1)
     means, values = basis_means(mesh, mesh[0], end)
     means, values = means.astype(dtype), values.astype(dtype)
-    # For each row, how many differences count: all polynomials, the polynomials of three orders, and the mean.
-    lengths = jnp.concatenate([jnp.asarray(INDEX), order + np.array([-1, 0, 1, 0], np.int32)])
-    is_mean = np.arange(LENGTH + 4) == LENGTH + 3
-    products = jnp.where(is_mean[:, None], means[None], values[None])
-    products = jnp.where(lengths[:, None] > INDEX[None], products, jnp.zeros((), dtype))
     integrals = means / values
     padded = jnp.concatenate([jnp.zeros(1, dtype), integrals, integrals[-1:]])
     # The integrals of the terms k - 2 to k + 1; the term k belongs to the new derivative.
     integrals = lax.dynamic_slice_in_dim(padded, order - 1, 4)
-    return Coefficients(h, end, products, integrals[2], jnp.diff(integrals))
+    means = jnp.where(order > INDEX, means, jnp.zeros((), dtype))
+    return Coefficients(h, end, means, values, order, integrals[2], jnp.diff(integrals))
 
 
 class AdamsRow(eqx.Module):
@@ -168,8 +164,8 @@ class AdamsSteps(AbstractSteps):
                 new, f = restart(dmoved, w, memory[0])
                 restarted = jnp.concatenate([f[None], jnp.zeros_like(memory[1:])])
                 w, memory = jnp.where(jump.made, new, w), jnp.where(jump.made, restarted, memory)
-            partial_sums, neighbours, mean = formulas.sums(memory)
-            predicted = w + h * mean
+            partial_sums, neighbours = formulas.sums(memory)
+            predicted = w + h * formulas.mean(memory)
 
             def evaluated(before, _):
                 w, f = field(dmoved.terms, before[0])

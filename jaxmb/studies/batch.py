@@ -25,8 +25,8 @@ _CARRIED, _MOST = 2**20, 64
 # thumb).
 _FUSED = 3
 # The number of members side by side, which fill a vector register in double precision; and the most bytes that their
-# loop carries for one: larger loops, such as of Bricard's mechanism, would compile for minutes.
-_SIDE_BY_SIDE, _MOST_SIDE_BY_SIDE = 8, 2**14
+# loop carries for one: larger loops, such as of the gradient of Bricard's mechanism, would compile for minutes.
+_SIDE_BY_SIDE, _MOST_SIDE_BY_SIDE = 8, 400_000
 # Arrays of several axes with at least this number of rows count as tables, of which a step writes one row.
 _LONG = 1024
 

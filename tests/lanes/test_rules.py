@@ -16,6 +16,11 @@ LARGE = RANDOM.standard_normal((MEMBERS, 40, 20))
 LONG = RANDOM.standard_normal((MEMBERS, 600, 20))
 VECTORS = RANDOM.standard_normal((MEMBERS, 4))
 PLACES = np.array([0, 3, 1, 2, 7])
+ORDERS = np.stack([RANDOM.permutation(20) for _ in range(MEMBERS)])
+
+
+def entries(a, order):
+    return a.at[order[:8, None], order[None, 4:]].get(mode="promise_in_bounds")
 
 
 def counted(x, k):
@@ -48,6 +53,9 @@ CASES = {
     "set": (lambda a, k: (a.at[k].set(1.0), a.at[k].add(a[0]), a.at[k, 1].set(5.0)), MATRICES, PLACES),
     "updated": (lambda a, k: lax.dynamic_update_slice(a, a[:1], (k, 0)), MATRICES, PLACES),
     "large rows": (lambda a, k: (a[k], a[k, k], lax.dynamic_slice(a, (k, 0), (2, 3)), a[9 * k]), LARGE, PLACES),
+    "large parts": (lambda a, k: lax.dynamic_slice(a, (5 * k, k), (3, 12)), LARGE, PLACES),
+    "entries": (entries, LARGE, ORDERS),
+    "entries at the same places": (entries, LARGE, np.tile(ORDERS[:1], (MEMBERS, 1))),
     "large set": (lambda a, k: (a.at[k].set(1.0), a.at[9 * k].set(a[0]), a.at[k, 2].set(5.0)), LARGE, PLACES),
     "large mode": (
         lambda a, k: (a.at[100 * k].set(a[0], mode="drop"), a.at[100 * k].set(0.0, mode="clip")),
