@@ -59,6 +59,10 @@ def test_gradients_of_members_are_those_of_each_alone():
     found = jax.jit(lambda masses: side_by_side(slope, masses))(MASSES)
     alone = [jax.jit(slope)(mass) for mass in MASSES]
     np.testing.assert_allclose(found, np.transpose(alone), rtol=1e-7)
+    exact = machine(jaxmb.mechanisms.four_bar, t1=0.3, rtol=1e-12)
+    total = jax.jit(lambda mass: jnp.sum(exact(mass)[0]))
+    differences = [(total(mass + 1e-4) - total(mass - 1e-4)) / 2e-4 for mass in MASSES]
+    np.testing.assert_allclose(found[1], differences, rtol=1e-6)
 
 
 @pytest.mark.slow
