@@ -3,7 +3,7 @@
 ```python
 from jaxmb import shapes
 beam = [shapes.Box((1.0, 0.1, 0.05)), shapes.Sphere(0.1, position=(0.5, 0.0, 0.0), color=(200, 60, 40))]
-strut = shapes.cylinder_between((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), 0.03)
+strut = shapes.Cylinder.between((-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), 0.03)
 lying = {"orientation": shapes.along((1.0, 0.0, 0.0))}  # From the z axis of a shape to the x axis of its body.
 logs = [shapes.Cylinder(0.1, 1.0, **lying), *shapes.capsule(0.1, 1.0, **lying)]
 egg = shapes.Ellipsoid((0.3, 0.2, 0.2))
@@ -23,6 +23,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
+from .._moved import tell_of_moved as _tell_of_moved
 from .._types import VectorLike
 from ..linalg import rotations as rot
 
@@ -36,7 +37,6 @@ __all__ = [
     "Sphere",
     "along",
     "capsule",
-    "cylinder_between",
 ]
 
 Color = tuple[int, int, int]
@@ -137,7 +137,7 @@ class Ellipsoid(AbstractShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cylinder(AbstractShape):
-    """A cylinder along its z axis, with its centre at the position; see also `cylinder_between` and `wheel`.
+    """A cylinder along its z axis, with its centre at the position; `Cylinder.between` makes one from its ends.
 
     **Arguments:** `radius` [m]; `length` [m].
     """
@@ -146,6 +146,13 @@ class Cylinder(AbstractShape):
     length: float
     primitive = "cylinder"
     lengths = ("radius", "length")
+
+    @classmethod
+    def between(cls, start: VectorLike, end: VectorLike, radius: float, **place: Any) -> "Cylinder":
+        """A round bar between two points [m] of a body."""
+        start, end = np.asarray(start, float), np.asarray(end, float)
+        length = float(np.linalg.norm(end - start))
+        return cls(radius, length, position=0.5 * (start + end), orientation=along(end - start), **place)
 
     @property
     def scale(self):
@@ -234,13 +241,6 @@ def along(axis: VectorLike) -> np.ndarray:
     return half / np.linalg.norm(half)
 
 
-def cylinder_between(start: VectorLike, end: VectorLike, radius: float, **place: Any) -> Cylinder:
-    """A round bar between two points [m] of a body."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
-    length = float(np.linalg.norm(end - start))
-    return Cylinder(radius, length, position=0.5 * (start + end), orientation=along(end - start), **place)
-
-
 def capsule(radius: float, length: float, **place: Any) -> tuple[AbstractShape, ...]:
     """A cylinder along its z axis with a half ball at either end; `length` [m] without the half balls."""
     middle = Cylinder(radius, length, **place)
@@ -287,3 +287,6 @@ def ball(point: VectorLike, size: float) -> Sphere:
 def sleeve(point: VectorLike, size: float, axis: VectorLike) -> Box:
     """A block or bush that slides."""
     return Box((3.2 * size, 3.2 * size, 6.0 * size), position=point, orientation=along(axis), color=DARK)
+
+
+_tell_of_moved(__name__, cylinder_between="jaxmb.shapes.Cylinder.between")

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from ._history import HIGHEST_ORDER
-from .stability import adams, spectral_radius
+from .stability import formula, spectral_radius
 
 # The factors of the conditions: for the stability bound, for the changes of the field, for the change of the state.
 _NEAR, _FASTER, _SMALLER = 0.3, 10.0, 3.0
@@ -72,6 +72,6 @@ def _bounds() -> NDArray[np.float64]:
     out = [0.0]
     sizes = np.geomspace(0.01, 4.0, 400)
     for order in range(1, HIGHEST_ORDER + 1):
-        unstable = spectral_radius(adams(order), -sizes) > 1 + 1e-6
+        unstable = spectral_radius(formula("Adams", order), -sizes) > 1 + 1e-6
         out.append(float(sizes[np.argmax(unstable)]))
     return np.array(out)

@@ -4,7 +4,7 @@
 from jaxmb.solvers import stability
 formula = stability.formula("E", 3)  # Enright's, with three points of the past.
 stability.is_zero_stable(formula), stability.stability_angle(formula), stability.stiff_abscissa(formula)
-stability.damping_at_infinity(formula), stability.spectral_radius(stability.adams(4), [-0.1, 0.1j])
+stability.spectral_radius(formula, [-0.1, 0.1j, -np.inf]), stability.formula("Adams", 4).error_constant
 stability.plot_regions([stability.formula("E", k) for k in (1, 2, 3)]).savefig("regions.png")
 ```
 
@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._moved import tell_of_moved as _tell_of_moved
 from ._formulas import FAMILIES
 
 if TYPE_CHECKING:
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Formula",
-    "adams",
-    "damping_at_infinity",
     "formula",
     "is_zero_stable",
     "plot_regions",
@@ -88,48 +87,42 @@ class Formula(NamedTuple):
 
 
 def formula(family: str, k: int) -> Formula:
-    """A second-derivative multistep formula of constant step, from its order conditions.
+    """A multistep formula of constant step, from its order conditions.
 
     **Arguments:**
 
     - `family`: "E": the interpolant of f, with its slope at the end, is integrated over the step; "H": the same with
         the slope at every point. "B": the interpolant of y, with its slope at the end, has the second derivative g
-        there; "Y": the same with the slope at every point.
-    - `k`: the number of points of the past, at least 1, also those without practical use.
+        there; "Y": the same with the slope at every point. "Adams": predictor and corrector, see below.
+    - `k`: the number of points of the past, at least 1, also those without practical use; of "Adams" the order of the
+        predictor.
+
+    In Adams' method with local extrapolation (PECE) the formula of Adams and Bashforth of order k predicts, and the
+    formula of Adams and Moulton of order k + 1 corrects. The derivative is evaluated after each. With the coefficients
+    `p_j` and `q_j` of the two formulas, on the test equation,
+
+        y_{n+1} = y_n + h q_0 λ (y_n + h sum_j p_j f_{n+1-j}) + h sum_j q_j f_{n+1-j},  j = 1 ... k,
+
+    where `λ f = g`. So its `Formula` has order k + 1 and `b_0 = c_0 = 0`; the `error_constant` is also for the test
+    equation.
 
     **Returns:** a `Formula`.
 
     **Raises:** `ValueError` for another family or `k < 1`.
     """
-    _check(family, k)
-    return _with_order(f"{family}{k}", *_coefficients(family, [Fraction(-j) for j in range(k + 1)]))
-
-
-def adams(k: int) -> Formula:
-    """Adams' predictor and corrector of order k with local extrapolation (PECE), on the test equation.
-
-    The formula of Adams and Bashforth of order k predicts, the formula of Adams and Moulton of order k + 1 corrects.
-    The derivative is evaluated after each. With the coefficients `p_j` and `q_j` of the two formulas,
-
-        y_{n+1} = y_n + h q_0 λ (y_n + h sum_j p_j f_{n+1-j}) + h sum_j q_j f_{n+1-j},  j = 1 ... k,
-
-    where `λ f = g`. The `error_constant` is also for the test equation.
-
-    **Arguments:** `k`: the order of the predictor, at least 1.
-
-    **Returns:** a `Formula` of order k + 1, with `b_0 = c_0 = 0`.
-
-    **Raises:** `ValueError` for `k < 1`.
-    """
-    if k < 1:
-        raise ValueError(f"Adams' method has the orders k = 1, 2, ...; got k={k}.")
+    _check((*FAMILIES, "Adams"), family, k)
     nodes = [Fraction(-j) for j in range(k + 1)]
+    if family == "Adams":
+        return _with_order(f"Adams {k}", *_of_adams(nodes))
+    return _with_order(f"{family}{k}", *_coefficients(family, nodes))
+
+
+def _of_adams(nodes: list[Fraction]) -> tuple[Rationals, Rationals, Rationals]:
     prediction, correction = _means(nodes[1:]), _means(nodes)
     zero = Fraction(0)
-    a = (Fraction(1), Fraction(-1), *[zero] * (k - 1))
+    a = (Fraction(1), Fraction(-1), *[zero] * (len(nodes) - 2))
     b = (zero, correction[0] + correction[1], *correction[2:])
-    c = (zero, *(correction[0] * p for p in prediction))
-    return _with_order(f"Adams {k}", a, b, c)
+    return a, b, (zero, *(correction[0] * p for p in prediction))
 
 
 def characteristic_roots(formula: Formula, mu: ArrayLike) -> NDArray[np.complex128]:
@@ -155,11 +148,16 @@ def characteristic_roots(formula: Formula, mu: ArrayLike) -> NDArray[np.complex1
 def spectral_radius(formula: Formula, mu: ArrayLike) -> NDArray[np.float64]:
     """The largest modulus of the roots, the growth factor of the error in a step.
 
-    **Arguments:** `mu`: `h λ`, complex, of any shape.
+    **Arguments:** `mu`: `h λ`, complex, of any shape; infinite for the stiffest components.
 
-    **Returns:** real, of the same shape; the formula is stable where it is below one.
+    **Returns:** real, of the same shape; the formula is stable where it is below one. At infinity it is `|R(∞)|`, 0 if
+    the stiffest components are damped at once, and infinite for an explicit formula.
     """
-    return np.max(np.abs(characteristic_roots(formula, mu)), axis=-1)
+    mu = np.asarray(mu, complex)
+    far = np.isinf(mu)
+    radius = np.max(np.abs(characteristic_roots(formula, np.where(far, 0.0, mu))), axis=-1)
+    # The leading coefficient of an explicit formula vanishes, so one root is infinite.
+    return np.where(far, _largest(np.roots(_floats(formula)[2])) if formula.c[0] else math.inf, radius)
 
 
 def boundary_locus(formula: Formula, theta: ArrayLike) -> NDArray[np.complex128]:
@@ -209,12 +207,6 @@ def stiff_abscissa(formula: Formula) -> float:
     return D if _is_stable(formula, rays[:, None] * _SIZES - D) else math.inf
 
 
-def damping_at_infinity(formula: Formula) -> float:
-    """`|R(∞)|`: the largest modulus of the roots as `μ -> -∞`, 0 if the stiffest components are damped at once."""
-    # The leading coefficient of an explicit formula vanishes, so one root is infinite.
-    return _largest(np.roots(_floats(formula)[2])) if formula.c[0] else math.inf
-
-
 def is_zero_stable(formula: Formula) -> bool:
     """Whether the formula is stable for `μ = 0`: all roots in the unit circle, and roots on it simple."""
     roots = characteristic_roots(formula, 0.0)
@@ -236,7 +228,7 @@ def largest_growth(family: str, k: int) -> float:
 
     **Raises:** `ValueError` for another family or `k < 1`.
     """
-    _check(family, k)
+    _check(tuple(FAMILIES), family, k)
     if FAMILIES[family].integrated or k == 1:
         return math.inf
 
@@ -302,9 +294,9 @@ def _window(formulas: Sequence[Formula], points: int = 161) -> tuple[NDArray[np.
     return re, np.linspace(0.0, np.max(np.abs(around.imag)) + margin, points // 2)
 
 
-def _check(family: str, k: int) -> None:
-    if family not in FAMILIES:
-        raise ValueError(f"The families are {', '.join(map(repr, FAMILIES))}; got family={family!r}.")
+def _check(families: Sequence[str], family: str, k: int) -> None:
+    if family not in families:
+        raise ValueError(f"The families are {', '.join(map(repr, families))}; got family={family!r}.")
     if k < 1:
         raise ValueError(f"The formulas of family {family!r} have k = 1, 2, ... points of the past; got k={k}.")
 
@@ -378,3 +370,6 @@ def _is_stable(formula: Formula, mu: ArrayLike) -> bool:
 
 def _largest(roots: NDArray[Any]) -> float:
     return float(np.max(np.abs(roots), initial=0.0))
+
+
+_tell_of_moved(__name__, adams='formula("Adams", k)', damping_at_infinity="spectral_radius(formula, -numpy.inf)")

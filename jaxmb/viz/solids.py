@@ -7,7 +7,7 @@ import numpy as np
 
 from ..linalg.rotations import from_matrix
 from ..parts.base import GROUND
-from ..parts.shapes import DARK, AbstractShape, Box, Color, Mesh, Sphere, cylinder_between
+from ..parts.shapes import DARK, AbstractShape, Box, Color, Cylinder, Mesh, Sphere
 from ..system.picture import Picture
 
 # Distinct also for colour-blind readers, after Okabe and Ito, darkened for a white background.
@@ -80,7 +80,7 @@ def _linkage(points, planar, width):
         if area > 2 * width * np.max(np.linalg.norm(corners - middle, axis=1)):
             return [_plate(middle, corners, width), Sphere(1.4 * width)]
     away = [point for point in points if np.linalg.norm(point) > 0.5 * width]
-    bars = [cylinder_between(np.zeros(3), point, width) for point in away]
+    bars = [Cylinder.between(np.zeros(3), point, width) for point in away]
     return [*bars, Sphere(1.4 * width)] if bars else []
 
 

@@ -366,7 +366,7 @@ def test_directions_and_bars():
     for axis in [*np.random.default_rng(0).standard_normal((5, 3)), (0.0, 0.0, -1.0), (0.0, 0.0, 2.0)]:
         turned = rot.rotate(shapes.along(axis), np.array([0.0, 0.0, 1.0]))
         assert np.allclose(turned, np.asarray(axis) / np.linalg.norm(axis))
-    bar = shapes.cylinder_between((1.0, 0.0, 0.0), (0.0, 2.0, 2.0), 0.1)
+    bar = shapes.Cylinder.between((1.0, 0.0, 0.0), (0.0, 2.0, 2.0), 0.1)
     place, turn = np.array([1.0, 2.0, 3.0]), rot.normalize(np.array([0.5, -0.2, 0.4, 0.8]))
     moved = bar.moved(place, turn)
     end = lambda shape: shape.position + rot.rotate(shape.orientation, np.array([0.0, 0.0, shape.length / 2]))
