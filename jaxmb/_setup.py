@@ -42,11 +42,13 @@ _FOR_SPEED = _QUICKLY | {
 }
 # For batches a whole block of members becomes one kernel. Its inner loops run over members, which stand side by side in
 # the registers of a processor. With multi-output fusion XLA computes a value once, and not once for each use. LLVM must
-# not unroll the loops over members, since it would no longer vectorise them.
+# not unroll the loops over members, since it would no longer vectorise them. It vectorises these short loops also where
+# it has to check at run time that operands and results do not overlap.
 _VECTORS = f"{_KERNEL_LOOPS}={2**27},xla_cpu_use_multi_output_fusion=true,xla_cpu_disable_loop_unrolling=true"
+_SHORT_LOOPS = "-vectorizer-min-trip-count=4"
 _FOR_BATCHES = _FOR_SPEED | {
     "xla_backend_optimization_level": "3",
-    "xla_backend_extra_options": _VECTORS,
+    "xla_backend_extra_options": f"{_VECTORS},{_SHORT_LOOPS}",
     "xla_disable_hlo_passes": f"{_FOR_SPEED['xla_disable_hlo_passes']},cpu-parallel-task-assigner",
     "xla_cpu_prefer_vector_width": "512",
 }
@@ -130,6 +132,7 @@ def _tell(flags: dict[str, str]) -> None:
     """Set options of XLA, in place of the options that this module has set before."""
     given = os.environ.get("XLA_FLAGS", "").split()
     kept = [flag for flag in given if flag not in {f"--{name}={value}" for name, value in _told.items()}]
+    flags = {name: _of_llvm(value) for name, value in flags.items()}
     names = [name for name in flags if takes_option(name) and not any(flag.startswith(f"--{name}") for flag in kept)]
     told = [f"--{name}={flags[name]}" for name in names]
     if set(given) == {*kept, *told}:
@@ -144,6 +147,12 @@ def _tell(flags: dict[str, str]) -> None:
     _told.clear()
     _told.update({name: flags[name] for name in names})
     os.environ["XLA_FLAGS"] = " ".join([*kept, *told])
+
+
+def _of_llvm(value: str) -> str:
+    """A value without the options of LLVM that this XLA does not take; they begin with a dash."""
+    parts = value.split(",")
+    return ",".join(x for x in parts if not x.startswith("-") or takes_option(x[1:].partition("=")[0]))
 
 
 def computes_side_by_side() -> bool:
