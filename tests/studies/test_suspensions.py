@@ -222,8 +222,8 @@ def designed(bushings=False):
     """The double wishbone by its hard points, for a change along a direction."""
     system = library("double_wishbone", joints="bushings").system if bushings else library("double_wishbone").system
     random, known = np.random.default_rng(0), mb.parameters(system)
-    names = ["tie_rod.point_a", "tie_rod.point_b", "upper_ball.point_a", "lower_ball.point_b"]
-    names += ["lower_front.point_a", "upper_rear.point_b"] if bushings else ["lower_hinge.point_a", "upper_hinge.point_b"]
+    ends = ["lower_front.point_a", "upper_rear.point_b"] if bushings else ["lower_hinge.point_a", "upper_hinge.point_b"]
+    names = ["tie_rod.point_a", "tie_rod.point_b", "upper_ball.point_a", "lower_ball.point_b", *ends]
     along = {name: jnp.asarray(random.normal(size=3)) for name in names}
     return lambda x: mb.with_parameters(system, {name: known[name] + x * along[name] for name in names})
 
