@@ -220,7 +220,7 @@ def _kind(system, name: str, entry: _Entry) -> str:
 def _along(system, parts, number, ts, ys, accelerations, multipliers):
     """Points, forces and moments in body axes along a motion, and the mass centre."""
     space = system.layout.space
-    centre = space.in_space(_mass_centre(system, number))
+    centre = space.in_space(mass_centre(system, number))
 
     def single(t, y, udot, multipliers):
         here = system.at(y)
@@ -293,7 +293,7 @@ def _in_body_axes(space, pose, wrench) -> tuple[Array, Array]:
     return force, jnp.pad(wrench[d:], (3 - wrench[d:].size, 0))
 
 
-def _mass_centre(system, number: int) -> Array:
+def mass_centre(system, number: int) -> Array:
     """The mass centre in the body's frame."""
     for group in system.bodies.groups:
         places = np.flatnonzero(group.group.body_index[:, 0] == number)
