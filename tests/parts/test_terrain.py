@@ -30,6 +30,14 @@ def test_heights_and_slopes_are_continuous(name):
     )
 
 
+@pytest.mark.parametrize("name", TERRAINS)
+def test_the_outward_normal_is_normal_to_the_slope_and_upward(name):
+    for x in (2.7, 4.1, 5.3):
+        slope = float(jax.grad(lambda x: TERRAINS[name].height(x[None]))(x))
+        normal = np.asarray(terrain.outward(TERRAINS[name], jnp.array([x, 0.0])))
+        np.testing.assert_allclose(normal, np.array([-slope, 1.0]) / np.hypot(slope, 1.0), rtol=0, atol=1e-14)
+
+
 def test_bump_is_that_of_the_vehicle():
     x = np.linspace(3.5, 6.0, 101)
     height, slope = oracle.bump(x)

@@ -342,6 +342,27 @@ def forces():
     }
 
 
+def test_the_deflection_of_a_tyre_decays_over_its_relaxation_length():
+    tyre = planar.Tyre(
+        "F",
+        "a",
+        terrain=terrain.Flat(),
+        normal=contact.Linear(30.0),
+        radius=0.5,
+        coefficient=0.4,
+        slip_stiffness=5.0,
+        relaxation_length=0.3,
+        deflection=0.1,
+        transition_speed=0.2,
+    )
+    # Rolling without slip at 2 m/s, then locked.
+    pose = jnp.array([[1.0, 0.5, 0.3]])
+    part, speed = tyre.resolve(PLANE, pose), np.hypot(2.0, 0.2)
+    for spin, slip in ((-4.0, 0.0), (0.0, 2.0)):
+        rates = part.state_rates(PLANE, pose, jnp.array([[2.0, 0.0, spin]]), 0.0)
+        np.testing.assert_allclose(rates["deflection"], [-slip - speed / 0.3 * 0.1], rtol=1e-12)
+
+
 def force_state():
     rng = np.random.default_rng(9)
     return random_poses(rng), random_poses(rng), random_poses(rng)
