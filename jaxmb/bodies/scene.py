@@ -33,7 +33,7 @@ from ..parts.base import (
     rows_of,
 )
 from ..parts.boundary import captured, check_kernels
-from ..parts.dry_friction import AbstractDryFriction
+from ..parts.dry_friction import AbstractDryFriction, AbstractStickSlip
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
@@ -198,11 +198,11 @@ class Scene(eqx.Module):
             return tuple(of_joint[name] for name in group.names)
 
         def between_velocities(group):
-            dry = isinstance(group.part, AbstractDryFriction)
+            dry = isinstance(group.part, AbstractStickSlip)
             return VelocityConstraintGroup(group, of_joints(group) if dry else ())
 
         of_joint = {law.name: law.joint for law, _ in laws}
-        of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractDryFriction)}
+        of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractStickSlip)}
         constraints = kind(AbstractConstraint)
         forces = ForceSet(
             groups=tuple(map(ForceGroup, kind(AbstractForce))),
