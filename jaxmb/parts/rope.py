@@ -64,7 +64,7 @@ class Pulley(NamedTuple):
         the axis towards the eye.
     - `centre` [m], body-fixed, default the origin of the frame; `axis`, in space, body-fixed.
     - `grips`: whether the rope does not slip on it, so that it turns with the rope. By default it is without friction.
-    - `friction` μ ≥ 0 of the rope on a pulley that it passes: it sticks or slips, see `Rope`.
+    - `friction` μ ≥ 0 of a rope of constant length on a pulley that it passes: it sticks or slips, see `Rope`.
     - `turns`: full turns of rope on it at the given poses: of a drum all, of another pulley those beyond the first,
         a whole number.
     """
@@ -556,7 +556,7 @@ class Rope(AbstractRope, AbstractCompound):
 
     It stands among the joints of a scene. Its places are points, to which it is guided without friction, and pulleys.
     Its two ends are points or drums. A pulley that grips it divides it into spans, each with a tension of its own;
-    without one there is one span and one tension. The length of a span contains the rope on its pulleys and drums. A
+    without such a pulley there is one span and one tension. The length of a span contains the rope on its pulleys and drums. A
     winch is a drum that a motor, `JointDriver` or `Driver` turns, or a `length` that is an input of `simulate`.
 
     The tension `"rope.tension"` [N], of several spans one each, is positive where the rope pulls. Its coordinates are
@@ -571,6 +571,15 @@ class Rope(AbstractRope, AbstractCompound):
     goes slack and tightens with an impact, both at times that `simulate` finds, and its coordinate `gap` [m] is how
     much longer it is than its path. An elastic rope, with a `stiffness`, only pulls: the tension of a span is
     `stiffness (l − length) + damping l̇`, zero where that is negative or the span is not stretched.
+
+    A pulley with `friction` μ holds the rope while neither tension exceeds the other by more than `e^(μ φ)` times, with
+    the angle φ of rope on it. Beyond, the rope slips: `T₂ = T₁ e^(μ φ)`, the equation of the capstan. Stick is exact,
+    and `simulate` finds the times of the changes, as for `DryFriction`: `Trajectory.events` has the kinds `"stick"` and
+    `"slip"` under the name of the rope, and the coordinate `"rope.mode"` is 2, 1 or -1; 1 is slip along the path. With
+    several such pulleys their names are `"rope.mode_1"`, `"rope.mode_2"` and so on. Each side of a pulley has a tension
+    of its own in `"rope.tension"`. If several pulleys at rest hold a rope at rest, the tension between them is
+    undetermined, and the run finds a possible value. A rope that pushes has friction too, by the size of its tensions.
+    In an impact friction has no impulse. If the `length` is an input, the rope is paid out at the start of its path.
 
     A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative.
 
