@@ -162,8 +162,8 @@ class ConstraintSet(eqx.Module):
     def reactions(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
     ) -> list[Float[Array, "parts k v"]]:
-        """Reaction wrenches of the joints of non-ideal laws on the joints' bodies, one array for each law group; of laws
-        of ropes their multipliers, shape (parts, rows).
+        """Reaction wrenches of the joints of non-ideal laws on the joints' bodies, one array for each law group; for
+        ropes their multipliers, shape (parts, rows).
         """
         named, wrenches, bodies = {name for g in laws if not g.of_ropes for name in g.joints}, [], []
         jacobian = None if self.elements is None else self.elements.jacobian(now.poses)
@@ -181,13 +181,16 @@ class ConstraintSet(eqx.Module):
             wrenches.append(jnp.sum(of_group[..., None, None] * of_parts, axis=1).reshape(-1))
             bodies.append((g.group.names, g.group.bodies))
         reactions = jnp.concatenate([*wrenches, jnp.zeros(1, now.poses.dtype)])
-        # A joint may be made of several constraints, all between the same bodies.
-        take = lambda g: unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints))
-        of_joints = [None if g.of_ropes else jnp.sum(take(g), axis=1) for g in laws]
-        # A law may have more scalar coordinates than its joint; these take no reaction.
-        padded = lambda g, reaction: jnp.pad(reaction, ((0, 0), (0, len(g.group.bodies[0]) - reaction.shape[1]), (0, 0)))
-        of_rope = lambda g: unchecked_take(multipliers, self._rows_of(g.joints))
-        return [of_rope(g) if x is None else padded(g, x) for g, x in zip(laws, of_joints, strict=True)]
+
+        def of_law(g):
+            if g.of_ropes:
+                return unchecked_take(multipliers, self._rows_of(g.joints))
+            # A joint may be made of several constraints, all between the same bodies.
+            of_joint = jnp.sum(unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints)), axis=1)
+            # A law may have more scalar coordinates than its joint; these take no reaction.
+            return jnp.pad(of_joint, ((0, 0), (0, len(g.group.bodies[0]) - of_joint.shape[1]), (0, 0)))
+
+        return [of_law(g) for g in laws]
 
     def _rows_of(self, names: Sequence[str]) -> np.ndarray:
         """The numbers of the rows of parts with these names, which have equally many."""

@@ -37,6 +37,7 @@ from ..parts.dry_friction import AbstractDryFriction, AbstractStickSlip
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
+from ..parts.modes import STICK
 from ..parts.names import check_arguments, unknown
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
@@ -459,6 +460,8 @@ def _strength(part, space, poses, velocities):
     if isinstance(part, AbstractForce):
         wrenches = part.wrenches(space, *part.seen(space, poses, velocities), jnp.zeros((), poses.dtype))
         return jnp.abs(part.wrenches_on_bodies(space, poses, wrenches))
+    if isinstance(part, AbstractStickSlip):
+        poses = poses.at[-part.rows :, 0].set(STICK)
     rows = rows_of(part, space, poses)
     return jnp.sum(jnp.abs(rows), axis=0)
 

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from .._compat import with_values
 from .._types import VectorLike
 from ..linalg.arrays import namespace
-from ..linalg.rotations import norm
 from ..linalg.elimination import solve
+from ..linalg.rotations import norm
 from ..linalg.sums import placed_sums, unchecked_take, with_entries
 from . import fields
 from .base import (
@@ -556,8 +556,9 @@ class Rope(AbstractRope, AbstractCompound):
 
     It stands among the joints of a scene. Its places are points, to which it is guided without friction, and pulleys.
     Its two ends are points or drums. A pulley that grips it divides it into spans, each with a tension of its own;
-    without such a pulley there is one span and one tension. The length of a span contains the rope on its pulleys and drums. A
-    winch is a drum that a motor, `JointDriver` or `Driver` turns, or a `length` that is an input of `simulate`.
+    without such a pulley there is one span and one tension. The length of a span contains the rope on its pulleys and
+    drums. A winch is a drum that a motor, `JointDriver` or `Driver` turns, or a `length` that is an input of
+    `simulate`.
 
     The tension `"rope.tension"` [N], of several spans one each, is positive where the rope pulls. Its coordinates are
     `length` [m], of all spans, and `wrap` [rad], the angles of rope on the pulleys.
@@ -682,8 +683,8 @@ class Rope(AbstractRope, AbstractCompound):
             )
         if any(self.rubs) and self.slack:
             raise ValueError(
-                f"{self.label}: with slack it has no friction of pulleys; leave slack out, or hang the loads on a Slack "
-                "at the ends of the rope."
+                f"{self.label}: with slack it has no friction of pulleys; leave slack out, or hang the loads on the "
+                "rope by a Slack."
             )
 
     def validate(self):
