@@ -130,11 +130,11 @@ def test_a_load_that_unwinds_a_drum_in_space():
     axle = spatial.Revolute("axle", "ground", "drum", point=(0.0, 0.0, 0.0), axis=AXIS)
     rope = mb.Rope("rope", [mb.Pulley("drum", r, "right", turns=50.0, axis=AXIS), ("load", (0.0, 0.0, 0.0))])
     system = mb.Scene([drum, load], joints=[axle, rope], forces=[DOWN[3]]).compile()
-    motion = mb.simulate(system, mb.assemble(system), t1=3.5, saveat=np.linspace(0.0, 3.5, 8), rtol=1e-9)
+    motion = mb.simulate(system, mb.assemble(system), t1=4.2, saveat=np.linspace(0.0, 4.2, 8), rtol=1e-9)
     wrap, free = motion["rope"].wrap[:, 0], 1.0 + r * 100 * np.pi - r * motion["rope"].wrap[:, 0]
     assert wrap[0] - wrap[-1] > 80 * np.pi
     fallen = 2.0 * G * np.ptp(motion["load"].position[:, 2])
-    np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=0, atol=1e-7 * fallen)
+    np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=0, atol=1e-6 * fallen)
     # The free part is as long as the rope that has left the drum.
     x, y, z = motion["load"].position.T
     straight = np.sqrt(x**2 + y**2 + z**2 - r**2)
