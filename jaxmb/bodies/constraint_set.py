@@ -69,7 +69,7 @@ class ConstraintSet(eqx.Module):
         """Pairs for each group with moving scalar coordinates: the coordinates' indices, and their inertias."""
         # No force changes the velocity of a friction mode, so any inertia will do.
         modes = [
-            (g.group.body_index[:, k], jnp.ones_like(g.group.part.coefficient))
+            (g.group.body_index[:, k], jnp.ones_like(g.group.part.coefficient, shape=(len(g.group.names),)))
             for g in self.frictions
             for k in range(-g.rows, 0)
         ]
@@ -162,8 +162,10 @@ class ConstraintSet(eqx.Module):
     def reactions(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
     ) -> list[Float[Array, "parts k v"]]:
-        """Reaction wrenches of the joints of non-ideal laws on the joints' bodies, one array for each law group."""
-        named, wrenches, bodies = {name for g in laws for name in g.joints}, [], []
+        """Reaction wrenches of the joints of non-ideal laws on the joints' bodies, one array for each law group; for
+        ropes their multipliers, shape (parts, rows).
+        """
+        named, wrenches, bodies = {name for g in laws if not g.of_ropes for name in g.joints}, [], []
         jacobian = None if self.elements is None else self.elements.jacobian(now.poses)
         first = 0
         for g, of_group in self.of_groups(multipliers):
@@ -179,12 +181,21 @@ class ConstraintSet(eqx.Module):
             wrenches.append(jnp.sum(of_group[..., None, None] * of_parts, axis=1).reshape(-1))
             bodies.append((g.group.names, g.group.bodies))
         reactions = jnp.concatenate([*wrenches, jnp.zeros(1, now.poses.dtype)])
-        # A joint may be made of several constraints, all between the same bodies.
-        take = lambda g: unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints))
-        of_joints = [jnp.sum(take(g), axis=1) for g in laws]
-        # A law may have more scalar coordinates than its joint; these take no reaction.
-        missing = [len(g.group.bodies[0]) - reaction.shape[1] for g, reaction in zip(laws, of_joints, strict=True)]
-        return [jnp.pad(reaction, ((0, 0), (0, k), (0, 0))) for reaction, k in zip(of_joints, missing, strict=True)]
+
+        def of_law(g):
+            if g.of_ropes:
+                return unchecked_take(multipliers, self._rows_of(g.joints))
+            # A joint may be made of several constraints, all between the same bodies.
+            of_joint = jnp.sum(unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints)), axis=1)
+            # A law may have more scalar coordinates than its joint; these take no reaction.
+            return jnp.pad(of_joint, ((0, 0), (0, len(g.group.bodies[0]) - of_joint.shape[1]), (0, 0)))
+
+        return [of_law(g) for g in laws]
+
+    def _rows_of(self, names: Sequence[str]) -> np.ndarray:
+        """The numbers of the rows of parts with these names, which have equally many."""
+        rows = np.array([name for g in self.groups for name in g.group.names for _ in range(g.rows)])
+        return np.stack([np.flatnonzero(rows == name) for name in names])
 
     def nonideal_wrenches(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]

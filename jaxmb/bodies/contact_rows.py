@@ -22,18 +22,26 @@ def contact_set(
     names = [name for g in contacts for name in g.group.names]
     contact_of, pairs = [], []
     for g in frictions:
-        pairs += range(len(contact_of), len(contact_of) + _count(g), 2) if g.rows == 2 else ()
+        pairs += range(len(contact_of), len(contact_of) + _count(g), 2) if g.group.part.directions == 2 else ()
         contact_of += [names.index(name) if name in names else -1 for name in g.joints for _ in range(g.rows)]
     laws = (*contacts, *frictions)
     return ContactSet(
-        names=tuple(name for g in laws for name in g.group.names for _ in range(g.rows)),
+        names=tuple(name for g in laws for name in _names(g)),
         rows=tuple(first_row[id(g)] + k for g in laws for k in range(_count(g))),
         places=tuple(place for g in laws for place in _places(g)),
         by_poisson=tuple(g.group.part.impact_law == "poisson" for g in contacts for _ in g.group.names),
         contact_of=tuple(contact_of),
         releases=tuple(g.group.part.static_coefficient is not None for g in frictions for _ in range(_count(g))),
         pairs=tuple(pairs),
+        coupled=any(g.group.part.coupled for g in frictions),
     )
+
+
+def _names(group: AbstractConstraintGroup) -> list[str]:
+    """The names of the rows; those of several slips of one part are the names of their modes."""
+    several = isinstance(group, VelocityConstraintGroup) and group.rows > group.group.part.directions
+    of_rows = (lambda name, k: f"{name}.mode_{k + 1}") if several else (lambda name, k: name)
+    return [of_rows(name, k) for name in group.group.names for k in range(group.rows)]
 
 
 def _count(group: AbstractConstraintGroup) -> int:

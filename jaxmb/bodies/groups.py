@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from .._captured import Captured
 from .._types import Scalar
 from ..linalg.sums import unchecked_take
-from ..parts.base import AbstractPart
+from ..parts.base import AbstractLink, AbstractPart
 from ..parts.boundary import captured
 from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal, of_each, of_one_kind
@@ -559,7 +559,30 @@ class NonIdealGroup(AbstractGroup):
 
     joints: tuple[str, ...] = eqx.field(static=True)
 
-    def wrenches(self, now: Kinematics, reactions: Float[Array, "parts k v"]) -> Float[Array, "parts k v"]:
+    @property
+    def of_ropes(self) -> bool:
+        """Whether the laws are friction of ropes, whose `reactions` are multipliers in place of wrenches."""
+        return isinstance(self.group.part, AbstractLink) and self.group.part.has_tension
+
+    def tensions(self, now: Kinematics, reactions: Float[Array, "parts rows"]) -> Float[Array, "parts spans"]:
+        """Tensions of the spans of ropes, see `of_ropes`."""
+        return self._of_reactions("tensions", now, reactions)
+
+    def normal_forces(self, now: Kinematics, reactions: Array) -> Float[Array, "laws d"]:
+        """Vectors as long as the normal forces of dry friction are large, for each row of the laws."""
+        part, d = self.group.part, self._space.dimension
+        if not self.of_ropes:
+            forces = reactions[:, part.last, :d]
+            return forces if part.rows == 1 else jnp.repeat(forces, part.rows, axis=0)
+        limits = self._of_reactions("limits", now, reactions).reshape(-1, 1)
+        return jnp.pad(limits, ((0, 0), (0, d - 1)))
+
+    def _of_reactions(self, name, now, reactions):
+        kernel = self.group.kernel(name)
+        single = lambda at, x, reaction: kernel(at(now.t), at(now.t).seen_poses(self._space, x), reaction)
+        return self._map(single, now.poses, per_part=(reactions,))
+
+    def wrenches(self, now: Kinematics, reactions: Array) -> Float[Array, "parts k v"]:
         """Wrenches of the laws on the bodies of their joints, from the joints' `reactions`."""
         space, kernel = self._space, self.group.kernel("wrenches")
 

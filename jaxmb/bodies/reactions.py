@@ -13,7 +13,7 @@ from ..linalg.arrays import add_up
 from ..linalg.rotations import cross
 from ..system.quantities import Measure, Reaction, view_of_motion
 from .constraint_set import ConstraintSet
-from .groups import AbstractGroup, Group
+from .groups import AbstractGroup, Group, VelocityConstraintGroup
 
 
 class Place(NamedTuple):
@@ -65,7 +65,8 @@ def _tension_measures(system) -> dict[str, Measure]:
     for of_forces, groups in ((True, system.constraints.groups), (False, system.forces.groups)):
         for g, group in enumerate(groups):
             if group.group.part.has_tension:
-                spans = group.group.part.spans
+                # Of a rope with friction, whose constraint comes first, each side of a pulley.
+                spans = group.group.part.sides
                 shape = () if spans == 1 else (spans,)
                 for k, name in enumerate(group.group.names):
                     out[f"{name}.tension"] = Measure(shape, _tension, (g, of_forces, shape, np.array(k)), of_forces)
@@ -75,6 +76,14 @@ def _tension_measures(system) -> dict[str, Measure]:
 @view_of_motion
 def _tension(system, place, ts, ys, solved):
     group, of_rows, shape, member = place
+    if of_rows and isinstance(friction := system.constraints.groups[group], VelocityConstraintGroup):
+
+        def with_friction(t, y, multipliers):
+            now = system.kinematics(t, y.q, y.u)
+            (reactions,) = system.constraints.reactions([friction.law], now, multipliers)
+            return friction.law.tensions(now, reactions)[member]
+
+        return jax.vmap(with_friction)(ts, ys, solved.multipliers)
     if of_rows:
         pulls = jax.vmap(lambda multipliers: system.constraints.of_groups(multipliers)[group][1][member])
         return pulls(solved.multipliers).reshape(-1, *shape)

@@ -325,10 +325,9 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def friction_reactions(self, t, q, u, multipliers):
-        groups = self.constraints.frictions
-        reactions = self.constraints.reactions([g.law for g in groups], self.kinematics(t, q, u), multipliers)
-        d, both = self.layout.space.dimension, zip(groups, reactions, strict=True)
-        return jnp.concatenate([_of_rows(reaction[:, g.group.part.last, :d], g.rows) for g, reaction in both])
+        laws, now = [g.law for g in self.constraints.frictions], self.kinematics(t, q, u)
+        reactions = self.constraints.reactions(laws, now, multipliers)
+        return jnp.concatenate([g.normal_forces(now, x) for g, x in zip(laws, reactions, strict=True)])
 
     # Motions and assembly
 
@@ -409,5 +408,7 @@ class RigidBodySystem(AbstractSystem):
 
 
 def _of_rows(values: Array, count: int) -> Array:
-    """Values of parts, repeated for each of their rows."""
+    """Values of parts, repeated for each of their rows; those of rows in order."""
+    if values.ndim == 2:
+        return values.reshape(-1)
     return values if count == 1 else jnp.repeat(values, count, axis=0)

@@ -33,10 +33,11 @@ from ..parts.base import (
     rows_of,
 )
 from ..parts.boundary import captured, check_kernels
-from ..parts.dry_friction import AbstractDryFriction
+from ..parts.dry_friction import AbstractDryFriction, AbstractStickSlip
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
+from ..parts.modes import STICK
 from ..parts.names import check_arguments, unknown
 from ..parts.planar.kinematics import PLANE
 from ..parts.servo import Servo
@@ -198,11 +199,11 @@ class Scene(eqx.Module):
             return tuple(of_joint[name] for name in group.names)
 
         def between_velocities(group):
-            dry = isinstance(group.part, AbstractDryFriction)
+            dry = isinstance(group.part, AbstractStickSlip)
             return VelocityConstraintGroup(group, of_joints(group) if dry else ())
 
         of_joint = {law.name: law.joint for law, _ in laws}
-        of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractDryFriction)}
+        of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractStickSlip)}
         constraints = kind(AbstractConstraint)
         forces = ForceSet(
             groups=tuple(map(ForceGroup, kind(AbstractForce))),
@@ -459,6 +460,8 @@ def _strength(part, space, poses, velocities):
     if isinstance(part, AbstractForce):
         wrenches = part.wrenches(space, *part.seen(space, poses, velocities), jnp.zeros((), poses.dtype))
         return jnp.abs(part.wrenches_on_bodies(space, poses, wrenches))
+    if isinstance(part, AbstractStickSlip):
+        poses = poses.at[-part.rows :, 0].set(STICK)
     rows = rows_of(part, space, poses)
     return jnp.sum(jnp.abs(rows), axis=0)
 

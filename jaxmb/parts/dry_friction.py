@@ -1,7 +1,7 @@
 """Dry friction that sticks exactly: Coulomb's law, with stick and slip as modes that change at exact times."""
 
 import abc
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -27,8 +27,55 @@ from .modes import STICK, kind_of, slip_direction
 from .space import AbstractSpace, rate_of
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
 
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
-class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
+
+class AbstractStickSlip(AbstractVelocityConstraint):
+    """A law of dry friction whose rows stick or slip, each by its mode: a scalar coordinate after the bodies."""
+
+    linear: ClassVar[bool] = True
+    # The number of directions of one slip: two rows that stick and slip together, or one.
+    directions: AbstractVar[int]
+    # Those of slip and stick, as multiples of the normal forces; the latter may be None.
+    coefficient: AbstractVar[Any]
+    static_coefficient: AbstractVar[Any]
+
+    @property
+    def coupled(self) -> bool:
+        """Whether the normal force of a row depends on the friction of other rows without other constraints."""
+        return False
+
+    @property
+    def homogeneous(self) -> bool:
+        return True
+
+    @property
+    @abc.abstractmethod
+    def joint_name(self) -> str:
+        """The name of the part whose force is the normal force."""
+
+    @property
+    def limit(self) -> Array:
+        """The coefficient of stick."""
+        return self.coefficient if self.static_coefficient is None else self.static_coefficient
+
+    def residual(self, space, poses, velocities, t):
+        del t
+        slip, modes = self._slip(space, poses, velocities), velocities[-self.rows :, 0]
+        return jnp.where(kind_of(self._modes(poses)) == STICK, slip, modes)
+
+    @abc.abstractmethod
+    def _slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, "rows"]:
+        """The velocities of slip [m/s], from poses and velocities of all bodies and modes."""
+
+    def _modes(self, poses):
+        return lax.stop_gradient(poses[-self.rows :, 0])
+
+
+class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
     """Coulomb friction in a joint or a rigid contact, along one direction of slip, or two in a contact in space.
 
     Subclasses define the velocity of `slip`. The part adds one coordinate, one velocity and one row to the scene. The
@@ -49,19 +96,13 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", constant=True)
     static_coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", optional=True, constant=True)
     directions: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
-    linear: ClassVar[bool] = True
 
     @property
     def rows(self) -> int:
         return self.directions
 
     @property
-    def homogeneous(self) -> bool:
-        return True
-
-    @property
     def joint_name(self) -> str:
-        """The name of the joint or contact."""
         return self.joint.partition(".")[0]
 
     @property
@@ -72,11 +113,6 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     def last(self) -> int:
         """The index of the joint's last body."""
         return len(self.joints["0"].bodies) - 1
-
-    @property
-    def limit(self) -> Array:
-        """The coefficient of stick."""
-        return self.coefficient if self.static_coefficient is None else self.static_coefficient
 
     def validate(self):
         if self.static_coefficient is not None and not self.static_coefficient >= self.coefficient:
@@ -116,11 +152,6 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
             return jnp.dot(held.outward(space, held.seen_poses(space, poses[: len(held.bodies)])), force)
         return norm(force)
 
-    def residual(self, space, poses, velocities, t):
-        del t
-        slip, modes = self._slip(space, poses, velocities), velocities[-self.rows :, 0]
-        return jnp.where(kind_of(self._modes(poses)) == STICK, slip, modes)
-
     def wrenches(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: float
     ) -> Wrenches:
@@ -134,9 +165,6 @@ class AbstractDryFriction(AbstractOfJoints, AbstractVelocityConstraint):
     def _slip(self, space, poses, velocities):
         at = np.array(self.places[0])
         return self.slip(space, unchecked_take(poses, at), unchecked_take(velocities, at))
-
-    def _modes(self, poses):
-        return lax.stop_gradient(poses[-self.rows :, 0])
 
 
 class DryFriction(AbstractDryFriction):

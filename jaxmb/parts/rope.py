@@ -13,8 +13,9 @@ from jaxtyping import Array, Float
 from .._compat import with_values
 from .._types import VectorLike
 from ..linalg.arrays import namespace
+from ..linalg.elimination import solve
 from ..linalg.rotations import norm
-from ..linalg.sums import placed_sums, unchecked_take
+from ..linalg.sums import placed_sums, unchecked_take, with_entries
 from . import fields
 from .base import (
     AbstractCompound,
@@ -27,7 +28,9 @@ from .base import (
     ScalarCoordinate,
 )
 from .coordinate_parts import shortest, turns
+from .dry_friction import AbstractStickSlip
 from .forces import generalized_force
+from .modes import FORWARD, kind_of
 from .shapes import wheel
 from .space import rate_of
 from .spatial.axes import perpendiculars
@@ -61,6 +64,7 @@ class Pulley(NamedTuple):
         the axis towards the eye.
     - `centre` [m], body-fixed, default the origin of the frame; `axis`, in space, body-fixed.
     - `grips`: whether the rope does not slip on it, so that it turns with the rope. By default it is without friction.
+    - `friction` μ ≥ 0 of a rope of constant length on a pulley that it passes: it sticks or slips, see `Rope`.
     - `turns`: full turns of rope on it at the given poses: of a drum all, of another pulley those beyond the first,
         a whole number.
     """
@@ -72,6 +76,7 @@ class Pulley(NamedTuple):
     axis: VectorLike | None = None
     grips: bool = False
     turns: float = 0.0
+    friction: Any = None
 
 
 class AbstractRope(AbstractLink):
@@ -138,6 +143,11 @@ class AbstractRope(AbstractLink):
     def spans(self) -> int:
         """The number of spans."""
         return int(self._span(len(self.senses) - 2)) + 1
+
+    @property
+    def sides(self) -> int:
+        """The number of tensions."""
+        return self.spans
 
     def _of_pulleys(self, places: np.ndarray, values: Any) -> Any:
         """Values of pulleys, one for each of some places."""
@@ -348,6 +358,138 @@ class TautRope(AbstractRope, AbstractConstraint):
         return self.length.reshape(-1) - self.lengths(space, poses)
 
 
+class RopeFriction(AbstractRope, AbstractStickSlip):
+    """Friction of a rope of constant length on pulleys, a row for each of them.
+
+    A pulley divides its span into sides with the tensions T₁ before and T₂ after it. Its normal force is their mean N,
+    as far as the law needs one: the rise D = T₂ − T₁ has the limit 2 N tanh(μ φ / 2) on an angle φ of rope. In slip
+    that is Euler's and Eytelwein's `T₂ = T₁ e^(μ φ)`. The multiplier in stick is −D. The multiplier of the span's
+    length is the mean of the tensions at its ends: then no rise enters the mean at its own pulley.
+
+    **Fields:** `rubs`: for each place of the path whether it is such a pulley; the `friction` μ of each.
+    """
+
+    rubs: tuple[bool, ...] = eqx.field(static=True, default=())
+    length: fields.Number = fields.parameter(shape=None, unit="m", sign="positive")
+    friction: fields.Number = fields.parameter(shape=(None,), unit="1", sign="non-negative", constant=True)
+    moving: ClassVar[tuple[str, ...]] = ("length", "points", "radii", "axes", "marks")
+    has_tension: ClassVar[bool] = True
+    directions: ClassVar[int] = 1
+    static_coefficient: ClassVar[None] = None
+
+    @property
+    def rows(self):
+        return sum(self.rubs)
+
+    @property
+    def joint_name(self):
+        return self.name
+
+    @property
+    def coefficient(self):
+        return jnp.ones_like(self.friction)
+
+    @property
+    def coupled(self):
+        return bool(np.any(self._shares_of_means))
+
+    def seen_wrenches(self, space, poses, wrenches):
+        # They are multipliers.
+        return wrenches
+
+    # Sides
+
+    @property
+    def _divided(self) -> "RopeFriction":
+        """The rope as if it were held where it rubs: its spans are the sides."""
+        view = self.with_fields(grips=tuple(a or b for a, b in zip(self.grips, self.rubs, strict=True)), marks=None)
+        if not len(self._holding):
+            return view
+        every = view._holding
+        none = jnp.zeros(len(every), self.marks.dtype)
+        return view.with_fields(marks=with_entries(none, np.searchsorted(every, self._holding), self.marks))
+
+    @property
+    def _places(self) -> np.ndarray:
+        """The places at which the rope rubs."""
+        return np.flatnonzero(self.rubs)
+
+    def _side(self, part: Any) -> np.ndarray:
+        """The side to which a straight part belongs, numbered by the place before it."""
+        dividers = [k for k in self._passed if self.grips[k] or self.rubs[k]]
+        return np.sum(np.asarray(part)[..., None] >= np.array(dividers, int), axis=-1)
+
+    @property
+    def sides(self):
+        return int(self._side(len(self.senses) - 2)) + 1
+
+    @property
+    def _span_of_side(self) -> np.ndarray:
+        parts = np.arange(len(self.senses) - 1)
+        return self._span(parts[np.unique(self._side(parts), return_index=True)[1]])
+
+    @property
+    def _halves(self) -> Float[np.ndarray, "rows sides"]:
+        """1/2 for the sides of a pulley's span after it, −1/2 before it."""
+        after = np.arange(self.sides) >= self._side(self._places)[:, None]
+        return (self._span_of_side == self._span(self._places)[:, None]) * np.where(after, 0.5, -0.5)
+
+    @property
+    def _shares_of_means(self) -> Float[np.ndarray, "rows rows"]:
+        """The shares of the rises at the pulleys in the mean tension at each of them."""
+        after = self._side(self._places)
+        return 0.5 * (self._halves.T[after] + self._halves.T[after - 1])
+
+    # Slip and tensions
+
+    def _slip(self, space, poses, velocities):
+        return rate_of(space, self, lambda part, x: part._passed_by(space, x), poses, velocities)[1]
+
+    def _passed_by(self, space, poses):
+        """The lengths [m] of rope that have passed the pulleys, but for constants. Rope is paid out at the start."""
+        straight, along = self._straight(space, poses)
+        view = self._divided
+        # Full turns are constant.
+        lengths = view._measured(space, poses, straight, view._angles(space, poses, along))
+        return self._halves @ lengths + 0.5 * self.length.reshape(-1)[self._span(self._places)]
+
+    def _wraps_of_places(self, space, poses):
+        """The angles [rad] of rope where it rubs."""
+        _, along = self._straight(space, poses)
+        angles = self._continued(space, poses, along)[: len(self._passed)]
+        return jnp.maximum(unchecked_take(angles, np.searchsorted(self._passed, self._places)), 0.0)
+
+    def _loads(self, space, poses, multipliers):
+        """Of each pulley the direction of slip, zero in stick; the limit of the rise of the tension, and the rise."""
+        mean, stuck = multipliers[self._span(self._places)], -multipliers[self.spans :]
+        share = 2.0 * jnp.tanh(0.5 * self.friction * self._wraps_of_places(space, poses))
+        modes, shares = kind_of(self._modes(poses)), self._shares_of_means
+        slips = jnp.where(jnp.abs(modes) == FORWARD, modes, 0.0)
+        # A rope that pushes rubs as much.
+        factor = jnp.where(mean < 0, -slips, slips) * share
+        rise = jnp.where(slips == 0, stuck, factor * mean)
+        if self.coupled:
+            rise = solve(jnp.eye(self.rows, dtype=rise.dtype) - factor[:, None] * shares, rise)
+            mean = mean + shares @ rise
+        return slips, share * mean, rise
+
+    def limits(self, space, poses, multipliers):
+        """The largest rises of the tension [N], negative where the rope pushes."""
+        return self._loads(space, poses, multipliers)[1]
+
+    def tensions(self, space, poses, multipliers):
+        """The tension of each side [N], from the multipliers of the spans and of this friction."""
+        _, _, rise = self._loads(space, poses, multipliers)
+        return multipliers[self._span_of_side] + self._halves.T @ rise
+
+    def wrenches(self, space, poses, velocities, multipliers, t):
+        """The wrenches of slip on the bodies."""
+        del t
+        slips, _, rise = self._loads(space, poses, multipliers)
+        _, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
+        return pull(jnp.where(slips == 0, 0.0, -rise))[0]
+
+
 class SlackRope(AbstractRope, AbstractGeometricContact):
     """A rope of constant length that may go slack."""
 
@@ -414,8 +556,9 @@ class Rope(AbstractRope, AbstractCompound):
 
     It stands among the joints of a scene. Its places are points, to which it is guided without friction, and pulleys.
     Its two ends are points or drums. A pulley that grips it divides it into spans, each with a tension of its own;
-    without one there is one span and one tension. The length of a span contains the rope on its pulleys and drums. A
-    winch is a drum that a motor, `JointDriver` or `Driver` turns, or a `length` that is an input of `simulate`.
+    without such a pulley there is one span and one tension. The length of a span contains the rope on its pulleys and
+    drums. A winch is a drum that a motor, `JointDriver` or `Driver` turns, or a `length` that is an input of
+    `simulate`.
 
     The tension `"rope.tension"` [N], of several spans one each, is positive where the rope pulls. Its coordinates are
     `length` [m], of all spans, and `wrap` [rad], the angles of rope on the pulleys.
@@ -429,6 +572,15 @@ class Rope(AbstractRope, AbstractCompound):
     goes slack and tightens with an impact, both at times that `simulate` finds, and its coordinate `gap` [m] is how
     much longer it is than its path. An elastic rope, with a `stiffness`, only pulls: the tension of a span is
     `stiffness (l − length) + damping l̇`, zero where that is negative or the span is not stretched.
+
+    A pulley with `friction` μ holds the rope while neither tension exceeds the other by more than `e^(μ φ)` times, with
+    the angle φ of rope on it. Beyond, the rope slips: `T₂ = T₁ e^(μ φ)`, the equation of the capstan. Stick is exact,
+    and `simulate` finds the times of the changes, as for `DryFriction`: `Trajectory.events` has the kinds `"stick"` and
+    `"slip"` under the name of the rope, and the coordinate `"rope.mode"` is 2, 1 or -1; 1 is slip along the path. With
+    several such pulleys their names are `"rope.mode_1"`, `"rope.mode_2"` and so on. Each side of a pulley has a tension
+    of its own in `"rope.tension"`. If several pulleys at rest hold a rope at rest, the tension between them is
+    undetermined, and the run finds a possible value. A rope that pushes has friction too, by the size of its tensions.
+    In an impact friction has no impulse. If the `length` is an input, the rope is paid out at the start of its path.
 
     A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative.
 
@@ -453,7 +605,11 @@ class Rope(AbstractRope, AbstractCompound):
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", optional=True)
     slack: bool = eqx.field(static=True, default=False)
     restitution: fields.Number = fields.parameter(unit="1", sign="non-negative", optional=True)
+    friction: fields.Number = fields.parameter(
+        shape=(None,), unit="1", sign="non-negative", optional=True, constant=True
+    )
     turns: tuple[float, ...] = eqx.field(static=True, default=())
+    rubs: tuple[bool, ...] = eqx.field(static=True, default=())
 
     def __init__(
         self,
@@ -478,6 +634,8 @@ class Rope(AbstractRope, AbstractCompound):
         self.senses = tuple(_SENSES[place.turn] for place in places)
         self.grips = tuple(place.grips for place in places)
         self.turns = tuple(float(place.turns) for place in places)
+        self.rubs = tuple(place.friction is not None for place in places)
+        self.friction = [place.friction for place in places if place.friction is not None] or None
         self.radii = [pulley.radius for pulley in pulleys] or None
         axes = [pulley.axis for pulley in pulleys]
         self.axes = None if all(axis is None for axis in axes) else axes
@@ -500,11 +658,34 @@ class Rope(AbstractRope, AbstractCompound):
             raise ValueError(f"{self.label}: damping belongs to an elastic rope; give its stiffness.")
         if self.restitution is not None and not self.slack:
             raise ValueError(f"{self.label}: restitution belongs to a rope with slack=True.")
+        self._check_friction()
         for k in self._passed:
             if self.turns[k] % 1:
                 raise ValueError(
                     f"{self.label}: turns of path[{k}], which is no drum, must be a whole number, got {self.turns[k]}."
                 )
+
+    def _check_friction(self) -> None:
+        for k in np.flatnonzero(self.rubs):
+            if k not in self._passed:
+                raise ValueError(
+                    f"{self.label}: path[{k}] is a drum, to which the rope is fastened; leave its friction out, or let "
+                    "the rope go on to a point."
+                )
+            if self.grips[k]:
+                raise ValueError(
+                    f"{self.label}: path[{k}] grips, so that the rope never slips on it; leave grips or friction out."
+                )
+        if any(self.rubs) and self.stiffness is not None:
+            raise ValueError(
+                f"{self.label}: friction of pulleys needs a rope of constant length; leave stiffness out, or put "
+                "springs at the ends of the rope."
+            )
+        if any(self.rubs) and self.slack:
+            raise ValueError(
+                f"{self.label}: with slack it has no friction of pulleys; leave slack out, or hang the loads on the "
+                "rope by a Slack."
+            )
 
     def validate(self):
         shape = () if self.spans == 1 else (self.spans,)
@@ -516,7 +697,9 @@ class Rope(AbstractRope, AbstractCompound):
     def scalar_coordinates(self, space, parts):
         counts = self.size if self._is_counted(space) else 0
         out = [ScalarCoordinate(f"{self.name}.angle_{k + 1}") for k in range(counts)]
-        return (*out, *([ScalarCoordinate(f"{self.name}.mode", moves=True)] if self.slack else []))
+        laws = self.slack + sum(self.rubs)
+        modes = [f"{self.name}.mode"] if laws == 1 else [f"{self.name}.mode_{k + 1}" for k in range(laws)]
+        return (*out, *(ScalarCoordinate(mode, moves=True) for mode in modes))
 
     def _is_counted(self, space):
         # In space the angles of drums are known up to full turns.
@@ -588,9 +771,8 @@ class Rope(AbstractRope, AbstractCompound):
         law = SlackRope if self.slack else law
         given = self.filled(damping=0.0, restitution=0.0)
         own = fields.values_of(given) | {"impact_law": "newton"}
-        return tuple(
-            with_values(kind, {name: own[name] for name in fields.field_names(kind)}) for kind in (RopePath, law)
-        )
+        kinds = (RopePath, law, RopeFriction) if any(self.rubs) else (RopePath, law)
+        return tuple(with_values(kind, {name: own[name] for name in fields.field_names(kind)}) for kind in kinds)
 
 
 def _place(label: str, place: Any) -> Pulley:

@@ -208,7 +208,8 @@ def _parts_on(system, number: int) -> dict[str, list[_Entry]]:
 
 def _kind(system, name: str, entry: _Entry) -> str:
     constraints, part = system.constraints, _sets(system)[entry.of][entry.number].group.part
-    rubbing = {name for group in constraints.frictions for name in group.group.names}
+    of_joints = (zip(group.group.names, group.joints, strict=True) for group in constraints.frictions)
+    rubbing = {name for pairs in of_joints for name, joint in pairs if name != joint}
     if entry.of == "laws" or (entry.of == "constraints" and name in rubbing):
         return "friction"
     if isinstance(part, AbstractUnilateralConstraint) or (isinstance(part, AbstractForce) and part.has_gaps):

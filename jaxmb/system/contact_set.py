@@ -48,6 +48,7 @@ class ContactSet:
     - For each direction of friction: the index of its contact in `contact_of`, -1 in a joint; and in `releases`,
         whether coefficients of slip and stick differ, so that accelerations jump as slip begins.
     - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
+    - `coupled`: whether the normal forces of friction in joints depend on friction itself, without other constraints.
     """
 
     names: tuple[str, ...] = ()
@@ -57,6 +58,7 @@ class ContactSet:
     contact_of: tuple[int, ...] = ()
     releases: tuple[bool, ...] = ()
     pairs: tuple[int, ...] = ()
+    coupled: bool = False
 
     def __bool__(self) -> bool:
         return bool(self.names)

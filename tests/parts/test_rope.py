@@ -136,6 +136,8 @@ def test_block_and_tackle():
     assert own("block.acceleration")[1] == pytest.approx(up, rel=1e-12)
     assert own("weight.acceleration")[1] == pytest.approx(-4.0 * up, rel=1e-12)
     assert own("rope.tension") == pytest.approx(G - 4.0 * up, rel=1e-12)
+    lifted = mb.assemble(system, fix={"block.y": -1.9, "weight.x": 0.65})
+    assert instant(system, lifted)("weight.position")[1] == pytest.approx(-1.0 - 4.0 * 0.1, rel=1e-12)
 
 
 def test_a_drum_and_a_belt():

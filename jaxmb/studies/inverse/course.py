@@ -75,6 +75,11 @@ def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Cours
             f"required_forces: positions do not determine {', '.join(system.state_names())}. Give a Trajectory, or "
             "name the part among the actuators."
         )
+    if system.contacts.m:
+        raise ValueError(
+            f"required_forces: positions do not determine whether {', '.join(system.contacts.friction_names)} sticks. "
+            "Give a Trajectory, or remove the friction."
+        )
     series = [value for value in motion.values() if isinstance(value, AbstractSignal) and value.of_arrays]
     if ts is None and not series:
         raise ValueError("required_forces: ts is missing, the times of the motion.")
