@@ -9,6 +9,7 @@ from every_contact import CONTACTS, system_of
 import jaxmb as mb
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts.modes import CLOSED, OPEN
+from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.system.instant import Instant
 
 
@@ -73,3 +74,11 @@ def test_one_of_two_balls_may_be_a_point():
     mb.Scene(bodies, joints=[meet(0.1)]).compile()
     with pytest.raises(ValueError, match="'meet': only one of radius_a and radius_b may be zero; give the other"):
         mb.Scene(bodies, joints=[meet(0.0)]).compile()
+
+
+def test_the_gap_of_a_taut_rope_is_the_length_that_it_lacks():
+    rope = mb.Slack("rope", "ground", "a", length=2.0)
+    at = lambda distance: jnp.array([[0.0, 0.0, 0.0], [0.6 * distance, -0.8 * distance, 0.0]])
+    part = rope.resolve(PLANE, at(2.0))
+    gap, rate = jax.value_and_grad(lambda distance: part.gap(PLANE, at(distance)))(2.0)
+    np.testing.assert_allclose([gap, rate, part.gap(PLANE, at(1.2))], [0.0, -1.0, 0.64], atol=1e-15)

@@ -1,5 +1,6 @@
 """Dry friction in every kind of joint and contact by itself: its constraint, its force, its numbers, its words."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,6 +19,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:The velocities given with the bo
 def state_of(system):
     """A state with velocities, in which contacts are closed."""
     return mb.assemble(system, fix={"joint.mode": 1} if system.contacts.n else {})
+
+
+def test_slip_counts_from_the_belt():
+    system = friction_scene("disc on a belt")
+    state, of, t = state_of(system), system.contacts, jnp.zeros(())
+    both = jax.jit(lambda q, u: (of.rates(system, t, q, u)[-1], of.gradients(system, t, q, u)[-1] @ u))
+    slip, moves = both(state.q, state.u)
+    np.testing.assert_allclose(slip, moves - FRICTIONS["disc on a belt"][2].speed, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -49,6 +49,14 @@ def test_a_spring_of_an_angle_is_a_torsional_spring_in_the_plane():
     assert not any(name.startswith("spring.joint") for name in mb.parameters(own))
 
 
+def test_a_position_servo_is_a_spring_and_damper():
+    servo = mb.Actuator("servo", "knee.angle", control=0.2, gear=2.0, gain=(3.0, 0.0, 0.0), bias=(0.0, -3.0, -0.4))
+    own, other = pendulums(servo), pendulums(mb.JointSpring("s", "knee.angle", stiffness=12.0, damping=1.6, free=0.1))
+    random = np.random.default_rng(0)
+    q, u = jnp.asarray(random.normal(size=6)), jnp.asarray(random.normal(size=6))
+    np.testing.assert_allclose(forces_of(own, q, u), forces_of(other, q, u), rtol=0, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_spring_of_an_angle_in_space_has_a_moment_about_the_axis():
     system = hinged(mb.JointSpring("spring", "hip.angle", stiffness=3.0, damping=0.4, free=-0.3))
