@@ -23,7 +23,7 @@ _SHAPED = (*ARRAYS, jax.ShapeDtypeStruct)
 
 
 class Captured:
-    """A function, and its programs for the arguments with which it was called before it was kept.
+    """A function with its traced programs, one for each set of argument shapes in calls before `keep`.
 
     It computes with these programs, even if the values that the function reads have changed; with arguments of other
     shapes it calls the function. Two are equal if all their programs compute the same. A function that was not called,

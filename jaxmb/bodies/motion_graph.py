@@ -6,13 +6,15 @@ An implicit step solves
     [       A           0  ] [l] = [c]
 
 with the derivatives K and D of the forces by positions and velocities, for a complex number r. Bodies and joints are
-the nodes of the elimination. A body is a neighbour of all bodies and joints with which it shares a force or a joint.
+the nodes of the elimination. Two bodies are neighbours if a force or a joint acts on both. A body and a joint are
+neighbours if the joint acts on the body.
 
 Pivots of bodies are regular. For dissipative forces the values of `xᴴ (M − r D − r² K) x` lie in a sector of the
 complex plane with an opening below 180 degrees. The values of every Schur complement lie in it too.
 
-The pivot of a joint is regular if the rows of eliminated joints are independent for the eliminated bodies. So a joint
-of a spanning tree waits for the body below it. A joint that closes a loop waits for all bodies of a shortest loop.
+The pivot of a joint is regular if its rows and those of eliminated joints are independent in the columns of the
+eliminated bodies. So a joint of a spanning tree waits for the body below it. A joint that closes a loop waits for all
+bodies of a shortest loop.
 
 Source: J. Brüdigam and Z. Manchester, "Linear-time variational integrators in maximal coordinates", 2021 (elimination
 over the graph of bodies and joints).

@@ -45,7 +45,8 @@ _LOCKED = 5e-3
 def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     """The system with its ranks, implied rows and order of elimination.
 
-    They are found once, by assembly from the given poses and elimination of concrete numbers; then they are static.
+    They are found once: the scene is assembled from the given poses, and its Jacobian is eliminated in concrete
+    numbers. Then they are static.
 
     **Raises:** `ValueError` if the constraints cannot be satisfied, or contradict each other in velocities or
     accelerations, or if the given pose is singular.

@@ -31,9 +31,9 @@ class Dry(NamedTuple):
 class Answers(NamedTuple):
     """Which laws hold.
 
-    **Fields:** contacts that are `closed`; friction that `sticks`; `slips`: the direction of other friction, 1 or -1,
-    for pairs the components of a unit vector, and 0 without force; `solvable`: there is a solution, and no slipping
-    contact has two; `implied`: friction of pairs that sticks by other laws, which carry its force.
+    **Fields:** contacts that are `closed`; friction that `sticks`; `slips`: the direction of sliding friction, 1 or -1,
+    for pairs a unit vector, and 0 without force; `solvable`: a solution exists, and is unique for slipping contacts;
+    `implied`: pairs whose sticking follows from other laws, which carry their force.
     """
 
     closed: Bool[Array, "n"]

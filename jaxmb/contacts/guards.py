@@ -127,5 +127,5 @@ class ContactGuards(AbstractGuards):
 def contact_guards(
     system: AbstractEquation, formulation: AbstractFormulation, tolerance: ContactTolerance | None
 ) -> ContactGuards | None:
-    """The guards of a system's contacts; None without a tolerance, as for a system without contacts."""
+    """The guards of a system's contacts; None if `tolerance` is None, as it is for systems without contacts."""
     return None if tolerance is None else ContactGuards(system, formulation, tolerance)

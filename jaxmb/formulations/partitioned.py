@@ -68,7 +68,7 @@ def reduced_accelerations(
     solve: Callable[[Float[Array, "f"]], Float[Array, "f"]],
     product: Callable[[Array, Array], Array] = jnp.matmul,
 ) -> Float[Array, "nu"]:
-    """The accelerations by the `factor` of A, with the solution of the reduced equations, `(EᵀME)⁻¹`."""
+    """The accelerations by the `factor` of A; `solve` applies `(EᵀME)⁻¹` to the reduced load."""
     particular = product(factor.right_inverse, gamma)
     load = product(factor.null_space.T, force - inertia.product(particular))
     return particular + product(factor.null_space, solve(load))

@@ -201,7 +201,9 @@ def unused(name: str, is_used: Callable[[str], bool]) -> str:
 
 
 def rotation_of(quaternion: Any) -> np.ndarray:
-    """The rotation matrix of Euler parameters of any length, scalar first, orthogonal to the last digit."""
+    """The rotation matrix of Euler parameters, scalar first. They need not be normalised; the matrix is orthogonal to
+    rounding.
+    """
     w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
     return np.array(
         [

@@ -107,7 +107,7 @@ def _dot_general(lanes, equation, values):
 
 
 def _sizes(shape, axes):
-    """The sizes of batched axes, the number of terms, and the sizes of free axes of a factor."""
+    """Of a factor: the sizes of its batched axes, the number of contracted terms, the sizes of its free axes."""
     inner, batch = axes
     free = [n for axis, n in enumerate(shape) if axis not in inner and axis not in batch]
     return [shape[axis] for axis in batch], math.prod(shape[axis] for axis in inner), free

@@ -35,8 +35,8 @@ _LANES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 class Stage:
     """Steps of elimination that one loop executes; each takes w nodes (lanes) that are not neighbours of each other.
 
-    Padding lanes have the index of the node after the last. Blocks of padding have the index after the last block, a
-    zero block; on the diagonal the next index, the identity.
+    Padding lanes have the index of the node after the last. With n blocks, padding blocks have the index n, of a zero
+    block; padding diagonal blocks have the index n + 1, of an identity.
 
     **Fields:** `nodes` (steps, w): the nodes; `later` (steps, w, d): their neighbours that are eliminated later, in
     order of elimination; `diagonal` (steps, w) and `columns` (steps, w, d): places of the nodes' blocks; `targets`

@@ -120,7 +120,7 @@ class Bracket(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """The search for the first zero in a step, whose times are fractions of it.
+    """The search for the first zero in a step. Times are fractions of the step.
 
     **Fields:** the `phase`; `s`: the next point of evaluation; `bracket`: of the function that changes its sign; which
     guards are `looked_at`, and which are `waiting`; the guards and their `rates` at the `end` of the step, the guards

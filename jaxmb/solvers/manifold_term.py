@@ -92,8 +92,8 @@ class AbstractGuards(eqx.Module):
 
     @abc.abstractmethod
     def rates(self, t: Any, y: PyTree[Array]) -> Float[Array, "guards"]:
-        """The rates of guards that may be negative in the middle of a step only, and of guards that pass their zeros in
-        one direction only; infinite for others.
+        """The rates of guards that can be negative inside a step but not at its ends, or whose zeros are crossed in one
+        direction; otherwise infinite.
         """
 
     @abc.abstractmethod

@@ -305,7 +305,10 @@ def _is_finite(y: PyTree) -> Any:
 
 
 def _changes(event: diffrax.Event, before: PyTree, values: PyTree, finite: Any) -> PyTree:
-    """Which events happened in a step to a `finite` state: a true value, a change of sign, or a new NaN."""
+    """Which events happened in a step: a true value, or a change of sign in the event's direction.
+
+    Without a direction also a new NaN, if the state after the step is `finite`.
+    """
 
     def changes(_, old, new, upwards):
         if jnp.issubdtype(jnp.result_type(new), jnp.bool_):

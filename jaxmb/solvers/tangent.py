@@ -89,9 +89,10 @@ class TangentControl(eqx.Module):
         return (None, self.direction) if self.excites else (self.direction,)
 
     def on_constraints(self, restore: Any, term: PyTree, y0: PyTree) -> "TangentControl":
-        """The same with starts that are tangents of the states returned by `restore(term, y)`, for a term.
+        """This control with starts pushed forward through `restore(term, y)`, so that they are tangent to constraints.
 
-        Otherwise a solver that projects its steps would end the first step, however short, at another tangent.
+        Otherwise a solver that projects its steps would change the start by a finite amount in the first step, however
+        short.
         """
         none = jax.tree.map(lambda _: None, term)
         starts = [

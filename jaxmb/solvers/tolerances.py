@@ -20,7 +20,9 @@ _SHARE = 1 / 20
 
 
 def closer_tolerance(rtol: Any, finest: float, dtype: Any) -> Any:
-    """The relative tolerance whose steps may err a hundredth as much; near rounding, a tenth.
+    """A tighter `rtol`, for the second run of an error estimate.
+
+    It allows a hundredth of the error of a step; near rounding, a tenth.
 
     **Arguments:** `finest`: as in `Tolerances.of_step`.
     """

@@ -3,10 +3,10 @@
 
 Units are SI and radians; Euler parameters are scalar first, and angular velocities are in the body frame. Joints have
 coordinates by name, `"hip.angle"` or `"slide.displacement"`, which `assemble` takes and `trajectory["hip"]` shows with
-rates and accelerations. Parts of `jaxmb` act on these coordinates, such as `JointSpring` and `Motor` on one, `Tendon`
-on several. Further parts of `jaxmb` are `RigidContact` and other unilateral constraints, `DryFriction`, `Servo`,
-`Controller`, and `Force` and other functions of the user's. `jaxmb help` lists them. Parts may name a `Frame`, fixed in
-a body, in place of the body. New classes derive from the classes of `jaxmb.parts`.
+rates and accelerations. Parts of `jaxmb` act on these coordinates: `JointSpring` and `Motor` on one, `Tendon` on
+several, among others. Further parts are `RigidContact` and other unilateral constraints, `DryFriction`, `Servo`,
+`Controller`, and parts with functions of the user, such as `Force`. `jaxmb help` lists them. Parts may name a `Frame`,
+fixed in a body, in place of the body. New classes derive from the classes of `jaxmb.parts`.
 """
 
 from .._moved import tell_of_moved as _tell_of_moved

@@ -101,7 +101,7 @@ def _violated(system, t, y) -> Any:
 
 
 def listed(system: AbstractSystem, violated: Any, residual: Any) -> str:
-    """Names of violated constraints with their largest residuals, the largest first, for messages."""
+    """The names of at most eight violated constraints with their largest residuals, the largest first, for messages."""
     worst: dict[str, float] = {}
     for (name, _), bad, value in zip(system.rows, violated, np.abs(np.asarray(residual)), strict=False):
         if bad:

@@ -63,12 +63,12 @@ def levenberg_marquardt(
     """Minimise an objective from its linearised residuals; trials that fail are rejected.
 
     A step s minimises `|r + J s|² + μ |D s|²`, with D the norms of the columns of J (Marquardt), subject to `c + C s =
-    0` for gaps c. With gaps the merit function is `f + ν |c|₁`, and a rejected step is halved first. The damping μ
-    follows the gain, the ratio of the actual decrease to the decrease of the linear model.
+    0` for gaps c. With gaps the merit function is `f + ν |c|₁`; a rejected step is then halved, down to 1/32, before μ
+    grows. The damping μ follows the gain, the ratio of the actual to the predicted decrease. With gaps an accepted full
+    step divides μ by ten.
 
-    A decrease of less than `tol` times the objective is below the varying errors of the motions, so that the objective
-    cannot judge it. If the model promises no more, steps are taken without a test, as long as each is less than a tenth
-    of the previous step.
+    Integration errors, which vary from trial to trial, hide any decrease below `tol` times the objective. If the model
+    predicts no more, small μ and closed gaps let steps pass without a gain, each at most a tenth of the last.
 
     Source: H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, Technical University of Denmark.
 

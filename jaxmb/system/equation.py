@@ -271,7 +271,7 @@ class AbstractEquation(eqx.Module):
     def friction_reactions(
         self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]
     ) -> Float[Array, "frictions d"]:
-        """The reaction forces [N] of the joints or contacts with dry friction, without the friction."""
+        """For each row of dry friction a vector [N] as long as its normal force is large."""
         del t, q, multipliers
         return jnp.zeros((0, 0), u.dtype)
 

@@ -69,7 +69,7 @@ def with_inputs(system: System, inputs: Signals) -> System:
 
 
 def input_break_times(system: AbstractSystem, t0: Scalar, t1: Scalar) -> np.ndarray:
-    """Times [s] of jumps of inputs, and of jumps of their rates if the rates count.
+    """Times [s] at which inputs jump, and at which rates of inputs jump that constraints depend on.
 
     **Raises:** `ValueError` naming an input that does not cover the times from `t0` to `t1`.
     """

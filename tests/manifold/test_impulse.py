@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.linalg.recent import Recent
-from jaxmb.manifold.impulse import find_jumps
+from jaxmb.manifold.impulse import after_jumps, find_jumps
 from jaxmb.simulate import outcome
 
 
@@ -77,6 +77,13 @@ def test_derivatives_over_a_jump(arm):
     before = (oracle(BEFORE + h, AFTER) - oracle(BEFORE - h, AFTER)) / (2 * h)
     after = (oracle(BEFORE, AFTER + h) - oracle(BEFORE, AFTER - h)) / (2 * h)
     np.testing.assert_allclose(forward, [before, after], rtol=0, atol=1e-6)
+
+
+def test_times_at_jumps_move_beyond_them_with_derivative_one():
+    jumps, times = jnp.array([0.5]), jnp.array([0.2, 0.5, 1.0])
+    shifted = lambda times: after_jumps(times, jumps, 0.0, 1.0)
+    np.testing.assert_array_equal(shifted(times), [0.2, np.nextafter(0.5, 1.0), np.nextafter(1.0, 0.0)])
+    np.testing.assert_array_equal(jax.jacrev(shifted)(times), np.eye(3))
 
 
 @pytest.mark.slow

@@ -72,7 +72,9 @@ def across(axis: Vector3, w: Vector3) -> Float[Array, "2"]:
 
 
 def half_sine(sine: Float[Array, "n"], cosine: Float[Array, ""]) -> Float[Array, "n"]:
-    """Twice the sine of half an angle [rad, for small angles], as a vector along the vector of its sine.
+    """The vector `2 sin(angle / 2)` [rad, for small angles] in the direction of `sine`.
+
+    Within 0.1 rad of half a turn its direction is arbitrary.
 
     A common factor of sine and cosine does not affect the result, which is zero if both are zero. The result vanishes
     with the angle, and there has the first and second derivatives of the sine. Half a turn away its length is two.

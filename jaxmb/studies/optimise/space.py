@@ -122,7 +122,7 @@ def space(
 
 
 def _scale(value: np.ndarray, low: np.ndarray, high: np.ndarray) -> Any:
-    """The distance of both bounds, or if one is missing the size of the start."""
+    """The distance between the bounds. If a bound is missing, the size of the start."""
     bounded = np.isfinite(low) & np.isfinite(high)
     return np.where(
         bounded, np.where(bounded, high, 1.0) - np.where(bounded, low, 0.0), typical_change(jnp.asarray(value))
