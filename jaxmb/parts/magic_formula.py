@@ -12,13 +12,12 @@ ed., Butterworth-Heinemann 2012, section 4.3.2, whose numbers of equations stand
 
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .tir import DEFAULTS
+from .tir import DEFAULTS, Version
 
-Version = Literal["5.2", "6.1"]
 Number = Any
 # The factor A_μ of the digressive friction (4.E8).
 _DIGRESSION = 10.0

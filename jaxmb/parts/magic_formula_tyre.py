@@ -88,7 +88,7 @@ class MagicFormulaTyre(AbstractTyre):
         version 6.1 by Q_FZ1, Q_FZ2, PFZ1 and Q_V2. Damping is VERTICAL_DAMPING.
     """
 
-    version: str = fields.choice("5.2", "6.1")
+    version: tyre_files.Version = fields.choice("5.2", "6.1")
     coefficients: fields.Numbers = fields.numbers()
     # −1 for a mirrored tyre; a number, so that the tyres of both sides are computed together.
     mirror: fields.Number = fields.parameter(unit="1", sign="nonzero")

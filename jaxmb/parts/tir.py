@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from ..linalg.arrays import is_traced
 
-_FORMATS = {"6": "5.2", "52": "5.2", "61": "6.1", "MF_05": "5.2", "MF_61": "6.1"}
+Version = Literal["5.2", "6.1"]
+_FORMATS: dict[str, Version] = {"6": "5.2", "52": "5.2", "61": "6.1", "MF_05": "5.2", "MF_61": "6.1"}
 _READ = "5.2 (FITTYP 6 or 52, or PROPERTY_FILE_FORMAT 'MF_05') and 6.1 (FITTYP 61, or 'MF_61')"
 
 # Keys that a file must have, of both versions and of each.
@@ -105,7 +106,7 @@ class TyreData(NamedTuple):
     measured, None if the file does not say, and the coefficients by name, in SI units.
     """
 
-    version: str
+    version: Version
     side: str | None
     coefficients: dict[str, Any]
 
@@ -162,7 +163,7 @@ def _value(text: str) -> Any:
         return text.strip("'\" ")
 
 
-def _version(entries: Mapping[str, Any], shown: str) -> str:
+def _version(entries: Mapping[str, Any], shown: str) -> Version:
     number, word = entries.get("FITTYP"), entries.get("PROPERTY_FILE_FORMAT")
     given = f"{number:g}" if isinstance(number, float | int) else number if number is not None else str(word).upper()
     if given not in _FORMATS:
