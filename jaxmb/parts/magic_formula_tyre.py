@@ -61,26 +61,27 @@ class MagicFormulaTyre(AbstractTyre):
     slippery = jaxmb.with_parameters(system, {"tyre.LMUX": 0.5, "tyre.LMUY": 0.5})
     ```
 
-    Forces and moments act at the contact's centre, where the wheel's middle plane, below its centre, meets the ground:
-    the load, forces forwards and to the left, the overturning couple about the direction forwards, rolling resistance
-    about that to the left, and the aligning moment about the normal (ISO axes). The slip κ is positive for driving, the
-    slip angle α for a wheel that moves to the left, and the inclination γ if its top leans to the right.
+    Forces and moments act at the contact's centre, where the wheel's middle plane meets the ground below its centre.
+    They are the load, forces forwards and to the left, the overturning couple and rolling resistance about these
+    directions, and the aligning moment about the normal (ISO axes). The slip κ is positive for driving. The slip angle
+    α is positive for a wheel that moves to the left, and the inclination γ if its top leans to the right; so PKY1 is
+    negative. Angles enter as such, without sines and tangents for large angles.
 
-    The tread deflects in each direction as `ḋ = −v_s − (V/σ) d`, as that of `Tyre`; v_s is the velocity of the wheel's
-    point at the effective rolling radius below the centre. The slips `κ = d/σ_κ` and `α = −arctan(d/σ_α)` enter the
-    Magic Formula. The relaxation lengths σ depend on the load: by PTX and PTY in version 5.2, and as the ratio of slip
-    stiffness to the stiffness of the carcass in 6.1. They are at least a tenth of the radius.
+    The tread deflects in each direction as in `Tyre`, `ḋ = −v_s − (V/σ) d`. The slip velocity v_s belongs to the
+    wheel's point at the effective rolling radius below the centre. The slips `κ = d/σ_κ` and `α = −arctan(d/σ_α)` enter
+    the Magic Formula. The relaxation lengths σ depend on the load: in version 5.2 by PTX and PTY, in 6.1 as slip
+    stiffness over the stiffness of the carcass. They are at least a tenth of the radius.
 
     Slips, inclination, load and pressure are clipped at the limits of the file (KPUMIN, ALPMIN, CAMMIN, FZMIN, PRESMIN,
     …). Below FZMIN, and below a thousandth of FNOMIN, forces and moments are proportional to the load. Near standstill
     the offsets of forces at zero slip, the pneumatic trail and rolling resistance vanish. Turn slip is not modelled.
 
-    The coefficients are parameters, `"tyre.PDY1"`.
+    The coefficients, and all scaling factors, are parameters, `"tyre.PDY1"`; `"tyre.mirror"` is −1 for a mirrored tyre.
 
     **Arguments:**
 
     - `tir`: the path of a file, or a mapping of its keys in SI units. `ValueError` for other versions and units, for
-        missing keys, and for unknown ones; scaling factors may be missing.
+        missing keys, for unknown ones, and for effects that are not modelled; scaling factors may be missing.
     - `side`: `"left"` or `"right"`, where the tyre is mounted; it is mirrored if TYRESIDE is the other side. Default as
         in the file.
     - `pressure` [Pa] > 0 of inflation, version 6.1; default INFLPRES, or else NOMPRES.
@@ -114,7 +115,7 @@ class MagicFormulaTyre(AbstractTyre):
         deflection: VectorLike = 0.0,
     ):
         label = f"MagicFormulaTyre {name!r}"
-        data = tyre_files.read(label, tir)
+        data = tyre_files.read(label, tir, for_load=normal is None)
         if side is not None and data.side is None:
             raise ValueError(f"{label}: side needs TYRESIDE = 'LEFT' or 'RIGHT' in tir.")
         if side not in (None, "left", "right"):
@@ -131,11 +132,18 @@ class MagicFormulaTyre(AbstractTyre):
         self.deflection = deflection
 
     def validate(self):
-        for signed, keys in (("positive", _POSITIVE), ("nonzero", _NONZERO)):
-            for key in keys:
-                value = self.coefficients.get(key, 1.0)
-                if not is_traced(value) and not (value > 0 if signed == "positive" else value != 0):
-                    raise ValueError(f"{self.label}: {key} must be {signed}, got {float(value):g}.")
+        # Of numbers that are not traced; operations on JAX arrays would compile here.
+        c = {key: float(value) for key, value in self.coefficients.items() if not is_traced(value)}
+        for key in (*_POSITIVE, *_NONZERO):
+            value = c.get(key, 1.0)
+            if value == 0 or (value < 0 and key in _POSITIVE):
+                raise ValueError(
+                    f"{self.label}: {key} must be {'positive' if key in _POSITIVE else 'nonzero'}, got {value:g}."
+                )
+        if "Q_FZ1" not in self.coefficients and c.keys() >= {"VERTICAL_STIFFNESS", "UNLOADED_RADIUS", "FNOMIN"}:
+            stiffness = c["VERTICAL_STIFFNESS"] * c["UNLOADED_RADIUS"] / c["FNOMIN"]
+            if stiffness**2 <= 4 * c.get("Q_FZ2", 0.0):
+                raise ValueError(f"{self.label}: Q_FZ2 is too large for VERTICAL_STIFFNESS; give Q_FZ1 as well.")
 
     @property
     def radius(self):  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -1,6 +1,6 @@
 """Tyre property files (`.tir`) of the Magic Formula, versions 5.2 and 6.1: their keys, and a reader."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -63,12 +63,14 @@ def _defaults(version: str) -> dict[str, float]:
 # The terms of the other version vanish.
 _NEUTRAL = {"PKY4": 2.0, "PKY5": 0.0, "PKY6": 0.0, "PKY7": 0.0, "PHY3": 0.0, "NOMPRES": 1.0, "Q_FZ1": None}
 DEFAULTS: dict[str, Any] = _NEUTRAL | _defaults("5.2") | _defaults("6.1")
-# Effects that are not modelled: zero turns them off.
-_EFFECTS = {
-    "the load that depends on the horizontal forces": "Q_FCX Q_FCY",
-    "the load that depends on the inclination": "Q_FZ3 Q_CAM Q_FCG",
-    "the gyroscopic couple of the belt": "QTZ1",
-    "the round section of a motorcycle tyre": "MC_CONTOUR_A MC_CONTOUR_B",
+# Keys of effects that are not modelled, which zero leaves out: of the load, and all.
+_OF_LOAD = {
+    **dict.fromkeys(("Q_FCX", "Q_FCY"), "the load that depends on the horizontal forces"),
+    **dict.fromkeys(("Q_FZ3", "Q_CAM", "Q_FCG"), "the load that depends on the inclination"),
+}
+_EFFECTS = _OF_LOAD | {
+    "QTZ1": "the gyroscopic couple of the belt",
+    **dict.fromkeys(("MC_CONTOUR_A", "MC_CONTOUR_B"), "the round section of a motorcycle tyre"),
 }
 # Of rigid ring models, obstacles, turn slip and the rim, without effect on steady forces and relaxation.
 _OTHERS = """
@@ -111,8 +113,10 @@ class TyreData(NamedTuple):
     coefficients: dict[str, Any]
 
 
-def read(label: str, tir: Any) -> TyreData:
-    """The data of a file, or of a mapping of the same keys.
+def read(label: str, tir: Any, *, for_load: bool = True) -> TyreData:
+    """The data of a file, or of a mapping of the same keys. All scaling factors of the version are among them.
+
+    **Arguments:** `for_load`: whether the load depends on them.
 
     **Raises:** `ValueError` for other formats, unknown units, and missing or unknown keys.
     """
@@ -131,10 +135,11 @@ def read(label: str, tir: Any) -> TyreData:
         _unit(entries, kind, shown)
     others = {*_OTHERS.split(), *_WORDS}
     numbers = {key: value for key, value in entries.items() if key not in others}
-    _check(numbers, version, shown)
+    _check(numbers, version, shown, _EFFECTS if for_load else _EFFECTS.keys() - _OF_LOAD.keys())
     scale = {key: _product(units, powers) for key, powers in _DIMENSIONS.items()}
-    kept = {key: value for key, value in numbers.items() if not _effect(key)}
-    return TyreData(version, side, {key: scale.get(key, 1.0) * value for key, value in kept.items()})
+    kept = {key: scale.get(key, 1.0) * value for key, value in numbers.items() if key not in _EFFECTS}
+    factors = {key: 1.0 for key in _of(version, _ONES, _ONES_BY) if key.startswith("L")}
+    return TyreData(version, side, factors | kept)
 
 
 def _entries(text: str, shown: str) -> dict[str, Any]:
@@ -189,11 +194,7 @@ def _product(units: list[float], powers: tuple[int, ...]) -> float:
     return length * force * time
 
 
-def _effect(key: str) -> str | None:
-    return next((effect for effect, keys in _EFFECTS.items() if key in keys.split()), None)
-
-
-def _check(numbers: Mapping[str, Any], version: str, shown: str) -> None:
+def _check(numbers: Mapping[str, Any], version: str, shown: str, zero: Collection[str]) -> None:
     required = _of(version, _REQUIRED, _REQUIRED_BY)
     missing = [key for key in required if key not in numbers]
     if missing:
@@ -201,10 +202,10 @@ def _check(numbers: Mapping[str, Any], version: str, shown: str) -> None:
     for key, value in numbers.items():
         if isinstance(value, str):
             raise ValueError(f"{shown}: {key} must be a number, got {value!r}.")
-        effect = _effect(key)
-        if effect is not None and (is_traced(value) or value != 0):
-            raise ValueError(f"{shown}: {key}: {effect} is not modelled; set {key} = 0 to leave it out.")
-    known = {*required, *_defaults(version), *_OPTIONAL[version].split()}
-    unknown = [key for key in numbers if key not in known and not _effect(key)]
+        if key in zero and (is_traced(value) or value != 0):
+            cure = f"set {key} = 0 to leave it out" + (", or give normal" if key in _OF_LOAD else "")
+            raise ValueError(f"{shown}: {key}: {_EFFECTS[key]} is not modelled; {cure}.")
+    known = {*_EFFECTS, *required, *_defaults(version), *_OPTIONAL[version].split()}
+    unknown = [key for key in numbers if key not in known]
     if unknown:
         raise ValueError(f"{shown}: unknown for version {version}: {', '.join(unknown)}; remove them.")

@@ -296,3 +296,11 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path):
     wheel = spatial.Body("wheel", mass=1.0, inertia=(1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match=r"FNOMIN must be positive, got 0"):
         mb.Scene([wheel], forces=[tyre(written(tmp_path, "6.1", ("FNOMIN = 4000", "FNOMIN = 0")))]).compile()
+    with pytest.raises(ValueError, match=r"Q_FZ2 is too large for VERTICAL_STIFFNESS; give Q_FZ1"):
+        mb.Scene([wheel], forces=[tyre(written(tmp_path, "6.1", ("Q_FZ2 = 14.0", "Q_FZ2 = 99.0")))]).compile()
+
+
+def test_effects_on_the_load_do_not_matter_for_a_law_of_the_user(tmp_path):
+    path = written(tmp_path, "6.1", ("Q_FCX = 0", "Q_FCX = 0.1"))
+    own = tyre(path, normal=mb.contact.Linear(2e5))
+    assert "Q_FCX" not in own.coefficients and own.coefficients["LYKA"] == 1.0
