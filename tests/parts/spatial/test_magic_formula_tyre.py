@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_quickly
-from every_part import METHOD
 from oracles import magic_formula as oracle
 
 import jaxmb as mb
@@ -185,32 +184,26 @@ def turning(version):
 
 @pytest.mark.slow
 @VERSIONS
-def test_derivatives_along_a_motion(version):
+def test_derivatives_of_forces_and_rates(version):
     """By scaling factors, coefficients, the pressure and the radius: forward, reverse, and differences."""
     system = turning(version)
     names = ["LMUY", "LMUX", "PKY1", "QDZ1", "UNLOADED_RADIUS", "VERTICAL_STIFFNESS", "QSY1"]
     names = [f"tyre.{name}" for name in (*names, *(["pressure"] if version == "6.1" else ["PTY1"]))]
     base = jnp.stack([mb.parameters(system)[name] for name in names])
+    q, u, z = system.guess.q, system.guess.u, jnp.array([0.01, -0.02])
 
-    rng = np.random.default_rng(0)
-    direction, weights = rng.uniform(0.5, 1.5, len(names)), jnp.asarray(rng.uniform(0.5, 1.5, 11))
+    def outputs(scale):
+        own = mb.with_parameters(system, dict(zip(names, base * scale, strict=True))).with_states(z)
+        return jnp.concatenate([own.force(0.0, q, u), own.state_rates(0.0, q, u)])
 
-    def seen(share, rtol):
-        own = mb.with_parameters(system, dict(zip(names, base * (1 + share * direction), strict=True)))
-        motion = mb.simulate(own, mb.assemble(own, throw=False), t1=0.1, rtol=rtol, throw=False, **METHOD)
-        wheel = motion["wheel"]
-        values = wheel.position, wheel.velocity, wheel.angular_velocity, motion["tyre"].deflection
-        return jnp.concatenate([value[-1] for value in values])
-
-    function = lambda share: seen(share, 1e-8)
-    forward = jit_quickly(lambda x: jax.jvp(function, (x,), (jnp.ones_like(x),))[1])(jnp.array(0.0))
-    reverse = jit_quickly(jax.grad(lambda x: weights @ function(x)))(jnp.array(0.0))
-    np.testing.assert_allclose(weights @ forward, reverse, rtol=1e-8)
-    h = 1e-4
-    values = jit_quickly(jax.vmap(lambda x: seen(x, 1e-11)))(jnp.array([h, -h]))
-    np.testing.assert_allclose(
-        (values[0] - values[1]) / (2 * h), forward, rtol=2e-5, atol=2e-5 * np.max(np.abs(forward))
-    )
+    one, h = jnp.ones(len(names)), 1e-5
+    forward, reverse = jit_quickly(lambda x: (jax.jacfwd(outputs)(x), jax.jacrev(outputs)(x)))(one)
+    moved = jnp.concatenate([one + h * jnp.eye(len(names)), one - h * jnp.eye(len(names))])
+    values = np.array(jit_quickly(jax.vmap(outputs))(moved))
+    differences = (values[: len(names)] - values[len(names) :]).T / (2 * h)
+    size = np.max(np.abs(forward), axis=1, keepdims=True)
+    np.testing.assert_allclose(forward / size, reverse / size, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(differences / size, forward / size, rtol=0, atol=1e-6)
 
 
 def force_at(system, states):
