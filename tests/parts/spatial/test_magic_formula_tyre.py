@@ -198,7 +198,7 @@ def test_derivatives_of_forces_and_rates(version):
 
     one, h = jnp.ones(len(names)), 1e-5
     forward, reverse = jit_quickly(lambda x: (jax.jacfwd(outputs)(x), jax.jacrev(outputs)(x)))(one)
-    moved = jnp.concatenate([one + h * jnp.eye(len(names)), one - h * jnp.eye(len(names))])
+    moved = jnp.concatenate([1.0 + h * jnp.eye(len(names)), 1.0 - h * jnp.eye(len(names))])
     values = np.array(jit_quickly(jax.vmap(outputs))(moved))
     differences = (values[: len(names)] - values[len(names) :]).T / (2 * h)
     size = np.max(np.abs(forward), axis=1, keepdims=True)
