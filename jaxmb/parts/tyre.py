@@ -4,7 +4,7 @@ Source: H. B. Pacejka, "Tyre and Vehicle Dynamics", 3rd ed., Butterworth-Heinema
 transient models).
 """
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,130 @@ from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step
 from .terrain import AbstractTerrain, distance, outward, pace_over
 
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
-class Tyre(AbstractDynamicForce, AbstractPotentialForce):
+
+class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
+    """A compliant wheel on terrain: its circle, the contact, and the deflection of its tread.
+
+    **Arguments:**
+
+    - `name`, of the tyre; `body`: the wheel, or a frame fixed in it.
+    - `centre` [m], default the origin of the frame.
+    - `axis`, unit, shape (3,), in space: the axle fixed in the body, pointing to the left of a wheel that rolls
+        forwards, default the y axis. The wheel must not lie flat.
+    - `terrain`, from `jaxmb.terrain`; `smoothing` [m] > 0 of the depth, `½ (δ + √(δ² + smoothing²))`.
+    - `damping_depth` [m] > 0: damping against the rate of the depth is full from there on.
+    - `transition_speed` [m/s] > 0: rolling speeds below it are regularised.
+    - `deflection` [m], (d − 1,), an internal state: the deflection of the tread in the contact relative to the rim,
+        forwards and, in space, to the left; initially zero. Off the ground it follows the slip as well, without a
+        force.
+    """
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    centre: fields.Number = fields.point(body=0, default="origin")
+    axis: fields.Number = fields.axis(body=0, optional=True, dimension=3)
+    terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
+    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.1)
+    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
+    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
+    deflection: fields.Number = fields.internal_state(shape=None, unit="m")
+    # Of the unloaded circle [m].
+    radius: AbstractVar[fields.Number]
+    # [N s/m]
+    damping: AbstractVar[fields.Number]
+    # Numbers of one direction along the ground or of all.
+    of_directions: ClassVar[tuple[str, ...]] = ("deflection",)
+    moving: ClassVar[tuple[str, ...]] = ("terrain",)
+    has_gaps: ClassVar[bool] = True
+
+    def complete(self, space, poses):
+        count = space.dimension - 1
+        for name in self.of_directions:
+            shape = np.shape(getattr(self, name))
+            if shape not in ((), (count,)):
+                raise ValueError(f"{self.label}: {name} must have shape () or ({count},), got {shape}.")
+        place = np.zeros(count, np.asarray(self.radius).dtype)
+        check_returns(self.label, "terrain.height", (), self.terrain.height, place)
+        part = self if space.dimension == 2 else self.filled(axis=np.eye(3)[1])
+        return part.with_fields(deflection=fields.as_parameter(np.broadcast_to(self.deflection, (count,))))
+
+    def may_vary(self, keys):
+        return keys[0] not in ("radius", "centre", "axis")
+
+    def gaps(self, space, poses, t):
+        return self._gap(space, poses[0])[None]
+
+    @property
+    def gap_width(self):
+        return self.smoothing
+
+    def gap_pace(self, space, poses, velocities, t):
+        centre = space.point(poses[0], self.centre)
+        passing = pace_over(self.terrain, centre, space.point_velocity(poses[0], velocities[0], self.centre))
+        return jnp.maximum(super().gap_pace(space, poses, velocities, t), passing)
+
+    def shapes(self, space, size):
+        # In the plane the axle points to the viewer.
+        axle = np.eye(3)[2] if space.dimension == 2 else self.axis
+        tyre = wheel(self.radius, axis=axle, position=space.in_space(self.centre))
+        return (None, Ground(height=self.terrain.height)), *((0, shape) for shape in tyre)
+
+    def _upwards(self, space, pose, normal_W):
+        """World unit vector from the point of the rim that is lowest over the ground to the wheel's centre."""
+        if space.dimension == 2:
+            return normal_W
+        axle = space.direction(pose, self.axis)
+        up = cross(axle, cross(normal_W, axle))
+        return up / norm(up)
+
+    def _directions(self, space, pose, normal_W):
+        """Unit vectors along the ground: forwards and, in space, to the left; world axes."""
+        if space.dimension == 2:
+            return jnp.stack([normal_W[1], -normal_W[0]])[None]
+        forwards = cross(space.direction(pose, self.axis), normal_W)
+        forwards = forwards / norm(forwards)
+        return jnp.stack([forwards, cross(normal_W, forwards)])
+
+    def _gap(self, space, pose):
+        centre = space.point(pose, self.centre)
+        rim = centre - self.radius * self._upwards(space, pose, outward(self.terrain, centre))
+        return distance(self.terrain, rim)
+
+    def _depth(self, space, pose, growth: Any = 0.0):
+        """The depth [m] in the ground of the circle, with a growth [m] of its radius."""
+        return ramp(growth - self._gap(space, pose), self.smoothing)
+
+    def _velocity(self, space, pose, velocity, point):
+        """The velocity of a point fixed in the body over the ground."""
+        return over_ground(self, space.point(pose, self.centre), space.point_velocity(pose, velocity, point))
+
+    def _contact(self, space, pose, velocity, reach):
+        """The ground's normal, the directions along the ground, the point [m] in the body's frame at a distance below
+        the centre, the slip velocities [m/s] of this point, and the velocity of the centre forwards.
+        """
+        centre = space.point(pose, self.centre)
+        normal = outward(self.terrain, centre)
+        point = space.body_point(pose, centre - reach * self._upwards(space, pose, normal))
+        along = self._directions(space, pose, normal)
+        slip = along @ self._velocity(space, pose, velocity, point)
+        return normal, along, point, slip, jnp.dot(along[0], self._velocity(space, pose, velocity, self.centre))
+
+    def _speed(self, rolling):
+        """The rolling speed [m/s], regularised."""
+        return jnp.sqrt(rolling**2 + self.transition_speed**2)
+
+    def _damping_force(self, space, pose, velocity, normal, depth):
+        """Force [N] along the normal against the rate of the depth."""
+        approach = jnp.dot(self._velocity(space, pose, velocity, self.centre), normal)
+        return -self.damping * step(depth / self.damping_depth) * approach
+
+
+class Tyre(AbstractTyre):
     """A tyre on a thin wheel, with relaxation, and with slip lengthwise and in space sideways.
 
     ```python
@@ -39,132 +161,40 @@ class Tyre(AbstractDynamicForce, AbstractPotentialForce):
 
     **Arguments:**
 
-    - `name`, of the tyre; `body`: the wheel, or a frame fixed in it.
-    - `radius` [m] > 0; `centre` [m], default the origin of the frame.
-    - `axis`, unit, shape (3,), in space: the axle fixed in the body, pointing to the left of a wheel that rolls
-        forwards, default the y axis. The wheel must not lie flat.
-    - `terrain`, from `jaxmb.terrain`; `normal`: the load [N] as a function of the depth, from `jaxmb.contact`;
-        `damping` [N s/m] ≥ 0 against the rate of the depth, full from `damping_depth` [m] > 0 on; `smoothing` [m] > 0
-        of the depth, `½ (δ + √(δ² + smoothing²))`.
+    - `radius` [m] > 0 of the circle.
+    - `normal`: the load [N] as a function of the depth, from `jaxmb.contact`; `damping` [N s/m] ≥ 0 against the rate of
+        the depth.
     - `slip_stiffness` c > 0, of one direction or of all, (d − 1,): force over load and slip, for small slips;
         `coefficient` μ > 0 of friction.
-    - `relaxation_length` σ [m] > 0, of one direction or of all; `transition_speed` [m/s] > 0: rolling speeds below it
-        are regularised.
-    - `deflection` [m], (d − 1,), an internal state: the deflection of the tread in the contact relative to the rim,
-        forwards and, in space, to the left; initially zero. Off the ground it follows the slip as well, without a
-        force.
+    - `relaxation_length` σ [m] > 0, of one direction or of all.
     """
 
-    name: str = fields.name()
-    body: str = fields.body_name()
     radius: fields.Number = fields.length(sign="positive")
-    centre: fields.Number = fields.point(body=0, default="origin")
-    axis: fields.Number = fields.axis(body=0, optional=True, dimension=3)
-    terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
     normal: AbstractNormalLaw = fields.law(AbstractNormalLaw, what="a law from jaxmb.contact")
     coefficient: fields.Number = fields.parameter(unit="1", sign="positive")
     slip_stiffness: fields.Number = fields.parameter(shape=None, unit="1", sign="positive")
     relaxation_length: fields.Number = fields.parameter(shape=None, unit="m", sign="positive")
-    transition_speed: fields.Number = fields.parameter(unit="m/s", sign="positive", default=0.1)
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
-    damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
-    smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
-    deflection: fields.Number = fields.internal_state(shape=None, unit="m")
-    moving: ClassVar[tuple[str, ...]] = ("terrain",)
-    has_gaps: ClassVar[bool] = True
-
-    def complete(self, space, poses):
-        count = space.dimension - 1
-        for name in ("slip_stiffness", "relaxation_length", "deflection"):
-            shape = np.shape(getattr(self, name))
-            if shape not in ((), (count,)):
-                raise ValueError(f"{self.label}: {name} must have shape () or ({count},), got {shape}.")
-        place = np.zeros(count, np.asarray(self.radius).dtype)
-        check_returns(self.label, "terrain.height", (), self.terrain.height, place)
-        part = self if space.dimension == 2 else self.filled(axis=np.eye(3)[1])
-        return part.with_fields(deflection=fields.as_parameter(np.broadcast_to(self.deflection, (count,))))
-
-    def may_vary(self, keys):
-        return keys[0] not in ("radius", "centre", "axis")
+    of_directions: ClassVar[tuple[str, ...]] = ("slip_stiffness", "relaxation_length", "deflection")
 
     def wrenches(self, space, poses, velocities, t):
         pose, velocity = poses[0], velocities[0]
         depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose))(pose)
         load = self.normal.force(depth)
         wrench = space.pull_back(pose, -load * gradient)
-        normal, point, along, *_ = self._contact(space, pose, velocity)
-        engaged = step(depth / self.damping_depth)
-        approach = jnp.dot(self._velocity(space, pose, velocity, self.centre), normal)
+        normal, along, point, *_ = self._contact(space, pose, velocity, self.radius)
         sliding = self.slip_stiffness * self.deflection / (self.relaxation_length * self.coefficient)
         # The law of dry friction, with the deflection in the place of slip.
         friction = dry_friction(self.coefficient * load, -sliding, 1.0)
-        force = friction @ along - self.damping * engaged * approach * normal
+        force = friction @ along + self._damping_force(space, pose, velocity, normal, depth) * normal
         return (wrench + space.point_force(pose, point, force))[None]
 
     def energy(self, space, poses, t):
         return self.normal.energy(self._depth(space, poses[0]))
 
-    def gaps(self, space, poses, t):
-        return self._gap(space, poses[0])[None]
-
-    @property
-    def gap_width(self):
-        return self.smoothing
-
-    def gap_pace(self, space, poses, velocities, t):
-        centre = space.point(poses[0], self.centre)
-        passing = pace_over(self.terrain, centre, space.point_velocity(poses[0], velocities[0], self.centre))
-        return jnp.maximum(super().gap_pace(space, poses, velocities, t), passing)
-
     def state_rates(self, space, poses, velocities, t):
-        *_, slip, speed = self._contact(space, poses[0], velocities[0])
-        return {"deflection": -slip - speed / self.relaxation_length * self.deflection}
+        *_, slip, rolling = self._contact(space, poses[0], velocities[0], self.radius)
+        return {"deflection": -slip - self._speed(rolling) / self.relaxation_length * self.deflection}
 
     def state_sizes(self):
         return {"deflection": 0.1 * jnp.max(self.relaxation_length)}
-
-    def shapes(self, space, size):
-        # In the plane the axle points to the viewer.
-        axle = np.eye(3)[2] if space.dimension == 2 else self.axis
-        tyre = wheel(self.radius, axis=axle, position=space.in_space(self.centre))
-        return (None, Ground(height=self.terrain.height)), *((0, shape) for shape in tyre)
-
-    def _lowest(self, space, pose, normal_W):
-        """World vector [m] from the wheel's centre to the point of its rim that is lowest over the ground."""
-        if space.dimension == 2:
-            return -self.radius * normal_W
-        axle = space.direction(pose, self.axis)
-        up = cross(axle, cross(normal_W, axle))
-        return -self.radius * up / norm(up)
-
-    def _directions(self, space, pose, normal_W):
-        """Unit vectors along the ground: forwards and, in space, to the left; world axes."""
-        if space.dimension == 2:
-            return jnp.stack([normal_W[1], -normal_W[0]])[None]
-        forwards = cross(space.direction(pose, self.axis), normal_W)
-        forwards = forwards / norm(forwards)
-        return jnp.stack([forwards, cross(normal_W, forwards)])
-
-    def _gap(self, space, pose):
-        centre = space.point(pose, self.centre)
-        rim = centre + self._lowest(space, pose, outward(self.terrain, centre))
-        return distance(self.terrain, rim)
-
-    def _depth(self, space, pose):
-        return ramp(-self._gap(space, pose), self.smoothing)
-
-    def _velocity(self, space, pose, velocity, point):
-        """The velocity of a point fixed in the body over the ground."""
-        return over_ground(self, space.point(pose, self.centre), space.point_velocity(pose, velocity, point))
-
-    def _contact(self, space, pose, velocity):
-        """The ground's normal, the wheel's lowest point in the body's frame, the directions along the ground, the slip
-        velocities along them, and the regularised rolling speed.
-        """
-        centre = space.point(pose, self.centre)
-        normal = outward(self.terrain, centre)
-        point = space.body_point(pose, centre + self._lowest(space, pose, normal))
-        along = self._directions(space, pose, normal)
-        slip = along @ self._velocity(space, pose, velocity, point)
-        rolling = jnp.dot(along[0], self._velocity(space, pose, velocity, self.centre))
-        return normal, point, along, slip, jnp.sqrt(rolling**2 + self.transition_speed**2)

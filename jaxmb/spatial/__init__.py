@@ -53,5 +53,6 @@ from ..parts.friction import Friction as Friction
 ## Ground and contact
 from ..parts.contact import Contact as Contact
 from ..parts.tyre import Tyre as Tyre
+from ..parts.magic_formula_tyre import MagicFormulaTyre as MagicFormulaTyre
 
 _tell_of_moved(__name__, TorsionalSpringDamper="jaxmb.JointSpring on the angle of a joint")

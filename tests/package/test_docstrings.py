@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from every_part import TYRE_FILE
 from exports import exported
 
 import jaxmb as mb
@@ -94,6 +95,10 @@ speeds = mb.cases.grid(speed=np.linspace(0.0, 5.0, 3))
 mb.sweep(lambda speed: {"angle": 2.0 * speed}, speeds, "runs.zarr", progress=False)
 """,
 }
+BEFORE["spatial.MagicFormulaTyre"] = f"""
+import shutil
+shutil.copy({str(TYRE_FILE)!r}, "tyre.tir")
+"""
 BOUNCE = """
 ball = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(0.0, 0.5))
 floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)

@@ -181,6 +181,7 @@ SPATIAL_FORCES = named(
     "Cylinder",
     "Contact",
     "Tyre",
+    "MagicFormulaTyre",
 )
 # Examples, and how they are integrated.
 GROUPS = {"planar joints": (named("planar", "Revolute", "Fixed", "PointOnLine", "Prismatic", "Distance"), FIXED)}

@@ -1,6 +1,7 @@
 """Every part in a small scene of its own, where gravity and a spring move it, and every method of integration."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -10,7 +11,7 @@ import numpy as np
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.manifold.default import Unconstrained
-from jaxmb.parts import AbstractForce, AbstractNonIdeal, contact, terrain
+from jaxmb.parts import AbstractForce, AbstractNonIdeal, contact, terrain, tir
 
 
 @dataclasses.dataclass
@@ -115,6 +116,25 @@ TYRE_2D = {
     "relaxation_length": 0.2,
     "damping": 5.0,
     "smoothing": 0.02,
+}
+# The example of a tyre on the scale of these bodies, with wide limits.
+TYRE_FILE = Path(__file__).parent / "example_61.tir"
+TYRE_3D = tir.read("", TYRE_FILE).coefficients | {
+    "FITTYP": 61,
+    "TYRESIDE": "left",
+    "UNLOADED_RADIUS": 0.25,
+    "FNOMIN": 10.0,
+    "LONGVL": 2.0,
+    "VERTICAL_STIFFNESS": 500.0,
+    "VERTICAL_DAMPING": 5.0,
+    "LONGITUDINAL_STIFFNESS": 900.0,
+    "LATERAL_STIFFNESS": 500.0,
+    **dict.fromkeys(("CAMMIN", "ALPMIN"), -1.5),
+    **dict.fromkeys(("CAMMAX", "ALPMAX"), 1.5),
+    "KPUMIN": -9.0,
+    "KPUMAX": 9.0,
+    "FZMIN": 0.1,
+    "FZMAX": 1e3,
 }
 POINT_MASS_2D = planar.PointMass("PointMass", mass=1.2, position=(0.4, 0.2))
 BODY_2D = body_2d("Body", velocity=(1.0, 0.0))
@@ -488,6 +508,7 @@ SPATIAL = [
     of_ground_3d(spatial.Cylinder, "pressure", bore_area=2e-3, pressure=8e3, point_a=(0.1, 0.0, -0.6)),
     on_body_3d(spatial.Contact, "normal.stiffness", **GROUND_2D),
     on_body_3d(spatial.Tyre, "slip_stiffness", **TYRE_2D),
+    on_body_3d(spatial.MagicFormulaTyre, "LMUY", tir=TYRE_3D, terrain=TYRE_2D["terrain"], smoothing=0.02),
 ]
 
 SPACES = {"planar": PLANAR, "functions": FUNCTIONS, "spatial": [*SPATIAL, rubbing_3d()]}
