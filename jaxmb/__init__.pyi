@@ -90,6 +90,12 @@ from .studies.linear import (
 from .studies.inverse import required_forces as required_forces, RequiredForces as RequiredForces
 from .studies.loads import loads as loads, Loads as Loads
 
+## Suspensions
+from .studies.suspension import (
+    kinematics_and_compliance as kinematics_and_compliance,
+    KinematicsAndCompliance as KinematicsAndCompliance,
+)
+
 ## Sweeps
 from .studies.sweep import sweep as sweep, load_sweep as load_sweep
 

@@ -49,6 +49,7 @@ from .bricard import bricard as bricard
 from .bennett import bennett as bennett
 from .swash_plate import swash_plate as swash_plate
 from .double_wishbone import double_wishbone as double_wishbone
+from .five_link import five_link as five_link
 from .flyball import flyball as flyball
 from .rolling_disc import rolling_disc as rolling_disc
 

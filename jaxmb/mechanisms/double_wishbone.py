@@ -4,18 +4,16 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from .. import spatial
 from .._types import VectorLike
 from ..bodies.scene import Scene
 from ..parts.forces import Gravity
-from ..parts.functions import Force
-from ..parts.names import unknown
 from ..states.assembly import assemble
+from ._suspension import observer, placed, spring, wheel_inertia
+from ._suspension import tyre as tyre_of
 from .mechanism import Mechanism, References, build, mechanism
-from .observe import body_axis
 
 _POINTS = {
     "lower_front": (0.14, 0.36, 0.24),
@@ -51,8 +49,9 @@ def double_wishbone(
     forward, y to the left, z up.
 
     Ball joints connect the upright and its wheel with both arms; hinges, or bushings at their ends, connect the arms
-    with the car; the massless tie rod ends at a fixed rack. With hinges there is one degree of freedom, with bushings
-    there are eleven. Spring, tyre and bushings are free of force at the start.
+    with the car; the massless tie rod ends at a fixed rack, whose place is the parameter `tie_rod.point_a`. With hinges
+    there is one degree of freedom, with bushings there are eleven. Spring, tyre and bushings are free of force at the
+    start.
 
     Source: data of this package. The reference values, for hinges, come from a model in the lower arm's angle.
 
@@ -72,25 +71,21 @@ def double_wishbone(
         raise ValueError(
             "Ideal joints have no bushings: leave out bushing and bushing_damping, or give joints='bushings'."
         )
-    for name in points or {}:
-        if name not in _POINTS:
-            raise unknown("point", name, _POINTS)
-    P = {name: np.asarray(value, float) for name, value in {**_POINTS, **(points or {})}.items()}
+    P = placed(_POINTS, points)
     bodies = [
         _arm("lower", masses[0], P),
         _arm("upper", masses[1], P),
-        spatial.Body("upright", mass=masses[2], inertia=_wheel(masses[2]), position=P["wheel"]),
+        spatial.Body("upright", mass=masses[2], inertia=wheel_inertia(masses[2]), position=P["wheel"]),
     ]
     balls: list[Any] = [spatial.Spherical(f"{arm}_ball", arm, "upright", point=P[f"{arm}_ball"]) for arm in _ARMS]
     outer = P["steering_arm"] - P["wheel"]
     links = [*balls, spatial.Distance("tie_rod", "ground", "upright", point_a=P["rack"], point_b=outer)]
     hinges = [_hinge(arm, P) for arm in _ARMS]
-    bottom = P["spring_bottom"] - np.asarray(bodies[0].position)
-    spring = spatial.SpringDamper(
-        "spring", "ground", "lower", stiffness=stiffness, damping=damping, point_a=P["spring_top"], point_b=bottom
-    )
-    contact = Force("tyre", "upright", _push, parameters={"stiffness": tyre, "z": P["wheel"][2]}, potential=_pushed)
-    forces = [spring, contact, Gravity((0.0, 0.0, -gravity))]
+    forces = [
+        spring(bodies[0], P, stiffness, damping),
+        tyre_of("upright", tyre, P["wheel"][2]),
+        Gravity((0.0, 0.0, -gravity)),
+    ]
     rates = {"upright.z": speed}
     if joints == "bushings":
         rigid = Scene(bodies, joints=[*hinges, *links]).compile()
@@ -108,7 +103,7 @@ def double_wishbone(
         "double_wishbone",
         Scene(bodies, joints=[*hinges, *links] if joints == "ideal" else links, forces=forces),
         t1=0.2,
-        observe=lambda trajectory: _observe(trajectory, P["wheel"]),
+        observe=observer("upright", P["wheel"]),
         description="Double wishbone suspension of a wheel, on hinges or bushings, jouncing on its tyre.",
         references=References.load("double_wishbone"),
         rates=rates,
@@ -121,31 +116,7 @@ def _arm(name, mass, P):
     return spatial.Body(name, mass=mass, inertia=spatial.box(mass, 0.3, 0.3, 0.03), position=place)
 
 
-def _wheel(mass):
-    return spatial.cylinder(mass, 0.3, 0.2, "y")
-
-
 def _hinge(arm, P):
     front, rear = P[f"{arm}_front"], P[f"{arm}_rear"]
     along = front - rear
     return spatial.Revolute(f"{arm}_hinge", "ground", arm, point=front, axis=along / np.linalg.norm(along))
-
-
-def _push(poses, velocities, t, p):
-    return jnp.zeros((1, 6)).at[0, 2].set(p["stiffness"] * (p["z"] - poses[0, 2]))
-
-
-def _pushed(poses, t, p):
-    return 0.5 * p["stiffness"] * (p["z"] - poses[0, 2]) ** 2
-
-
-def _observe(trajectory, wheel):
-    upright = trajectory["upright"]
-    axle = body_axis(trajectory, "upright", (0.0, 1.0, 0.0))
-    return {
-        "z": upright.position[:, 2] - wheel[2],
-        "y": upright.position[:, 1] - wheel[1],
-        "camber": -jnp.arcsin(axle[:, 2]),
-        "toe": jnp.arctan2(axle[:, 0], axle[:, 1]),
-        "rate": upright.velocity[:, 2],
-    }

@@ -252,7 +252,7 @@ def _along(systems, parts, number, ts, ys, solved):
     """
     (system, machine), (parts, drives, acting) = systems, parts
     space = system.layout.space
-    centre = space.in_space(_mass_centre(system, number))
+    centre = space.in_space(mass_centre(system, number))
 
     def single(t, y, udot, multipliers, given):
         sought = {drive.where: x for drive, x in zip(drives, given, strict=True) if drive.of == "parameter"}
@@ -347,7 +347,7 @@ def _in_body_axes(space, pose, wrench) -> tuple[Array, Array]:
     return force, jnp.pad(wrench[d:], (3 - wrench[d:].size, 0))
 
 
-def _mass_centre(system, number: int) -> Array:
+def mass_centre(system, number: int) -> Array:
     """The mass centre in the body's frame."""
     for group in system.bodies.groups:
         places = np.flatnonzero(group.group.body_index[:, 0] == number)

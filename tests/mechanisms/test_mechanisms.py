@@ -20,7 +20,7 @@ from jaxmb import mechanisms
 RTOL = 1e-10
 
 # By a method that is compiled sooner than the default.
-LINKAGES = ("swash_plate", "bennett", "double_wishbone")
+LINKAGES = ("swash_plate", "bennett", "double_wishbone", "five_link")
 QUICKLY = {"rtol": 1e-11, "solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection()}
 
 
@@ -403,6 +403,7 @@ def test_a_wobbling_disc_ends_where_an_independent_model_does():
     "bennett",
     "swash_plate",
     "double_wishbone",
+    "five_link",
     "flyball",
     "spherical_four_bar",
 )
@@ -436,6 +437,7 @@ def test_names_are_checked():
         ("double_wishbone", {"joints": "rubber"}, "ideal, bushings"),
         ("double_wishbone", {"bushing": (1e6, 0.0)}, "no bushings"),
         ("double_wishbone", {"points": {"weel": (0.0, 0.0, 0.0)}}, "wheel"),
+        ("five_link", {"points": {"tie_rod": (0.0, 0.0, 0.0)}}, "tie_rod_inner"),
         ("bennett", {"lengths": (1.0, 0.5)}, "leave no other twist"),
     ],
 )

@@ -12,6 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from . import suspensions
+
 X, Y, Z = np.eye(3)
 _TINY = 1e-30
 
@@ -238,3 +240,52 @@ def double_wishbone(times, *, masses=(4.0, 3.0, 30.0), stiffness=4e4, damping=1.
         x, y, z = R[2][:, 1]
         out.append([*(r[2] - wheel)[[2, 1]], -np.arcsin(z), np.arctan2(x, y), rise(q) * rate])
     return np.array(out)
+
+
+def five_link(times, *, masses=(16.0, 18.0), stiffness=4e4, damping=1.5e3, tyre=2e5, speed=2.0, g=9.81):
+    """Carrier and wheel of a left wheel on five rods, by the height of the wheel's centre: x forward, y to the left.
+
+    The wheel spins freely and does not at the start, so its moment of momentum about the axle stays zero: its moment of
+    inertia there counts as zero. Positions between nodes follow from polynomials in the height.
+
+    **Returns:** travel of the wheel's centre up and outward, camber, toe, and rate of travel, shape (times, 5).
+    """
+    points, span = suspensions.arrays(suspensions.FIVE_LINK), 0.05
+    nodes = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
+    at_nodes = [suspensions.five_link(points, span * x) for x in nodes]
+    values = [np.concatenate([r, _rodrigues(R)]) for r, R, _ in at_nodes]
+    fitted = np.polynomial.chebyshev.chebfit(nodes, np.array(values), 24)
+
+    def position(q):
+        x = np.polynomial.chebyshev.chebval(q / span, fitted)
+        return x[:3], suspensions.cayley(x[3:])
+
+    def poses(q):
+        r, R = position(q)
+        return np.stack([r, r]), np.stack([R, R])
+
+    def length(q):
+        r, R = position(q)
+        arm = r + R @ (points["spring_bottom"] - points["wheel"]) - points["spring_top"]
+        return np.sqrt(arm @ arm)
+
+    free = np.sqrt(np.sum((points["spring_bottom"] - points["spring_top"]) ** 2))
+    stored = lambda q: stiffness * (length(q) - free) ** 2 / 2 + tyre * q**2 / 2
+    a, b, c = 0.2, 0.1, 0.4
+    box = masses[0] / 12 * np.diag([b**2 + c**2, a**2 + c**2, a**2 + b**2])
+    across = masses[1] * (0.3**2 / 4 + 0.2**2 / 12)
+    inertias = np.array([box, np.diag([across, 0.0, across])])
+    linkage = Linkage(np.array(masses), inertias, poses, -g * Z, stored)
+    resistance = lambda q: damping * (length(q + 1j * _TINY).imag / _TINY) ** 2
+    out = []
+    for q, rate in linkage.swung(times, 0.0, speed, damping=resistance, span=(-0.045, 0.045)):
+        r, R = position(q)
+        x, y, z = R[:, 1]
+        out.append([q, r[1] - points["wheel"][1], -np.arcsin(z), np.arctan2(x, y), rate])
+    return np.array(out)
+
+
+def _rodrigues(R):
+    """tan(angle/2) along the axis of a rotation."""
+    skew = (R - R.T) / (1 + np.trace(R))
+    return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
