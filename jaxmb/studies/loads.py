@@ -154,9 +154,11 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
 
     A load acts at the point of its part on the body, or of the joint on whose coordinate its part acts; without such a
     point, as in a contact, at the mass centre. With `required_forces`, the needed forces of actuators are loads by
-    their names in `by`; of a parameter, `"engine.torque"`, the load has the name of the part. The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Shares of redundant
-    joints depend on the rows that were dropped, and `undetermined` names these joints. The loads are differentiable, so
-    that a design can bound them.
+    their names in `by`; of a parameter, `"engine.torque"`, the load has the name of the part.
+
+    The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Shares of
+    redundant joints depend on the rows that were dropped, and `undetermined` names these joints. The loads are
+    differentiable, so that a design can bound them.
 
     **Arguments:** the `motion` of bodies, from `simulate` or `required_forces`; the name of the `body`.
 

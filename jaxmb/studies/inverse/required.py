@@ -34,9 +34,9 @@ class RequiredForces(eqx.Module):
     ```
 
     **Fields:** `ts` [s], shape (times,); `forces` by the names of the actuators, shape (times,), or (times, components)
-    of a vector [N, of an angle N m]; `power` [W] by the same names, shape (times,): the power that each actuator puts
-    into the machine; `ys`, the states of the motion; `accelerations` u̇; `multipliers` of the rows of `system`, the
-    `machine` without its named drives and forces.
+    of a vector [N, of an angle N m, of a parameter in its unit]; `power` [W] by the same names, shape (times,): the
+    power that each actuator puts into the machine; `ys`, the states of the motion; `accelerations` u̇; `multipliers` of
+    the rows of `system`, the `machine` without its named drives and forces.
     """
 
     ts: Float[Array, "times"]
@@ -72,7 +72,7 @@ class RequiredForces(eqx.Module):
             return super().__repr__()
         largest = {name: np.max(np.abs(force), initial=0.0) for name, force in self.forces.items()}
         sizes = ", ".join(f"{name} {size:.4g}" for name, size in largest.items())
-        return f"RequiredForces at {self.ts.size} times; largest [N, N m]: {sizes}"
+        return f"RequiredForces at {self.ts.size} times; largest, in SI units: {sizes}"
 
 
 @names_arguments
