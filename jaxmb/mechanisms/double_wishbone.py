@@ -11,8 +11,7 @@ from .._types import VectorLike
 from ..bodies.scene import Scene
 from ..parts.forces import Gravity
 from ..states.assembly import assemble
-from ._suspension import observer, placed, spring, wheel_inertia
-from ._suspension import tyre as tyre_of
+from ._suspension import observer, placed, spring, tyre as tyre_of, wheel_inertia
 from .mechanism import Mechanism, References, build, mechanism
 
 _POINTS = {

@@ -6,8 +6,7 @@ from .. import spatial
 from .._types import VectorLike
 from ..bodies.scene import Scene
 from ..parts.forces import Gravity
-from ._suspension import observer, placed, spring, wheel_inertia
-from ._suspension import tyre as tyre_of
+from ._suspension import observer, placed, spring, tyre as tyre_of, wheel_inertia
 from .mechanism import Mechanism, References, build, mechanism
 
 _LINKS = ("lower_front", "lower_rear", "upper_front", "upper_rear", "tie_rod")
@@ -58,7 +57,9 @@ def five_link(
     front inward; `rate` [m/s], ż.
     """
     P = placed(_POINTS, points)
-    carrier = spatial.Body("carrier", mass=masses[0], inertia=spatial.box(masses[0], 0.2, 0.1, 0.4), position=P["wheel"])
+    carrier = spatial.Body(
+        "carrier", mass=masses[0], inertia=spatial.box(masses[0], 0.2, 0.1, 0.4), position=P["wheel"]
+    )
     wheel = spatial.Body("wheel", mass=masses[1], inertia=wheel_inertia(masses[1]), position=P["wheel"])
     rods = [
         spatial.Distance(name, "ground", "carrier", point_a=P[f"{name}_inner"], point_b=P[f"{name}_outer"] - P["wheel"])

@@ -23,7 +23,7 @@ from ...system.quantities import component_names, directions
 from ..loads import mass_centre
 from .positions import Inputs, Position, Rig, Steering, as_inputs, as_vector, solved
 from .result import KinematicsAndCompliance
-from .wheel import Spring, Wheel
+from .wheel import Spring, SteeringAxis, Wheel
 
 _NAME = "kinematics_and_compliance"
 _LOADS = ("longitudinal_force", "lateral_force", "aligning_moment")
@@ -114,14 +114,18 @@ def kinematics_and_compliance(
 
 
 class _Curves(NamedTuple):
-    """Values on the grid, shape (travels, steers, …); derivatives by travel, steer and loads on the last axis."""
+    """Values on the grid, shape (travels, steers, …).
+
+    **Fields:** `at`: the positions without derivatives; `patch` and its displacement from the guess (`moved`); `rates`:
+    derivatives of what is seen by travel, steer and loads, on the last axis; `steers`: the largest by steer.
+    """
 
     at: Position
     q: Array
     toe: Array
     camber: Array
     patch: Array
-    lengths: Array
+    moved: Array
     rates: Any
     steering_axis: Any
     steers: Array
@@ -165,20 +169,20 @@ def _position(rig: Rig, springs: tuple[Spring, ...], inputs: Inputs) -> _Curves:
         turning = rates.pose[:, 1] - rates.pose[:, 0] * of_spring[1] / of_spring[0]
         axis = rig.wheel.steering_axis(rig.system, q, turning)
     steers = jnp.max(jnp.abs(rates.pose[:, 1]))
-    return _Curves(at, q, values.toe, values.camber, values.patch, values.lengths, rates, axis, steers)
+    moved = values.patch - rig.wheel.attitude(rig.system, rig.guess).patch
+    return _Curves(at, q, values.toe, values.camber, values.patch, moved, rates, axis, steers)
 
 
 def _result(curves: _Curves, rig: Rig, springs: tuple[str, ...], travel, steers) -> KinematicsAndCompliance:
     wheel, rates = rig.wheel, curves.rates
     side = wheel.side
-    moved = curves.patch - wheel.attitude(rig.system, rig.guess).patch
     along = lambda k: {
         "toe": rates.toe[..., k],
         "camber": rates.camber[..., k],
         "track": side * rates.patch[..., 1, k],
         "wheelbase": rates.patch[..., 0, k],
     }
-    axis = (None,) * 4 if curves.steering_axis is None else curves.steering_axis
+    axis = SteeringAxis(None, None, None, None) if curves.steering_axis is None else curves.steering_axis
     return KinematicsAndCompliance(
         travel,
         steers,
@@ -186,11 +190,14 @@ def _result(curves: _Curves, rig: Rig, springs: tuple[str, ...], travel, steers)
         curves.camber,
         rates.toe[..., 0],
         rates.camber[..., 0],
-        side * moved[..., 1],
-        moved[..., 0],
+        side * curves.moved[..., 1],
+        curves.moved[..., 0],
         curves.patch[..., 1] * rates.patch[..., 1, 0] / rates.patch[..., 2, 0],
         {name: -rates.lengths[..., k, 0] for k, name in enumerate(springs)},
-        *axis,
+        axis.caster,
+        axis.kingpin_inclination,
+        axis.scrub_radius,
+        axis.caster_trail,
         {name: along(2 + k) for k, name in enumerate(_LOADS)},
         curves.q,
         rig.freedoms,
@@ -256,12 +263,15 @@ def _wheel(system, guess, carrier, side, radius, centre, axis) -> Wheel:
         raise ValueError(f"{_NAME}: side is 'left' or 'right', got {side!r}.")
     number, dtype = system.body_names.index(carrier), guess.dtype
     if not system.layout.rotates[number]:
-        raise ValueError(f"{_NAME}: the carrier {carrier!r} is a point mass, which has no attitude; give it an inertia.")
+        raise ValueError(
+            f"{_NAME}: the carrier {carrier!r} is a point mass, which has no attitude; give it an inertia."
+        )
     radius = jnp.asarray(real_array(f"{_NAME}: radius", radius, dtype))
     if not is_traced(radius) and not radius > 0:
         raise ValueError(f"{_NAME}: radius must be positive, got {float(radius):g} m.")
     centre, axis = (
-        jnp.asarray(real_array(f"{_NAME}: {name}", x, dtype, ((3,),))) for name, x in (("centre", centre), ("axis", axis))
+        jnp.asarray(real_array(f"{_NAME}: {name}", x, dtype, ((3,),)))
+        for name, x in (("centre", centre), ("axis", axis))
     )
     size = jnp.linalg.norm(axis)
     if not is_traced(size) and not size > 0:
@@ -270,7 +280,9 @@ def _wheel(system, guess, carrier, side, radius, centre, axis) -> Wheel:
     pose, space = wheel.pose(system, guess), system.layout.space
     lateral, axle = space.point(pose, wheel.centre)[1], space.direction(pose, wheel.axle)
     if not is_traced(axle) and np.hypot(*axle[:2]) < _HORIZONTAL:
-        raise ValueError(f"{_NAME}: the spin axis of the wheel on {carrier!r} is parallel to the travel; give its axis.")
+        raise ValueError(
+            f"{_NAME}: the spin axis of the wheel on {carrier!r} is parallel to the travel; give its axis."
+        )
     if side is None and not is_traced(lateral) and lateral == 0:
         raise ValueError(f"{_NAME}: the wheel's centre is in the plane y = 0; give side='left' or 'right'.")
     sign = jnp.where(lateral < 0, -1.0, 1.0) if side is None else jnp.asarray(_SIDES[side])
@@ -334,7 +346,9 @@ def _checked(curves: _Curves, rig: Rig, given, throw) -> _Curves:
             raise ValueError(_refusal(curves, rig, given))
         if rig.steering is not None and np.max(curves.steers) < _STEERS:
             name = rig.system.body_names[rig.wheel.number]
-            raise ValueError(f"{_NAME}: {rig.steering.name!r} does not move {name!r}; steer by a number of its tie rod.")
+            raise ValueError(
+                f"{_NAME}: {rig.steering.name!r} does not move {name!r}; steer by a number of its tie rod."
+            )
         return curves
     return jax.vmap(jax.vmap(lambda curves: nan_where(~curves.at.ok, curves)))(curves)
 
@@ -351,7 +365,9 @@ def _refusal(curves: _Curves, rig: Rig, given) -> str:
         known = directions(rig.system.rate_names())
         order = np.argsort(-np.abs(free))
         names = ", ".join(known[int(k)] for k in order[:4] if abs(free[k]) > _SHARE * abs(free[order[0]]))
-        cure = "Hold it by a joint or a spring" if rig.steering else "Steer it with steer, or hold it by a joint or spring"
+        cure = (
+            "Hold it by a joint or a spring" if rig.steering else "Steer it with steer, or hold it by a joint or spring"
+        )
         return f"{lead} no force resists a displacement of {names}. {cure}."
     system = rig.steered(Inputs(jnp.asarray(travels[i]), jnp.asarray(steers[j]), jnp.asarray(load)))
     violated = violated_joints(system, rig.t, q, 1e-6)

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -29,8 +28,8 @@ from ...system.instant import Instant
 from ...system.parameters import parameters
 from .wheel import Wheel
 
-# The number of steps from the guess to a position; the largest number of corrections in each. Corrections have a largest
-# size in units of the system's size and radians, a size from which they are not shortened, and a least share.
+# The number of steps from the guess to a position, and the largest number of corrections in each. Corrections have a
+# largest size in units of the system's size and radians, a size from which they are not shortened, and a least share.
 _STEPS, _CORRECTIONS, _LONGEST, _SMALL, _LEAST = 6, 40, 0.5, 1e-6, 1e-9
 # Singular values and stiffnesses below this part of the largest are rounding errors.
 _NEGLIGIBLE, _UNRESISTED = 1e-12, 1e-10
@@ -146,11 +145,12 @@ class Rig(eqx.Module):
         """
         at = at.shifted(self, x)
         rows = self.rows(inputs, at.q)
-        if not self.freedoms:
+        unit = self.stiffness
+        if unit is None:
             return rows
         system, rest = self.steered(inputs), jnp.zeros(self.system.nu, at.q.dtype)
         rank, length = self.system.velocity_rank, lax.stop_gradient(self.system.length)
-        multipliers = at.multipliers * self.stiffness / length
+        multipliers = at.multipliers * unit / length
         of_rows = multipliers[:rank]
         if self.chosen is not None:
             of_rows = jnp.zeros(self.system.position_rows, rest.dtype).at[self.chosen].set(of_rows)
@@ -160,7 +160,7 @@ class Rig(eqx.Module):
         if self.prescribed == 2:
             _, pull = jax.vjp(lambda step: self._steering(self.moved(at.q, step)), rest)
             force += pull(multipliers[-1])[0]
-        return jnp.concatenate([force / self.stiffness, rows])
+        return jnp.concatenate([force / unit, rows])
 
 
 class Position(NamedTuple):
@@ -217,7 +217,7 @@ def _corrected(rig: Rig, inputs: Inputs, at: Position) -> tuple[Position, Float[
         good = (residual < search.residual) | ((search.longest < _SMALL) & jnp.isfinite(residual))
         step = -(_inverse(matrix) @ value if rig.freedoms else solve(matrix, value))
         longest = jnp.max(jnp.abs(step[: rig.system.nu]))
-        limited = jnp.minimum(1.0, _LONGEST / jnp.where(longest > 0, longest, 1.0))
+        limited = jnp.where(longest > _LONGEST, _LONGEST / longest, 1.0)
         # After a whole step below the root of eps the error is of the order of eps.
         done = good & (search.longest <= close) & (search.share == 1.0) & (search.k > 0)
         fresh = _Search(trial, residual, matrix, limited * step, limited, limited * longest, done, search.k + 1)
@@ -229,7 +229,9 @@ def _corrected(rig: Rig, inputs: Inputs, at: Position) -> tuple[Position, Float[
     def proceed(search):
         return ~search.done & (search.k < _CORRECTIONS) & (search.share > _LEAST)
 
-    start = _Search(at, none + jnp.inf, jnp.eye(n, dtype=dtype), still, none + 1.0, none, jnp.array(False), jnp.array(0))
+    start = _Search(
+        at, none + jnp.inf, jnp.eye(n, dtype=dtype), still, none + 1.0, none, jnp.array(False), jnp.array(0)
+    )
     search = lax.while_loop(proceed, advance, start)
     unmet = jnp.max(jnp.abs(rig.constraints(inputs, search.at.q)), initial=0.0) / rig.system.length
     return search.at._replace(ok=search.done & (unmet <= tolerance(dtype))), search.matrix
@@ -282,7 +284,7 @@ class Solved(NamedTuple):
 def solved(rig: Rig, inputs: Inputs) -> Solved:
     """The position for travel, steering and load."""
     at, matrix = approached(rig, inputs)
-    still, w = jnp.zeros(matrix.shape[0], at.q.dtype), as_vector(inputs)
+    still = jnp.zeros(matrix.shape[0], matrix.dtype)
     equations = lambda x, w: rig.balance(at, as_inputs(w), x)
     if rig.freedoms:
         # Freedoms that neither rows nor forces bind do not move.
@@ -291,9 +293,12 @@ def solved(rig: Rig, inputs: Inputs) -> Solved:
         equations = lambda x, w: inverse @ rig.balance(at, as_inputs(w), x) + loose @ x
     # Without a position, equations with a solution replace these, so that derivatives stay finite.
     closed = lambda x, w: jnp.where(at.ok, equations(x, w), x)
-    x = root(lambda x: closed(x, w), still, lambda _, x: x)
-    by_all = jax.jacfwd(lambda both: closed(both[: x.size], both[x.size :]))(jnp.concatenate([x, w]))
-    return Solved(at, x, -solve(by_all[:, : x.size], by_all[:, x.size :]))
+    # JAX 0.10 derives a vectorised root only if its start depends on all that is vectorised.
+    w = as_vector(inputs)
+    start = jnp.where(at.ok & jnp.all(jnp.isfinite(w)), still, -still)
+    x = root(lambda x: closed(x, w), start, lambda _, x: x)
+    by_x, by_inputs = jax.jacfwd(closed, (0, 1))(x, w)
+    return Solved(at, x, -solve(by_x, by_inputs))
 
 
 def as_vector(inputs: Inputs) -> Float[Array, "5"]:

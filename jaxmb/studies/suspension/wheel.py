@@ -92,12 +92,14 @@ class Attitude(NamedTuple):
 
 
 class SteeringAxis(NamedTuple):
-    """The `caster` and `kingpin_inclination` [rad] of a steering axis, its `scrub_radius` and `caster_trail` [m]."""
+    """The `caster` and `kingpin_inclination` [rad] of a steering axis, its `scrub_radius` and `caster_trail` [m]; None
+    without an axis.
+    """
 
-    caster: Float[Array, ""]
-    kingpin_inclination: Float[Array, ""]
-    scrub_radius: Float[Array, ""]
-    caster_trail: Float[Array, ""]
+    caster: Float[Array, ""] | None
+    kingpin_inclination: Float[Array, ""] | None
+    scrub_radius: Float[Array, ""] | None
+    caster_trail: Float[Array, ""] | None
 
 
 class Spring(NamedTuple):
