@@ -26,6 +26,8 @@ from ..trajectory import Trajectory
 from .inverse.drives import Drive, drives_of
 from .inverse.required import RequiredForces
 
+# Forces that differ by this part of them are equal.
+_ROUNDING = 1e-9
 _COLUMNS = ("time", "part", *(f"{what}_{axis}" for what in ("point", "force", "moment") for axis in "xyz"))
 
 
@@ -120,7 +122,8 @@ class Loads(Printed, eqx.Module):
         sizes, turns = np.asarray(norm(self.forces)), np.asarray(norm(self.moments))
         lines = [("load", "kind", "largest force [N]", "at t [s]", "largest moment [N m]")]
         for k, (name, kind) in enumerate(zip(self.names, self.kinds, strict=True)):
-            worst = int(np.argmax(sizes[:, k]))
+            # The first of several, up to rounding.
+            worst = int(np.argmax(sizes[:, k] >= (1 - _ROUNDING) * np.max(sizes[:, k])))
             numbers = f"{sizes[worst, k]:.5g}", f"{float(self.ts[worst]):.5g}", f"{np.max(turns[:, k]):.5g}"
             lines.append((name, kind, *numbers))
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
