@@ -2,6 +2,7 @@
 
 import importlib
 import warnings
+from types import UnionType
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from .linalg.arrays import as_array, is_traced
 
 
-def check_kind(name: str, value: Any, kind: type, expected: str, cure: str) -> None:
+def check_kind(name: str, value: Any, kind: type | UnionType, expected: str, cure: str) -> None:
     """Raise a `ValueError` unless an argument is an instance of a class."""
     if isinstance(value, kind):
         return

@@ -17,10 +17,17 @@ from ..linalg.arrays import add_up, is_traced
 from ..linalg.jitted import jitted
 from ..linalg.rotations import cross, norm
 from ..parts.base import AbstractForce
+from ..parts.coordinate_parts import AbstractCoordinatePart
 from ..parts.names import unknown
 from ..parts.unilateral import AbstractUnilateralConstraint
+from ..system import with_parameters
+from ..system.instant import Instant
 from ..trajectory import Trajectory
+from .inverse.drives import Drive, drives_of
+from .inverse.required import RequiredForces
 
+# Forces that differ by this part of them are equal.
+_ROUNDING = 1e-9
 _COLUMNS = ("time", "part", *(f"{what}_{axis}" for what in ("point", "force", "moment") for axis in "xyz"))
 
 
@@ -115,7 +122,8 @@ class Loads(Printed, eqx.Module):
         sizes, turns = np.asarray(norm(self.forces)), np.asarray(norm(self.moments))
         lines = [("load", "kind", "largest force [N]", "at t [s]", "largest moment [N m]")]
         for k, (name, kind) in enumerate(zip(self.names, self.kinds, strict=True)):
-            worst = int(np.argmax(sizes[:, k]))
+            # The first of several, up to rounding.
+            worst = int(np.argmax(sizes[:, k] >= (1 - _ROUNDING) * np.max(sizes[:, k])))
             numbers = f"{sizes[worst, k]:.5g}", f"{float(self.ts[worst]):.5g}", f"{np.max(turns[:, k]):.5g}"
             lines.append((name, kind, *numbers))
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
@@ -138,7 +146,7 @@ class _Entry(NamedTuple):
     place: int
 
 
-def loads(trajectory: Trajectory, body: str) -> Loads:
+def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     """All forces on a body along a motion: of joints, contacts and friction, applied forces, gravity and inertia.
 
     ```python
@@ -147,45 +155,51 @@ def loads(trajectory: Trajectory, body: str) -> Loads:
     on_bar["pin"].force, on_bar["inertia"].force, on_bar.balance
     ```
 
-    A load acts at the point of its part on the body; without such a point, as in a contact, at the mass centre. The
-    load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Shares of redundant
-    joints depend on the rows that were dropped, and `undetermined` names these joints. The loads are differentiable, so
-    that a design can bound them.
+    A load acts at the point of its part on the body, or of the joint on whose coordinate its part acts; without such a
+    point, as in a contact, at the mass centre. With `required_forces`, the needed forces of actuators are loads by
+    their names in `by`; of a parameter, `"engine.torque"`, the load has the name of the part.
 
-    **Arguments:** the `trajectory` of bodies; the name of the `body`.
+    The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Shares of
+    redundant joints depend on the rows that were dropped, and `undetermined` names these joints. The loads are
+    differentiable, so that a design can bound them.
+
+    **Arguments:** the `motion` of bodies, from `simulate` or `required_forces`; the name of the `body`.
 
     **Returns:** `Loads`, in body axes.
 
     **Raises:** `ValueError` for an unknown body, for a system without bodies and for a batch, whose members `jax.vmap`
     takes.
     """
-    check_kind("loads: trajectory", trajectory, Trajectory, "a Trajectory", "jaxmb.simulate returns one")
-    system = trajectory.system
+    kinds_of_motion, cure = "a Trajectory or RequiredForces", "jaxmb.simulate and jaxmb.required_forces return one"
+    check_kind("loads: motion", motion, Trajectory | RequiredForces, kinds_of_motion, cure)
+    system = motion.system
     if body not in system.body_names:
         raise unknown("body", body, system.body_names, "loads")
-    if trajectory.ts.ndim != 1:
+    if motion.ts.ndim != 1:
         raise ValueError("loads takes a single motion; jax.vmap(lambda motion: …)(motions) takes each of a batch.")
-    motion, number = trajectory.trimmed(), system.body_names.index(body)
-    parts = _parts_on(system, number)
+    number, drives, machine = system.body_names.index(body), (), system
+    # Concrete classes: only inverse dynamics has actuators apart from the system.
+    if isinstance(motion, Trajectory):
+        motion, given = motion.trimmed(), ()
+    else:
+        machine, given = motion.machine, tuple(motion.forces.values())
+        drives = drives_of(machine, motion.forces)
+    parts, acting = _parts_on(system, number), _drives_on(machine, drives, number)
     points, forces, moments, centre = _along(
-        system,
-        tuple(map(tuple, parts.values())),
+        (system, machine),
+        (tuple(map(tuple, parts.values())), drives, acting),
         number,
         motion.ts,
         motion.ys,
-        motion.accelerations,
-        motion.multipliers,
+        (motion.accelerations, motion.multipliers, given),
     )
-    gravity = () if system.forces.gravity is None else (system.forces.gravity_name,)
-    kinds = (
-        *(_kind(system, name, entries[0]) for name, entries in parts.items()),
-        *("gravity" for _ in gravity),
-        "inertia",
-    )
+    own = {} if system.forces.gravity is None else {system.forces.gravity_name: "gravity"}
+    kinds = {name: _kind(system, name, entries[0]) for name, entries in parts.items()}
+    kinds |= {drives[k].name: "force" for k, *_ in acting} | own | {"inertia": "inertia"}
     shared = {name for row in system.implied for name in (row.name, *row.by)}
-    names = *parts, *gravity, "inertia"
     undetermined = tuple(name for name in parts if name in shared)
-    return Loads(body, names, kinds, undetermined, motion.ts, points, forces, moments, centre)
+    values = motion.ts, points, forces, moments, centre
+    return Loads(body, tuple(kinds), tuple(kinds.values()), undetermined, *values)
 
 
 def _sets(system) -> dict[str, tuple[Any, ...]]:
@@ -206,6 +220,24 @@ def _parts_on(system, number: int) -> dict[str, list[_Entry]]:
     return out
 
 
+def _drives_on(machine, drives, number: int) -> tuple[tuple[int, Any, int], ...]:
+    """The actuators besides parameters that act on a body: their numbers, the groups of their parts, or of the joints
+    on whose coordinates they act, and the numbers of the parts there.
+    """
+    out = []
+    for k, drive in enumerate(drives):
+        match drive.of:
+            case "velocity":
+                if np.isin(machine.layout.velocity_index[number], drive.where).any():
+                    out.append((k, None, 0))
+            case "joint" | "part":
+                at = drive.where
+                group = machine.measured[at.group] if drive.of == "joint" else at.group(machine)
+                if number in group.group.bodies[int(at.member)]:
+                    out.append((k, group, int(at.member)))
+    return tuple(out)
+
+
 def _kind(system, name: str, entry: _Entry) -> str:
     constraints, part = system.constraints, _sets(system)[entry.of][entry.number].group.part
     of_joints = (zip(group.group.names, group.joints, strict=True) for group in constraints.frictions)
@@ -218,16 +250,24 @@ def _kind(system, name: str, entry: _Entry) -> str:
 
 
 @jitted
-def _along(system, parts, number, ts, ys, accelerations, multipliers):
-    """Points, forces and moments in body axes along a motion, and the mass centre."""
+def _along(systems, parts, number, ts, ys, solved):
+    """Points, forces and moments in body axes along a motion, and the mass centre.
+
+    **Arguments:** `systems`: the system, and that of the actuators; `parts`: entries of parts by name, all actuators,
+    and those that act on the body; `solved`: accelerations, multipliers, and the forces of actuators.
+    """
+    (system, machine), (parts, drives, acting) = systems, parts
     space = system.layout.space
     centre = space.in_space(mass_centre(system, number))
 
-    def single(t, y, udot, multipliers):
-        here = system.at(y)
+    def single(t, y, udot, multipliers, given):
+        sought = {drive.where: x for drive, x in zip(drives, given, strict=True) if drive.of == "parameter"}
+        here = (with_parameters(system, sought) if sought else system).at(y)
         now = here.kinematics(t, y.q, y.u)
         wrenches = _wrenches(here, parts, now, multipliers)
+        wrenches += [_of_drive(machine, drives[k], number, Instant.of(here, t, y), given[k]) for k, *_ in acting]
         points = [_point(here, entries, now.t) for entries in parts]
+        points += [_point_of(group, member, number, now.t) for _, group, member in acting]
         own = _of_body(here, number, now, udot)
         turns = [_in_body_axes(space, now.poses[number], wrench) for wrench in (*wrenches, *own)]
         forces, moments = (jnp.stack(x) for x in zip(*turns, strict=True))
@@ -237,7 +277,26 @@ def _along(system, parts, number, ts, ys, accelerations, multipliers):
         points = jnp.stack([*(none if x is None else space.in_space(x) for x in points), *(none for _ in own)])
         return points + centre[None], forces, moments - jnp.cross(points, forces)
 
-    return *jax.vmap(single)(ts, ys, accelerations, multipliers), centre
+    return *jax.vmap(single)(ts, ys, *solved), centre
+
+
+def _of_drive(machine, drive: Drive, number: int, at: Instant, force) -> Array:
+    """The wrench of an actuator on the body: the components of its generalized force along the body's velocities."""
+    generalized = jnp.append(force.reshape(-1) @ drive.rows(machine, at), 0.0)
+    return generalized[machine.layout.velocity_index[number]]
+
+
+def _point_of(group, member: int, number: int, t) -> Array | None:
+    """The point of a part on a body, in the axes at its mass centre; None without one."""
+    return None if group is None else _anchor(group.group.single(member, t), group.group.bodies[member].index(number))
+
+
+def _anchor(part, place: int) -> Array | None:
+    """The point of a part, or of the joint on whose coordinate it acts, on a body."""
+    point = part.anchor(place)
+    if point is None and isinstance(part, AbstractCoordinatePart) and place in part.places[0]:
+        return part.joint.anchor(part.places[0].index(place))
+    return point
 
 
 def _wrenches(system, parts, now, multipliers) -> list[Array]:
@@ -271,7 +330,7 @@ def _point(system, entries, t) -> Array | None:
             joint = group.joints[member]
             holders = [(g, g.group.names.index(joint)) for g in sets["constraints"] if joint in g.group.names]
         for holder, k in holders:
-            point = holder.group.single(k, t).anchor(place)
+            point = _anchor(holder.group.single(k, t), place)
             if point is not None:
                 return point
     return None

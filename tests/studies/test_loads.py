@@ -11,7 +11,7 @@ from oracles import four_bar_forces
 from trajectories import motion_of
 
 import jaxmb as mb
-from jaxmb import mechanisms, planar
+from jaxmb import mechanisms, planar, spatial
 
 LENGTHS, BASE, MASSES, GRAVITY = (1.0, 3.0, 2.5), 2.5, (1.0, 3.0, 2.5), 9.81
 
@@ -115,6 +115,78 @@ def test_a_body_with_friction_a_stop_a_motor_and_its_frame_elsewhere():
     np.testing.assert_allclose(on_rod["wind"].moment, 0.0, atol=1e-13)
     np.testing.assert_allclose(on_rod["motor"].moment, [[0.0, 0.0, 1.5]], atol=1e-12)
     check_balance(motion)
+
+
+def lifted(space, *, driven=False):
+    """A boom with its frame at the pin, on a cylinder."""
+    of = (lambda v: v) if space is planar else (lambda v: (*v, 0.0))
+    if space is planar:
+        inertia, pinned = 6.0, {}
+    else:
+        inertia, pinned = (0.5, 6.0, 6.0), {"axis": (0.0, 0.0, 1.0)}
+    boom = space.Body("boom", mass=40.0, inertia=inertia, centre=of((0.9, 0.1)))
+    pin = space.Revolute("pin", "ground", "boom", point=of((0.0, 0.0)), **pinned)
+    lift = space.Cylinder("lift", "ground", "boom", bore_area=2e-3, point_a=of((0.2, -0.5)), point_b=of((0.6, -0.2)))
+    move = [mb.JointDriver("move", "lift.length", rate=0.4)] if driven else []
+    tip = space.PointForce("tip", "boom", force=of((3.0, -50.0)), point=of((2.0, 0.0)))
+    return mb.Scene([boom], joints=[pin, lift, *move], forces=[mb.Gravity(of((0.0, -9.81))), tip]).compile()
+
+
+@pytest.mark.parametrize(
+    "space, by",
+    [
+        (planar, "lift.pressure"),
+        *(pytest.param(planar, by, marks=pytest.mark.slow) for by in ("move", "lift.length", "boom.angle")),
+        *(pytest.param(spatial, by, marks=pytest.mark.slow) for by in ("move", "lift.length", "pin.angle")),
+    ],
+)
+def test_needed_forces_are_loads_as_forces_of_a_drive(space, by):
+    motion = through(lifted(space, driven=True))
+    expected, system = mb.loads(motion, "boom"), motion.system if by == "move" else lifted(space)
+    np.testing.assert_allclose(expected["move"].point[0, :2], [0.6, -0.2], atol=1e-14)
+    np.testing.assert_allclose(expected["move"].moment, 0.0, atol=1e-10)
+    needed = mb.required_forces(system, motion, by=[by])
+    found, load = mb.loads(needed, "boom"), by.removesuffix(".pressure")
+    assert found.kinds[found.names.index(load)] == "force"
+    for total in found.balance:
+        np.testing.assert_allclose(total, 0.0, atol=1e-9)
+    if by.endswith(".angle"):
+        np.testing.assert_allclose(found[load].force, 0.0, atol=1e-12)
+        np.testing.assert_allclose(found[load].moment[:, 2], needed[by], rtol=1e-12)
+        return
+    for name, other in ((load, "move"), ("pin", "pin"), ("tip", "tip"), ("inertia", "inertia")):
+        for a, b in zip(found[name], expected[other], strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_of_loads_under_needed_forces():
+    """Of a pin force along a prescribed motion, by a mass and by the place of the cylinder, alone and in a batch."""
+    system, ts = lifted(planar), np.linspace(0.0, 0.4, 5)
+    swing = {"pin.angle": lambda t: 0.3 + 0.2 * jnp.sin(4.0 * t)}
+
+    def pinned(x):
+        place = {"boom.mass": x[0], "lift.point_b": jnp.stack([x[1], -0.2 + 0.0 * x[1]])}
+        needed = mb.required_forces(mb.with_parameters(system, place), swing, by=["lift.pressure"], ts=ts)
+        return jnp.max(mb.rotations.norm(mb.loads(needed, "boom")["pin"].force))
+
+    x, along = jnp.array([40.0, 0.6]), jnp.array([3.0, 0.1])
+    reverse = jnp.vdot(jax.jit(jax.grad(pinned))(x), along)
+    _, forward = jax.jit(lambda v: jax.jvp(pinned, (x,), (v,)))(along)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+    steps = jnp.array([1e-3, -1e-3, 2e-3, -2e-3])
+    a, b, c, d = jax.vmap(lambda h: pinned(x + h * along))(steps)
+    np.testing.assert_allclose(forward, (8 * (a - b) - (c - d)) / 12e-3, rtol=1e-8)
+
+
+def test_quantities_of_a_needed_motion():
+    system = lifted(planar, driven=True)
+    motion = through(system)
+    needed = mb.required_forces(system, motion, by=["move"])
+    for name in ("lift.length", "boom.position", "boom.acceleration", "pin.force"):
+        np.testing.assert_allclose(needed.quantity(name), motion.quantity(name), rtol=1e-9)
+    with pytest.raises(ValueError, match=r"did you mean 'lift\.length'"):
+        needed.quantity("lift.lenght")
 
 
 LIBRARY = (

@@ -17,7 +17,7 @@ from ...states.arguments import check_system, checked_guess
 from ...states.consistency import listed
 from ...system import AbstractSystem
 from ...system.description import counted
-from ...system.quantities import Reaction
+from ...system.quantities import Reaction, Solved
 from ...trajectory import Trajectory
 from .balance import Drives, Found, balanced, searched
 from .course import Course, free_names, planned, recorded
@@ -30,12 +30,13 @@ class RequiredForces(eqx.Module):
     ```python
     needed = jaxmb.required_forces(system, motion, by=["pin.angle"])
     needed["pin.angle"], needed.power["pin.angle"], needed.reaction("pin").force
+    needed.quantity("bar.position"), jaxmb.loads(needed, "bar")
     ```
 
     **Fields:** `ts` [s], shape (times,); `forces` by the names of the actuators, shape (times,), or (times, components)
-    of a vector [N, of an angle N m]; `power` [W] by the same names, shape (times,): the power that each actuator puts
-    into the machine; `ys`, the states of the motion; `accelerations` u̇; `multipliers` of the rows of `system`, the
-    machine without its named drives and forces.
+    of a vector [N, of an angle N m, of a parameter in its unit]; `power` [W] by the same names, shape (times,): the
+    power that each actuator puts into the machine; `ys`, the states of the motion; `accelerations` u̇; `multipliers` of
+    the rows of `system`, the `machine` without its named drives and forces.
     """
 
     ts: Float[Array, "times"]
@@ -45,6 +46,7 @@ class RequiredForces(eqx.Module):
     accelerations: Float[Array, "times nu"]
     multipliers: Float[Array, "times rows"]
     system: Any
+    machine: Any
 
     def __getitem__(self, name: str) -> Array:
         if name not in self.forces:
@@ -58,12 +60,19 @@ class RequiredForces(eqx.Module):
             raise unknown("joint", name, names)
         return self.system.catalogue.reaction(name, self.ts, self.ys, self.multipliers)
 
+    def quantity(self, name: str) -> Array:
+        """A quantity of the motion by its name, as in `Trajectory.quantity`: `"pin.angle"`, `"bar.position"`."""
+        quantities = self.system.quantities()
+        if name not in quantities:
+            raise unknown("quantity", name, quantities)
+        return quantities[name].value(self.ts, self.ys, Solved(self.accelerations, self.multipliers))
+
     def __repr__(self) -> str:
         if is_traced((self.ts, self.forces)):
             return super().__repr__()
         largest = {name: np.max(np.abs(force), initial=0.0) for name, force in self.forces.items()}
         sizes = ", ".join(f"{name} {size:.4g}" for name, size in largest.items())
-        return f"RequiredForces at {self.ts.size} times; largest [N, N m]: {sizes}"
+        return f"RequiredForces at {self.ts.size} times; largest, in SI units: {sizes}"
 
 
 @names_arguments
@@ -133,7 +142,7 @@ def required_forces(
     of_each = lambda x: zip(drives, jnp.split(x, ends[:-1], axis=1), strict=True)
     forces = {drive.name: force.reshape(-1, *drive.shape) for drive, force in of_each(values)}
     power = {drive.name: jnp.sum(parts, axis=1) for drive, parts in of_each(powers)}
-    return RequiredForces(path.ts, forces, power, path.ys, path.accelerations, multipliers, rest)
+    return RequiredForces(path.ts, forces, power, path.ys, path.accelerations, multipliers, rest, system)
 
 
 def _start(system, guess) -> State:
