@@ -22,7 +22,7 @@ FAULTS = [
     ("parts/forces.py", "- 2 * self.free_length * norm(d)", "- self.free_length * norm(d)"),
     ("parts/contact.py", "* depth**2.5 / 2.5", "* depth**2.5 / 1.5"),
     ("parts/contact.py", "-load * gradient - resistance * normal", "-load * gradient + resistance * normal"),
-    ("parts/tyre.py", "-slip - speed / self.relaxation_length", "-slip + speed / self.relaxation_length"),
+    ("parts/tyre.py", "-slip - self._speed(rolling)", "-slip + self._speed(rolling)"),
     ("parts/spatial/rolling.py", "slip = slip - self.spin", "slip = slip + self.spin"),
     ("parts/terrain.py", ".set(-slope)", ".set(slope)"),
     ("parts/actuators.py", "* control + jnp.dot(self.bias, terms)", "* control - jnp.dot(self.bias, terms)"),
