@@ -13,7 +13,7 @@ from jaxmb.manifold import Partition
 
 def test_restored_velocities_and_accelerations_under_friction():
     pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
-    rub = planar.Friction("rub", "pin", coefficient=0.3, radius=0.1)
+    rub = planar.Friction("rub", "pin", coefficient=0.3, radius=0.1, transition_speed=0.2)
     bead = planar.PointMass("bead", mass=0.5, position=(0.6, -0.8))
     cord = planar.Distance("cord", "ground", "bead", length=1.0)
     system = mb.Scene([rod(), bead], joints=[cord, pin], forces=[rub, GRAVITY]).compile()
