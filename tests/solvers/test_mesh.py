@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from jaxmb._compat import WrapTerm
 from jaxmb.solvers import Adams, MeshAdjoint, MultistepController
+from jaxmb.solvers.adams_steps import _at_start
 
 
 def decay(rate, start, **options):
@@ -43,3 +45,10 @@ def test_the_time_of_an_event_has_its_derivative():
     time = lambda rate, start: decay(rate, start, event=event).ts[-1]
     found = jax.jit(jax.grad(time, (0, 1)))(RATE, START)
     np.testing.assert_allclose(found, [-np.log(START / 0.2) / RATE**2, 1 / (START * RATE)], rtol=1e-7)
+
+
+def test_the_first_row_has_the_field_at_the_start():
+    field = lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0]) + t])
+    solver, term, start = Adams(rtol=1e-6, atol=1e-6), WrapTerm(diffrax.ODETerm(field), 1), jnp.array([0.4, 1.2])
+    step = lambda: solver.step(term, 0.1, 0.2, start, None, solver.init(term, 0.1, 0.2, start, None), False)
+    np.testing.assert_allclose(_at_start(term, jax.jit(step)()[3])[0], field(0.1, start, None), rtol=1e-14)
