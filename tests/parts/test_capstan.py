@@ -254,7 +254,7 @@ def test_the_limits_of_friction(friction, same):
         system = atwood(**pulley)
         motion = mb.simulate(system, mb.assemble(system), t1=0.3, rtol=1e-10)
         found.append((motion["left"].position[-1], motion["wheel"].angle[-1], motion["rope"].tension[-1]))
-        assert len(motion.events) == 0
+        assert "friction" not in pulley or len(motion.events) == 0
     for a, b in zip(*found, strict=True):
         np.testing.assert_allclose(np.broadcast_to(a, np.shape(b)), b, rtol=1e-9, atol=1e-12)
 
@@ -300,15 +300,16 @@ def test_a_length_that_is_an_input():
 def test_loads_and_required_forces():
     """Loads on the wheel balance; a trajectory gives back its motor, and coordinates alone do not."""
     system = band_brake()
-    motion = mb.simulate(system, mb.assemble(system), t1=0.8, inputs=MOTOR, saveat=[0.2, 0.5, 0.8], rtol=1e-9)
+    motion = mb.simulate(system, mb.assemble(system), t1=0.8, inputs=MOTOR, saveat=[0.5, 0.65, 0.8], rtol=1e-9)
     on_wheel = mb.loads(motion, "wheel")
     assert dict(zip(on_wheel.names, on_wheel.kinds, strict=True))["rope"] == "joint"
     for total in on_wheel.balance:
         np.testing.assert_allclose(total, 0.0, atol=1e-9)
     taut = motion["rope"].tension
     np.testing.assert_allclose(on_wheel["rope"].moment[:, 2], R * (taut[:, 0] - taut[:, 1]), rtol=1e-9)
-    needed = mb.required_forces(system, motion, by=["motor"])
+    needed = mb.required_forces(system, motion, by=["motor", "load.x"])
     np.testing.assert_allclose(needed["motor"], -RATE * motion.ts, rtol=1e-7)
+    np.testing.assert_allclose(needed["load.x"], 0.0, atol=1e-7)
     with pytest.raises(ValueError, match="do not determine whether rope sticks"):
         mb.required_forces(system, {"axle.angle": lambda t: t**2, "load.x": lambda t: R}, by=["motor"], ts=[0.1])
 

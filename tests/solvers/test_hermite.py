@@ -1,6 +1,8 @@
 """The implicit second-derivative methods: orders, stiff problems, derivatives, diffrax's features, and bad input."""
 
 import functools
+from types import SimpleNamespace
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -15,7 +17,7 @@ import jaxmb as mb
 from jaxmb import planar
 from jaxmb.solvers import Hermite, MultistepController
 from jaxmb.solvers._formulas import FAMILIES, double, formulas, start
-from jaxmb.solvers._history import advance, basis, before_each
+from jaxmb.solvers._history import History, advance, basis, before_each
 
 
 def relative_error(problem, rtol, **kwargs):
@@ -394,3 +396,19 @@ def test_a_field_that_is_not_finite_ends_the_solve():
         term, Hermite(), 0.0, 1.0, None, jnp.ones(1), stepsize_controller=controller, throw=False
     )
     assert solution.result == diffrax.RESULTS.dt_min_reached
+
+
+def test_the_prediction_extrapolates_states_and_their_slope():
+    solver, end, family = Hermite(), 0.9, FAMILIES[Hermite().family]
+    states = lambda t: jnp.stack([t**2 - t, 3.0 * t])
+    times = jnp.array([0.0, 0.2, 0.35, 0.6, 0.7])
+    differences = jnp.zeros((family.length, 2)).at[0].set(states(times[0]))
+    history = History(differences, times[0] - 0.1 * np.arange(family.length), jnp.array(1))
+    for t in times[1:]:
+        weights = before_each(family.length) * basis(history.mesh, t[None]).T
+        history = advance(history, t, states(t), weights @ history.differences)
+    values = basis(history.mesh, jnp.array([end]))[:, 0]
+    formula: Any = SimpleNamespace(nodes=1, values=values, end=end)
+    state, slope = solver._predicted(formula, history, 2)
+    np.testing.assert_allclose(state, states(jnp.array(end)), rtol=1e-12)
+    np.testing.assert_allclose(slope, [2 * end - 1, 3.0], rtol=1e-12)
