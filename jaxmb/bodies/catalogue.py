@@ -15,7 +15,7 @@ from ..system.structures import of_structure
 from .joint_coordinates import joint_coordinates, joint_measures
 from .motion import body_measures, body_motion, frame_measures, scalar_measures
 from .picture import picture
-from .reactions import applied_wrenches, joint_places, places, reaction_measures, reactions
+from .reactions import applied_wrenches, joint_places, lifted_ropes, places, reaction_measures, reactions
 
 
 class SceneCatalogue(Catalogue):
@@ -34,6 +34,9 @@ class SceneCatalogue(Catalogue):
         out |= reaction_measures(system, self.joint_names()) | scalar_measures(system.layout)
         out |= joint_measures(self.joint_coordinates()) | frame_measures(system.frames, system.layout)
         return out | _drive_measures(system)
+
+    def cautions(self, motion):
+        return lifted_ropes(self.system, motion)
 
     @of_structure
     def joint_coordinates(self):

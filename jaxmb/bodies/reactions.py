@@ -15,6 +15,9 @@ from ..system.quantities import Measure, Reaction, view_of_motion
 from .constraint_set import ConstraintSet
 from .groups import AbstractGroup, Group, VelocityConstraintGroup
 
+# A negative angle [rad] of rope beyond rounding.
+_LIFTED = 1e-6
+
 
 class Place(NamedTuple):
     """The place of a part among groups.
@@ -71,6 +74,27 @@ def _tension_measures(system) -> dict[str, Measure]:
                 for k, name in enumerate(group.group.names):
                     out[f"{name}.tension"] = Measure(shape, _tension, (g, of_forces, shape, np.array(k)), of_forces)
     return out
+
+
+def lifted_ropes(system: Any, motion: Any) -> list[str]:
+    """A sentence for each rope that has left a pulley in a saved state of a concrete motion."""
+    out = {}
+    for group in (*system.constraints.groups, *system.forces.groups):
+        part = group.group.part
+        if not (part.has_tension and part.passed_pulleys.size):
+            continue
+        for name in group.group.names:
+            wraps = np.asarray(motion.quantity(f"{name}.wrap"))[:, part.passed_pulleys]
+            tensions = np.asarray(motion.quantity(f"{name}.tension")).reshape(len(wraps), -1)
+            off = (wraps < -_LIFTED) & np.any(tensions, axis=1)[:, None]
+            if np.any(off):
+                k, pulley = np.argwhere(off)[0]
+                out[name] = (
+                    f"Rope {name!r} is off its pulley path[{part.passed_places[pulley]}] at t = "
+                    f"{float(motion.ts[k]):.6g}: its angle there is {wraps[k, pulley]:.3g} rad, and it is still guided "
+                    "by the pulley. Leave the pulley out, or end the run by an event where the angle is zero."
+                )
+    return list(out.values())
 
 
 @view_of_motion

@@ -260,11 +260,7 @@ class Impacting:
         udot, multipliers, opening = free_accelerations(system, self.formulation, self.moves.projector, t, q, u)
         if not self.contacts.in_joints.any():
             return udot, opening, None
-        answers = self.moves.answers
-        if self.contacts.coupled:
-            # All friction as if it stuck: its force is then its multiplier.
-            q, rows = self.contacts.bound(q), np.array(self.contacts.rows)
-            answers = answers + jnp.asarray(np.eye(answers.shape[1])[rows], answers.dtype)
+        q, answers = self.contacts.stuck(q, self.moves.answers)
         reactions = lambda multipliers: system.friction_reactions(t, q, u, multipliers)
         return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], answers]))
 

@@ -125,6 +125,16 @@ class AbstractRope(AbstractLink):
         return np.array([k for k in self._pulleys if 0 < k < len(self.senses) - 1], int)
 
     @property
+    def passed_places(self) -> np.ndarray:
+        """The places of the path at which the rope passes a pulley."""
+        return self._passed
+
+    @property
+    def passed_pulleys(self) -> np.ndarray:
+        """The numbers of these pulleys among all pulleys."""
+        return np.searchsorted(self._pulleys, self._passed)
+
+    @property
     def _holding(self) -> np.ndarray:
         """The places of pulleys that hold the rope."""
         return np.array([k for k in self._pulleys if self.grips[k] or k in (0, len(self.senses) - 1)], int)
@@ -582,7 +592,8 @@ class Rope(AbstractRope, AbstractCompound):
     undetermined, and the run finds a possible value. A rope that pushes has friction too, by the size of its tensions.
     In an impact friction has no impulse. If the `length` is an input, the rope is paid out at the start of its path.
 
-    A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative.
+    A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative. `simulate`
+    warns of such saved states; `diffrax.Event` on the coordinate `wrap` ends a run there.
 
     In space the rope lies in the plane of a pulley, through its centre, and leaves it where its projection on this
     plane is a tangent. That is exact for a rope in the plane; a straight part at an angle α to it, of length l in it,

@@ -114,6 +114,12 @@ def warn_of_stiffness(stats) -> None:
     )
 
 
+def warn_of_parts(system, motion) -> None:
+    """Warn of parts that a concrete motion uses beyond their model."""
+    for caution in system.catalogue.cautions(motion):
+        warnings.warn(caution, stacklevel=5)
+
+
 def warn_of_wrong_derivative() -> None:
     warnings.warn(
         "The derivative of the vector field contradicts its differences, so the results of `Hermite` may be wrong: "

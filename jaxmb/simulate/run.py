@@ -40,6 +40,7 @@ from .outcome import (
     Outcome,
     message_of_failure,
     warn_of_jumps,
+    warn_of_parts,
     warn_of_stiffness,
     warn_of_wrong_derivative,
 )
@@ -188,6 +189,7 @@ class Run:
                 trajectory = trajectory.result.error_if(trajectory, ended.outcome.flags[0])
         else:
             trajectory = self._explained(ended)
+            warn_of_parts(ended.problem.system, trajectory)
         if asked.error:
             closer = self._closer(ended.problem)
             trajectory = eqx.tree_at(lambda t: t.closer, trajectory, closer, is_leaf=lambda leaf: leaf is None)

@@ -47,6 +47,11 @@ class Catalogue:
             out[f"{name}.force"] = Measure((self.system.nu,), _force_along, self._rows_of(name), of_forces=True)
         return out
 
+    def cautions(self, motion: Any) -> list[str]:
+        """Sentences about saved states of a concrete motion in which a part is used beyond its model."""
+        del motion
+        return []
+
     @of_structure
     def joint_coordinates(self) -> dict[str, Any]:
         """The coordinates of joints by name; each has a `shape`."""

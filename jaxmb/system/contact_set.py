@@ -121,6 +121,17 @@ class ContactSet:
         """The coordinates with all contacts closed and all friction sticking."""
         return self.with_modes(q, np.repeat([CLOSED, STICK], [self.n, self.m]).astype(float))
 
+    def stuck(
+        self, q: Coordinates, multipliers: Float[Array, "laws m"]
+    ) -> tuple[Float[Array, "nq"], Float[Array, "laws m"]]:
+        """Coordinates and multipliers of each law from which its reactions follow. Of coupled friction these are those
+        of stick, whose force is the multiplier of its row.
+        """
+        if not self.coupled:
+            return q, multipliers
+        own = np.eye(multipliers.shape[1])[np.array(self.rows)]
+        return self.bound(q), multipliers + jnp.asarray(own, multipliers.dtype)
+
     # Gaps and slips of the `system` with these contacts, as if all contacts were closed and all friction stuck
 
     def gaps(self, system: Any, t: Scalar, q: Coordinates) -> Float[Array, "contacts"]:

@@ -1,5 +1,7 @@
 """Ropes over pulleys: tangents, tensions and motions against closed forms and equations of motion by hand."""
 
+import warnings
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -377,6 +379,19 @@ def test_a_run_fails_where_turns_are_not_counted():
 
 
 # Winches, slack ropes, derivatives
+
+
+def test_a_rope_that_lifts_off_is_warned_of():
+    load = planar.PointMass("load", mass=1.0, position=(1.0, -0.2))
+    over = mb.Pulley("ground", radius=0.1, turn="right")
+    rope = mb.Rope("rope", [("ground", (-1.0, -0.2)), over, ("load", (0.0, 0.0))])
+    system = mb.Scene([load], joints=[rope]).compile()
+    start = mb.assemble(system, rates={"load.y": 3.0})
+    with pytest.warns(UserWarning, match=r"Rope 'rope' is off its pulley path\[1\] at t = 0\.2: its angle there is -0"):
+        mb.simulate(system, start, t1=0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mb.simulate(system, start, t1=0.05)
 
 
 @pytest.mark.slow

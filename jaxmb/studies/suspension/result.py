@@ -15,6 +15,8 @@ class KinematicsAndCompliance(Printed, eqx.Module):
     """Curves of a suspension, from `kinematics_and_compliance`; `print` shows a table.
 
     ```python
+    wishbone = jaxmb.mechanisms.double_wishbone().system
+    curves = jaxmb.kinematics_and_compliance(wishbone, "upright", radius=0.32, travel=np.linspace(-0.08, 0.08, 9))
     curves.toe, curves.bump_steer, curves.motion_ratio["spring"], curves.compliance["lateral_force"]["toe"]
     ```
 
