@@ -120,19 +120,14 @@ class AbstractRope(AbstractLink):
         return np.flatnonzero(self.senses)
 
     @property
-    def _passed(self) -> np.ndarray:
+    def passed_places(self) -> np.ndarray:
         """The places of pulleys that the rope passes, all but drums at its ends."""
         return np.array([k for k in self._pulleys if 0 < k < len(self.senses) - 1], int)
 
     @property
-    def passed_places(self) -> np.ndarray:
-        """The places of the path at which the rope passes a pulley."""
-        return self._passed
-
-    @property
     def passed_pulleys(self) -> np.ndarray:
         """The numbers of these pulleys among all pulleys."""
-        return np.searchsorted(self._pulleys, self._passed)
+        return np.searchsorted(self._pulleys, self.passed_places)
 
     @property
     def _holding(self) -> np.ndarray:
@@ -142,11 +137,11 @@ class AbstractRope(AbstractLink):
     @property
     def size(self) -> int:
         """The number of angles of the rope."""
-        return len(self._passed) + len(self._holding)
+        return len(self.passed_places) + len(self._holding)
 
     def _span(self, part: Any) -> np.ndarray:
         """The span to which a straight part belongs, numbered by the place before it."""
-        inner = [k for k in self._passed if self.grips[k]]
+        inner = [k for k in self.passed_places if self.grips[k]]
         return np.sum(np.asarray(part)[..., None] >= np.array(inner, int), axis=-1)
 
     @property
@@ -205,7 +200,7 @@ class AbstractRope(AbstractLink):
         """Angles [rad] up to full turns, shape (size,), positive as the rope turns: those by which it turns on pulleys
         that it passes, and the bearings at pulleys that hold it.
         """
-        k, xp = self._passed, namespace(along)
+        k, xp = self.passed_places, namespace(along)
         before, after = along[k - 1], along[k]
         if space.dimension == 2:
             sine = xp.sum(_quarter_turn(before) * after, axis=1)
@@ -249,7 +244,7 @@ class AbstractRope(AbstractLink):
         """Angles [rad] of rope, from those of `_angles`: on pulleys that it passes; and from the mark of each
         pulley that holds it to the straight part.
         """
-        holding, passed = self._holding, len(self._passed)
+        holding, passed = self._holding, len(self.passed_places)
         bearings = angles[passed:]
         if space.dimension == 2 and len(holding):
             # Angles of bodies count full turns.
@@ -270,8 +265,8 @@ class AbstractRope(AbstractLink):
             holding = self._holding
             after, before = np.flatnonzero(holding < len(straight)), np.flatnonzero(holding > 0)
             held = held * self._of_pulleys(holding, self.radii)
-            parts += [wraps * self._of_pulleys(self._passed, self.radii), held[after], -held[before]]
-            spans += [self._span(self._passed), self._span(holding[after]), self._span(holding[before] - 1)]
+            parts += [wraps * self._of_pulleys(self.passed_places, self.radii), held[after], -held[before]]
+            spans += [self._span(self.passed_places), self._span(holding[after]), self._span(holding[before] - 1)]
         values, span = xp.concatenate(parts), np.concatenate(spans)
         if xp is np:
             return np.bincount(span, values, self.spans)
@@ -288,7 +283,7 @@ class AbstractRope(AbstractLink):
         holding, last = self._holding.tolist(), len(self.senses) - 1
         ends = [(k, k == 0, holding.index(k)) for k in self._pulleys if k in (0, last)]
         out = [wraps, *((held[h] if first else -held[h])[None] for _, first, h in ends)]
-        order = np.argsort([*self._passed, *(k for k, _, _ in ends)])
+        order = np.argsort([*self.passed_places, *(k for k, _, _ in ends)])
         return jnp.concatenate(out)[order]
 
     # Pictures
@@ -426,7 +421,7 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
 
     def _side(self, part: Any) -> np.ndarray:
         """The side to which a straight part belongs, numbered by the place before it."""
-        dividers = [k for k in self._passed if self.grips[k] or self.rubs[k]]
+        dividers = [k for k in self.passed_places if self.grips[k] or self.rubs[k]]
         return np.sum(np.asarray(part)[..., None] >= np.array(dividers, int), axis=-1)
 
     @property
@@ -466,8 +461,8 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
     def _wraps_of_places(self, space, poses):
         """The angles [rad] of rope where it rubs."""
         _, along = self._straight(space, poses)
-        angles = self._continued(space, poses, along)[: len(self._passed)]
-        return jnp.maximum(unchecked_take(angles, np.searchsorted(self._passed, self._places)), 0.0)
+        angles = self._continued(space, poses, along)[: len(self.passed_places)]
+        return jnp.maximum(unchecked_take(angles, np.searchsorted(self.passed_places, self._places)), 0.0)
 
     def _loads(self, space, poses, multipliers):
         """Of each pulley the direction of slip, zero in stick; the limit of the rise of the tension, and the rise."""
@@ -670,7 +665,7 @@ class Rope(AbstractRope, AbstractCompound):
         if self.restitution is not None and not self.slack:
             raise ValueError(f"{self.label}: restitution belongs to a rope with slack=True.")
         self._check_friction()
-        for k in self._passed:
+        for k in self.passed_places:
             if self.turns[k] % 1:
                 raise ValueError(
                     f"{self.label}: turns of path[{k}], which is no drum, must be a whole number, got {self.turns[k]}."
@@ -678,7 +673,7 @@ class Rope(AbstractRope, AbstractCompound):
 
     def _check_friction(self) -> None:
         for k in np.flatnonzero(self.rubs):
-            if k not in self._passed:
+            if k not in self.passed_places:
                 raise ValueError(
                     f"{self.label}: path[{k}] is a drum, to which the rope is fastened; leave its friction out, or let "
                     "the rope go on to a point."
@@ -723,10 +718,10 @@ class Rope(AbstractRope, AbstractCompound):
         self._check_tangents(straight)
         part, angles = self.with_fields(counts=self._is_counted(space)), np.zeros(0)
         if self.size:
-            passed, number = len(self._passed), np.array(self.turns)
+            passed, number = len(self.passed_places), np.array(self.turns)
             angles = np.array(self._angles(space, poses, along))
             # A rope that passes a pulley turns back by less than a quarter of a turn.
-            angles[:passed] += 2 * np.pi * ((angles[:passed] < -0.5 * np.pi) + number[self._passed])
+            angles[:passed] += 2 * np.pi * ((angles[:passed] < -0.5 * np.pi) + number[self.passed_places])
             _, marks = self._wound(space, poses, angles)
             # The rope leaves the mark of a drum at the start, and goes to that of one at the end.
             sides = np.where(self._holding == 0, -1, self._holding == len(straight))

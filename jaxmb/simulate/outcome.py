@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._results import RESULTS
+from .._types import State
 from ..formulations.friction import coupled_most
 from ..linalg.arrays import is_traced
 from ..linalg.recent import Recent
@@ -115,8 +116,9 @@ def warn_of_stiffness(stats) -> None:
 
 
 def warn_of_parts(system, motion) -> None:
-    """Warn of parts that a concrete motion uses beyond their model."""
-    for caution in system.catalogue.cautions(motion):
+    """Warn of parts that a concrete motion uses beyond their model, if it saves states."""
+    cautions = system.catalogue.cautions(motion) if isinstance(motion.ys, State) else ()
+    for caution in cautions:
         warnings.warn(caution, stacklevel=5)
 
 

@@ -5,27 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from at_instants import instant, point
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.formulations import Multipliers, accelerations
-from jaxmb.system.quantities import Solved
 
 G, R = 9.81, 0.1
 GRAVITY = mb.Gravity((0.0, -G))
 # Compiled sooner than the default.
 METHOD = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection()}
-
-
-def instant(system, state, t=0.0):
-    """Quantities by name at one state."""
-    udot, multipliers = accelerations(system.at(state), Multipliers(), t, state.q, state.u)
-    along = jnp.full(1, t), jax.tree.map(lambda x: x[None], state), Solved(udot[None], multipliers[None])
-    return lambda name: np.asarray(system.quantities()[name].value(*along)[0])
-
-
-def point(name, mass, *position, **state):
-    return planar.PointMass(name, mass=mass, position=position, **state)
 
 
 def wheel(inertia, *position, name="wheel", **state):

@@ -9,27 +9,15 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.optimize
+from at_instants import instant, point
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.formulations import Multipliers, accelerations
-from jaxmb.system.quantities import Solved
 
 G = 9.81
 GRAVITY = mb.Gravity((0.0, -G))
 # Compiled sooner than the default; any method will do.
 METHOD = {"solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection(), "max_steps": 4096}
-
-
-def instant(system, state, t=0.0):
-    """Quantities by name at one state, in the plane and in space."""
-    udot, multipliers = accelerations(system.at(state), Multipliers(), t, state.q, state.u)
-    along = jnp.full(1, t), jax.tree.map(lambda x: x[None], state), Solved(udot[None], multipliers[None])
-    return lambda name: np.asarray(system.quantities()[name].value(*along)[0])
-
-
-def point(name, mass, *position, **state):
-    return planar.PointMass(name, mass=mass, position=position, **state)
 
 
 def disc(name, mass, radius, *position):
@@ -392,6 +380,9 @@ def test_a_rope_that_lifts_off_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mb.simulate(system, start, t1=0.05)
+        # Other values than states are not looked at.
+        heights = diffrax.SaveAt(t1=True, fn=lambda t, y, args: y.q[1])
+        mb.simulate(system, start, t1=0.2, saveat=heights)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from ..._types import Scalar, State, VectorLike
 from ...linalg.arrays import is_traced
 from ...linalg.failure import nan_where
 from ...linalg.jitted import jitted
+from ...linalg.rotations import norm
 from ...parts.forces import SpringDamper
 from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
@@ -273,7 +274,7 @@ def _wheel(system, guess, carrier, side, radius, centre, axis) -> Wheel:
         jnp.asarray(real_array(f"{_NAME}: {name}", x, dtype, ((3,),)))
         for name, x in (("centre", centre), ("axis", axis))
     )
-    size = jnp.linalg.norm(axis)
+    size = norm(axis)
     if not is_traced(size) and not size > 0:
         raise ValueError(f"{_NAME}: axis must be a direction, got zero.")
     wheel = Wheel(number, jnp.ones((), dtype), centre - mass_centre(system, number), axis / size, radius)

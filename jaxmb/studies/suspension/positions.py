@@ -26,6 +26,7 @@ from ...states.closest import tolerance
 from ...system import with_parameters
 from ...system.instant import Instant
 from ...system.parameters import parameters
+from ..linear.pseudoinverse import pseudoinverse
 from .wheel import Wheel
 
 # The number of steps from the guess to a position, and the largest number of corrections in each. Corrections have a
@@ -180,13 +181,6 @@ class Position(NamedTuple):
         return self._replace(q=rig.moved(self.q, x[:nu]), multipliers=self.multipliers + x[nu:])
 
 
-def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The pseudo-inverse: freedoms that neither rows nor forces bind do not move."""
-    left, values, right = jnp.linalg.svd(matrix)
-    kept = values > _NEGLIGIBLE * jnp.max(values)
-    return (right.T * jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)[None, :]) @ left.T
-
-
 class _Search(NamedTuple):
     """A search for a position: the position and the size of its residuals; the matrix of the equations; the next
     `step`, a `share` of a step of Newton's method, and its largest displacement; whether the position was reached by a
@@ -215,7 +209,8 @@ def _corrected(rig: Rig, inputs: Inputs, at: Position) -> tuple[Position, Float[
         residual = norm(value)
         # The last steps change the residuals by rounding errors only.
         good = (residual < search.residual) | ((search.longest < _SMALL) & jnp.isfinite(residual))
-        step = -(_inverse(matrix) @ value if rig.freedoms else solve(matrix, value))
+        # Freedoms that neither rows nor forces bind do not move.
+        step = -(pseudoinverse(matrix, _NEGLIGIBLE) @ value if rig.freedoms else solve(matrix, value))
         longest = jnp.max(jnp.abs(step[: rig.system.nu]))
         limited = jnp.where(longest > _LONGEST, _LONGEST / longest, 1.0)
         # After a whole step below the root of eps the error is of the order of eps.
@@ -288,7 +283,7 @@ def solved(rig: Rig, inputs: Inputs) -> Solved:
     equations = lambda x, w: rig.balance(at, as_inputs(w), x)
     if rig.freedoms:
         # Freedoms that neither rows nor forces bind do not move.
-        inverse = _inverse(matrix)
+        inverse = pseudoinverse(matrix, _NEGLIGIBLE)
         loose = jnp.eye(still.size, dtype=still.dtype) - inverse @ matrix
         equations = lambda x, w: inverse @ rig.balance(at, as_inputs(w), x) + loose @ x
     # Without a position, equations with a solution replace these, so that derivatives stay finite.
