@@ -39,7 +39,7 @@ def contact_set(
 
 def _names(group: AbstractConstraintGroup) -> list[str]:
     """The names of the rows; those of several slips of one part are the names of their modes."""
-    several = isinstance(group, VelocityConstraintGroup) and group.rows > group.group.part.directions
+    several = not group.of_poses and group.rows > group.group.part.directions
     of_rows = (lambda name, k: f"{name}.mode_{k + 1}") if several else (lambda name, k: name)
     return [of_rows(name, k) for name in group.group.names for k in range(group.rows)]
 

@@ -384,6 +384,11 @@ class ConstraintGroup(AbstractConstraintGroup):
         """Derivatives along `n` motions of every body. One body moves, the others rest."""
 
         def single(at, x, moves):
+            if self.rows < len(moves):
+                value, pull = jax.vjp(lambda x: self._residual(at, t, x), x)
+                (rows,) = jax.vmap(pull)(jnp.eye(self.rows, dtype=value.dtype))
+                return jax.vmap(lambda of_bodies: jax.vmap(jnp.matmul)(moves, of_bodies))(rows)
+
             def along_one(body):
                 # The residual's value is the same for every body, so XLA computes it once.
                 residual = lambda pose: self._residual(at, t, jnp.stack([*x[:body], pose, *x[body + 1 :]]))

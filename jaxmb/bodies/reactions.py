@@ -13,7 +13,7 @@ from ..linalg.arrays import add_up
 from ..linalg.rotations import cross
 from ..system.quantities import Measure, Reaction, view_of_motion
 from .constraint_set import ConstraintSet
-from .groups import AbstractGroup, Group, VelocityConstraintGroup
+from .groups import AbstractGroup, Group
 
 # A negative angle [rad] of rope beyond rounding.
 _LIFTED = 1e-6
@@ -100,7 +100,7 @@ def lifted_ropes(system: Any, motion: Any) -> list[str]:
 @view_of_motion
 def _tension(system, place, ts, ys, solved):
     group, of_rows, shape, member = place
-    if of_rows and isinstance(friction := system.constraints.groups[group], VelocityConstraintGroup):
+    if of_rows and not (friction := system.constraints.groups[group]).of_poses:
 
         def with_friction(t, y, multipliers):
             now = system.kinematics(t, y.q, y.u)

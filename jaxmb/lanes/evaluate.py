@@ -75,7 +75,9 @@ class Lanes(NamedTuple):
         """The outputs of an equation."""
         inner = called(equation)
         if inner is not None:
-            rare = self.rare or equation.primitive.name == "custom_vmap_call"
+            # `cond_of_lanes` gives a condition a rule for batches; other programs with such rules are longer.
+            ends = [last.primitive.name for last in inner.jaxpr.eqns[-1:]]
+            rare = self.rare or (equation.primitive.name == "custom_vmap_call" and ends == ["cond"])
             return self._replace(rare=rare).run(inner, values)
         if not any(value.varies for value in values) and equation.primitive.name not in _LOOPS:
             out = bound(equation, [value.array for value in values])

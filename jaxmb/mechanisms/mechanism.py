@@ -190,8 +190,8 @@ def build(
 ) -> Mechanism:
     """Compile and assemble a scene, or assemble a system, into a mechanism."""
     fix, rates = fix or {}, rates or {}
-    # A concrete class: only a scene has parts to extend, and must be compiled.
-    parts = scene if isinstance(scene, Scene) else None
+    # Only a scene has parts to extend, and must be compiled.
+    parts = None if isinstance(scene, AbstractSystem) else scene
     system: Any = scene if parts is None else parts.compile()
     state = assemble(system, fix=fix, rates=rates) if start is None else start(system, system.guess)
     observe = eqx.filter_jit(observe)

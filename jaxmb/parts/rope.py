@@ -14,7 +14,7 @@ from .._compat import with_values
 from .._types import VectorLike
 from ..linalg.arrays import namespace
 from ..linalg.elimination import solve
-from ..linalg.rotations import norm
+from ..linalg.rotations import cross, norm
 from ..linalg.sums import placed_sums, unchecked_take, with_entries
 from . import fields
 from .base import (
@@ -34,6 +34,7 @@ from .modes import FORWARD, kind_of
 from .shapes import wheel
 from .space import rate_of
 from .spatial.axes import perpendiculars
+from .tangents import quarter_turn, tangent_lines
 from .unilateral import AbstractGeometricContact
 
 # Neighbouring pulleys in space have axes that are parallel to this sine.
@@ -164,9 +165,13 @@ class AbstractRope(AbstractLink):
 
     # Geometry
 
+    def _at(self, poses, places: Any = slice(None)) -> Any:
+        """The poses of the bodies at some places of the path."""
+        return unchecked_take(poses, np.array(self.owners)[places])
+
     def _straight(self, space, poses) -> tuple[Any, Any]:
         """Of the straight parts: lengths [m], and unit vectors along them in the planes of their pulleys."""
-        centres = _each(space.point, poses[np.array(self.owners)], self.points)
+        centres = _each(space.point, self._at(poses), self.points)
         xp = namespace(centres)
         d: Any = centres[1:] - centres[:-1]
         if not len(self._pulleys):
@@ -177,36 +182,26 @@ class AbstractRope(AbstractLink):
         at = lambda values, index: unchecked_take(xp.concatenate([values, xp.zeros_like(values[:1])]), index)
         # The rope is to the right of the centre of a pulley on which it turns left.
         offset = self._signed(places, at(self.radii, number))
-        more, beside = (offset[1:] - offset[:-1])[:, None], 0.0
-        if space.dimension == 2:
-            across = _quarter_turn(d)
-        else:
+        axes = None
+        if space.dimension == 3:
             axes = at(self._axes(space, poses), np.minimum(number[:-1], number[1:]))
-            beside = xp.sum(d * axes, axis=1, keepdims=True)
-            d = d - beside * axes
-            across = xp.cross(axes, d)
-        square = xp.sum(d * d, axis=1, keepdims=True)
-        # Circles without a common tangent, and points in a circle, give NaN, without a warning of NumPy.
-        with np.errstate(invalid="ignore", divide="ignore"):
-            flat = xp.sqrt(square - more**2)
-            along = (flat * d - more * across) / square
-        return (flat if space.dimension == 2 else xp.sqrt(flat**2 + beside**2))[:, 0], along
+        return tangent_lines(d, offset[1:] - offset[:-1], axes)
 
     def _axes(self, space, poses) -> Any:
         """Axes of the pulleys, in the world."""
-        return _each(space.direction, poses[np.array(self.owners)[self._pulleys]], self.axes)
+        return _each(space.direction, self._at(poses, self._pulleys), self.axes)
 
     def _angles(self, space, poses, along) -> Any:
         """Angles [rad] up to full turns, shape (size,), positive as the rope turns: those by which it turns on pulleys
         that it passes, and the bearings at pulleys that hold it.
         """
         k, xp = self.passed_places, namespace(along)
-        before, after = along[k - 1], along[k]
+        before, after = unchecked_take(along, k - 1), unchecked_take(along, k)
         if space.dimension == 2:
-            sine = xp.sum(_quarter_turn(before) * after, axis=1)
+            sine = xp.sum(quarter_turn(before) * after, axis=1)
         else:
             axes = self._of_pulleys(k, self._axes(space, poses))
-            sine = xp.sum(axes * xp.cross(before, after), axis=1)
+            sine = xp.sum(axes * cross(before, after), axis=1)
         turned = self._signed(k, xp.arctan2(sine, xp.sum(before * after, axis=1)))
         if not len(self._holding):
             return turned
@@ -217,10 +212,10 @@ class AbstractRope(AbstractLink):
         the start after it: in the plane from the x axis of the world, in space from an axis of the pulley's body.
         """
         k, xp = self._holding, namespace(along)
-        lines = along[np.maximum(k - 1, 0)]
+        lines = unchecked_take(along, np.maximum(k - 1, 0))
         x, y = lines[:, 0], lines[:, 1]
         if space.dimension == 3:
-            lines = _each(space.body_direction, poses[np.array(self.owners)[k]], lines)
+            lines = _each(space.body_direction, self._at(poses, k), lines)
             across = _each(perpendiculars, self._of_pulleys(k, self.axes))
             x, y = (xp.sum(across[:, i] * lines, axis=1) for i in (0, 1))
         return self._signed(k, xp.arctan2(y, x))
@@ -248,7 +243,7 @@ class AbstractRope(AbstractLink):
         bearings = angles[passed:]
         if space.dimension == 2 and len(holding):
             # Angles of bodies count full turns.
-            bearings = bearings - self._signed(holding, poses[np.array(self.owners)[holding], 2])
+            bearings = bearings - self._signed(holding, self._at(poses, holding)[:, 2])
         return angles[:passed], bearings if self.marks is None else bearings - self.marks
 
     def lengths(self, space, poses) -> Float[Array, "spans"]:
@@ -265,7 +260,11 @@ class AbstractRope(AbstractLink):
             holding = self._holding
             after, before = np.flatnonzero(holding < len(straight)), np.flatnonzero(holding > 0)
             held = held * self._of_pulleys(holding, self.radii)
-            parts += [wraps * self._of_pulleys(self.passed_places, self.radii), held[after], -held[before]]
+            parts += [
+                wraps * self._of_pulleys(self.passed_places, self.radii),
+                unchecked_take(held, after),
+                -unchecked_take(held, before),
+            ]
             spans += [self._span(self.passed_places), self._span(holding[after]), self._span(holding[before] - 1)]
         values, span = xp.concatenate(parts), np.concatenate(spans)
         if xp is np:
@@ -284,13 +283,13 @@ class AbstractRope(AbstractLink):
         ends = [(k, k == 0, holding.index(k)) for k in self._pulleys if k in (0, last)]
         out = [wraps, *((held[h] if first else -held[h])[None] for _, first, h in ends)]
         order = np.argsort([*self.passed_places, *(k for k, _, _ in ends)])
-        return jnp.concatenate(out)[order]
+        return unchecked_take(jnp.concatenate(out), order)
 
     # Pictures
 
     def path(self, space, poses):
         _, along = self._straight(space, poses)
-        centres = jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
+        centres = _each(space.point, self._at(poses), self.points)
         angles = iter(self._wraps(space, poses)) if self.size else iter(())
         axes = iter(self._axes(space, poses)) if self.axes is not None else itertools.repeat(None)
         radii, out = iter(() if self.radii is None else self.radii), []
@@ -301,7 +300,7 @@ class AbstractRope(AbstractLink):
             axis, turned = next(axes), sense * next(angles) * jnp.linspace(0.0, 1.0, 17)
             e = along[max(k - 1, 0)][None]
             turned = turned[:, None] - turned[-1] * (k == 0)
-            side = _quarter_turn(e) if axis is None else jnp.cross(axis[None], e)
+            side = quarter_turn(e) if axis is None else cross(axis[None], e)
             out.append(centres[k][None] - sense * next(radii) * (jnp.cos(turned) * side - jnp.sin(turned) * e))
         # There and back, since a belt is a closed line.
         there = jnp.concatenate(out)
@@ -317,11 +316,6 @@ class AbstractRope(AbstractLink):
             for k, radius, axis in zip(self._pulleys, self.radii, axes, strict=False)
             for shape in wheel(radius, None, space.in_space(self.points[k]), axis)
         )
-
-
-def _quarter_turn(v):
-    """Vectors of the plane, turned counter-clockwise."""
-    return namespace(v).stack([-v[:, 1], v[:, 0]], axis=1)
 
 
 def _each(function, *rows):
@@ -466,7 +460,7 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
 
     def _loads(self, space, poses, multipliers):
         """Of each pulley the direction of slip, zero in stick; the limit of the rise of the tension, and the rise."""
-        mean, stuck = multipliers[self._span(self._places)], -multipliers[self.spans :]
+        mean, stuck = unchecked_take(multipliers, self._span(self._places)), -multipliers[self.spans :]
         share = 2.0 * jnp.tanh(0.5 * self.friction * self._wraps_of_places(space, poses))
         modes, shares = kind_of(self._modes(poses)), self._shares_of_means
         slips = jnp.where(jnp.abs(modes) == FORWARD, modes, 0.0)
@@ -485,7 +479,7 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
     def tensions(self, space, poses, multipliers):
         """The tension of each side [N], from the multipliers of the spans and of this friction."""
         _, _, rise = self._loads(space, poses, multipliers)
-        return multipliers[self._span_of_side] + self._halves.T @ rise
+        return unchecked_take(multipliers, self._span_of_side) + self._halves.T @ rise
 
     def wrenches(self, space, poses, velocities, multipliers, t):
         """The wrenches of slip on the bodies."""

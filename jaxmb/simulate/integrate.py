@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 from jax import lax
 
+from ..lanes.members import of_one_or_more
 from ..manifold.orthogonal_projection import project
 from ..solvers import MeshAdjoint
 from ..solvers.one_step import with_tangents
@@ -42,7 +43,7 @@ def _on_mesh(integration, control, room, projects_steps):
     """The solution on a mesh that resolves the motion, and tangents as well if it is differentiated."""
     del control, projects_steps
     term, solver, options = integration
-    return _solution(term, solver, options, room, None)
+    return of_one_or_more(_solution, term, solver, options, room, None)
 
 
 @_on_mesh.def_jvp

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._arguments import whole_number
-from .._compat import ClosedJaxpr, Jaxpr, sizes_of_scan
-from .._setup import bytes_of_kernel_loops, computes_side_by_side
+from .._setup import bytes_of_kernel_loops
 from .._traced_functions import NEED_NUMBERS
 from ..lanes import together as side_by_side
+from ..lanes.members import SIDE_BY_SIDE, stand_side_by_side
+from ..lanes.sizes import loops
 from ..linalg.arrays import ARRAYS
 from ..linalg.members import in_blocks
 from ..parts.names import names_arguments
@@ -24,11 +25,6 @@ _CARRIED, _MOST = 2**20, 64
 # Ratio of the bytes that the equations of a loop body write to the bytes that its fused kernels read and write (rule of
 # thumb).
 _FUSED = 3
-# The number of members side by side, which fill a vector register in double precision; and the most bytes that their
-# loop carries for one: larger loops, such as of the gradient of Bricard's mechanism, would compile for minutes.
-_SIDE_BY_SIDE, _MOST_SIDE_BY_SIDE = 8, 400_000
-# Arrays of several axes with at least this number of rows count as tables, of which a step writes one row.
-_LONG = 1024
 
 
 @names_arguments
@@ -102,7 +98,7 @@ class Member:
 
     @functools.cached_property
     def _loops(self) -> list[tuple[int, int]]:
-        return list(_loops(self._program))
+        return list(loops(self._program))
 
     @property
     def _carried(self) -> int:
@@ -111,14 +107,14 @@ class Member:
 
     @property
     def _side_by_side(self) -> bool:
-        return computes_side_by_side() and self._carried <= _MOST_SIDE_BY_SIDE
+        return stand_side_by_side(self._carried)
 
     def block_size(self, members: int) -> int:
         """The number of members, a power of two or all, that are computed at once on the default device."""
         if self._carried == 0 or jax.default_backend() != "cpu":
             return members
         if self._side_by_side:
-            return min(_SIDE_BY_SIDE, members)
+            return min(SIDE_BY_SIDE, members)
         if max(written for _, written in self._loops) < _FUSED * bytes_of_kernel_loops():
             return 1
         return min(2 ** int(math.log2(max(_CARRIED / self._carried, 1))), _MOST)
@@ -143,47 +139,6 @@ class Member:
     def _in_lanes(self, members: PyTree) -> PyTree:
         program, like = jax.make_jaxpr(self._function, return_shape=True)(self._like)
         return jax.tree.unflatten(jax.tree.structure(like), side_by_side(program)(*jax.tree.leaves(members)))
-
-
-def _loops(program: Any) -> Iterator[tuple[int, int]]:
-    """For each loop of a program, the bytes carried from step to step and the bytes that the loop's equations write."""
-    for equation in getattr(program, "jaxpr", program).eqns:
-        inner = _inner(equation)
-        if equation.primitive.name in ("while", "scan"):
-            # A scan does not carry the results of single steps.
-            yield _bytes(equation.outvars[: _loop_values(equation)]), sum(map(_written, inner))
-        for inner_program in inner:
-            yield from _loops(inner_program)
-
-
-def _loop_values(equation: Any) -> int:
-    """The number of outputs that a loop carries from step to step."""
-    scans = equation.primitive.name == "scan"
-    return sizes_of_scan(equation.params)[1] if scans else len(equation.outvars)
-
-
-def _written(program: Any) -> int:
-    """The bytes that the equations of a program write, in one pass of each loop."""
-    pairs = ((equation, _inner(equation)) for equation in getattr(program, "jaxpr", program).eqns)
-    return sum(sum(map(_written, inner)) if inner else _bytes(equation.outvars) for equation, inner in pairs)
-
-
-def _inner(equation: Any) -> list[Any]:
-    """The programs within an equation."""
-    return [x for x in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program) if _is_program(x)]
-
-
-def _bytes(variables: list[Any]) -> int:
-    return sum(_touched(x.aval.shape) * x.aval.dtype.itemsize for x in variables)
-
-
-def _touched(shape: tuple[int, ...]) -> int:
-    """The numbers of an array that a step touches: one row of a long table, such as the states of all steps."""
-    return math.prod(shape[1:] if len(shape) > 1 and shape[0] >= _LONG else shape)
-
-
-def _is_program(x: Any) -> bool:
-    return isinstance(x, ClosedJaxpr | Jaxpr)
 
 
 def _count(members: tuple[Any, ...]) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmb
-from jaxmb.lanes import together
+from jaxmb.lanes import members, sizes, together
 
 MASSES = jnp.linspace(0.9, 1.1, 3)
 
@@ -35,6 +35,41 @@ def test_members_end_where_each_alone_does():
     alone = [jax.jit(end)(mass) for mass in MASSES]
     np.testing.assert_allclose(found, [q for q, _ in alone], rtol=1e-8, atol=1e-8)
     assert np.all(np.abs(steps - np.array([count for _, count in alone])) <= 2)
+
+
+def carried_shapes(program):
+    """The shapes of arrays that the loops of a program carry."""
+    for equation in getattr(program, "jaxpr", program).eqns:
+        if equation.primitive.name == "while":
+            yield from (variable.aval.shape for variable in equation.outvars)
+        for inner in sizes.inner_programs(equation):
+            yield from carried_shapes(inner)
+
+
+def test_a_vmap_has_members_side_by_side(monkeypatch):
+    # No other test has traced this motion.
+    end = machine(jaxmb.mechanisms.slider_crank, t1=0.3, rtol=1e-9)
+    monkeypatch.setattr(members, "computes_side_by_side", lambda: True)
+    masses = jnp.linspace(0.9, 1.1, 11)
+    together = jax.jit(jax.vmap(lambda mass: end(mass)[0]))
+    alone = jax.jit(lambda mass: end(mass)[0])
+    np.testing.assert_allclose(together(masses), [alone(mass) for mass in masses], rtol=1e-8, atol=1e-8)
+    # Eleven members are two blocks of six.
+    shapes = set(carried_shapes(together.trace(masses).jaxpr))
+    assert any(shape[-1:] == (6,) for shape in shapes) and not any(shape[:1] == (11,) for shape in shapes)
+
+
+@pytest.mark.slow
+def test_a_vmap_within_a_vmap_and_its_derivatives(monkeypatch):
+    end = machine(jaxmb.mechanisms.four_bar, t1=0.1, rtol=3e-9)
+    masses = jnp.linspace(0.9, 1.1, 6).reshape(2, 3)
+    every = jax.vmap(jax.vmap(lambda mass: end(mass)[0]))
+    total = lambda masses: jnp.sum(every(masses) ** 2)
+    expected = jax.jit(every)(masses), jax.jit(jax.grad(total))(masses)
+    monkeypatch.setattr(members, "computes_side_by_side", lambda: True)
+    jax.clear_caches()
+    found = jax.jit(lambda masses: every(masses))(masses), jax.jit(jax.grad(lambda masses: total(masses)))(masses)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9), found, expected)
 
 
 @pytest.mark.slow

@@ -358,6 +358,27 @@ def test_a_ball_on_a_rope_that_winds_up_around_a_pole(dimension):
 
 
 @pytest.mark.slow
+def test_a_drum_unwinds_by_forty_turns():
+    """In space, where Euler parameters count no turns. The load falls with a constant acceleration."""
+    r, mass, inertia, turns = 0.05, 2.0, 0.01, 40.0
+    drum = spatial.Body("drum", mass=1.0, inertia=(0.01, inertia, 0.01))
+    load = spatial.PointMass("load", mass=mass, position=(r, 0.0, -1.0))
+    axle = spatial.Revolute("axle", "ground", "drum", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    wound = mb.Pulley("drum", r, "left", axis=(0.0, 1.0, 0.0), turns=turns + 1.0)
+    rope = mb.Rope("rope", [wound, ("load", (0.0, 0.0, 0.0))])
+    down = mb.Gravity((0.0, 0.0, -G))
+    system = mb.Scene([drum, load], joints=[axle, rope], forces=[down]).compile()
+    acceleration = mass * G / (mass + inertia / r**2)
+    ts = np.linspace(0.0, np.sqrt(4 * np.pi * r * turns / acceleration), 9)
+    motion = mb.simulate(system, mb.assemble(system), t1=ts[-1], saveat=ts, rtol=1e-10, **METHOD)
+    fallen = 0.5 * acceleration * ts**2
+    np.testing.assert_allclose(motion["load"].position[:, 2], -1.0 - fallen, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(motion["rope"].wrap[:, 0], 2 * np.pi * (turns + 1) - fallen / r, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(motion["rope"].tension, mass * (G - acceleration), rtol=1e-7)
+    np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=0, atol=1e-7 * np.ptp(motion.kinetic_energy))
+
+
+@pytest.mark.slow
 def test_a_run_fails_where_turns_are_not_counted():
     ball = point("ball", 1.0, 1.0, -0.05, velocity=(0.0, 1.0))
     system = mb.Scene([ball], joints=[mb.Rope("rope", [mb.Pulley("ground", 0.05, "left"), ("ball", (0.0, 0.0))])])
@@ -436,10 +457,11 @@ def test_a_slack_rope_tightens_and_goes_slack():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("rope", [{}, ELASTIC], ids=["gripping", "elastic"])
-def test_derivatives(rope):
+def test_derivatives(rope, dimension):
     """By radii, length, mass and stiffness: forwards, backwards and differences of a tighter solution, in a batch."""
-    system = crane(2, **rope)
+    system = crane(dimension, **rope)
     known = mb.parameters(system)
     names = {"rope.radii", "rope.length", "load.mass", *(f"rope.{name}" for name in rope)}
     values = {name: known[name] for name in names}
@@ -459,4 +481,4 @@ def test_derivatives(rope):
         rest = {other: jnp.broadcast_to(x, (size, *x.shape)) for other, x in values.items()}
         ends = [tight(rest | {name: moved(sign)[name]}) for sign in (1, -1)]
         difference = (ends[0] - ends[1]) / (2 * h)
-        np.testing.assert_allclose(forward[name].reshape(3, -1).T, difference, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(forward[name].reshape(dimension + 1, -1).T, difference, rtol=1e-5, atol=1e-6)

@@ -186,7 +186,7 @@ def test_motions_in_blocks():
 @pytest.fixture
 def side_by_side(monkeypatch):
     """As after `setup(compile="for batches")`, with any options of the compiler."""
-    monkeypatch.setattr("jaxmb.studies.batch.computes_side_by_side", lambda: True)
+    monkeypatch.setattr("jaxmb.lanes.members.computes_side_by_side", lambda: True)
 
 
 @pytest.mark.parametrize("count", [1, 3, 8, 19])

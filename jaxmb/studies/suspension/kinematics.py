@@ -15,7 +15,6 @@ from ...linalg.arrays import is_traced
 from ...linalg.failure import nan_where
 from ...linalg.jitted import jitted
 from ...linalg.rotations import norm
-from ...parts.forces import SpringDamper
 from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...states.refusals import violated_joints
@@ -308,8 +307,8 @@ def _springs(system, springs) -> dict[str, Spring]:
         part = group.group.part
         if hasattr(part, "point_a") and hasattr(part, "point_b"):
             known |= {name: Spring(g, k) for k, name in enumerate(group.group.names)}
-            # A concrete class: springs are the usual choice, other forces between points are not.
-            linear += group.group.names if isinstance(part, SpringDamper) else ()
+            # Springs are the usual choice, other forces between points are not.
+            linear += group.group.names if hasattr(part, "stiffness") else ()
     if springs is None:
         return {name: known[name] for name in linear}
     if isinstance(springs, str):
