@@ -41,6 +41,8 @@ from .unilateral import AbstractGeometricContact
 _PARALLEL = 1e-6
 # In the plane angles that are not counted change by no more than this [rad], in both directions.
 _FARTHEST = 0.9 * np.pi
+# Angles beyond this are of a rope off its pulley [rad]; other negative ones are of more than half a turn.
+_FARTHEST_OFF = 0.8 * np.pi
 # Lengths that differ by no more than this share are equal.
 _ROUNDING = 1e-9
 # Of a point none.
@@ -68,6 +70,7 @@ class Pulley(NamedTuple):
     - `friction` μ ≥ 0 of a rope of constant length on a pulley that it passes: it sticks or slips, see `Rope`.
     - `turns`: full turns of rope on it at the given poses: of a drum all, of another pulley those beyond the first,
         a whole number.
+    - `lifts`: whether an elastic rope in the plane may lift off it, and come back; see `Rope`.
     """
 
     body: str
@@ -78,6 +81,7 @@ class Pulley(NamedTuple):
     grips: bool = False
     turns: float = 0.0
     friction: Any = None
+    lifts: bool = False
 
 
 class AbstractRope(AbstractLink):
@@ -88,7 +92,8 @@ class AbstractRope(AbstractLink):
     **Fields:**
 
     - `bodies`, each once. For each place of the path: `owners`, the index of its body among them; `points` [m], the
-        centre of a pulley; `senses`, 1 for a pulley on which the rope turns left, -1 right, 0 for a point; `grips`.
+        centre of a pulley; `senses`, 1 for a pulley on which the rope turns left, -1 right, 0 for a point; `grips`;
+        `lifts`.
     - For each pulley: `radii` [m]; `axes`, in space.
     - `counts`: whether full turns are counted; `bearings` [rad]: the `_angles` at the given poses.
     - `marks` [rad]: of pulleys that hold the rope (drums, and those that grip), the bearing without rope on a drum, and
@@ -100,6 +105,7 @@ class AbstractRope(AbstractLink):
     owners: tuple[int, ...] = eqx.field(static=True, default=())
     senses: tuple[int, ...] = eqx.field(static=True, default=())
     grips: tuple[bool, ...] = eqx.field(static=True, default=())
+    lifts: tuple[bool, ...] = eqx.field(static=True, default=())
     counts: bool = eqx.field(static=True, default=False)
     points: fields.Number = fields.parameter(shape=(None, "d"), unit="m")
     radii: fields.Number = fields.length(shape=(None,), sign="positive", optional=True)
@@ -170,10 +176,42 @@ class AbstractRope(AbstractLink):
         return unchecked_take(poses, np.array(self.owners)[places])
 
     def _straight(self, space, poses) -> tuple[Any, Any]:
-        """Of the straight parts: lengths [m], and unit vectors along them in the planes of their pulleys."""
+        """Of the straight parts: lengths [m], and unit vectors along them in the planes of their pulleys. The part
+        before a pulley off which the rope has lifted leads to the place behind it, and the next part has no length.
+        """
+        places, k = np.arange(len(self.senses)), np.flatnonzero(self.lifts)
+        lengths, along = self._between(space, poses, places[:-1], places[1:])
+        if not k.size:
+            return lengths, along
+        past, along_past = self._between(space, poses, k - 1, k + 1)
+        xp, number, first = namespace(lengths), np.full(len(lengths), k.size), np.zeros(len(lengths))
+        number[k - 1] = number[k] = np.arange(k.size)
+        first[k - 1] = 1.0
+        of_parts = lambda values: unchecked_take(xp.concatenate([values, xp.ones_like(values[:1])]), number)
+        angles, past = of_parts(self._lifted(space, poses, along)), first.astype(lengths.dtype) * of_parts(past)
+        off, lengths = angles <= 0, xp.where(xp.isnan(angles), np.nan, lengths)
+        return xp.where(off, past, lengths), xp.where(off[:, None], of_parts(along_past), along)
+
+    def _lifted(self, space, poses, along) -> Any:
+        """The angles [rad] on pulleys that the rope may leave, from parts that touch them; negative where it is off."""
+        angles, lifting = self._angles(space, poses, along), np.flatnonzero(self.lifts)
+        xp, of_these = (
+            namespace(angles),
+            lambda values: unchecked_take(values, np.searchsorted(self.passed_places, lifting)),
+        )
+        angles: Any = of_these(angles)
+        if not self.counts or self.bearings is None:
+            return xp.where(angles > -_FARTHEST_OFF, angles, angles + 2 * np.pi)
+        known = of_these(self._counted(poses) + self.bearings)
+        angles = angles + turns(known - angles)
+        # Farther off, the rope would seem to touch the pulley again.
+        return jnp.where(jnp.abs(angles - known) < _FARTHEST_OFF, angles, jnp.nan)
+
+    def _between(self, space, poses, before: np.ndarray, after: np.ndarray) -> tuple[Any, Any]:
+        """Lengths and directions of the straight parts between some places."""
         centres = _each(space.point, self._at(poses), self.points)
         xp = namespace(centres)
-        d: Any = centres[1:] - centres[:-1]
+        d: Any = unchecked_take(centres, after) - unchecked_take(centres, before)
         if not len(self._pulleys):
             length = norm(d)
             return length, d / xp.where(length > 0, length, 1.0)[:, None]
@@ -184,8 +222,8 @@ class AbstractRope(AbstractLink):
         offset = self._signed(places, at(self.radii, number))
         axes = None
         if space.dimension == 3:
-            axes = at(self._axes(space, poses), np.minimum(number[:-1], number[1:]))
-        return tangent_lines(d, offset[1:] - offset[:-1], axes)
+            axes = at(self._axes(space, poses), np.minimum(number[before], number[after]))
+        return tangent_lines(d, unchecked_take(offset, after) - unchecked_take(offset, before), axes)
 
     def _axes(self, space, poses) -> Any:
         """Axes of the pulleys, in the world."""
@@ -534,7 +572,11 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
         return 0.5 * self.stiffness * jnp.sum(jnp.maximum(self._stretch(space, poses), 0.0) ** 2)
 
     def gaps(self, space, poses, t):
-        return -self._stretch(space, poses)
+        if not any(self.lifts):
+            return -self._stretch(space, poses)
+        places = np.arange(len(self.senses))
+        _, along = self._between(space, poses, places[:-1], places[1:])
+        return jnp.concatenate([-self._stretch(space, poses), -self._lifted(space, poses, along)])
 
 
 class Rope(AbstractRope, AbstractCompound):
@@ -582,7 +624,9 @@ class Rope(AbstractRope, AbstractCompound):
     In an impact friction has no impulse. If the `length` is an input, the rope is paid out at the start of its path.
 
     A rope touches all its pulleys, also where it would lift off: there its angle on the pulley is negative. `simulate`
-    warns of such saved states; `diffrax.Event` on the coordinate `wrap` ends a run there.
+    warns of such saved states; `diffrax.Event` on the coordinate `wrap` ends a run there. An elastic rope in the plane
+    lifts off pulleys with `lifts=True`, where its angle is then zero, and comes back. Neighbours on the path are points
+    or pulleys without `lifts`. In the plane without `count_turns`, such a rope turns by less than 1.1 half turns.
 
     In space the rope lies in the plane of a pulley, through its centre, and leaves it where its projection on this
     plane is a tangent. That is exact for a rope in the plane; a straight part at an angle α to it, of length l in it,
@@ -633,6 +677,7 @@ class Rope(AbstractRope, AbstractCompound):
         self.points = [np.zeros(dimension) if place.centre is None else place.centre for place in places]
         self.senses = tuple(_SENSES[place.turn] for place in places)
         self.grips = tuple(place.grips for place in places)
+        self.lifts = tuple(place.lifts for place in places)
         self.turns = tuple(float(place.turns) for place in places)
         self.rubs = tuple(place.friction is not None for place in places)
         self.friction = [place.friction for place in places if place.friction is not None] or None
@@ -659,6 +704,7 @@ class Rope(AbstractRope, AbstractCompound):
         if self.restitution is not None and not self.slack:
             raise ValueError(f"{self.label}: restitution belongs to a rope with slack=True.")
         self._check_friction()
+        self._check_lifts()
         for k in self.passed_places:
             if self.turns[k] % 1:
                 raise ValueError(
@@ -687,6 +733,26 @@ class Rope(AbstractRope, AbstractCompound):
                 "rope by a Slack."
             )
 
+    def _check_lifts(self) -> None:
+        for k in np.flatnonzero(self.lifts):
+            if k not in self.passed_places or self.grips[k]:
+                raise ValueError(
+                    f"{self.label}: path[{k}] holds the rope, which cannot lift off it; leave lifts out, or let the "
+                    "rope pass it without grips."
+                )
+            if self.stiffness is None:
+                raise ValueError(
+                    f"{self.label}: the force of a rope of constant length would jump where it lifts off path[{k}]; "
+                    "give its stiffness, or leave lifts out."
+                )
+            if self.lifts[k + 1]:
+                raise ValueError(
+                    f"{self.label}: it may lift off path[{k}] and path[{k + 1}], which are neighbours; leave lifts out "
+                    "at every second pulley."
+                )
+            if self.turns[k]:
+                raise ValueError(f"{self.label}: path[{k}] has full turns of rope; leave lifts or turns out.")
+
     def validate(self):
         shape = () if self.spans == 1 else (self.spans,)
         if self.length is not None and self.length.shape != shape:
@@ -708,6 +774,11 @@ class Rope(AbstractRope, AbstractCompound):
     def complete(self, space, poses):
         if space.dimension == 3:
             self._check_axes(space, poses)
+            if any(self.lifts):
+                raise ValueError(
+                    f"{self.label}: in space the length of a rope would jump where it lifts off a pulley; leave lifts "
+                    "out."
+                )
         straight, along = self._straight(space, poses)
         self._check_tangents(straight)
         part, angles = self.with_fields(counts=self._is_counted(space)), np.zeros(0)
@@ -719,7 +790,13 @@ class Rope(AbstractRope, AbstractCompound):
             _, marks = self._wound(space, poses, angles)
             # The rope leaves the mark of a drum at the start, and goes to that of one at the end.
             sides = np.where(self._holding == 0, -1, self._holding == len(straight))
-            part = part.filled(bearings=angles, marks=marks + 2 * np.pi * sides * number[self._holding])
+            bearings = angles
+            if not part.counts:
+                # Angles up to a turn more than those off the pulley.
+                free = np.searchsorted(self.passed_places, np.flatnonzero(self.lifts))
+                bearings = angles.copy()
+                bearings[free] = np.pi - _FARTHEST_OFF
+            part = part.filled(bearings=bearings, marks=marks + 2 * np.pi * sides * number[self._holding])
         lengths = part._measured(space, poses, straight, angles)
         self._check_length(lengths, part._measured(space, poses, 0 * straight, angles))
         return part.filled(length=lengths[0] if self.spans == 1 else lengths)

@@ -178,12 +178,14 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     if motion.ts.ndim != 1:
         raise ValueError("loads takes a single motion; jax.vmap(lambda motion: …)(motions) takes each of a batch.")
     number, drives, machine = system.body_names.index(body), (), system
+    given: tuple[Any, ...] = ()
+    result: Any = motion
     # Only inverse dynamics has actuators apart from the system.
-    if hasattr(motion, "forces"):
-        machine, given = motion.machine, tuple(motion.forces.values())
-        drives = drives_of(machine, motion.forces)
+    if hasattr(result, "machine"):
+        machine, given = result.machine, tuple(result.forces.values())
+        drives = drives_of(machine, result.forces)
     else:
-        motion, given = motion.trimmed(), ()
+        motion = result.trimmed()
     parts, acting = _parts_on(system, number), _drives_on(machine, drives, number)
     points, forces, moments, centre = _along(
         (system, machine),

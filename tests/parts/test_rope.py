@@ -241,6 +241,26 @@ MESSAGES = {
     ),
     "lengths": ((END, WHEEL), {"length": (1.0, 1.0)}, r"length must have shape \(\), one for each of its spans"),
     "slack and elastic": ((END, WHEEL), {"slack": True, "stiffness": 1.0}, "an elastic rope goes slack by itself"),
+    "off a drum": (
+        (END, mb.Pulley("wheel", 0.2, "left", lifts=True)),
+        {"stiffness": 1.0},
+        r"path\[1\] holds the rope, which cannot lift off it",
+    ),
+    "off by a constant length": (
+        (END, mb.Pulley("wheel", 0.2, "left", lifts=True), ("ground", (2.0, 0.0))),
+        {},
+        r"the force of a rope of constant length would jump where it lifts off path\[1\]; give its stiffness",
+    ),
+    "off two neighbours": (
+        (END, *[mb.Pulley("ground", 0.1, "left", (x, 0.0), lifts=True) for x in (0.5, 1.0)], ("ground", (2.0, 0.0))),
+        {"stiffness": 1.0},
+        r"it may lift off path\[1\] and path\[2\], which are neighbours",
+    ),
+    "off with full turns": (
+        (END, mb.Pulley("wheel", 0.2, "left", turns=1.0, lifts=True), ("ground", (2.0, 0.0))),
+        {"stiffness": 1.0},
+        r"path\[1\] has full turns of rope; leave lifts or turns out",
+    ),
     "damping alone": ((END, WHEEL), {"damping": 1.0}, "damping belongs to an elastic rope"),
     "restitution alone": ((END, WHEEL), {"restitution": 0.5}, "restitution belongs to a rope with slack=True"),
 }
@@ -406,6 +426,70 @@ def test_a_rope_that_lifts_off_is_warned_of():
         mb.simulate(system, start, t1=0.2, saveat=heights)
 
 
+def over_a_peg(counts):
+    """An elastic rope from the ground over a pulley to a load that is thrown up, so that it lifts off the pulley."""
+    load = planar.PointMass("load", mass=1.0, position=(1.0, -0.3))
+    over = mb.Pulley("ground", radius=0.1, turn="right", lifts=True)
+    path = [("ground", (-1.0, -0.2)), over, ("load", (0.0, 0.0))]
+    rope = mb.Rope("rope", path, length=1.6, stiffness=15.0, damping=0.5, count_turns=counts)
+    return mb.Scene([load], joints=[rope], forces=[GRAVITY]).compile()
+
+
+def length_over_a_peg(x):
+    """The length of the shortest way from the point (-1, -0.2) over a circle about the origin, and its arc."""
+    fixed, r = jnp.array([-1.0, -0.2]), 0.1
+    d = x - fixed
+    height = (d[0] * -fixed[1] - d[1] * -fixed[0]) / jnp.linalg.norm(d)
+    a, b = jnp.linalg.norm(fixed), jnp.linalg.norm(x)
+    angle = jnp.arccos(fixed @ x / (a * b))
+    angle = jnp.where(fixed[0] * x[1] - fixed[1] * x[0] > 0, 2 * jnp.pi - angle, angle)
+    arc = angle - jnp.arccos(r / a) - jnp.arccos(r / b)
+    touches = jnp.sqrt(a**2 - r**2) + jnp.sqrt(b**2 - r**2) + r * arc
+    return jnp.where(height > -r, touches, jnp.linalg.norm(d)), jnp.where(height > -r, arc, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("counts", [False, True])
+def test_an_elastic_rope_lifts_off_and_comes_back(counts):
+    """The motion by hand, with the way over the pulley or past it. Derivatives are those of a tighter solution."""
+    system = over_a_peg(counts)
+    known = {"rope.stiffness": jnp.asarray(15.0), "load.mass": jnp.asarray(1.0)}
+    ts = np.linspace(0.0, 0.9, 19)
+
+    def run(values, rtol=1e-10):
+        changed = mb.with_parameters(system, values)
+        start = mb.assemble(changed, rates={"load.x": 2.0, "load.y": 4.5})
+        return mb.simulate(changed, start, t1=ts[-1], saveat=ts, rtol=rtol, **METHOD)
+
+    motion = run(known)
+    slope = jax.jit(jax.value_and_grad(lambda x: length_over_a_peg(x)[0]))
+
+    def field(t, y):
+        length, along = slope(y[:2])
+        stretch = float(length) - 1.6
+        pull = max(15.0 * stretch + 0.5 * float(along @ y[2:]), 0.0) if stretch > 0 else 0.0
+        return [*y[2:], *(-pull * np.asarray(along) + [0.0, -G])]
+
+    by_hand = scipy.integrate.solve_ivp(
+        field, (0.0, ts[-1]), (1.0, -0.3, 2.0, 4.5), t_eval=ts, method="DOP853", rtol=1e-11, atol=1e-12
+    )
+    np.testing.assert_allclose(motion["load"].position, by_hand.y[:2].T, rtol=0, atol=1e-7)
+    lengths, arcs = jax.vmap(length_over_a_peg)(jnp.asarray(by_hand.y[:2].T))
+    np.testing.assert_allclose(motion["rope"].length, lengths, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(motion["rope"].wrap[:, 0], arcs, rtol=0, atol=1e-6)
+    # It is off the pulley in between, and taut there for a while.
+    assert arcs[0] > 0 and arcs[-1] > 0 and np.any((arcs == 0) & (lengths > 1.6))
+
+    end = lambda values, rtol=1e-10: run(values, rtol)["load"].position[-1]
+    forward, reverse = jax.jit(jax.jacfwd(end))(known), jax.jit(jax.jacrev(end))(known)
+    tight = jax.jit(lambda values: end(values, 1e-12))
+    for name, value in known.items():
+        h = 1e-5 * value
+        difference = (tight(known | {name: value + h}) - tight(known | {name: value - h})) / (2 * h)
+        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(forward[name], difference, rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_a_crane_that_swings_while_it_hoists():
     """Lagrange's equation by hand, l θ̈ + 2 V θ̇ + R θ̇² + g sin θ = 0 with the free length l, l̇ = R θ̇ + V, of a rope
@@ -454,6 +538,39 @@ def test_a_slack_rope_tightens_and_goes_slack():
     np.testing.assert_allclose(motion["load"].position[:, 1], heights, rtol=0, atol=1e-8)
     np.testing.assert_allclose(motion["rope"].gap, np.array(heights) + 1.0, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(motion["rope"].tension, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_derivatives_through_the_impact_of_a_slack_rope(dimension):
+    """By length and restitution, of the height after the impact and of its time, as of the closed forms."""
+    if dimension == 2:
+        load, over, end = point("load", 1.0, 0.1, -0.2), mb.Pulley("ground", 0.1, "right"), (-0.5, 0.1)
+    else:
+        load = spatial.PointMass("load", mass=1.0, position=(0.1, 0.0, -0.2))
+        over, end = mb.Pulley("ground", 0.1, "right", axis=AXIS), (-0.5, 0.0, 0.1)
+    length = 1.5 + 0.05 * np.pi
+    path = [("ground", end), over, ("load", np.zeros(dimension))]
+    rope = mb.Rope("rope", path, length=length, slack=True, restitution=0.5)
+    gravity = GRAVITY if dimension == 2 else UP_3D
+    system = mb.Scene([load], joints=[rope], forces=[gravity]).compile()
+    start, at = mb.assemble(system), {"rope.length": jnp.asarray(length), "rope.restitution": jnp.asarray(0.5)}
+
+    def end_of_run(values):
+        motion = mb.simulate(mb.with_parameters(system, values), start, t1=0.5, rtol=1e-10, max_events=4)
+        return jnp.stack([motion["load"].position[-1, -1], motion.events.times[0]])
+
+    def by_hand(values):
+        depth, back = 0.8 + values["rope.length"] - length, values["rope.restitution"]
+        fall = jnp.sqrt(2.0 * depth / G)
+        after = 0.5 - fall
+        return jnp.stack([-0.2 - depth + back * G * fall * after - 0.5 * G * after**2, fall])
+
+    expected = jax.jacfwd(by_hand)(at)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = jax.jit(derivative(end_of_run))(at)
+        for name, value in expected.items():
+            np.testing.assert_allclose(found[name], value, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.slow
