@@ -92,7 +92,8 @@ def lifted_ropes(system: Any, motion: Any) -> list[str]:
                 out[name] = (
                     f"Rope {name!r} is off its pulley path[{part.passed_places[pulley]}] at t = "
                     f"{float(motion.ts[k]):.6g}: its angle there is {wraps[k, pulley]:.3g} rad, and it is still guided "
-                    "by the pulley. Leave the pulley out, or end the run by an event where the angle is zero."
+                    "by the pulley. Leave the pulley out, end the run by an event where the angle is zero, or in the "
+                    "plane let an elastic rope leave a Pulley(..., lifts=True)."
                 )
     return list(out.values())
 

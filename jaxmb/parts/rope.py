@@ -184,7 +184,8 @@ class AbstractRope(AbstractLink):
         if not k.size:
             return lengths, along
         past, along_past = self._between(space, poses, k - 1, k + 1)
-        xp, number, first = namespace(lengths), np.full(len(lengths), k.size), np.zeros(len(lengths))
+        xp: Any = namespace(lengths)
+        number, first = np.full(len(lengths), k.size), np.zeros(len(lengths))
         number[k - 1] = number[k] = np.arange(k.size)
         first[k - 1] = 1.0
         of_parts = lambda values: unchecked_take(xp.concatenate([values, xp.ones_like(values[:1])]), number)
@@ -194,22 +195,18 @@ class AbstractRope(AbstractLink):
 
     def _lifted(self, space, poses, along) -> Any:
         """The angles [rad] on pulleys that the rope may leave, from parts that touch them; negative where it is off."""
-        angles, lifting = self._angles(space, poses, along), np.flatnonzero(self.lifts)
-        xp, of_these = (
-            namespace(angles),
-            lambda values: unchecked_take(values, np.searchsorted(self.passed_places, lifting)),
-        )
-        angles: Any = of_these(angles)
+        numbers = np.searchsorted(self.passed_places, np.flatnonzero(self.lifts))
+        angles: Any = unchecked_take(self._angles(space, poses, along), numbers)
         if not self.counts or self.bearings is None:
-            return xp.where(angles > -_FARTHEST_OFF, angles, angles + 2 * np.pi)
-        known = of_these(self._counted(poses) + self.bearings)
+            return namespace(angles).where(angles > -_FARTHEST_OFF, angles, angles + 2 * np.pi)
+        known = unchecked_take(self._counted(poses) + self.bearings, numbers)
         angles = angles + turns(known - angles)
         # Farther off, the rope would seem to touch the pulley again.
         return jnp.where(jnp.abs(angles - known) < _FARTHEST_OFF, angles, jnp.nan)
 
     def _between(self, space, poses, before: np.ndarray, after: np.ndarray) -> tuple[Any, Any]:
         """Lengths and directions of the straight parts between some places."""
-        centres = _each(space.point, self._at(poses), self.points)
+        centres: Any = _each(space.point, self._at(poses), self.points)
         xp = namespace(centres)
         d: Any = unchecked_take(centres, after) - unchecked_take(centres, before)
         if not len(self._pulleys):
@@ -555,7 +552,9 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
         return self.lengths(space, poses) - self.length.reshape(-1)
 
     def _tension(self, stretch, rate):
-        pull = jnp.maximum(self.stiffness * stretch + self.damping * rate, 0.0)
+        # A force that jumps where the rope tightens would have wrong derivatives.
+        pull = self.stiffness * stretch
+        pull = pull + jnp.clip(self.damping * rate, -pull, pull)
         # Not the other way round: a path without tangents is not slack.
         return jnp.where(stretch <= 0, 0.0, pull)
 
@@ -612,7 +611,8 @@ class Rope(AbstractRope, AbstractCompound):
     A rope of constant length pulls and pushes, so that its tension may be negative. With `slack=True` it only pulls: it
     goes slack and tightens with an impact, both at times that `simulate` finds, and its coordinate `gap` [m] is how
     much longer it is than its path. An elastic rope, with a `stiffness`, only pulls: the tension of a span is
-    `stiffness (l − length) + damping l̇`, zero where that is negative or the span is not stretched.
+    `stiffness (l − length) + damping l̇`, and zero where it is not stretched. The part of the damping is at most as
+    large as that of the stiffness, so that the tension neither jumps nor pushes.
 
     A pulley with `friction` μ holds the rope while neither tension exceeds the other by more than `e^(μ φ)` times, with
     the angle φ of rope on it. Beyond, the rope slips: `T₂ = T₁ e^(μ φ)`, the equation of the capstan. Stick is exact,
