@@ -179,8 +179,7 @@ class AbstractRope(AbstractLink):
         """Of the straight parts: lengths [m], and unit vectors along them in the planes of their pulleys. The part
         before a pulley off which the rope has lifted leads to the place behind it, and the next part has no length.
         """
-        places, k = np.arange(len(self.senses)), np.flatnonzero(self.lifts)
-        lengths, along = self._between(space, poses, places[:-1], places[1:])
+        k, (lengths, along) = np.flatnonzero(self.lifts), self._touching(space, poses)
         if not k.size:
             return lengths, along
         past, along_past = self._between(space, poses, k - 1, k + 1)
@@ -189,8 +188,8 @@ class AbstractRope(AbstractLink):
         number[k - 1] = number[k] = np.arange(k.size)
         first[k - 1] = 1.0
         of_parts = lambda values: unchecked_take(xp.concatenate([values, xp.ones_like(values[:1])]), number)
-        angles, past = of_parts(self._lifted(space, poses, along)), first.astype(lengths.dtype) * of_parts(past)
-        off, lengths = angles <= 0, xp.where(xp.isnan(angles), np.nan, lengths)
+        past = first.astype(lengths.dtype) * of_parts(past)
+        off = of_parts(self._lifted(space, poses, along)) <= 0
         return xp.where(off, past, lengths), xp.where(off[:, None], of_parts(along_past), along)
 
     def _lifted(self, space, poses, along) -> Any:
@@ -200,9 +199,12 @@ class AbstractRope(AbstractLink):
         if not self.counts or self.bearings is None:
             return namespace(angles).where(angles > -_FARTHEST_OFF, angles, angles + 2 * np.pi)
         known = unchecked_take(self._counted(poses) + self.bearings, numbers)
-        angles = angles + turns(known - angles)
-        # Farther off, the rope would seem to touch the pulley again.
-        return jnp.where(jnp.abs(angles - known) < _FARTHEST_OFF, angles, jnp.nan)
+        return angles + turns(known - angles)
+
+    def _touching(self, space, poses) -> tuple[Any, Any]:
+        """The straight parts of a rope that touches all its pulleys."""
+        places = np.arange(len(self.senses))
+        return self._between(space, poses, places[:-1], places[1:])
 
     def _between(self, space, poses, before: np.ndarray, after: np.ndarray) -> tuple[Any, Any]:
         """Lengths and directions of the straight parts between some places."""
@@ -261,7 +263,10 @@ class AbstractRope(AbstractLink):
             return jnp.zeros(0, along.dtype)
         angles = self._angles(space, poses, along)
         if self.counts:
-            return angles + turns(self._counted(poses) + self.bearings - angles)
+            known = self._counted(poses) + self.bearings
+            off = np.isin(np.arange(self.size), np.searchsorted(self.passed_places, np.flatnonzero(self.lifts)))
+            known = jnp.where(off & (known < 0), 0.0, known) if np.any(off) else known
+            return angles + turns(known - angles)
         away = shortest(angles - self.bearings)
         # No step passes from here to the other side, where the angle would jump by a turn.
         return self.bearings + jnp.where(jnp.abs(away) < _FARTHEST, away, jnp.nan)
@@ -370,7 +375,8 @@ class RopePath(AbstractRope, AbstractTendon):
     def residual(self, space, poses, t):
         if not self.rows:
             return super().residual(space, poses, t)
-        angles = self._angles(space, poses, self._straight(space, poses)[1])
+        # The rates of other angles jump where the rope lifts off.
+        angles = self._angles(space, poses, self._touching(space, poses)[1])
         return shortest(self._counted(poses) + self.bearings - angles)
 
     def length(self, space, poses):
@@ -573,8 +579,7 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
     def gaps(self, space, poses, t):
         if not any(self.lifts):
             return -self._stretch(space, poses)
-        places = np.arange(len(self.senses))
-        _, along = self._between(space, poses, places[:-1], places[1:])
+        _, along = self._touching(space, poses)
         return jnp.concatenate([-self._stretch(space, poses), -self._lifted(space, poses, along)])
 
 
