@@ -8,7 +8,6 @@ import dataclasses
 import itertools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from jaxtyping import Array
 
 from ..linalg.graphs import connected
 from ..linalg.inertia import DiagonalInertia
+from ..linalg.jitted import on_host
 from ..linalg.rotations import unrotate
 from ..states.closest import largest_residual, meet_in_blocks, tolerance
 from ..states.redundancy import (
@@ -117,18 +117,14 @@ def _analysed(system):
     if on_host is not None and on_host.holds(met):
         q, at = met, _of_host(on_host, met)
     else:
-        q, *at = map(_numbers, _met(system))
+        q, *at = _met(system)
         at = _Evaluation(*at)
     norms: Any = _row_norms(system, at.blocks)
     residual = largest_residual(at.unmet, norms[: system.position_rows])
     return jax.device_put(q), residual, at
 
 
-def _numbers(tree):
-    return jax.tree.map(np.asarray, tree)
-
-
-@eqx.filter_jit
+@on_host
 def _met(system):
     q, t = system.guess.q, jnp.zeros((), system.guess.q.dtype)
     at, fixed = _at_rest(system, t, q), np.zeros(system.nu, bool)
@@ -159,7 +155,7 @@ def _displaced(system, t, q, moved):
     """The evaluation after displacements along velocities, in multiples of their scales."""
     on_host = system.on_host(t)
     if on_host is None:
-        return _Evaluation(*_numbers(_displaced_by_jax(system, t, q, moved)))
+        return _displaced_by_jax(system, t, q, moved)
     return _of_host(on_host, on_host.displaced(np.asarray(q), on_host.velocity_scale * moved))
 
 
@@ -167,12 +163,12 @@ def _at_rest(system, t, q):
     return Instant(system, t, q, jnp.zeros(system.nu, q.dtype))
 
 
-@eqx.filter_jit
+@on_host
 def _displaced_by_jax(system, t, q, moved):
     return _evaluated(system, t, _at_rest(system, t, q).moved(system.velocity_scale() * moved).q)
 
 
-@eqx.filter_jit
+@on_host
 def _asked(system, q):
     """Residuals of the guess's velocities, and of zero accelerations after the velocities are corrected."""
     t, u = jnp.zeros((), q.dtype), system.guess.u
@@ -197,7 +193,7 @@ def _motions_as_one(layout, q):
     return np.pad(np.concatenate([moved, turned]), ((0, 0), (0, resting), (0, 0)))
 
 
-@eqx.filter_jit
+@on_host
 def _way_back(system, t, q, moved):
     """The smallest displacement from the displaced configuration to the constraints, in multiples of scales."""
     scale = system.velocity_scale()
@@ -212,7 +208,7 @@ def _check_contradictions(system, q, shares):
     """
     if not shares or not system.linear or (system.drift_free and not system.constraints.servos):
         return
-    for what, asked in zip(("velocities", "accelerations"), map(np.asarray, _asked(system, q)), strict=True):
+    for what, asked in zip(("velocities", "accelerations"), _asked(system, q), strict=True):
         least = 1e-6 * max(np.max(np.abs(asked), initial=0.0), 1e-6)
         names, largest = set(), 0.0
         for row, by, multiples in shares:
@@ -319,7 +315,7 @@ def _check_nearby(system, q, joints, subsets):
         t = np.asarray(t, q.dtype)
         at = _displaced(system, t, q, moved)
         displaced, unmet = joints._replace(blocks=_of_parts(at.blocks)), np.asarray(at.unmet)
-        back: Any = np.asarray(_way_back(system, t, q, moved)) if is_sparse else None
+        back: Any = _way_back(system, t, q, moved) if is_sparse else None
 
         def dense(subset):
             return displaced.dense(subset.parts, subset.columns) * joints.scale[subset.columns]
