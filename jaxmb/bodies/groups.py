@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .._captured import Captured
 from .._types import Scalar
+from ..linalg.blocks import vector_products
 from ..linalg.sums import unchecked_take
 from ..parts.base import AbstractLink, AbstractPart
 from ..parts.boundary import captured
@@ -385,9 +386,10 @@ class ConstraintGroup(AbstractConstraintGroup):
 
         def single(at, x, moves):
             if self.rows < len(moves):
+                # Fewer rows than bodies: the gradient of each row, then its products with the motions.
                 value, pull = jax.vjp(lambda x: self._residual(at, t, x), x)
-                (rows,) = jax.vmap(pull)(jnp.eye(self.rows, dtype=value.dtype))
-                return jax.vmap(lambda of_bodies: jax.vmap(jnp.matmul)(moves, of_bodies))(rows)
+                (gradients,) = jax.vmap(pull)(jnp.eye(self.rows, dtype=value.dtype))
+                return jax.vmap(lambda of_bodies: vector_products(moves, of_bodies))(gradients)
 
             def along_one(body):
                 # The residual's value is the same for every body, so XLA computes it once.

@@ -212,17 +212,21 @@ class AbstractRope(AbstractLink):
         xp = namespace(centres)
         d: Any = unchecked_take(centres, after) - unchecked_take(centres, before)
         if not len(self._pulleys):
-            length = norm(d)
-            return length, d / xp.where(length > 0, length, 1.0)[:, None]
+            return _between_points(d)
         places = np.arange(len(self.senses))
         number = np.where(np.isin(places, self._pulleys), np.searchsorted(self._pulleys, places), len(self._pulleys))
         at = lambda values, index: unchecked_take(xp.concatenate([values, xp.zeros_like(values[:1])]), index)
         # The rope is to the right of the centre of a pulley on which it turns left.
         offset = self._signed(places, at(self.radii, number))
-        axes = None
+        axes, nearest = None, np.minimum(number[before], number[after])
         if space.dimension == 3:
-            axes = at(self._axes(space, poses), np.minimum(number[before], number[after]))
-        return tangent_lines(d, unchecked_take(offset, after) - unchecked_take(offset, before), axes)
+            axes = at(self._axes(space, poses), nearest)
+        lengths, along = tangent_lines(d, unchecked_take(offset, after) - unchecked_take(offset, before), axes)
+        if axes is not None and len(self._pulleys) in nearest:
+            # Between two points there is no axis.
+            plain, (length, direction) = nearest == len(self._pulleys), _between_points(d)
+            return xp.where(plain, length, lengths), xp.where(plain[:, None], direction, along)
+        return lengths, along
 
     def _axes(self, space, poses) -> Any:
         """Axes of the pulleys, in the world."""
@@ -356,6 +360,12 @@ class AbstractRope(AbstractLink):
             for k, radius, axis in zip(self._pulleys, self.radii, axes, strict=False)
             for shape in wheel(radius, None, space.in_space(self.points[k]), axis)
         )
+
+
+def _between_points(d):
+    """The lengths of vectors, and unit vectors along them; zero of a zero vector."""
+    length = norm(d)
+    return length, d / namespace(d).where(length > 0, length, 1.0)[:, None]
 
 
 def _each(function, *rows):

@@ -313,6 +313,25 @@ def test_a_rope_leaves_the_plane_of_a_pulley():
     np.testing.assert_allclose(system.force(0.0, state.q, state.u), pull, rtol=0, atol=1e-11)
 
 
+def test_a_rope_through_an_eye_in_space():
+    """A straight part between two points, beside a pulley: accelerations are those of the plane, out of a motion."""
+    found = []
+    for dimension in (2, 3):
+        own, axis = (planar, {}) if dimension == 2 else (spatial, {"axis": AXIS})
+        at = lambda x, z, dimension=dimension: (x, z) if dimension == 2 else (x, 0.0, z)
+        ends = {"left": at(-1.2, -0.9), "right": at(0.8, -1.1)}
+        loads = [own.PointMass(name, mass=1.0, position=place) for name, place in ends.items()]
+        path = [("left", at(0.0, 0.0)), ("ground", at(-0.5, 0.0)), mb.Pulley("ground", 0.2, "right", **axis)]
+        rope = mb.Rope("rope", [*path, ("right", at(0.0, 0.0))])
+        system = mb.Scene(loads, joints=[rope], forces=[GRAVITY if dimension == 2 else UP_3D]).compile()
+        up = "y" if dimension == 2 else "z"
+        rates = {"left.x": 0.7, f"left.{up}": -0.4, "right.x": 0.9}
+        own_values = instant(system, mb.assemble(system, rates=rates))
+        found.append([own_values(f"{name}.acceleration")[[0, -1]] for name in ends] + [own_values("rope.tension")])
+    for plane, space in zip(*found, strict=True):
+        np.testing.assert_allclose(space, plane, rtol=1e-12)
+
+
 def crane(dimension, **rope):
     """A load that swings under a pulley, on a rope from a drum with a motor."""
     own, axis = (planar, {}) if dimension == 2 else (spatial, {"axis": AXIS})
