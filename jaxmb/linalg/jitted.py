@@ -8,12 +8,14 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 
+from .._compat import current_trace
 from .arrays import ARRAYS, is_traced
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
+_NO_TRACE = current_trace()
 # Programs that are called a few times then compile in half the time.
 _FOR_FEW_CALLS = {"xla_backend_optimization_level": 0}
 
@@ -57,9 +59,14 @@ def on_host(function: Callable[_Arguments, Any]) -> Callable[_Arguments, Any]:
 
     @functools.wraps(function)
     def called(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:
-        # Within a trace JAX would trace these numbers as well. The context costs a program for each constant.
-        tracing = is_traced(jax.device_put(0.0))
-        with jax.ensure_compile_time_eval() if tracing else contextlib.nullcontext():
+        with computed_at_once():
             return jax.tree.map(np.asarray, program(*arguments, **named))
 
     return called
+
+
+def computed_at_once() -> contextlib.AbstractContextManager[None]:
+    """A context in which concrete numbers stay so, even while JAX traces something else."""
+    # Under `jit` JAX would trace these numbers as well. The context costs a program for each constant.
+    traces = current_trace() != _NO_TRACE and is_traced(jax.device_put(0.0))
+    return jax.ensure_compile_time_eval() if traces else contextlib.nullcontext()

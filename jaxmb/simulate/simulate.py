@@ -1,5 +1,6 @@
 """From a system and a state to a motion."""
 
+import contextlib
 from collections.abc import Mapping
 from typing import Literal
 
@@ -8,6 +9,7 @@ from jaxtyping import ArrayLike
 
 from .._types import Scalar, State, VectorLike
 from ..formulations import AbstractFormulation
+from ..linalg.jitted import computed_at_once
 from ..manifold import AbstractManifold
 from ..parts.names import names_arguments
 from ..system import AbstractSystem
@@ -124,4 +126,5 @@ def simulate(
         progress_meter=progress_meter,
     )
     run = Run.checked(asked)
-    return run.finished(run.solved())
+    with contextlib.nullcontext() if run.problem.traced else computed_at_once():
+        return run.finished(run.solved())

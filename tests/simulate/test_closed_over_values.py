@@ -48,6 +48,20 @@ def test_derivatives_by_what_functions_close_over(run, x):
     np.testing.assert_allclose(both[0], reverse, rtol=1e-9)
 
 
+def test_a_motion_of_numbers_within_a_trace():
+    """It is computed once, at the trace, and its failure is told there."""
+    end = lambda t1=0.5: mb.simulate(PENDULUM.system, PENDULUM.state, t1=t1).ys.q[-1]
+    expected = end()
+    np.testing.assert_allclose(jax.jit(lambda factor: factor * end())(2.0), 2.0 * expected, rtol=1e-12)
+    slope = jax.jit(jax.grad(lambda factor: jnp.sum(factor * end())))(2.0)
+    np.testing.assert_allclose(slope, np.sum(expected), rtol=1e-12)
+    both = jax.jit(jax.vmap(lambda factor: factor * end()))(jnp.arange(2.0))
+    np.testing.assert_allclose(both, np.outer([0.0, 1.0], expected), rtol=1e-12)
+    with pytest.raises(RuntimeError, match="The motion came to"):
+        run = lambda: mb.simulate(PENDULUM.system, PENDULUM.state, t1=0.5, max_steps=3)
+        jax.jit(lambda factor: factor * run().ys.q[-1])(2.0)
+
+
 def test_values_that_cannot_be_found():
     class Hidden:
         pass
