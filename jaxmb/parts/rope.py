@@ -341,11 +341,13 @@ class AbstractRope(AbstractLink):
             if not sense:
                 out.append(centres[k][None])
                 continue
-            axis, turned = next(axes), sense * next(angles) * jnp.linspace(0.0, 1.0, 17)
+            axis, angle = next(axes), next(angles)
+            turned = sense * angle * jnp.linspace(0.0, 1.0, 17)
             e = along[max(k - 1, 0)][None]
-            turned = turned[:, None] - turned[-1] * (k == 0)
+            turned = turned[:, None] - (turned[-1] if k == 0 else 0.0)
             side = quarter_turn(e) if axis is None else cross(axis[None], e)
-            out.append(centres[k][None] - sense * next(radii) * (jnp.cos(turned) * side - jnp.sin(turned) * e))
+            arc = centres[k][None] - sense * next(radii) * (jnp.cos(turned) * side - jnp.sin(turned) * e)
+            out.append(jnp.where(angle > 0, arc, out[-1][-1:]) if self.lifts[k] else arc)
         # There and back, since a belt is a closed line.
         there = jnp.concatenate(out)
         return jnp.concatenate([there, there[-2:0:-1]])
@@ -795,7 +797,7 @@ class Rope(AbstractRope, AbstractCompound):
                     "out."
                 )
         straight, along = self._straight(space, poses)
-        self._check_tangents(straight)
+        self._check_tangents(self._touching(space, poses)[0])
         part, angles = self.with_fields(counts=self._is_counted(space)), np.zeros(0)
         if self.size:
             passed, number = len(self.passed_places), np.array(self.turns)

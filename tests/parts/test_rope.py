@@ -454,6 +454,23 @@ def over_a_peg(counts):
     return mb.Scene([load], joints=[rope], forces=[GRAVITY]).compile()
 
 
+def test_a_rope_that_begins_off_its_pulley():
+    """It is a straight line, also in pictures, with the tension of a spring between its ends."""
+    load, over = point("load", 1.0, 1.0, 0.5), mb.Pulley("ground", radius=0.1, turn="right", lifts=True)
+    path = [("ground", (-1.0, -0.2)), over, ("load", (0.0, 0.0))]
+    system = mb.Scene([load], joints=[mb.Rope("rope", path, length=1.9, stiffness=50.0)]).compile()
+    own, length = instant(system, mb.assemble(system)), np.hypot(2.0, 0.7)
+    assert own("rope.length") == pytest.approx(length, rel=1e-14) and own("rope.wrap")[0] == 0
+    np.testing.assert_allclose(own("load.acceleration"), -50.0 * (length - 1.9) * np.array([2.0, 0.7]) / length)
+    (group,) = [g.group for g in system.forces.groups if g.group.part.has_tension]
+    line = jax.tree.map(lambda x: x[0], group.part).path(
+        group.layout.space, np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
+    )
+    np.testing.assert_allclose(
+        (np.asarray(line) + np.array([1.0, 0.2])) @ np.array([-0.7, 2.0]), 0.0, rtol=0, atol=1e-14
+    )
+
+
 def length_over_a_peg(x):
     """The length of the shortest way from the point (-1, -0.2) over a circle about the origin, and its arc."""
     fixed, r = jnp.array([-1.0, -0.2]), 0.1
