@@ -117,7 +117,7 @@ class Force(AbstractPotentialForce):
     - `function`: returns shape `(len(bodies), 3)` in the plane (force [N], moment [N m]) or `(len(bodies), 6)` in space
         (force in the world frame, moment in the body frame); of one body also shape `(3,)` or `(6,)`. Force and moment
         refer to the origin of the body's frame, whose pose and velocity the function sees: the mass centre, unless the
-        body was given `centre=`.
+        body was given `centre=`. Derivatives of the motion are wrong if it jumps where a state passes a value.
     - `parameters`: numbers by name; they become parameters of the system, `"name.key"`. An equinox module, such as a
         neural network, may be among them: the function calls it as `parameters["net"](x)`, and all its weights are one
         parameter, a vector. `with_parameters` takes new weights as a vector or a module; `jaxmb.modules` returns the
