@@ -1,7 +1,7 @@
 """The evaluation of a program of one member for several members."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -113,13 +113,16 @@ def apart(function: Callable[..., Any]) -> Callable[..., Any]:
     return separate
 
 
-def in_lanes(program: Any, size: int) -> Callable[..., list[Any]]:
+def in_lanes(program: Any, size: int, varies: Sequence[bool] | None = None) -> Callable[..., list[Any]]:
     """A closed program of one member, as a function of arrays with `size` members along their last axis. Results have
     members along their last axis as well.
+
+    **Arguments:** `varies`: which arrays have members, default all; the others are the same for all members.
     """
 
     def of_members(*arrays):
-        out = Lanes(size).run(program, [Value(x, True) for x in arrays])
+        values = map(Value, arrays, [True] * len(arrays) if varies is None else varies)
+        out = Lanes(size).run(program, list(values))
         return [Lanes(size).spread(value) for value in out]
 
     return of_members

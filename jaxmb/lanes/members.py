@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from .._setup import computes_side_by_side
 from ..linalg.members import in_blocks
-from .evaluate import Lanes, Value
+from .evaluate import in_lanes
 from .sizes import loops
 
 # The number of members side by side, which fill a vector register in double precision; and the most bytes that their
@@ -48,10 +48,9 @@ def of_one_or_more(function: Callable[..., PyTree], *arguments: Any) -> PyTree:
             return jax.vmap(of_one.fun, (axes,))(arrays), all_batched(out)
 
         def of_block(members):
-            lanes = Lanes(jax.tree.leaves(members)[0].shape[0])
-            every = zip(jax.tree.leaves(eqx.combine(members, arrays)), jax.tree.leaves(varies), strict=True)
-            values = [Value(jnp.moveaxis(x, 0, -1) if varies else x, varies) for x, varies in every]
-            return [jnp.moveaxis(lanes.spread(value), -1, 0) for value in lanes.run(program, values)]
+            last = eqx.combine(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), members), arrays)
+            evaluated = in_lanes(program, jax.tree.leaves(members)[0].shape[0], jax.tree.leaves(varies))
+            return [jnp.moveaxis(x, -1, 0) for x in evaluated(*jax.tree.leaves(last))]
 
         results = in_blocks(of_block, eqx.filter(arrays, varies), SIDE_BY_SIDE)
         return jax.tree.unflatten(jax.tree.structure(out), results), all_batched(out)
