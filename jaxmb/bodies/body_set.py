@@ -96,12 +96,11 @@ class BodySet(eqx.Module):
             rates = rates.at[self._places(g)].set(-g.velocity(self.kinematics(t, q, u)))
         return rates
 
-    def normalize(self, q: Coordinates) -> Float[Array, "nq"]:
+    def normalize(self, t: Scalar, q: Coordinates) -> Float[Array, "nq"]:
         """Coordinates with Euler parameters of length one, and with exact counts of turns."""
         q = self._pack(jax.vmap(self.layout.space.normalize)(self._poses(q)))
         for g in self.turn_counts:
-            # A count of turns does not depend on the time.
-            unmet = g.residual(jnp.zeros((), q.dtype), self.prepared_poses(q))
+            unmet = g.residual(jnp.asarray(t, q.dtype), self.prepared_poses(q))
             q = q.at[self._places(g)].add(-unmet)
         return q
 

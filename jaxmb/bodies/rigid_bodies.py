@@ -157,8 +157,8 @@ class RigidBodySystem(AbstractSystem):
     def rates(self, t, q, u):
         return u if self.rates_are_velocities else self.bodies.rates(t, q, u)
 
-    def normalize(self, q):
-        return q if self.rates_are_velocities else self.bodies.normalize(q)
+    def normalize(self, t, q):
+        return q if self.rates_are_velocities else self.bodies.normalize(t, q)
 
     def normalize_fixed(self, q, fixed):
         return self.bodies.normalize_fixed(q, fixed)

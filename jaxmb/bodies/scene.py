@@ -268,7 +268,8 @@ def _with_initial_scalars(system: RigidBodySystem) -> RigidBodySystem:
 @on_host
 def _scalars(system):
     guess, layout = system.guess, system.layout
-    t, q, u = jnp.zeros((), guess.q.dtype), system.normalize(guess.q), guess.u
+    t, u = jnp.zeros((), guess.q.dtype), guess.u
+    q = system.normalize(t, guess.q)
     for g in system.constraints.inertial:
         scalars = g.group.body_index[:, -1]
         unmet = g.residual(t, system.bodies.prepared_poses(q))[:, 0]

@@ -45,8 +45,9 @@ class ContactGuards(AbstractGuards):
 
     def values(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
-        contacts, q = system.contacts, system.normalize(y.q)
-        t, modes = jnp.asarray(t, q.dtype), contacts.modes(q)
+        contacts, t = system.contacts, jnp.asarray(t, y.q.dtype)
+        q = system.normalize(t, y.q)
+        modes = contacts.modes(q)
         gap = contacts.gaps(system, t, q)
         free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers.peaks), system.length)
         acts = self.forces(y)
@@ -88,7 +89,7 @@ class ContactGuards(AbstractGuards):
 
     def changed(self, before, after):
         system, before, after = lax.stop_gradient((self.system, before, after))
-        kinds = lambda y: system.contacts.modes(system.normalize(y.q)).kinds
+        kinds = lambda y: system.contacts.modes(y.q).kinds
         # Without impulses, velocities change by rounding errors.
         scale, change = system.velocity_scale(), jnp.abs(after.u - before.u)
         sizes = jnp.abs(after.u) + jnp.abs(before.u)
@@ -96,7 +97,7 @@ class ContactGuards(AbstractGuards):
         return jnp.any(kinds(before) != kinds(after)) | ~jnp.all(change <= least)
 
     def forces(self, y):
-        modes = self.system.contacts.modes(self.system.normalize(y.q))
+        modes = self.system.contacts.modes(y.q)
         return jnp.concatenate([modes.closed, modes.held])
 
     def begins(self, t, y):
@@ -104,8 +105,9 @@ class ContactGuards(AbstractGuards):
         contacts = system.contacts
         if not contacts.m:
             return None
-        q = system.normalize(y.q)
-        modes, rates = contacts.modes(q), contacts.rates(system, jnp.asarray(t, q.dtype), q, y.u)[contacts.n :]
+        t = jnp.asarray(t, y.q.dtype)
+        q = system.normalize(t, y.q)
+        modes, rates = contacts.modes(q), contacts.rates(system, t, q, y.u)[contacts.n :]
         begins = modes.slides & (modes.of_friction * rates <= self.touch * system.length)
         if contacts.pairs:
             begins = for_first(contacts.pairs, modes.in_plane.begun, begins)
@@ -113,8 +115,8 @@ class ContactGuards(AbstractGuards):
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
-        contacts, q = system.contacts, system.normalize(y.q)
-        t = jnp.asarray(t, q.dtype)
+        contacts, t = system.contacts, jnp.asarray(t, y.q.dtype)
+        q = system.normalize(t, y.q)
         slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers.peaks
         rates = contacts.rates(system, t, q, y.u)[: contacts.n] * slopes / system.length
         # The rates of bodies that move side by side are rounding errors, and close nothing.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar
-from .dataflow import depends
+from ..system.dataflow import depends
 from .kinematics import Parameters
 
 if TYPE_CHECKING:
@@ -35,14 +35,20 @@ class AbstractCoordinateConstraint(eqx.Module):
         """The residual, with `v = q̇` and `a = q̈`; derivatives above the constraint's level are not used."""
 
     def is_linear(self, q: Coordinates, parameters: Parameters) -> bool:
-        """Hook: whether the rows are affine in velocities; always true for a constraint between accelerations."""
-        del q, parameters
-        return True
+        """Hook: whether the rows are affine in velocities, by default from the data flow of `value`; always true for
+        other constraints than between velocities.
+        """
+        slope = lambda t, q, v, p: jax.jacfwd(self.value, 2)(t, q, v, v, p)
+        return self.level != 1 or not depends(slope, (jnp.zeros((), q.dtype), q, q, parameters), 2)
 
     def is_drift_free(self, q: Coordinates, parameters: Parameters) -> bool:
-        """Hook: whether rows between velocities vanish at rest; always true for a constraint between accelerations."""
-        del q, parameters
-        return True
+        """Hook: whether rows between velocities, or rates of rows between positions, vanish at rest; always true for a
+        constraint between accelerations. By default rows between velocities count as if they had a drift.
+        """
+        if self.level != 0:
+            return self.level == 2
+        t = jnp.zeros((), q.dtype)
+        return not depends(lambda t, q, p: self.value(t, q, q, q, p), (t, q, parameters), 0)
 
 
 class Holonomic(AbstractCoordinateConstraint):
@@ -61,10 +67,6 @@ class Holonomic(AbstractCoordinateConstraint):
 
     def value(self, t, q, v, a, parameters):
         return jnp.ravel(self.residual(t, q, parameters))
-
-    def is_drift_free(self, q, parameters):
-        t = jnp.zeros((), q.dtype)
-        return not depends(lambda t, q, p: self.value(t, q, q, q, p), (t, q, parameters), 0)
 
 
 class Nonholonomic(AbstractCoordinateConstraint):
@@ -85,14 +87,6 @@ class Nonholonomic(AbstractCoordinateConstraint):
 
     def value(self, t, q, v, a, parameters):
         return jnp.ravel(self.residual(t, q, v, parameters))
-
-    def is_linear(self, q, parameters):
-        slope = lambda t, q, v, p: jax.jacfwd(self.value, 2)(t, q, v, v, p)
-        return not depends(slope, (jnp.zeros((), q.dtype), q, q, parameters), 2)
-
-    def is_drift_free(self, q, parameters):
-        # Unknown for a function.
-        return False
 
 
 class Pfaffian(AbstractCoordinateConstraint):

@@ -12,8 +12,8 @@ from jaxtyping import Array
 from .._compat import with_values
 from .._types import Scalar
 from ..parts.series import AbstractSignal, of_each, of_one_kind
+from ..system.dataflow import depends
 from ..system.parameter_table import ParameterTable
-from .dataflow import depends
 
 
 class DrivenParameters(eqx.Module):

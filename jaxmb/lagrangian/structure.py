@@ -20,14 +20,14 @@ from ..parts.boundary import is_of_user, with_captured
 from ..parts.names import unknown
 from ..states.closest import meet_constraints, residual_size, tolerance
 from ..states.redundancy import check_gradients, check_implied_as_one
+from ..system.dataflow import depends, is_analytic, shaken
 from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
-from .dataflow import depends
 from .host import HostLagrangian
 from .kinematics import AbstractKinematics, Parameters
 from .model import AbstractLagrangian, Unanalysed
 
-# Number of sets of parameters at which the entries of the mass matrix are compared with zero.
+# Number of random sets of parameters at which the entries of the mass matrix are compared with zero.
 _LOOKS = 3
 # Equilibrated pivots below this power of eps count as zero.
 _ZERO = 0.5
@@ -135,8 +135,11 @@ def find_structure(system: AbstractLagrangian) -> Structure:
     u, p = np.asarray(system.guess.u), system.parameters
     t, host = np.zeros((), q.dtype), HostLagrangian(system, 0.0)
     # A matrix that depends on the coordinates may have other entries elsewhere.
-    constant = system.kinematics.identity and not depends(jax.hessian(system.lagrangian, 2), (t, q, q, p), 0, 1, 2)
-    rates, columns, masses = _evaluate(system, constant)
+    matrix, given = jax.hessian(system.lagrangian, 2), (t, q, q, p)
+    constant = system.kinematics.identity and not depends(matrix, given, 0, 1, 2) and is_analytic(matrix, given, 3)
+    looks = [p, *(shaken(p, seed) for seed in range(_LOOKS if constant else 0))]
+    stacked = jax.tree.map(lambda *each: np.stack(each), *looks)
+    rates, columns, masses = _evaluate(system, stacked, len(looks))
     _check_finite(system, rates, masses[0])
     jacobian = np.zeros((0, rates.size), q.dtype)
     if system.acceleration_rows:
@@ -211,22 +214,18 @@ def _met_by_jax(system):
 
 
 @on_host
-def _evaluate(system, constant):
-    """The rates, their derivatives with respect to the velocities, and second derivatives of L, if they are `constant`
-    also with other parameters.
+def _evaluate(system, looks, count):
+    """The rates, their derivatives with respect to the velocities, and second derivatives of L for stacked sets of
+    parameters: `looks`, as many as `count`.
     """
-    q, u, p = system.guess.q, system.guess.u, system.parameters
+    q, u = system.guess.q, system.guess.u
     t = jnp.zeros((), q.dtype)
     v = system.rates(t, q, u)
     columns = jnp.eye(q.size, dtype=q.dtype)
     if not system.kinematics.identity:
         columns = jax.jacfwd(lambda u: system.rates(t, q, u))(u)
-    shares = jnp.asarray([0.0, *[0.1] * (_LOOKS if constant else 0)], q.dtype)
-    looks = jnp.arange(shares.size, dtype=q.dtype)
-    hessian = lambda share, k: jax.hessian(system.lagrangian, 2)(
-        t, q, v, jax.tree.map(lambda x: _shaken(x, share, k), p)
-    )
-    return v, columns, jax.vmap(hessian)(shares, looks)
+    hessian = lambda p: jax.hessian(system.lagrangian, 2)(t, q, v, p)
+    return v, columns, jax.vmap(hessian, axis_size=count)(looks)
 
 
 @eqx.filter_jit
@@ -234,11 +233,6 @@ def _asked(system, q):
     """The right-hand side of the rows for accelerations, at the given velocities."""
     u = system.guess.u
     return -system.acceleration_residual(jnp.zeros((), q.dtype), q, u, jnp.zeros_like(u))
-
-
-def _shaken(x: Array, share: Array, k: Array) -> Array:
-    """A parameter with each of its numbers changed by a different factor, by about this fraction."""
-    return x * (1 + share * jnp.cos(k + jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape))
 
 
 def _row_counts(system):

@@ -21,8 +21,8 @@ class CompliantGaps(AbstractGaps):
 
     def seen(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
-        q = system.normalize(y.q)
-        return system.gaps_seen(jnp.asarray(t, q.dtype), q, y.u)
+        t = jnp.asarray(t, y.q.dtype)
+        return system.gaps_seen(t, system.normalize(t, y.q), y.u)
 
 
 def compliant_gaps(system: AbstractEquation) -> CompliantGaps | None:

@@ -144,7 +144,7 @@ def find_jumps(
 def _prescribed(system, q, shift, t):
     """The residuals of ψ and A where nothing moves, with shifted coordinates."""
     rest = jnp.zeros(system.nu, q.dtype)
-    at = Instant(system, t, system.normalize(q + system.coordinate_scale() * shift), rest)
+    at = Instant(system, t, system.normalize(t, q + system.coordinate_scale() * shift), rest)
     return jnp.concatenate([at.velocity_residual, at.acceleration_residual(rest)])
 
 

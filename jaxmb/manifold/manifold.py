@@ -123,8 +123,7 @@ class VectorField(AbstractVectorField):
 
 def normalize_state(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state with normalised coordinates."""
-    del t
-    return dataclasses.replace(y, q=system.normalize(y.q))
+    return dataclasses.replace(y, q=system.normalize(t, y.q))
 
 
 def newton_tolerance(given: float | None, rtol: Scalar) -> Any:

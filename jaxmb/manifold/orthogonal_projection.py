@@ -279,7 +279,7 @@ def project_in_metric(
         projector_there = projector_at(projected_q)
     # The solution depends on the initial state like one Newton correction at the solution, with constant matrices. The
     # norm of unnormalised coordinates does not enter: constraints hold for normalised ones.
-    start = at.system.normalize(at.q)
+    start = at.system.normalize(at.t, at.q)
     at = at.with_(q=projected_q + (start - lax.stop_gradient(start)))
     at = at.moved(projector_there.displacement(-at.position_rows))
     here = at.binding_velocities.projector(metric_of(at), projector_there.factor)

@@ -81,7 +81,7 @@ def about_friction(system, coupling) -> str:
 
 def about_contacts(system, outcome: Outcome) -> str:
     """The message about touching bodies for which no forces of contacts and friction are possible."""
-    q = system.normalize(outcome.y.q)
+    q = system.normalize(outcome.t, outcome.y.q)
     contacts = system.contacts
     touch = np.asarray(contacts.gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
     touch = np.append(touch, [True] * contacts.m)
@@ -266,7 +266,7 @@ def about_unmet(system, outcome: Outcome, ahead, rates) -> str:
     speed = np.max(np.abs(y.u) / system.velocity_scale(), initial=0.0)
     next_step = [] if outcome.step is None else [float(outcome.step)]
     for step in [*next_step, *ahead]:
-        q = system.normalize(y.q + step * rates)
+        q = system.normalize(t + step, y.q + step * rates)
         unmet = violated_joints(system, t + step, q, least=max(1e-9, _UNMET * abs(step) * speed))
         if unmet:
             units = " [m, rad]" if system.body_names else ""

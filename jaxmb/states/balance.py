@@ -46,7 +46,7 @@ class Balance(eqx.Module):
 
     def moved(self, q, z):
         """The configuration after a small displacement."""
-        return self.system.normalize(q + self.at(q).with_(u=self.system.velocity_scale() * z).rates)
+        return self.system.normalize(self.t, q + self.at(q).with_(u=self.system.velocity_scale() * z).rates)
 
     def applied(self, q):
         """The applied forces."""

@@ -15,7 +15,7 @@ the metric `M = Kᵀ S⁻² K`, projected by the elimination of `A M⁻¹ Aᵀ`.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,9 +37,12 @@ from ..system.instant import Instant
 # From this number of rows on, closest states of systems with an order of elimination are found in blocks.
 _MANY_ROWS = 300
 
-# Largest number of Gauss–Newton steps to the constraints; each must reduce the squared residuals below this share.
+# Largest number of Gauss–Newton steps to the constraints. Each must reduce the squared residuals by this share, a part of
+# a step by this part of the share.
 _ITERATIONS = 400
-_PROGRESS = 0.999
+_PROGRESS = 0.001
+# Largest error of the linearisation, relative to the change of the residuals, that lets the next step be longer.
+_STRAIGHT = 0.01
 # Pivots of implied rows, relative to the largest entry of the diagonal.
 _SHIFT = 1e-13
 # In blocks these pivots are a multiple of the largest residual, as in the method of Levenberg and Marquardt. They are
@@ -94,6 +97,19 @@ def residual_size(
 # Gauss–Newton steps to the constraints
 
 
+def next_reach(reach: Any, before: Float[Array, "m"], after: Float[Array, "m"], share: Any) -> Any:
+    """The largest size of the next step, in the scales of the coordinates.
+
+    It doubles while residuals fall as their linearisation says, as along a slide, and else it is one: rotations by more
+    than about a radian leave the region where the linearisation is valid.
+
+    **Arguments:** `reach` of the last step; residuals before and after it; `share`: its part of a Newton step.
+    """
+    xp = namespace(before, after)
+    off = xp.sum((after - (1 - share) * before) ** 2)
+    return xp.where(off <= (_STRAIGHT * share) ** 2 * xp.sum(before**2), 2.0 * reach, 1.0)
+
+
 def meet_constraints(
     system: AbstractEquation, t: Scalar, start: Coordinates, scale: Float[Array, "nq"]
 ) -> tuple[Float[Array, "nq"], Float[Array, "m nq"]]:
@@ -106,22 +122,23 @@ def meet_constraints(
     residual = lambda q: system.coordinate_residual(t, q)
 
     def correct(at):
-        q, _ = at
+        q, _, reach = at
         before, jacobian = residual(q), system.coordinate_jacobian(t, q)
         scaled = jacobian * scale[None, :]
         gram = scaled @ scaled.T
         shift = _SHIFT * jnp.max(jnp.diag(gram)) + jnp.finfo(q.dtype).tiny
         step = -scale * (scaled.T @ solve(gram + shift * jnp.eye(gram.shape[0], dtype=q.dtype), before))
         longest = jnp.max(jnp.where(scale > 0, jnp.abs(step) / jnp.where(scale > 0, scale, 1.0), 0.0))
-        best, size, _ = _shortened(residual, lambda step: q + step, q, step, longest)
-        return (best, jacobian), size
+        best, size, _, reach = _shortened(residual, lambda step: q + step, before, step, longest / reach, reach)
+        return (best, jacobian, reach), size
 
     def far(at, size):
-        q, _ = at
+        q, *_ = at
         return (size > 1e-2 * tolerance(q.dtype) * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
 
     none = jnp.zeros((system.coordinate_rows, system.nq), start.dtype)
-    return newton(correct, far, (start, none), most=_ITERATIONS, dtype=start.dtype)[0]
+    begun = start, none, jnp.ones((), start.dtype)
+    return newton(correct, far, begun, most=_ITERATIONS, dtype=start.dtype)[0][:2]
 
 
 def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array, "nq"]:
@@ -138,7 +155,8 @@ def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array
     metric = DiagonalInertia(jnp.where(fixed, jnp.inf, 1 / scale**2))
     residual = lambda q: start.with_(q=q).position_residual
 
-    def correct(q):
+    def correct(carry):
+        q, reach = carry
         at = start.with_(q=q)
         before, jacobian = at.position_residual, at.binding_velocities
         largest = largest_residual(before, jacobian.row_norms(scale)[: system.position_rows])
@@ -146,29 +164,35 @@ def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array
         multipliers = factor.refined(jacobian.gather_rows(at.position_rows))
         step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
         longest = jnp.max(jnp.abs(step) / scale)
-        best, size, better = _shortened(residual, lambda step: at.moved(step).q, q, step, longest)
-        return jnp.where(better, best, q), size
+        moved = lambda step: at.moved(step).q
+        best, size, better, reach = _shortened(residual, moved, before, step, longest / reach, reach)
+        return (jnp.where(better, best, q), reach), size
 
     small = float(jnp.finfo(dtype).eps) ** 0.75
-    far = lambda q, size: (size > small * jnp.max(scale)) & jnp.all(jnp.isfinite(q))
-    return newton(correct, far, start.normalized().q, most=_ITERATIONS, dtype=dtype)[0]
+    far = lambda carry, size: (size > small * jnp.max(scale)) & jnp.all(jnp.isfinite(carry[0]))
+    begun = start.normalized().q, jnp.ones((), dtype)
+    return newton(correct, far, begun, most=_ITERATIONS, dtype=dtype)[0][0]
 
 
-def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Array], q, step, longest):
-    """The best configuration along a Gauss–Newton step, the step's size, and whether it reduces the residuals.
+def _shortened(residual: Callable[[Array], Array], moved: Callable[[Array], Array], before, step, longest, reach):
+    """The best configuration along a Gauss–Newton step, the step's size, whether it reduces the residuals, and the
+    reach of the next step.
 
     The size is zero if the residuals hardly decrease.
+
+    **Arguments:** residuals `before` the step; `longest`: the size of the step relative to its `reach`.
     """
-    before = jnp.sum(residual(q) ** 2)
-    # Rotations by more than about a radian leave the region where the linearisation is valid.
-    step = step * jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
+    squares = jnp.sum(before**2)
+    share = jnp.minimum(1.0, 1.0 / jnp.where(longest > 0, longest, 1.0))
+    step = step * share
     lengths = 0.5 ** jnp.arange(8, dtype=step.dtype)
     reached = jax.vmap(lambda a: moved(a * step))(lengths)
-    sizes = jax.vmap(lambda configuration: jnp.sum(residual(configuration) ** 2))(reached)
+    after = jax.vmap(residual)(reached)
+    sizes = jnp.sum(after**2, axis=1)
     best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
     # Residuals that hardly decrease cannot vanish, and in a batch all members would wait for this search.
-    size = jnp.where(sizes[best] < _PROGRESS * before, jnp.max(jnp.abs(step)), 0.0)
-    return reached[best], size, sizes[best] < before
+    size = jnp.where(sizes[best] < (1 - _PROGRESS * share) * squares, jnp.max(jnp.abs(step)), 0.0)
+    return reached[best], size, sizes[best] < squares, next_reach(reach, before, after[0], share)
 
 
 # Closest states

@@ -98,7 +98,7 @@ def _weights(system, t, q):
 
 def _residual(system, t, q):
     """Φ of normalised coordinates, and the coordinates' invariants, so that no body shrinks to close a gap."""
-    position = system.position_residual(t, system.normalize(q))
+    position = system.position_residual(t, system.normalize(t, q))
     return jnp.concatenate([position, system.coordinate_residual(t, q)[system.position_rows :]])
 
 

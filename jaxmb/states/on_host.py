@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .closest import independent_above, largest_residual, tolerance
+from .closest import independent_above, largest_residual, next_reach, tolerance
 
 # The largest numbers of rows and coordinates whose dense matrices are cheap.
 MOST = 150
 # Largest numbers of Gauss–Newton steps (`_STEPS`), of Newton steps, and of steps to velocities of constraints that are
-# not linear. `_PROGRESS`: the largest share of squared residuals after a useful step. `_SMALL`: the size of the last
-# step, as a power of eps.
-_STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.999, 0.75
+# not linear. `_PROGRESS`: the least share by which a useful step reduces squared residuals; a part of a step needs this
+# part of the share. `_SMALL`: the size of the last step, as a power of eps.
+_STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.001, 0.75
 # A full step is not shortened if it reduces the squared residuals below this share.
 _WHOLE = 0.01
 # Largest rounding error of residuals, in units of eps.
@@ -61,15 +61,15 @@ class AbstractHost(abc.ABC):
     def met(self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None) -> Float[np.ndarray, "nq"]:
         """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of `held` coordinates."""
         scale = self.coordinate_scale if held is None else np.where(held, 0.0, self.coordinate_scale)
-        before, small = self.coordinate_residual(q), float(np.finfo(q.dtype).eps) ** _SMALL
+        before, small, reach = self.coordinate_residual(q), float(np.finfo(q.dtype).eps) ** _SMALL, 1.0
         for _ in range(_STEPS if before.size and np.all(np.isfinite(before)) else 0):
             jacobian = self.coordinate_jacobian(q) * scale
             if not np.all(np.isfinite(jacobian)):
                 break
             step = -scale * np.linalg.lstsq(jacobian, before, rcond=small)[0]
             longest = np.max(np.abs(step[scale > 0] / scale[scale > 0]), initial=0.0)
-            step = step * min(1.0, 1.0 / longest if longest > 0 else 1.0)
-            size = before @ before
+            share = min(1.0, reach / longest if longest > 0 else 1.0)
+            step, size = step * share, before @ before
             reached = [(q + step, self.coordinate_residual(q + step))]
             # Shorter steps are not better than a full step that removes nearly all of the residuals.
             if not np.sum(reached[0][1] ** 2) < _WHOLE * size:
@@ -80,7 +80,8 @@ class AbstractHost(abc.ABC):
             best = int(np.argmin(np.where(np.isfinite(sizes), sizes, np.inf)))
             if not sizes[best] < size:
                 break
-            gained = sizes[best] < _PROGRESS * size
+            gained = sizes[best] < (1 - _PROGRESS * share) * size
+            reach = next_reach(reach, before, reached[0][1], share)
             q, before = reached[best]
             if longest <= small or not gained:
                 break

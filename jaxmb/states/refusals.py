@@ -208,7 +208,7 @@ def lost_rank(system: AbstractSystem, t: Scalar, y: State) -> LostRank | None:
     """
     if not 0 < system.acceleration_rank <= system.acceleration_rows <= _MOST_ROWS:
         return None
-    q = system.normalize(y.q)
+    q = system.normalize(t, y.q)
     jacobian = np.asarray(system.jacobian(t, q, y.u)) * np.asarray(system.velocity_scale())
     if not np.all(np.isfinite(jacobian)):
         return None

@@ -11,7 +11,7 @@ work. M depends on u only if velocities are nonlinear in q̇.
 """
 
 import abc
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..solvers.manifold_term import AbstractFieldJacobian, GapsSeen
 from .contact_set import ContactNumbers, ContactSet
+from .velocity_facts import VelocityFact, is_drift_free, is_linear
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -56,7 +57,8 @@ class AbstractEquation(eqx.Module):
     - `length` [m]: the scale of position residuals.
     - `ranks`: the numbers of independent rows.
     - `positive_definite_mass`: whether M is positive definite for all velocities, even if they violate constraints.
-    - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero.
+    - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero. By default they
+        are found from ψ, and hold for all numbers of the system.
     - `elimination`: the order of elimination of the blocks of A; None for one dense matrix. Static.
     - `contacts`: the unilateral constraints and dry friction. Static.
     """
@@ -67,8 +69,8 @@ class AbstractEquation(eqx.Module):
 
     ranks: ClassVar[Ranks] = Ranks(0, 0, 0, 0)
     positive_definite_mass: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
-    drift_free: ClassVar[bool] = True
+    linear: ClassVar[Any] = VelocityFact(is_linear)
+    drift_free: ClassVar[Any] = VelocityFact(is_drift_free)
     elimination: ClassVar[JointOrder | None] = None
     contacts: ClassVar[ContactSet] = ContactSet()
 
@@ -121,8 +123,9 @@ class AbstractEquation(eqx.Module):
         """`K(t, q, u)`."""
         return u
 
-    def normalize(self, q: Coordinates) -> Float[Array, "nq"]:
-        """The nearest coordinates that satisfy the coordinates' invariants."""
+    def normalize(self, t: Scalar, q: Coordinates) -> Float[Array, "nq"]:
+        """The nearest coordinates that satisfy the coordinates' invariants at a time."""
+        del t
         return q
 
     @abc.abstractmethod

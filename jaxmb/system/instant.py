@@ -93,7 +93,7 @@ class Instant(eqx.Module, Keeper):
 
     def normalized(self) -> Self:
         """The same instant with the coordinates' invariants satisfied."""
-        return self.with_(q=self.system.normalize(self.q))
+        return self.with_(q=self.system.normalize(self.t, self.q))
 
     def moved(self, step: Float[Array, "nu"]) -> Self:
         """The instant with its coordinates after a small displacement along the velocities."""
@@ -101,7 +101,7 @@ class Instant(eqx.Module, Keeper):
             return self.with_(q=self.q + step)
         rates = lambda u: self.system.rates(self.t, self.q, u)
         _, change = jax.jvp(rates, (jnp.zeros_like(step),), (step,))
-        return self.with_(q=self.system.normalize(self.q + change))
+        return self.with_(q=self.system.normalize(self.t, self.q + change))
 
     def motion(self, udot: Float[Array, "nu"]) -> State:
         """The rate of the state with accelerations `udot`."""

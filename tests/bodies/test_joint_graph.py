@@ -303,7 +303,7 @@ def check_random(seed):
     compare(system, state.q, state.u, atol=1e-9)
     own = by_blocks(system)
     y = mb.State(state.q + 1e-3 * jnp.asarray(rng.normal(size=system.nq)), state.u)
-    y = jax.jit(lambda y: mb.manifold.project(own, 0.0, mb.State(own.normalize(y.q), y.u)))(y)
+    y = jax.jit(lambda y: mb.manifold.project(own, 0.0, mb.State(own.normalize(0.0, y.q), y.u)))(y)
     assert np.max(np.abs(system.coordinate_residual(0.0, y.q))) <= 1e-12
     assert np.max(np.abs(system.velocity_residual(0.0, y.q, y.u))) <= 1e-11
 

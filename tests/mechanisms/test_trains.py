@@ -285,7 +285,7 @@ def test_any_joints_in_chains(build):
         return [accelerations(*case, 0.0, q, u) for case in cases], products
 
     for _ in range(3):
-        q = system.normalize(system.guess.q + 0.1 * jnp.asarray(rng.normal(size=system.nq)))
+        q = system.normalize(0.0, system.guess.q + 0.1 * jnp.asarray(rng.normal(size=system.nq)))
         for found in solve(q, *jnp.asarray(rng.normal(size=(2, system.nu)))):
             for case in found[:-1]:
                 for a, b in zip(case, found[-1], strict=True):

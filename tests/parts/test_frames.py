@@ -15,7 +15,7 @@ G = mb.Gravity((0.0, 0.0, -9.81))
 
 def random_state(system, seed=0):
     random = np.random.default_rng(seed)
-    q = system.normalize(jnp.asarray(random.normal(size=system.nq)))
+    q = system.normalize(0.0, jnp.asarray(random.normal(size=system.nq)))
     return q, jnp.asarray(random.normal(size=system.nu))
 
 

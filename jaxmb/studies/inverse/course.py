@@ -194,7 +194,7 @@ def _followed(system, signals, guess, ts):
         values = {name: signal(t).astype(q.dtype) for name, signal in signals.items()}
         held = holding(system, {name: values[name] for name in of_joints}, {}, t)
         fix = {name: value for name, value in values.items() if name not in joints}
-        q, _, met = configuration(held, system.normalize(q + (t - before) * qdot), fix, t, False)
+        q, _, met = configuration(held, system.normalize(t, q + (t - before) * qdot), fix, t, False)
         kinematics = _Kinematics(system, signals, t, q)
         u, udot, determined = kinematics.solved(guess.u)
         off = kinematics.values(t, q) - kinematics.wanted(t)

@@ -131,7 +131,7 @@ def floquet(
     rtol = real_array("floquet: rtol", rtol, state.q.dtype)
     names = check_state_names(system, t, state, coordinates, rates)
     free = [_indices(system, name) for name in checked_names("coordinate", ignorable)]
-    state = consistent(system, t, State(system.normalize(state.q), state.u))
+    state = consistent(system, t, State(system.normalize(t, state.q), state.u))
     perturbed = eqx.filter_jit(perturbations)(system, t, state, names)
     if not is_traced((system, state, perturbed.regular)) and not np.all(np.asarray(perturbed.regular)):
         raise ValueError("The state is singular, or the named coordinates or rates are not independent in it.")

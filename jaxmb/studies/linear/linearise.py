@@ -82,7 +82,7 @@ def linearise(
     shapes = {name: value.shape for name, value in parameters(system).items()} if len(tuple(inputs)) else {}
     seen = {name: value.shape for name, value in system.quantities().items()}
     chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
-    state = consistent(system, t, dataclasses.replace(state, q=system.normalize(state.q)))
+    state = consistent(system, t, dataclasses.replace(state, q=system.normalize(t, state.q)))
     if system.contacts.m:
         names = ", ".join(system.contacts.friction_names)
         raise ValueError(

@@ -91,7 +91,7 @@ def steady_motion(
     t = jnp.asarray(checked_time("steady_motion", t, guess.q.dtype))
     chosen, values = _conditions(system, t, guess, {} if fix is None else fix, {} if rates is None else rates)
     advancing = _indices(system, ignorable)
-    solution = _search(system, t, State(system.normalize(guess.q), guess.u), chosen, values, advancing)
+    solution = _search(system, t, State(system.normalize(t, guess.q), guess.u), chosen, values, advancing)
     holds = True if solution.against is None else ~jnp.any(solution.against[0] | solution.against[1])
     if is_traced(solution) or not throw:
         return nan_where(~(solution.ok & holds), solution.state, (system, guess, values, t))
@@ -191,7 +191,7 @@ def _search(
     good = solved & jnp.all(jnp.isfinite(inverse))
     equations = lambda x: jnp.where(good, inverse @ residual((system, t, values), x) + free @ (x - z), x - z)
     solution = unknowns(scale * root(equations, z, lambda _, x: x))
-    state = State(system.normalize(solution.state.q), solution.state.u)
+    state = State(system.normalize(t, solution.state.q), solution.state.u)
 
     # The residuals at another time, and the remaining rates now.
     check = _residual(system, t, values, chosen, advancing, solution, (*units, rate), 0.7 * later)

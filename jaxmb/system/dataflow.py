@@ -1,0 +1,83 @@
+"""Facts about a function that hold for all its arguments, found from its data flow without compiling it."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._compat import ClosedJaxpr, Jaxpr, Literal
+
+# Operations that are analytic where they are finite. A composition of these that vanishes at independent random numbers
+# vanishes everywhere.
+_ANALYTIC = {
+    *("add", "add_any", "sub", "mul", "div", "neg", "square", "integer_pow", "pow", "sqrt", "rsqrt", "cbrt"),
+    *("exp", "exp2", "expm1", "log", "log1p", "logistic", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
+    *("sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "dot_general", "reduce_sum", "cumsum", "reduce_prod"),
+    *("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "concatenate", "pad", "rev", "copy"),
+    *("slice", "dynamic_slice", "dynamic_update_slice", "gather", "scatter", "scatter-add", "convert_element_type"),
+    *("stop_gradient", "optimization_barrier", "triangular_solve", "cholesky", "symmetric_product", "split"),
+}
+# Operations that do what their inner program does.
+_CALLS = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "custom_jvp_call", "custom_vjp_call"}
+
+
+def depends(function: Callable[..., Any], arguments: tuple[Any, ...], *which: int) -> bool:
+    """Whether the data flow of a function leads from one of these arguments to its values.
+
+    A dependence with a factor of zero counts as well.
+    """
+    closed = jax.make_jaxpr(function)(*arguments)
+    reached = _arguments_of(closed, arguments, which)
+    for _ in _reached(closed, reached):
+        pass
+    return any(not isinstance(v, Literal) and v in reached for v in closed.jaxpr.outvars)
+
+
+def is_analytic(function: Callable[..., Any], arguments: tuple[Any, ...], *which: int) -> bool:
+    """Whether only analytic operations lead from these arguments to a function's values.
+
+    A comparison, a choice, a loop or an absolute value may behave otherwise for other numbers.
+    """
+    closed = jax.make_jaxpr(function)(*arguments)
+    return all(map(_is_analytic, _reached(closed, _arguments_of(closed, arguments, which))))
+
+
+def shaken(values: Any, seed: int, share: float = 0.1) -> Any:
+    """A pytree with independent random numbers: each number changes by up to this share of it, a zero becomes about 1.
+
+    Numbers that are traced are replaced by numbers of about 1.
+    """
+    random = np.random.default_rng(seed)
+
+    def one(value):
+        if not np.issubdtype(np.dtype(value.dtype), np.floating):
+            return value
+        about_one = 1 + random.uniform(-0.5, 0.5, value.shape)
+        if isinstance(value, jax.core.Tracer | jax.ShapeDtypeStruct):
+            return about_one.astype(value.dtype)
+        value = np.asarray(value)
+        return np.where(value == 0, about_one, value * (1 + 2 * share * (about_one - 1))).astype(value.dtype)
+
+    return jax.tree.map(one, values)
+
+
+def _arguments_of(closed, arguments, which):
+    owner = [k for k, argument in enumerate(arguments) for _ in jax.tree.leaves(argument)]
+    return {v for k, v in zip(owner, closed.jaxpr.invars, strict=True) if k in which}
+
+
+def _reached(closed: ClosedJaxpr, reached: set[Any]) -> Iterator[Any]:
+    """The operations that some values reach; their results are added to these values."""
+    for equation in closed.jaxpr.eqns:
+        if any(not isinstance(v, Literal) and v in reached for v in equation.invars):
+            reached.update(equation.outvars)
+            yield equation
+
+
+def _is_analytic(equation: Any) -> bool:
+    if equation.primitive.name not in _CALLS:
+        return equation.primitive.name in _ANALYTIC
+    programs = [x for x in equation.params.values() if isinstance(x, ClosedJaxpr | Jaxpr)]
+    inner = [getattr(program, "jaxpr", program) for program in programs]
+    return bool(inner) and all(_is_analytic(e) for program in inner for e in program.eqns)
