@@ -71,7 +71,8 @@ def _read(mujoco, model, names, notes, k, name):
     elif model.actuator_biastype[k] != biases.mjBIAS_AFFINE:
         return refuse("has a bias that is not affine in length and speed")
     force_range = tuple(model.actuator_forcerange[k]) if model.actuator_forcelimited[k] else None
-    if kind != transmissions.mjTRN_TENDON and model.jnt_actfrclimited[target]:
+    # An actuator with the gear 0 exerts no force, so a limit has no effect.
+    if kind != transmissions.mjTRN_TENDON and model.jnt_actfrclimited[target] and gear:
         if len(_acting_on(mujoco, model, target)) > 1:
             return refuse(f"shares the limit of the actuator force of joint {of!r} with others")
         limits = np.sort(np.array(model.jnt_actfrcrange[target]) / gear)

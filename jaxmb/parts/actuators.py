@@ -12,6 +12,7 @@ import numpy as np
 from . import fields
 from .base import AbstractDynamicForce
 from .coordinate_parts import AbstractCoordinatePart, AbstractScalarPart
+from .kinks import clipped
 
 
 class Motor(AbstractCoordinatePart, AbstractDynamicForce):
@@ -157,4 +158,4 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
 
 
 def _clipped(value, limits):
-    return value if limits is None else jnp.clip(value, limits[0], limits[1])
+    return value if limits is None else clipped(value, limits[0], limits[1])

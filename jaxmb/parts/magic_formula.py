@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from .kinks import clipped
 from .tir import DEFAULTS, Version
 
 Number = Any
@@ -64,10 +65,10 @@ class Point:
         self.is_newer = version == "6.1"
         self.radius, self.nominal = c.UNLOADED_RADIUS, c.LFZO * c.FNOMIN  # (4.E1)
         least = jnp.maximum(c.FZMIN, _LEAST_LOAD * c.FNOMIN)
-        self.load = jnp.clip(load, least, c.FZMAX)
+        self.load = clipped(load, least, c.FZMAX)
         # Below the least load forces are proportional to the load.
-        self.share = jnp.minimum(load / least, 1.0)
-        self.gamma = jnp.clip(inclination, c.CAMMIN, c.CAMMAX)
+        self.share = jnp.where(load < least, load / least, 1.0)
+        self.gamma = clipped(inclination, c.CAMMIN, c.CAMMAX)
         self.dfz = (self.load - self.nominal) / self.nominal  # (4.E2a)
         self.dpi = _excess(c, pressure)  # (4.E2b)
 
@@ -113,7 +114,7 @@ class Point:
         pneumatic trail and rolling resistance vanish.
         """
         c = self.c
-        kappa, alpha = jnp.clip(kappa, c.KPUMIN, c.KPUMAX), jnp.clip(alpha, c.ALPMIN, c.ALPMAX)
+        kappa, alpha = clipped(kappa, c.KPUMIN, c.KPUMAX), clipped(alpha, c.ALPMIN, c.ALPMAX)
         fading = 1 + c.LMUV * slip_speed / c.LONGVL  # (4.E7)
         mu_x, mu_y = c.LMUX / fading, c.LMUY / fading
         pure_x = self._longitudinal(kappa, mu_x, travel**2)
@@ -234,7 +235,7 @@ class Point:
 def _angle(x, slope, curvature):
     """The argument of the Magic Formula, over its shape factor."""
     u = slope * x
-    return jnp.arctan(u - jnp.minimum(curvature, 1.0) * (u - jnp.arctan(u)))
+    return jnp.arctan(u - jnp.where(curvature > 1.0, 1.0, curvature) * (u - jnp.arctan(u)))
 
 
 def _cos_arctan(x):
@@ -280,4 +281,4 @@ def _all(coefficients):
 
 
 def _excess(c, pressure):
-    return 0.0 if pressure is None else jnp.clip(pressure, c.PRESMIN, c.PRESMAX) / c.NOMPRES - 1.0
+    return 0.0 if pressure is None else clipped(pressure, c.PRESMIN, c.PRESMAX) / c.NOMPRES - 1.0

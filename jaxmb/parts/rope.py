@@ -30,6 +30,7 @@ from .base import (
 from .coordinate_parts import shortest, turns
 from .dry_friction import AbstractStickSlip
 from .forces import generalized_force
+from .kinks import clipped, excess
 from .modes import FORWARD, kind_of
 from .shapes import wheel
 from .space import rate_of
@@ -509,7 +510,7 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
         """The angles [rad] of rope where it rubs."""
         _, along = self._straight(space, poses)
         angles = self._continued(space, poses, along)[: len(self.passed_places)]
-        return jnp.maximum(unchecked_take(angles, np.searchsorted(self.passed_places, self._places)), 0.0)
+        return excess(unchecked_take(angles, np.searchsorted(self.passed_places, self._places)))
 
     def _loads(self, space, poses, multipliers):
         """Of each pulley the direction of slip, zero in stick; the limit of the rise of the tension, and the rise."""
@@ -572,9 +573,9 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
     def _tension(self, stretch, rate):
         # A force that jumps where the rope tightens would have wrong derivatives.
         pull = self.stiffness * stretch
-        pull = pull + jnp.clip(self.damping * rate, -pull, pull)
+        pull = pull + clipped(self.damping * rate, -pull, pull)
         # Not the other way round: a path without tangents is not slack.
-        return jnp.where(stretch <= 0, 0.0, pull)
+        return jnp.where(stretch < 0, 0.0, pull)
 
     def tension(self, space, poses, velocities, t):
         """The tension of each span [N]."""
@@ -586,7 +587,7 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
         return generalized_force(space, self, stretch, poses, velocities, lambda x, v: -self._tension(x, v))
 
     def energy(self, space, poses, t):
-        return 0.5 * self.stiffness * jnp.sum(jnp.maximum(self._stretch(space, poses), 0.0) ** 2)
+        return 0.5 * self.stiffness * jnp.sum(excess(self._stretch(space, poses)) ** 2)
 
     def gaps(self, space, poses, t):
         if not any(self.lifts):

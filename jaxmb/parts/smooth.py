@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from .kinks import clipped
 
 
 def sign(speed: Float[Array, "*n"], transition_speed: Scalar) -> Float[Array, "*n"]:
@@ -32,7 +33,7 @@ def ramp(d: Float[Array, "*n"], width: Scalar) -> Float[Array, "*n"]:
 
 def step(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """A C² step from 0 at s ≤ 0 to 1 at s ≥ 1."""
-    return quintic(jnp.clip(s, 0.0, 1.0))
+    return quintic(clipped(s, 0.0, 1.0))
 
 
 def quintic(s: Float[Array, "*n"]) -> Float[Array, "*n"]:

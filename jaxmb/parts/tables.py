@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from . import fields, local_spline
 from .base import AbstractDynamicForce, AbstractForce, AbstractPotentialForce
 from .coordinate_parts import AbstractScalarPart
+from .kinks import clipped
 
 
 class TableSpring(AbstractScalarPart, AbstractPotentialForce):
@@ -131,4 +132,4 @@ class TableMotor(AbstractScalarPart, AbstractDynamicForce):
         return {} if self.lag is None else {"activation": (self._control() - self.activation) / self.lag}
 
     def _control(self):
-        return jnp.clip(self.control, -1.0, 1.0)
+        return clipped(self.control, -1.0, 1.0)

@@ -24,6 +24,7 @@ from ..linalg.arrays import is_traced
 from ..linalg.rotations import norm
 from . import fields, local_spline
 from .base import AbstractLaw
+from .kinks import clipped
 from .smooth import step
 
 __all__ = ["AbstractTerrain", "Bump", "Flat", "Ramp", "Sinusoid", "Slope", "Spline", "Surface"]
@@ -98,7 +99,7 @@ class Bump(AbstractTerrain):
     peak: fields.Number = fields.parameter(unit="m")
 
     def height(self, place):
-        s = jnp.clip((place[0] - self.start) / self.length, 0.0, 1.0)
+        s = clipped((place[0] - self.start) / self.length, 0.0, 1.0)
         return self.peak * jnp.sin(jnp.pi * s) ** 2
 
     def detail(self, place):

@@ -26,6 +26,7 @@ from .base import (
 )
 from .coordinate_parts import AbstractScalarPart
 from .forces import over_ground
+from .kinks import clipped
 from .modes import CLOSED, kind_of
 from .shapes import Box, Ground
 from .space import AbstractSpace, round_shapes, separation
@@ -349,7 +350,7 @@ class RigidBoxContact(AbstractRigidContact, AbstractPointPair):
     def _outside(self, space, poses):
         """From the nearest point of the box to the centre of the ball, in the axes of the box."""
         centre = space.body_point(poses[0], space.point(poses[1], self.point_b)) - self.point_a
-        return centre - jnp.clip(centre, -0.5 * self.size, 0.5 * self.size)
+        return centre - clipped(centre, -0.5 * self.size, 0.5 * self.size)
 
     def shapes(self, space, size):
         extent = space.in_space(self.size)

@@ -37,8 +37,8 @@ from ..system.instant import Instant
 # From this number of rows on, closest states of systems with an order of elimination are found in blocks.
 _MANY_ROWS = 300
 
-# Largest number of Gauss–Newton steps to the constraints. Each must reduce the squared residuals by this share, a part of
-# a step by this part of the share.
+# Largest number of Gauss–Newton steps to the constraints. Each must reduce the squared residuals by this share, a part
+# of a step by this part of the share.
 _ITERATIONS = 400
 _PROGRESS = 0.001
 # Largest error of the linearisation, relative to the change of the residuals, that lets the next step be longer.

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce, PathKind
+from ..kinks import clipped
 from ..smooth import quintic, sign
 from ..space import force_pair, separation, separation_rate
 
@@ -113,8 +114,8 @@ class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
     def _engaged(self, x):
         """A smooth step from 0 to 1 over the width `smoothing`, and its first and second integral."""
         width = self.smoothing
-        z = jnp.clip(x / width + 0.5, 0.0, 1.0)
-        beyond = jnp.maximum(x - 0.5 * width, 0.0)
+        z = clipped(x / width + 0.5, 0.0, 1.0)
+        beyond = jnp.where(x > 0.5 * width, x - 0.5 * width, 0.0)
         ramp = z**4 * (2.5 + z * (z - 3))
         area = z**5 * (0.5 + z * (z / 7 - 0.5))
         # With x = width/2 + beyond: the ramp is x, its integral x²/2 + width²/56.
