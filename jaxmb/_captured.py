@@ -15,7 +15,9 @@ import numpy as np
 from jax.core import Tracer
 
 from ._compat import ClosedJaxpr, canonical, default_float, is_weakly_typed, jaxpr_as_function
+from ._index_bounds import check_indices
 from ._jaxpr_digest import digest_of
+from ._traced_functions import shown_function
 from .linalg.arrays import ARRAYS
 from .solvers.closures import opened
 
@@ -160,6 +162,7 @@ def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> 
     closed = jax.make_jaxpr(of_arrays)(*(_like(x) for x in leaves if isinstance(x, _SHAPED)))
     if any(isinstance(constant, Tracer) for constant in closed.consts):
         return None
+    check_indices(closed, shown_function(function))
     tree, rest = results
     digest = digest_of(closed, rules=True)
     constants = [_own(v, constant) for v, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True)]

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ._compat import REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function, like_of
-from ._traced_functions import is_installed
+from ._traced_functions import is_installed, is_of_jax
 
 _PLAIN = {bool, int, float, complex, str, bytes, type(None), type(Ellipsis)}
 
@@ -52,6 +52,8 @@ class _Digest:
         # Programs that occur several times. Each hash keeps its program, so that no other program gets its address.
         self._done: dict[int, tuple[Any, bytes]] = {}
         self._shapes: dict[Any, str] = {}
+        # Functions of packages, which may close over each other.
+        self._functions: dict[int, Any] = {}
 
     def of(self, value: Any) -> bytes:
         """The hash of a program, or of a parameter of an equation."""
@@ -157,10 +159,19 @@ class _Digest:
         return _joined(f"{array.dtype} {array.shape}", [array.tobytes()])
 
     def _function(self, function: types.FunctionType) -> bytes:
-        """A function that is called from Python, as in a callback: a package's function counts by its name."""
+        """A function that is called from Python, as in a callback: a package's function counts by its name and by the
+        values that it closes over or has as defaults. Of JAX and its relatives only the name counts.
+        """
+        name = f"{function.__module__}.{function.__qualname__}".encode()
         if not is_installed(function.__code__.co_filename):
             self.unknown.append(function)
-        return _joined("function", [f"{function.__module__}.{function.__qualname__}".encode()])
+            return _joined("function", [name])
+        if id(function) in self._functions or is_of_jax(function.__module__):
+            return _joined("function", [name])
+        self._functions[id(function)] = function
+        held = [cell.cell_contents for cell in function.__closure__ or () if _is_filled(cell)]
+        held += [function.__defaults__, function.__kwdefaults__]
+        return _joined("function", [name, *map(self.of, held)])
 
     def _shown(self, value: Any) -> bytes:
         shown = repr(value)
@@ -168,6 +179,13 @@ class _Digest:
             self.unknown.append(value)
             return b""
         return shown.encode()
+
+
+def _is_filled(cell: types.CellType) -> bool:
+    try:
+        return cell.cell_contents is not cell
+    except ValueError:
+        return False
 
 
 def _joined(tag: str, parts: list[bytes]) -> bytes:

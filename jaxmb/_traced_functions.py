@@ -37,6 +37,11 @@ def is_installed(file: str | None) -> bool:
     return file is not None and file[0] != "<" and any(place in _PACKAGES for place in Path(file).resolve().parents)
 
 
+def is_of_jax(module: str | None) -> bool:
+    """Whether a module, by its name, belongs to JAX, to packages that compute with it, or to jaxmb."""
+    return (module or "").partition(".")[0] in _COMPUTE
+
+
 @contextlib.contextmanager
 def traced_by_jax(what: str, argument: str) -> Iterator[None]:
     """A context in which a function of the user is traced.
@@ -91,7 +96,7 @@ def is_of_user(error: BaseException) -> bool:
     if isinstance(error, OSError):
         return bool(_users_frames(error))
     for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
-        if frame.f_globals.get("__name__", "").partition(".")[0] in _COMPUTE:
+        if is_of_jax(frame.f_globals.get("__name__")):
             return False
         if not is_installed(frame.f_code.co_filename):
             return True
@@ -111,6 +116,13 @@ def with_note(function: Callable[..., Any], what: str) -> Callable[..., Any]:
             raise
 
     return noted
+
+
+def shown_function(function: Callable[..., Any]) -> str:
+    """A function by its name and the place of its definition."""
+    code = getattr(function, "__code__", None)
+    name = getattr(function, "__qualname__", type(function).__name__)
+    return f"The function {name}" + ("" if code is None else f" ({code.co_filename}:{code.co_firstlineno})")
 
 
 def asked_argument(error: KeyError) -> tuple[str, Mapping[Any, Any]] | None:

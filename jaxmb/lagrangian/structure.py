@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from .._captured import Captured
 from .._compat import changed
+from .._index_bounds import check_indices
 from .._traced_functions import note_of, traced_by_jax, with_note
 from .._types import State
 from ..linalg.independent_rows import dense_pivots
@@ -64,14 +65,16 @@ def constraint_sizes(
 def _shape(name: str, expected: tuple[int, ...] | None, evaluate: Callable[..., Any], *given: Any) -> tuple[int, ...]:
     try:
         with traced_by_jax(name, "an argument"):
-            shape = jax.eval_shape(with_note(lambda *given: jnp.asarray(evaluate(*given)), name), *given).shape
+            noted = with_note(lambda *given: jnp.asarray(evaluate(*given)), name)
+            program, out = jax.make_jaxpr(noted, return_shape=True)(*given)
+            check_indices(program, name)
     except TypeError as error:
         if note_of(name) in getattr(error, "__notes__", ()):
             raise
         raise ValueError(f"{name} does not fit the system: {error}") from error
-    if expected is not None and shape != expected:
-        raise ValueError(f"{name} must have shape {expected}, got {shape}.")
-    return shape
+    if expected is not None and out.shape != expected:
+        raise ValueError(f"{name} must have shape {expected}, got {out.shape}.")
+    return out.shape
 
 
 def with_programs(system: Unanalysed) -> Unanalysed:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._arguments import check_kind, real_shape
+from .._index_bounds import check_indices
 from .._traced_functions import asked_argument, traced_by_jax
 from .._types import VectorLike
 from ..linalg.arrays import is_traced
@@ -124,7 +125,9 @@ def _checked(added: DesignVariables, existing: Mapping[str, Array]) -> dict[str,
         if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
             raise ValueError(f"The derived parameter {name!r} is not finite: {np.asarray(value)}.")
     with traced_by_jax("derive", "a design variable"):
-        program = jax.make_jaxpr(added.derive)(dict(added.values)).jaxpr
+        closed = jax.make_jaxpr(added.derive)(dict(added.values))
+    check_indices(closed, "derive")
+    program = closed.jaxpr
     used = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
     # JAX sorts the entries of a dictionary.
     idle = [name for name, v in zip(sorted(added.values), program.invars, strict=True) if id(v) not in used]
