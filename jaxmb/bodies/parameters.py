@@ -1,6 +1,7 @@
 """Parameters of stacked parts by name, `"part.field"` or `"part.field.key"`: their arrays, checks and inputs."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
@@ -10,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from ..linalg.arrays import is_traced
 from ..parts.base import AbstractPart
@@ -20,6 +22,8 @@ from ..system.parameter_table import ParameterTable
 from ..system.structures import of_structure
 from .groups import Input, together
 
+# The factor by which the size of a scene must change to count as another size.
+_OTHER_SIZE = 10.0
 # Paths to the groups of a system: of position constraints, of all constraints, and of all parts.
 _BIND_POSITIONS = "constraints.position"
 _BIND = (_BIND_POSITIONS, "constraints.velocity", "constraints.servos")
@@ -132,6 +136,25 @@ class SceneParameters(ParameterTable):
         if not changed:
             return self.system
         return dataclasses.replace(self.system, guess=self.system.bodies.shifted(self.system.guess, changed))
+
+    @of_structure
+    def _sized(self):
+        """The places of the lengths that determine the scene's size, by name."""
+        numbers = (number for number in stacked_numbers(self._groups) if number.declared.sizes)
+        return {number.name: (number.path, number.group, number.keys) for number in numbers}
+
+    def with_size(self, names):
+        system, sized = self.system, self._sized()
+        if not any(name in sized for name in names):
+            return system
+        values = [_accessor(*place)(system) for place in dict.fromkeys(sized.values())]
+        xp = jnp if is_traced((values, system.length)) else np
+        each = [xp.max(xp.abs(lax.stop_gradient(x)), initial=0.0) for x in values if x is not None]
+        size = functools.reduce(xp.maximum, each).astype(system.length.dtype)
+        # A size that stays about the same keeps the tolerances of a family of designs.
+        other = (size > _OTHER_SIZE * system.length) | ((size > 0) & (_OTHER_SIZE * size < system.length))
+        length = xp.where(other, size, lax.stop_gradient(system.length))
+        return eqx.tree_at(lambda s: s.length, system, length if xp is jnp else jax.device_put(length))
 
     @property
     def signals(self):

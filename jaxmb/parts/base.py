@@ -117,6 +117,7 @@ class AbstractPart(eqx.Module):
         """
         fields.check_numbers(self, self.label, self.dimensions[0] if dimension is None else dimension)
         type(self).validate(self)
+        fields.check_matrices(self, self.label)
 
     def validate(self) -> None:
         """Hook: raise a `ValueError` for inconsistent numbers; each number has already been checked by itself."""

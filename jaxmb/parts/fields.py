@@ -599,6 +599,28 @@ def _check_number(declared: Declaration, label: str, shown: str, value: np.ndarr
         raise ValueError(f"{label}: {shown} must be a unit vector, got {row.tolist()} of length {size:.6g}; {cure}.")
 
 
+def check_matrices(part: Any, label: str, prefix: str = "") -> None:
+    """Raise a `ValueError` for numbers that are declared as positive definite matrices and are not, in the part and its
+    laws.
+    """
+    values = values_of(part)
+    for field, declared in declarations(type(part)).items():
+        value, shown = values[field], prefix + field
+        if declared.kind == "law" and value is not None:
+            check_matrices(value, label, f"{shown}.")
+        if declared.sign != "positive definite" or value is None or is_traced(value):
+            continue
+        matrix = np.asarray(value)
+        if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2]:
+            raise ValueError(f"{label}: {shown} must be a square matrix, got shape {matrix.shape}.")
+        transposed = np.swapaxes(matrix, -1, -2)
+        if not np.allclose(matrix, transposed, rtol=0.0, atol=1e-9 * np.max(np.abs(matrix), initial=0.0)):
+            raise ValueError(f"{label}: {shown} must be symmetric, got {matrix.tolist()}; use (A + A.T) / 2.")
+        sizes = np.linalg.eigvalsh(matrix)
+        if np.any(sizes[..., 0] <= 0):
+            raise ValueError(f"{label}: {shown} must be positive definite, got eigenvalues {sizes.tolist()}.")
+
+
 # Contents of a part
 
 

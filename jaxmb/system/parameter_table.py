@@ -55,6 +55,11 @@ class ParameterTable:
         del before
         return self.system
 
+    def with_size(self, names: Collection[str]) -> Any:
+        """The system after a change of some parameters, with the scale of its lengths."""
+        del names
+        return self.system
+
     @property
     def signals(self) -> dict[str, tuple[AbstractSignal, bool]]:
         """The parameters that are functions of time, each with whether its rate counts."""

@@ -61,7 +61,8 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
 
     Ranks and index sets are kept: if a change makes implied rows independent, `compile` the scene anew. The guess of
     the bodies' frames is kept as well: if `"rod.centre"` moves a mass centre, its guess moves too. The length of a bar
-    appears in the points of its joints and in its inertia: change all of them, or give it one name by `design`.
+    appears in the points of its joints and in its inertia: change all of them, or give it one name by `design`. The
+    scene's size, the unit of its tolerances, follows if its lengths change it by more than a factor of ten.
 
     **Arguments:** `values`: new numbers by name, as in `parameters`, of the same shapes. The weights of a module are
     given by a vector, or by a module that differs in its weights only. New design variables change all parameters that
@@ -110,6 +111,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
                 raise ValueError(f"Parameter {name!r} has shape {shape}, got {value.shape}.")
             system = eqx.tree_at(where, system, value if index is None else replaced(old, index, value))
     system = system.parameter_table.with_frames_of(before)
+    system = system.parameter_table.with_size(given)
     if design:
         system = eqx.tree_at(lambda s: s.design, system, tuple(design))
     system.parameter_table.check(given)

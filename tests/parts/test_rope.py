@@ -636,3 +636,36 @@ def test_derivatives(rope, dimension):
         ends = [tight(rest | {name: moved(sign)[name]}) for sign in (1, -1)]
         difference = (ends[0] - ends[1]) / (2 * h)
         np.testing.assert_allclose(forward[name].reshape(dimension + 1, -1).T, difference, rtol=1e-5, atol=1e-6)
+
+
+def drum_with_a_moving_end():
+    """A drum that is held, and a rope on it whose other end goes round the drum with 1 rad/s."""
+    wheel = planar.Body("wheel", mass=1.0, inertia=1.0)
+    axle = planar.Revolute("axle", "ground", "wheel", point=(0.0, 0.0))
+    hold = planar.Driver("hold", "ground", "wheel", quantity="angle", motion=lambda t, p: 0.0 * t)
+    drum = mb.Pulley("wheel", radius=0.1, turn="left", turns=3.0)
+    rope = mb.Rope("rope", [drum, ("ground", (1.0, 0.0))], stiffness=1.0, length=2.5, count_turns=True)
+    circle = lambda t: jnp.array([[0.0, 0.0], [jnp.cos(t), jnp.sin(t)]])
+    return mb.Scene([wheel], joints=[axle, hold, rope]).compile(), circle
+
+
+def test_counts_of_turns_at_a_time():
+    """The exact count of turns belongs to the place of the rope's end at the time."""
+    system, circle = drum_with_a_moving_end()
+    moving = mb.system.with_inputs(system, {"rope.points": circle})
+    normalized = jax.jit(moving.normalize)
+    for t, near in ((1.0, 0.9), (4.0, 4.1), (9.0, 8.8)):
+        q = moving.guess.q.at[-1].add(near)
+        np.testing.assert_allclose(abs(normalized(t, q) - moving.guess.q), [0.0, 0.0, 0.0, t], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "manifold", [mb.manifold.Partition(), mb.manifold.Projection()], ids=["Partition", "Projection"]
+)
+def test_turns_about_a_drum_with_a_moving_end(manifold):
+    """The rope on the drum is longer by the radius times the angle."""
+    system, circle = drum_with_a_moving_end()
+    options = {"t1": 4.0, "saveat": np.linspace(0.0, 4.0, 9), "inputs": {"rope.points": circle}, "manifold": manifold}
+    length = mb.simulate(system, mb.assemble(system), **options)["rope"].length
+    np.testing.assert_allclose(length[-1] - length[0], 0.4, atol=1e-8)

@@ -162,3 +162,50 @@ def test_a_body_that_is_far_from_where_it_belongs(distance):
     size = system.coordinate_scale()
     gradient = (x - distance) * -y / size[0] ** 2 + (y - 0.2) * x / size[1] ** 2 + (angle - 0.3) / size[2] ** 2
     np.testing.assert_allclose(gradient * size[0] ** 2 / distance, 0.0, atol=1e-10)
+
+
+def slide_of(random):
+    """A block on a slide through a random point, along a random direction."""
+    angle, point = random.uniform(-np.pi, np.pi), random.normal(size=2)
+    block = planar.Body("block", mass=1.0, inertia=0.1, position=point)
+    axis = np.array([np.cos(angle), np.sin(angle)])
+    slide = planar.Prismatic("slide", "ground", "block", point=point, axis=axis)
+    return mb.Scene([block], joints=[slide]).compile(), point, axis
+
+
+def check_far_on_a_slide(seed):
+    """Every place on a slide is a configuration, also far from where the block was given."""
+    random = np.random.default_rng(seed)
+    system, point, axis = slide_of(random)
+    distance = random.choice([-1, 1]) * 10 ** random.uniform(0, 5)
+    state = mb.assemble(system, fix={"slide.displacement": distance})
+    np.testing.assert_allclose(state.q, [*(point + distance * axis), 0.0], atol=1e-9 * abs(distance))
+
+
+def test_far_on_a_slide():
+    for seed in range(4):
+        check_far_on_a_slide(seed)
+
+
+@pytest.mark.slow
+def test_far_under_jit_and_in_other_systems():
+    """A slide under `jit` and `vmap` and with its derivative, a cylindrical joint, and a Lagrangian system."""
+    system, point, axis = slide_of(np.random.default_rng(7))
+    place = lambda d: mb.assemble(system, fix={"slide.displacement": d}).q
+    far = jnp.array([1.0, -4e3, 1e6])
+    expected = np.append(point, 0.0) + np.outer(far, np.append(axis, 0.0))
+    np.testing.assert_allclose(jax.jit(jax.vmap(place))(far), expected, atol=1e-8, rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(place)(4e3), np.append(axis, 0.0), atol=1e-9)
+    body = spatial.Body("body", mass=1.0, inertia=np.eye(3))
+    joint = spatial.Cylindrical("joint", "ground", "body", point=(0.0, 0.0, 0.0), axis=(0.0, 0.6, 0.8))
+    turned = mb.assemble(
+        mb.Scene([body], joints=[joint]).compile(), fix={"joint.displacement": 1e4, "joint.angle": 1.0}
+    ).q
+    np.testing.assert_allclose(turned[:3], [0.0, 6e3, 8e3], atol=1e-8)
+    np.testing.assert_allclose(turned[3:], [np.cos(0.5), 0.0, 0.6 * np.sin(0.5), 0.8 * np.sin(0.5)], atol=1e-9)
+    line = mb.lagrangian.Holonomic("line", lambda t, q, p: q[:1] - 2 * q[1:] - p["d"])
+    free = mb.lagrangian.LagrangianSystem(
+        lambda t, q, v, p: 0.5 * v @ v, q=[0.0, 0.0], constraints=[line], parameters={"d": 1.0}
+    )
+    q = mb.assemble(mb.with_parameters(free, {"d": 1e6})).q
+    np.testing.assert_allclose(q, [2e5, -4e5], rtol=1e-12)
