@@ -41,6 +41,8 @@ _MANY_ROWS = 300
 # of a step by this part of the share.
 _ITERATIONS = 400
 _PROGRESS = 0.001
+# Rounding errors of residuals, in units of the machine's precision and of the terms of their linearisation.
+_ROUNDING = 4.0
 # Largest error of the linearisation, relative to the change of the residuals, that lets the next step be longer.
 _STRAIGHT = 0.01
 # Pivots of implied rows, relative to the largest entry of the diagonal.
@@ -79,19 +81,28 @@ def independent_above(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.45
 
 
-def largest_residual(residual: Float[Array, "m"], row_norms: Float[Array, "m"]) -> Float[Array, ""]:
-    """The largest residual, with each row divided by the norm of its scaled gradient."""
+def rounding_of(jacobian: Float[Array, "m n"], q: Coordinates) -> Float[Array, "m"]:
+    """The rounding errors of residuals far from the origin, from their derivatives."""
+    xp = namespace(jacobian, q)
+    return _ROUNDING * float(jnp.finfo(q.dtype).eps) * (xp.abs(jacobian) @ xp.abs(q))
+
+
+def largest_residual(
+    residual: Float[Array, "m"], row_norms: Float[Array, "m"], rounding: Any = 0.0
+) -> Float[Array, ""]:
+    """The largest residual beyond `rounding` errors, with each row divided by the norm of its scaled gradient."""
     xp, precision = namespace(residual, row_norms), jnp.finfo(residual.dtype)
     floor = precision.eps**0.75 * xp.max(row_norms, initial=0.0) + precision.tiny
-    return xp.max(xp.abs(residual) / xp.maximum(row_norms, floor), initial=0.0)
+    return xp.max(xp.maximum(xp.abs(residual) - rounding, 0.0) / xp.maximum(row_norms, floor), initial=0.0)
 
 
 def residual_size(
     system: AbstractEquation, t: Scalar, q: Coordinates, jacobian: Float[Array, "m nq"]
 ) -> Float[Array, ""]:
     """`largest_residual` of `coordinate_residual`; `jacobian`: its Jacobian at q or near it."""
-    jacobian = jacobian * system.coordinate_scale()[None, :]
-    return largest_residual(system.coordinate_residual(t, q), jnp.sqrt(jnp.sum(jacobian * jacobian, axis=1)))
+    scaled = jacobian * system.coordinate_scale()[None, :]
+    sizes, rounding = jnp.sqrt(jnp.sum(scaled * scaled, axis=1)), rounding_of(jacobian, q)
+    return largest_residual(system.coordinate_residual(t, q), sizes, rounding)
 
 
 # Gauss–Newton steps to the constraints

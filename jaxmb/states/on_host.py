@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .closest import independent_above, largest_residual, next_reach, tolerance
+from .closest import independent_above, largest_residual, next_reach, rounding_of, tolerance
 
 # The largest numbers of rows and coordinates whose dense matrices are cheap.
 MOST = 150
@@ -54,9 +54,10 @@ class AbstractHost(abc.ABC):
 
     def holds(self, q: Float[np.ndarray, "nq"]) -> bool:
         """Whether the constraints hold."""
-        norms: Any = np.linalg.norm(self.coordinate_jacobian(q) * self.coordinate_scale, axis=1)
+        jacobian: Any = self.coordinate_jacobian(q)
+        norms: Any = np.linalg.norm(jacobian * self.coordinate_scale, axis=1)
         residual: Any = self.coordinate_residual(q)
-        return bool(largest_residual(residual, norms) <= tolerance(q.dtype))
+        return bool(largest_residual(residual, norms, rounding_of(jacobian, q)) <= tolerance(q.dtype))
 
     def met(self, q: Float[np.ndarray, "nq"], held: Bool[np.ndarray, "nq"] | None = None) -> Float[np.ndarray, "nq"]:
         """Coordinates on the constraints, by Gauss–Newton steps with halving, without motion of `held` coordinates."""

@@ -4,6 +4,8 @@ which is still there, by the old one.
 
 import copy
 import functools
+import os
+import sysconfig
 
 import changing_numbers
 import diffrax
@@ -18,6 +20,7 @@ from changing_numbers import BALL, PIN, PLACES, WAYS
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb._captured import Captured
+from jaxmb.simulate.captured import captured_event
 
 
 def plain(k):
@@ -232,3 +235,64 @@ def test_functions_sent_to_another_process():
             cloudpickle.loads(sent)
     finally:
         scaled.__defaults__[0]["k"] = 2.0
+
+
+FACTORY = """
+import functools
+def called(k):
+    return lambda x: k * x
+def by_default(k):
+    def scaled(x, k=k):
+        return k * x
+    return scaled
+def through_another(k):
+    inner = called(k)
+    return lambda x: inner(x)
+def wrapped(k):
+    return functools.wraps(called)(called(k))
+"""
+
+
+@pytest.mark.parametrize("factory", ["called", "by_default", "through_another", "wrapped"])
+def test_callbacks_of_a_package(factory):
+    """Two functions of one factory in an installed package are two functions, and the same one is one."""
+    space = {"__name__": "some_package"}
+    exec(compile(FACTORY, os.path.join(sysconfig.get_paths()["purelib"], "some_package.py"), "exec"), space)
+
+    def captured(k):
+        called, shape = space[factory](k), jax.ShapeDtypeStruct((), float)
+        own = Captured(lambda x: jax.pure_callback(called, shape, x))
+        own.trace(jnp.ones(()))
+        own.keep()
+        return own
+
+    assert captured(2.0) == captured(2.0) != captured(3.0)
+    assert captured(2.0).digests == captured(2.0).digests
+    assert captured(np.ones(2)) != captured(np.full(2, 2.0))
+
+
+def test_events_by_what_they_compute_now():
+    """Events that need the rates, or times of the run; and events that cannot be traced before the run."""
+    numbers, state = {"k": 1.0}, mb.State(jnp.zeros(2), jnp.zeros(2))
+    rates = lambda t, y, args, *, terms, **more: y.q[0] - numbers["k"] + jnp.sum(terms.vf(t, y, args).q)
+    times = lambda t, y, args, *, t1, **more: y.q[0] - numbers["k"] * t1
+    solver = lambda t, y, args, *, solver, **more: y.q[0] - numbers["k"] * solver.order(None)
+    kept = lambda function: captured_event(diffrax.Event(function), 0.0, state).cond_fn
+    for function, may_be_same in ((rates, True), (times, True), (solver, False)):
+        numbers["k"] = 1.0
+        before, again = kept(function), kept(function)
+        assert (before == again) == may_be_same
+        numbers["k"] = 2.0
+        assert kept(function) != before
+
+
+@pytest.mark.slow
+def test_motion_to_an_event_that_needs_the_rates():
+    numbers = {"k": 1.0}
+    system = mb.Scene([BALL]).compile()
+    start = mb.State(jnp.zeros(3), jnp.array([1.0, 0.0, 0.0]))
+    place = lambda t, y, args, *, terms, t1, **_: (y.q[0] - numbers["k"]) * terms.vf(t, y, args).q[0] * t1
+    for k in (1.0, 2.0):
+        numbers["k"] = k
+        motion = mb.simulate(system, start, t1=10.0, event=diffrax.Event(place, optx.Newton(1e-10, 1e-10)))
+        np.testing.assert_allclose(motion.ts[-1], k, atol=1e-8)

@@ -10,6 +10,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.parts import fields
 
 SIZE = (0.1, 0.2, 0.25)
 
@@ -161,3 +162,44 @@ def test_an_error_of_another_kind_is_one_line():
         r"The motion came to t = \d\S* of 1 in max_steps = 3 steps, with steps of about \S+ in the end\. ", text
     )
     assert 'solver="auto"' in text and "solver=jaxmb.solvers.Hermite()" in text and "\n" not in text
+
+
+class Anisotropic(mb.parts.AbstractForce):
+    """A spring of one's own with a stiffness in each direction, to the origin."""
+
+    name: str = fields.name()
+    bodies: fields.Names = fields.body_names()
+    stiffness: fields.Number = fields.parameter(shape=(2, 2), unit="N/m", sign="positive definite")
+
+    def wrenches(self, space, poses, velocities, t):
+        return jnp.append(-self.stiffness @ poses[0, :2], 0.0)[None]
+
+
+@pytest.mark.parametrize(
+    "matrix, message",
+    [
+        (np.diag([1.0, -1.0]), "stiffness must be positive definite"),
+        (np.zeros((2, 2)), "stiffness must be positive definite"),
+        ([[1.0, 0.5], [0.0, 1.0]], "stiffness must be symmetric"),
+    ],
+)
+def test_matrices_of_ones_own(matrix, message):
+    body = planar.Body("body", mass=1.0, inertia=1.0)
+    compiled = lambda matrix: mb.Scene([body], forces=[Anisotropic("spring", "body", stiffness=matrix)]).compile()
+    with pytest.raises(ValueError, match=f"Anisotropic 'spring': {message}"):
+        compiled(matrix)
+    with pytest.raises(ValueError, match=f"Anisotropic 'spring': {message}"):
+        mb.with_parameters(compiled(np.eye(2)), {"spring.stiffness": matrix})
+
+
+def test_the_size_of_a_scene_after_a_change():
+    """Tolerances follow a machine that becomes a thousand times smaller or larger, also under `jit`, and stay for a
+    family of designs.
+    """
+    system = mb.mechanisms.get("four_bar").system
+    points = {name: value for name, value in mb.parameters(system).items() if "point" in name}
+    length = lambda factor: mb.with_parameters(system, {name: factor * x for name, x in points.items()}).length
+    for factor, expected in ((1.0, 1.0), (0.5, 1.0), (2.0, 1.0), (1e-3, 1e-3), (1e3, 1e3)):
+        np.testing.assert_allclose(length(factor), expected * system.length, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(length)(1e-3), 1e-3 * system.length, rtol=1e-12)
+    assert jax.grad(length)(1e-3) == 0.0
