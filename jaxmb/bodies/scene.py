@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from .._dataflow import shaken
 from .._printed import preformatted
 from .._traced_functions import traced_by_jax
 from .._types import State
@@ -423,14 +424,14 @@ def _check_rotation(part, components, bodies, layout, poses):
 def _loaded(part):
     """The part with unit values for zero forces and moments, since inputs may replace them.
 
-    Zeros among the parameters of a user's function become ones too.
+    The parameters of a user's function, weights of modules among them, become independent numbers.
     """
     filled = lambda x: np.ones_like(x) if isinstance(x, ARRAYS) and not np.any(x) else x
     ones = {}
     for name, declared in declarations(type(part)).items():
         value = values_of(part)[name]
         if isinstance(value, Mapping):
-            ones[name] = {key: filled(x) for key, x in value.items()}
+            ones[name] = shaken(dict(value), 0)
         elif declared.unit in ("N", "N m", "Pa") and value is not None:
             ones[name] = filled(value)
     return _call(part, "with_fields", **ones) if ones else part

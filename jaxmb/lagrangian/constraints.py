@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._dataflow import depends
 from .._types import Coordinates, Scalar
-from ..system.dataflow import depends
 from .kinematics import Parameters
 
 if TYPE_CHECKING:

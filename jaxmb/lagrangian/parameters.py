@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._compat import with_values
+from .._dataflow import depends
 from .._types import Scalar
 from ..parts.series import AbstractSignal, of_each, of_one_kind
-from ..system.dataflow import depends
 from ..system.parameter_table import ParameterTable
 
 

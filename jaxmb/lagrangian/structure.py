@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from .._captured import Captured
 from .._compat import changed
+from .._dataflow import depends, is_analytic, shaken
 from .._index_bounds import check_indices
 from .._traced_functions import note_of, traced_by_jax, with_note
 from .._types import State
@@ -21,7 +22,6 @@ from ..parts.boundary import is_of_user, with_captured
 from ..parts.names import unknown
 from ..states.closest import meet_constraints, residual_size, tolerance
 from ..states.redundancy import check_gradients, check_implied_as_one
-from ..system.dataflow import depends, is_analytic, shaken
 from ..system.equation import Ranks
 from .constraints import AbstractCoordinateConstraint
 from .host import HostLagrangian

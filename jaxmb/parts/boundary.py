@@ -15,7 +15,9 @@ import numpy as np
 
 from .._captured import Captured
 from .._compat import with_values
+from .._dataflow import depends, shaken
 from .._traced_functions import NEED_NUMBERS, is_installed, note_of, traced_by_jax, with_note
+from ..linalg.jitted import on_host
 from .base import (
     AbstractBody,
     AbstractConstraint,
@@ -55,8 +57,35 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
         rows = sum(element.rows(space.dimension) for element in part.elements)
         if rows != part.rows:
             raise ValueError(f"{part.label}: its elements have {rows} rows, but rows = {part.rows}.")
+    _check_declared(part, space, bodies)
     if isinstance(part, AbstractForce) and not isinstance(part, AbstractPotentialForce) and hasattr(part, "energy"):
         raise ValueError(f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce.")
+
+
+def _check_declared(part: Any, space: AbstractSpace, bodies: int) -> None:
+    """Refuse a constraint from a user's function or class that is not what it declares."""
+    is_constraint = isinstance(part, AbstractConstraint | AbstractVelocityConstraint)
+    if not is_constraint or not (is_of_user(part) or with_captured(part)[1]):
+        return
+    poses, velocities, t = _arguments(space, bodies)
+    if isinstance(part, AbstractConstraint):
+        if not part.rheonomic and depends(lambda x, t: part.residual(space, x, t), (poses, t), 1):
+            raise ValueError(f"{part.label}: its residual depends on t; declare rheonomic=True.")
+        return
+    residual = lambda x, v, t: part.residual(space, x, v, t)
+    if part.linear and depends(jax.jacfwd(residual, 1), (poses, velocities, t), 1):
+        raise ValueError(
+            f"{part.label}: the derivative of its residual by the velocities depends on the velocities; declare "
+            "linear=False."
+        )
+    at_rest = _at_rest(shaken(part, 0), space, *shaken((poses, t), 1)) if part.homogeneous else np.zeros(1)
+    if np.any(np.isfinite(at_rest) & (at_rest != 0)):
+        raise ValueError(f"{part.label}: its residual is not zero at rest; declare homogeneous=False.")
+
+
+@on_host
+def _at_rest(part, space, poses, t):
+    return part.residual(space, poses, jnp.zeros((poses.shape[0], space.velocity_size), poses.dtype), t)
 
 
 def captured(part: T, space: AbstractSpace, bodies: int) -> tuple[T, dict[str, Captured]]:

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._dataflow import depends, is_analytic, shaken
 from ..linalg.arrays import ARRAYS
 from ..linalg.jitted import on_host
-from .dataflow import depends, is_analytic, shaken
 
 # The number of sets of random numbers at which residuals at rest are compared with zero.
 _LOOKS = 3

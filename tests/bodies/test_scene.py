@@ -1,5 +1,7 @@
 """Scenes that are made of others, and parts that cannot act on a point mass."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -41,6 +43,18 @@ def turning(poses, velocities, t, parameters):
     return jnp.stack([1.0, 0.0, parameters["moment"]])[None]
 
 
+def turning_by_difference(poses, velocities, t, parameters):
+    return jnp.stack([1.0, 0.0, parameters["a"] - parameters["b"]])[None]
+
+
+def turning_by_network(poses, velocities, t, parameters):
+    return parameters["net"](poses[0, :2])[None]
+
+
+# A network whose weights are all zero, as before a training that starts from no force.
+ZERO = jax.tree.map(jnp.zeros_like, eqx.nn.Linear(2, 3, key=jax.random.key(0)))
+
+
 @pytest.mark.parametrize(
     ("bodies", "part"),
     [
@@ -56,6 +70,8 @@ def turning(poses, velocities, t, parameters):
         (DEEP, spatial.Torque("part", "mass", torque=(0.0, 0.0, 0.0))),
         (FLAT, mb.RigidContact("part", "mass", terrain=terrain.Flat(), centre=(0.1, 0.0))),
         (FLAT, mb.Force("part", "mass", turning, parameters={"moment": 0.0})),
+        (FLAT, mb.Force("part", "mass", turning_by_difference, parameters={"a": 1.0, "b": 1.0})),
+        (FLAT, mb.Force("part", "mass", turning_by_network, parameters={"net": ZERO})),
     ],
 )
 def test_what_would_turn_a_point_mass_is_refused(bodies, part):

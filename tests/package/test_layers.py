@@ -28,7 +28,7 @@ LAYERS = [
     ["linalg", "lanes"],
     ["_arguments"],
     ["solvers"],
-    ["_captured", "_index_bounds", "_jaxpr_digest", "_traced_functions"],
+    ["_captured", "_dataflow", "_index_bounds", "_jaxpr_digest", "_traced_functions"],
     ["parts"],
     ["planar", "spatial", "system"],
     ["formulations"],

@@ -65,3 +65,56 @@ def test_a_gap_is_a_number_or_a_vector():
     assert not scene(None).compile().has_gaps
     with pytest.raises(ValueError, match=r"'layer': gaps must return a vector, got shape \(1, 3\)"):
         scene(lambda x, t, p: x).compile()
+
+
+BODY = planar.Body("body", mass=1.0, inertia=0.1, position=(1.0, 0.0))
+ZERO = {"a": 0.0}
+DECLARED = {
+    "rheonomic": (
+        lambda: mb.Constraint(
+            "bound", "body", lambda x, t, p: x[0, 0] - p["a"] * jnp.sin(t) - 1.0, parameters=ZERO, rheonomic=False
+        ),
+        "its residual depends on t; declare rheonomic=True",
+    ),
+    "linear": (
+        lambda: mb.VelocityConstraint(
+            "bound", "body", lambda x, v, t, p: v[0, 0] + p["a"] * v[0, 1] ** 2, parameters=ZERO, linear=True
+        ),
+        "depends on the velocities; declare linear=False",
+    ),
+    "homogeneous": (
+        lambda: mb.VelocityConstraint(
+            "bound", "body", lambda x, v, t, p: v[0, 0] - p["a"], parameters=ZERO, homogeneous=True
+        ),
+        "its residual is not zero at rest; declare homogeneous=False",
+    ),
+}
+
+
+@pytest.mark.parametrize("word", DECLARED)
+def test_constraints_that_are_not_what_they_declare(word):
+    """Also where a parameter that is zero hides it."""
+    make, message = DECLARED[word]
+    with pytest.raises(ValueError, match=f"'bound'.*{message}"):
+        mb.Scene([BODY], joints=[make()]).compile()
+
+
+def test_constraints_that_are_what_they_declare():
+    blade = lambda x, v, t, p: v[0, 1] * jnp.cos(x[0, 2]) - v[0, 0] * jnp.sin(x[0, 2] - p["a"])
+    parts = [
+        mb.Constraint("ring", "body", lambda x, t, p: jnp.dot(x[0, :2], x[0, :2]) - 1.0, rheonomic=False),
+        mb.VelocityConstraint("blade", "body", blade, parameters={"a": 0.0}, linear=True, homogeneous=True),
+    ]
+    assert mb.Scene([BODY], joints=parts).compile().drift_free
+
+
+def test_indices_out_of_bounds_of_derived_arrays():
+    """A function indexes outside of an array that it computes from its arguments."""
+    far = lambda poses, velocities, t, p: jnp.stack([jnp.sin(poses)[0, 7], 0.0, 0.0])[None]
+    with pytest.raises(ValueError, match="index 7 is out of bounds for axis 1 with size 3"):
+        mb.Scene([BODY], forces=[mb.Force("far", "body", far)]).compile()
+    law = lambda t, measured, states, p: jnp.cos(jnp.stack([measured["x"], measured["x"]]))[4]
+    push = mb.Controller("push", law, {"x": "slide.displacement"}, "slide.displacement")
+    slide = planar.Prismatic("slide", "ground", "body", point=(1.0, 0.0), axis=(1.0, 0.0))
+    with pytest.raises(ValueError, match="index 4 is out of bounds for axis 0 with size 2"):
+        mb.Scene([BODY], joints=[slide], forces=[push]).compile()

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._compat import ClosedJaxpr, Jaxpr, Literal
+from ._compat import ClosedJaxpr, Jaxpr, Literal
 
 # Operations that are analytic where they are finite. A composition of these that vanishes at independent random numbers
 # vanishes everywhere.
