@@ -11,11 +11,15 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
+from ..linalg.arrays import is_traced, namespace, replaced
 from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
 from ..linalg.rotations import cross, normalize, rotate
 from ..linalg.sums import placed_sums, unchecked_take
 from .groups import Acting, BodyGroup, BodyPoses, BodyVelocities, ConstraintGroup, CoordinateGroup, Kinematics
 from .layout import Layout
+
+# The error of a squared length by rounding, in units of eps.
+_UNIT = 16
 
 
 class BodySet(eqx.Module):
@@ -103,6 +107,15 @@ class BodySet(eqx.Module):
             unmet = g.residual(jnp.asarray(t, q.dtype), self.prepared_poses(q))
             q = q.at[self._places(g)].add(-unmet)
         return q
+
+    def with_unit_attitudes(self, q: Coordinates) -> Float[Array, "nq"]:
+        """Coordinates with Euler parameters of length one; the same array if they have this length."""
+        index = self.layout.pose_index[self.layout.turning, 3:]
+        if not is_traced(q):
+            squares = np.sum(np.asarray(q)[index] ** 2, axis=1)
+            if np.all(np.abs(squares - 1.0) <= _UNIT * np.finfo(q.dtype).eps):
+                return q
+        return replaced(q, index.reshape(-1), normalize(namespace(q).asarray(q)[index]).reshape(-1))
 
     @property
     def turn_counts(self) -> tuple[ConstraintGroup, ...]:

@@ -160,6 +160,9 @@ class RigidBodySystem(AbstractSystem):
     def normalize(self, t, q):
         return q if self.rates_are_velocities else self.bodies.normalize(t, q)
 
+    def with_unit_attitudes(self, q):
+        return self.bodies.with_unit_attitudes(q) if self.layout.turning else q
+
     def normalize_fixed(self, q, fixed):
         return self.bodies.normalize_fixed(q, fixed)
 

@@ -179,17 +179,22 @@ def angular_velocity(p: Float[Array, "4"], pdot: Float[Array, "4"]) -> Float[Arr
     return 4.0 * pull_back(p, pdot)
 
 
-def normalize(p: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
-    """The nearest unit Euler parameters."""
+def normalize(p: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """The vector of length one in the same direction; of Euler parameters, the nearest unit ones."""
     return p / norm(p)[..., None]
 
 
 def from_axis_angle(axis: VectorLike, angle: Scalar) -> Float[Array, "4"]:
-    """Euler parameters of a turn by `angle` [rad] about the unit vector `axis`."""
+    """Unit Euler parameters of a turn by `angle` [rad] about the vector `axis` of any length but zero.
+
+    **Raises:** `ValueError` for the zero vector; under a trace the result is NaN.
+    """
     dtype = jnp.result_type(float)
     axis, half = as_array(axis, dtype), as_array(angle, dtype) / 2
     xp = namespace(axis, half)
-    return jax.device_put(xp.concatenate([xp.cos(half)[None], xp.sin(half) * axis]))
+    if xp is np and not np.any(axis):
+        raise ValueError("from_axis_angle: the axis is the zero vector, which has no direction.")
+    return jax.device_put(xp.concatenate([xp.cos(half)[None], xp.sin(half) * normalize(axis)]))
 
 
 def from_matrix(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:

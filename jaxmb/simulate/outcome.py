@@ -166,10 +166,20 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
     if result == RESULTS.max_steps_reached:
         return about_steps(outcome, span, stats, is_stiff_at_end(probe, stats, solver))
     if not np.all(np.isfinite(np.concatenate(jax.tree.leaves(outcome.y)))):
-        return RESULTS[result]
+        return RESULTS[result] + about_zero_attitudes(system, outcome.y.q)
     if result == RESULTS.inconsistent_constraints:
         return contradiction(system, outcome.t, outcome.y)
     return f"{how_far(outcome, span)} {reason_of_failure(system, result, span, outcome)}"
+
+
+def about_zero_attitudes(system, q) -> str:
+    """The bodies whose Euler parameters alone are not finite after normalisation; empty if there are none."""
+    wrong = ~np.isfinite(np.asarray(q))
+    attitudes = {n: index for n, index in system.coordinate_names().items() if n.endswith(".orientation")}
+    zero = [name for name, index in attitudes.items() if np.all(wrong[index])]
+    if not zero or np.sum(wrong) > sum(len(attitudes[name]) for name in zero):
+        return ""
+    return f" Euler parameters that are all zero have no direction: give {', '.join(zero[:_NAMED])}."
 
 
 def how_far(outcome: Outcome, span: Span) -> str:

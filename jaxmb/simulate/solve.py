@@ -16,6 +16,7 @@ from ..contacts.guards import contact_guards
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
 from ..manifold.diagnosis import diagnose_friction
+from ..manifold.manifold import normalize_state
 from ..solvers import AbstractMultistep
 from ..solvers.controller import intended_step
 from ..solvers.events import NO_STATE, events_found
@@ -76,9 +77,9 @@ class Problem(NamedTuple):
 class Start(NamedTuple):
     """The start of a run.
 
-    **Fields:** the `given` state, NaN if it violates the constraints, and `y`, which follows a moving start; whether
-    the state is `consistent`; whether parameters are in their range (`valid`); `finite`: whether both hold and all
-    numbers of the state are finite.
+    **Fields:** the `given` state, normalised, and NaN if it violates the constraints; `y`, which follows a moving
+    start; whether the state is `consistent`; whether parameters are in their range (`valid`); `finite`: whether both
+    hold and all numbers of the state are finite.
     """
 
     given: State
@@ -94,6 +95,8 @@ class Start(NamedTuple):
         consistent = is_consistent(system, span.t0, y) if method.policy.restores else True
         if consistent is not True:
             y = jax.tree.map(lambda x: jnp.where(consistent, x, jnp.nan), y)
+        # Only directions of Euler parameters have a meaning, and the methods integrate them with their length.
+        y = normalize_state(system, span.t0, y)
         finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]) & valid
         given = y
         if span.moving[0]:

@@ -58,8 +58,9 @@ def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
     z: Any = system.guess.z
     if guess.z is not None:
         z = _vector(f"{function}: guess.z", guess.z, z)
+    # The closest state to longer or shorter Euler parameters would be another one.
     return State(
-        _vector(f"{function}: guess.q", guess.q, system.guess.q),
+        system.with_unit_attitudes(_vector(f"{function}: guess.q", guess.q, system.guess.q)),
         _vector(f"{function}: guess.u", guess.u, system.guess.u),
         z,
     )

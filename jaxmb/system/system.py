@@ -107,6 +107,10 @@ class AbstractSystem(AbstractEquation):
         """Indices in z by name; one name may denote several internal states."""
         return {}
 
+    def with_unit_attitudes(self, q: Coordinates) -> Float[Array, "nq"]:
+        """Coordinates with Euler parameters of length one; the same array if they have this length."""
+        return q
+
     def normalize_fixed(self, q: Coordinates, fixed: Bool[np.ndarray, "nq"]) -> tuple[Float[Array, "nq"], int]:
         """Coordinates that satisfy all invariants of fixed entries alone, and the number of these invariants.
 

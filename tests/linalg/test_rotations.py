@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxmb import spatial
 from jaxmb.linalg import rotations as rot
 
 RNG = np.random.default_rng(1)
@@ -57,6 +58,22 @@ def test_axis_angle_and_orders():
     p = rot.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)
     np.testing.assert_allclose(rot.rotate(p, jnp.array([1.0, 0.0, 0.0])), [0.0, 1.0, 0.0], rtol=0, atol=1e-15)
     np.testing.assert_allclose(rot.from_xyzw(rot.to_xyzw(p)), p, rtol=0, atol=0)
+
+
+def test_axes_of_any_length():
+    """A turn by 90 degrees about (1, 1, 0), against SciPy; the derivative along the axis itself is zero."""
+    axis = np.array([1.0, 1.0, 0.0])
+    expected = Rotation.from_rotvec(np.pi / 2 * axis / np.sqrt(2)).as_matrix()
+    for length in (1.0, 0.01, 300.0):
+        p = rot.from_axis_angle(length * axis, np.pi / 2)
+        np.testing.assert_allclose(rot.rotation_matrix(p), expected, rtol=0, atol=1e-15)
+    body = spatial.Body("body", mass=1.0, inertia=(1, 1, 1), orientation=p)
+    np.testing.assert_allclose(rot.rotation_matrix(body.orientation), expected, rtol=0, atol=1e-15)
+    along = jax.jvp(lambda x: rot.from_axis_angle(x, 0.7), (jnp.asarray(axis),), (jnp.asarray(axis),))[1]
+    np.testing.assert_allclose(along, 0.0, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match="zero vector"):
+        rot.from_axis_angle((0.0, 0.0, 0.0), 1.0)
+    assert np.isnan(jax.jit(lambda x: rot.from_axis_angle(x, 1.0))(jnp.zeros(3))[1:]).all()
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.1, np.pi, 0.2)])
