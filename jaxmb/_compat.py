@@ -4,6 +4,7 @@ Each stands here once, with its purpose and the versions where it was found. `te
 of them, and says what is missing when an update removes it.
 """
 
+import dataclasses
 import functools
 import importlib.util
 import mmap
@@ -525,6 +526,14 @@ def save_states(state: Any) -> list[Any]:
     """
     is_one = lambda x: isinstance(x, SaveState)
     return [x for x in jax.tree.leaves(state.save_state, is_leaf=is_one) if is_one(x)]
+
+
+def with_save_states(state: Any, change: Callable[[Any], Any]) -> Any:
+    """A state of diffrax's loop with a change of each of its `save_states`."""
+    is_one = lambda x: isinstance(x, SaveState)
+    changed_one = lambda x: change(x) if is_one(x) else x
+    save_state = jax.tree.map(changed_one, state.save_state, is_leaf=is_one)
+    return dataclasses.replace(state, save_state=save_state)
 
 
 def steps_of(interpolation: diffrax.DenseInterpolation) -> tuple[Array, Array]:

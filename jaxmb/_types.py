@@ -36,15 +36,18 @@ class State(eqx.Module):
         frame, angular velocity [rad/s] in the body frame).
     - `z`: internal states of first order, shape `(nz,)`, such as the torque of a motor with lag; None if no part has
         any.
+    - `angles` [rad], shape `(k,)`: of joints in space, in the order of `system.wrapped_angle_names()`. Only their full
+        turns have a meaning, which q does not tell; None if no angle is beyond half a turn. A motion counts them.
     """
 
     q: Float[Array, "... nq"]
     u: Float[Array, "... nu"]
     z: Float[Array, "... nz"] | None = None
+    angles: Float[Array, "... k"] | None = None
 
     def __repr__(self) -> str:
-        parts = {"q": self.q, "u": self.u} | ({} if self.z is None else {"z": self.z})
-        return f"State({', '.join(f'{name}={_shown(x)}' for name, x in parts.items())})"
+        parts = {"q": self.q, "u": self.u, "z": self.z, "angles": self.angles}
+        return f"State({', '.join(f'{name}={_shown(x)}' for name, x in parts.items() if x is not None)})"
 
 
 def _shown(x: Any) -> str:

@@ -1,5 +1,6 @@
 """A motion, with views by name."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -470,8 +471,8 @@ class PartMotion:
     `.angle_rate`, `.angle_acceleration`, `.force`, …, of a frame `.position`, `.specific_force`, …; `dir` lists them,
     and the classes of joints and frames describe them. Axis 0 is time, after the batch's axes.
 
-    An angle of a joint is continued over full turns. Saved times must be close: between two of them, the angle's change
-    must differ by less than half a turn from the trapezoidal rule of its rate.
+    An angle of a joint counts the full turns since the start of the run, whatever times are saved. At the start it is
+    in (−π, π] unless the state carries turns, as after another run, or after `assemble(fix={"pin.angle": 4.0})`.
     """
 
     def __init__(self, trajectory: Trajectory, name: str):
@@ -541,14 +542,15 @@ def _components(values: Mapping[str, np.ndarray]) -> dict[int, tuple[str, list[A
 @eqx.filter_jit
 @_of_each_member
 def _largest_error(motion):
-    system, errors = motion.system, _distance(motion.ys, motion.closer.ys)
+    system, errors = motion.system, dataclasses.replace(_distance(motion.ys, motion.closer.ys), angles=None)
     scales = State(system.coordinate_scale(), system.velocity_scale(), system.state_scale() if system.nz else None)
+    values = State(motion.ys.q, motion.ys.u, motion.ys.z)
 
     def relative(error, values, scale):
         error, size = (jnp.max(jnp.abs(x) / scale[None], initial=0.0) for x in (error, values))
         return error / jnp.where(size > 0, size, 1.0)
 
-    errors = jax.tree.leaves(jax.tree.map(relative, errors, motion.ys, scales))
+    errors = jax.tree.leaves(jax.tree.map(relative, errors, values, scales))
     return lax.stop_gradient(jnp.max(jnp.stack(errors)))
 
 

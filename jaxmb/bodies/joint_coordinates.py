@@ -1,6 +1,7 @@
 """Coordinates of joints by name, `"hip.angle"`, `"slide.displacement"`, with rates and accelerations."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,8 +15,9 @@ from jaxtyping import Array
 from .._compat import default_float
 from .._types import Scalar
 from ..parts.coordinate_parts import JointDriver
+from ..solvers.turning import nearest_turn
 from ..system.quantities import Measure, view_of_motion
-from .groups import ConstraintGroup, CoordinateGroup, Group
+from .groups import BodyPoses, ConstraintGroup, CoordinateGroup, Group
 from .layout import Layout
 
 # Ends of the names of a coordinate, of its rate and of its acceleration.
@@ -26,7 +28,8 @@ class JointCoordinate(NamedTuple):
     """A coordinate of a joint.
 
     **Fields:** `group`: the index of the joint's group; `member`: the joint's index in the group; `field`: the name
-    within the joint; the `shape`; `periodic`: whether the coordinate is an angle known up to full turns.
+    within the joint; the `shape`; `periodic`: whether the coordinate is an angle known up to full turns; `place`: the
+    index of such a number among the `wrapped_angles`, None for other coordinates.
     """
 
     group: int
@@ -34,13 +37,14 @@ class JointCoordinate(NamedTuple):
     field: str
     shape: tuple[int, ...]
     periodic: bool
+    place: Any = None
 
 
 def joint_coordinates(
     groups: Sequence[ConstraintGroup | CoordinateGroup], layout: Layout
 ) -> dict[str, JointCoordinate]:
     """The coordinates of all joints, by name."""
-    space, out, dtype = layout.space, {}, default_float()
+    space, out, dtype, places = layout.space, {}, default_float(), itertools.count()
     ground = np.asarray(space.ground, dtype)
     # Only shapes are evaluated.
     poses = jax.eval_shape(lambda ground: jnp.tile(space.prepare(ground), (layout.ground + 1, 1)), ground)
@@ -48,21 +52,34 @@ def joint_coordinates(
     for g, group in enumerate(groups):
         coordinates = jax.eval_shape(lambda group, t, poses: group.coordinates(t, poses), group, time, poses)
         for field, values in coordinates.items():
+            shape, periodic = values.shape[1:], field in group.group.part.periodic
             for k, name in enumerate(group.group.names):
-                coordinate = JointCoordinate(g, k, field, values.shape[1:], field in group.group.part.periodic)
-                out[f"{name}.{field}"] = coordinate
+                place = next(places) if periodic and not shape else None
+                out[f"{name}.{field}"] = JointCoordinate(g, k, field, shape, periodic, place)
     return out
+
+
+def wrapped_angles(groups: Sequence[ConstraintGroup | CoordinateGroup], t: Scalar, poses: BodyPoses) -> Array:
+    """The angles of all joints that are known up to full turns, in the order of `joint_coordinates`."""
+    out = [jnp.zeros(0, poses.dtype)]
+    for group in groups:
+        periodic = group.group.part.periodic
+        # A joint without angles is not evaluated.
+        coordinates = group.coordinates(t, poses) if periodic else {}
+        out += [values for field, values in coordinates.items() if field in periodic and values.ndim == 1]
+    return jnp.concatenate(out)
 
 
 def joint_measures(coordinates: Mapping[str, JointCoordinate]) -> dict[str, Measure]:
     """Coordinates of joints, their rates and accelerations, as quantities of a motion.
 
-    Angles known up to full turns are unwrapped: the change in an interval is the possible change nearest to the
-    trapezoidal rule of the rate.
+    Angles known up to full turns have the turns that the states carry. Along states that carry none, the change in an
+    interval is the possible change nearest to the trapezoidal rule of the rate.
     """
     out = {}
     for name, coordinate in coordinates.items():
-        place = coordinate._replace(member=np.array(coordinate.member))
+        number = None if coordinate.place is None else np.array(coordinate.place)
+        place = coordinate._replace(member=np.array(coordinate.member), place=number)
         for order, end in enumerate(ORDERS):
             out[f"{name}{end}"] = Measure(coordinate.shape, _of_joint, (place, order), of_forces=order == 2)
     return out
@@ -87,6 +104,9 @@ def _of_joint(system, place, ts, ys, solved):
     value, rate = jax.vmap(with_rate)(ts, ys.q, ys.u)
     if order == 1:
         return rate
+    if coordinate.place is not None and ys.angles is not None:
+        near = lax.dynamic_index_in_dim(ys.angles, coordinate.place, axis=1, keepdims=False)
+        return nearest_turn(value, near)
     return _continued(ts, value, rate) if coordinate.periodic and ts.size > 1 else value
 
 

@@ -28,7 +28,7 @@ from .field_jacobian import motion_jacobian
 from .force_set import ForceSet
 from .groups import ConstraintGroup, CoordinateGroup, FrameGroup, Kinematics
 from .host import host_scene
-from .joint_coordinates import held_groups
+from .joint_coordinates import held_groups, wrapped_angles
 from .joint_graph import extended_joint_order
 from .layout import Layout
 from .motion import coordinate_names, rate_names
@@ -348,6 +348,12 @@ class RigidBodySystem(AbstractSystem):
 
     def on_host(self, t):
         return None if is_traced((self, t)) else host_scene(self, t)
+
+    def wrapped_angle_names(self):
+        return tuple(name for name, known in self.joint_coordinates().items() if known.place is not None)
+
+    def wrapped_angles(self, t, q):
+        return wrapped_angles(self.measured, t, self.bodies.prepared_poses(q))
 
     def holding(self, values, rates, t):
         held = held_groups(self.measured, self.joint_coordinates(), values, rates, t)

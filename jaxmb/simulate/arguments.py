@@ -138,6 +138,14 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
         has = f"has {nz} internal states" if nz else "has no internal states"
         raise ValueError(f"The system {has}, but the state has {'none' if state.z is None else 'some, in z'}; {cure}.")
     of_states = [] if state.z is None else [("z", state.z, nz)]
+    if state.angles is not None:
+        count = len(system.wrapped_angle_names())
+        if np.shape(state.angles) != (count,):
+            shape = np.shape(state.angles)
+            raise ValueError(
+                f"The system has {count} angles known up to full turns, got state.angles of shape {shape}."
+            )
+        of_states.append(("angles", state.angles, count))
     for name, value, size in (("q", state.q, nq), ("u", state.u, nu), *of_states):
         kind = value.dtype if isinstance(value, ARRAYS) else type(value)
         if np.result_type(kind).kind not in "fiub":

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .._compat import direction_of, while_loop, with_loops
 from ..solvers import MeshAdjoint
-from ..solvers.stepping import loop
+from ..solvers.stepping import loop, with_tables_of_angles
 
 
 class Loop(diffrax.AbstractAdjoint):
@@ -40,6 +40,7 @@ class Loop(diffrax.AbstractAdjoint):
     def loop(self, *, terms, solver, saveat, init_state, max_steps, **options):
         if self.times is not None:
             saveat, init_state = self._with_times(saveat, init_state, direction_of(terms))
+        init_state = with_tables_of_angles(init_state)
         given = options | {"terms": terms, "saveat": saveat, "init_state": init_state}
         if self.derivatives is not None:
             return self.derivatives.run(max_steps, self.limit, solver=solver, **given)

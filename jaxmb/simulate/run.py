@@ -12,6 +12,7 @@ from jax import lax
 
 from .._arguments import check_kind
 from .._results import RESULTS
+from .._types import State
 from ..contacts.impact import NO_SECOND_DERIVATIVES
 from ..linalg.arrays import derivatives_of, is_traced
 from ..solvers import Adams, Hermite
@@ -45,7 +46,7 @@ from .outcome import (
     warn_of_wrong_derivative,
 )
 from .room import Room, note_long, rooms_for, was_long
-from .saves import checked_saveat, padded, with_end
+from .saves import STATES, checked_saveat, padded, with_end
 from .solve import Problem, made_precise, solved
 from .span import Span
 from .stops import Stops, breaks_of, checked_jumps, turns_of
@@ -140,7 +141,9 @@ class Run:
         meter = _NO_METER if asked.progress_meter is None else asked.progress_meter
         interpolated = asked.event is not None or first.ts is not None
         room = Room(asked.max_steps, None, asked.adjoint)
-        problem = Problem(system, state, span, method, saves, interpolated, stops, watched, room, meter, False)
+        angles = _counted_at_start(asked, first.fn)
+        state = State(state.q, state.u, state.z)
+        problem = Problem(system, state, span, method, saves, interpolated, stops, watched, room, meter, False, angles)
         return cls(asked, *_settled(problem, asked))
 
     def solved(self) -> Ended:
@@ -251,6 +254,16 @@ def _method(asked, rtol, atol):
     dtmax = checked_longest_step(asked.dtmax, controller, solver, asked.state.q.dtype)
     tolerances = {"controller": controller, "rtol": rtol, "atol": atol, "dtmax": dtmax}
     return Method.chosen(asked.system, solver, asked.manifold, asked.formulation, **tolerances)
+
+
+def _counted_at_start(asked, seen):
+    """The angles that a run counts, at its start, to within half a turn; None if it counts none. A function of saved
+    states does not see them, and diffrax's own loop does not count.
+    """
+    count = len(asked.system.wrapped_angle_names())
+    if count == 0 or seen is not STATES or asked.adjoint is not None:
+        return None
+    return np.zeros(count, asked.state.q.dtype) if asked.state.angles is None else asked.state.angles
 
 
 def _settled(problem, asked):

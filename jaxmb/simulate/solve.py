@@ -1,5 +1,6 @@
 """The motion of a system as one compiled program."""
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from ..manifold.manifold import normalize_state
 from ..solvers import AbstractMultistep
 from ..solvers.controller import intended_step
 from ..solvers.events import NO_STATE, events_found
+from ..solvers.turning import Counted, TurningController
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.inputs import inputs_ended
@@ -40,7 +42,8 @@ class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
 
     **Fields:** `system` and `state` at the start; `saveat`: the user's series and the end; `interpolated`: whether
-    states are interpolated; `traced`: whether any argument is traced.
+    states are interpolated; `traced`: whether any argument is traced; `angles`: the counted angles at the start, None
+    if none are counted.
     """
 
     system: AbstractSystem
@@ -54,24 +57,38 @@ class Problem(NamedTuple):
     room: Room
     progress_meter: Any
     traced: bool
+    angles: Any = None
 
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
         """The options of `diffrax.diffeqsolve`."""
         system, method = self.system, self.method
         contacts, gaps = bool(system.contacts), method.watches_gaps(system)
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
+        controller = self.stops.around(controller, contacts, gaps)
+        if self.angles is not None:
+            controller = TurningController(controller, WrappedAngles(system), self.angles)
         return {
             "y0": y0,
             "t0": span.t0,
             "t1": span.t1,
             "dt0": span.dt0,
             "saveat": saveat,
-            "stepsize_controller": self.stops.around(controller, contacts, gaps),
+            "stepsize_controller": controller,
             "event": self.stops.event,
             "progress_meter": self.progress_meter,
             # Contacts may close, or be closed, at the start.
             **({"made_jump": jnp.array(True)} if contacts else {}),
         }
+
+
+class WrappedAngles(eqx.Module):
+    """The angles of joints that are known up to full turns, and their rates, as a function of time and state."""
+
+    system: AbstractSystem
+
+    def __call__(self, t, y):
+        along = jnp.ones_like(t), self.system.rates(t, y.q, y.u)
+        return jax.jvp(self.system.wrapped_angles, (t, y.q), along)
 
 
 class Start(NamedTuple):
@@ -119,7 +136,7 @@ class End(NamedTuple):
 
     @classmethod
     def of(cls, solution: Any, stops: Stops) -> "End":
-        t, y = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], solution.ys[1])
+        t, y = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], _parted(solution.ys[1])[0])
         contact_events, events = None, events_found(solution.controller_state)
         if events is not None:
             contact_events = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch)
@@ -160,13 +177,15 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         (term, solver, options), control, problem.room, method.projects_steps(system), bool(watched.differentiated)
     )
 
-    ts, ys, lost = solution.ts[0], solution.ys[0], False
+    (ys, angles), ts, lost = _parted(solution.ys[0]), solution.ts[0], False
     ts = saves.restored(ts, None if stops.restarts is None else problem.span.t0, start.finite)
     if correction is not None:
         ys, lost = corrected(correction, system.prepared(), ts, ys, (span.t0, start.y))
     ts, ys = moved(saves.series, term, problem.span, start.given, ts, ys)
     if later:
         ys = seen(first.fn, ts, ys, (problem.span.t0, start.y))
+    elif angles is not None:
+        ys = dataclasses.replace(ys, angles=angles)
     end = End.of(solution, stops)
     result, stuck, ran_out, coupling = _verdict(problem, span, start, end, solution, lost, saves.outside)
     motion, failed = (ys, solution.interpolation), has_failed(result)
@@ -191,6 +210,11 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         "found_events": end.events,
     }
     return fields, outcome
+
+
+def _parted(saved):
+    """The saved states of a series, and the counted angles beside them, or None."""
+    return (saved.states, saved.angles) if isinstance(saved, Counted) else (saved, None)
 
 
 def _verdict(problem, interval, start, end, solution, lost, outside):

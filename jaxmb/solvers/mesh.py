@@ -25,6 +25,7 @@ from .packing import Layout
 from .segments import Row, Segments, choice_of, first_of, remainder, row_of, start_of
 from .stepping import constant_fields, ended, stepped
 from .steps import AbstractSteps, LinearStep, Moving
+from .turning import Counted
 from .whole_steps import jump_times, steps_of
 
 _TOO_LONG = (
@@ -519,13 +520,18 @@ def _of_loop(final, along: Tangents, like):
         final.y,
         final.dense_infos,
         final.event_dense_info,
-        *(saved.ys for saved in save_states(final)),
+        *(_states(saved.ys) for saved in save_states(final)),
         *(() if (events := event_state(final)) is None else (events.states,)),
     )
     series = len(save_states(final))
     tables, events = along.saved[:series], along.saved[series:]
     new = state(along.end[0]), along.dense, along.last, *(jax.vmap(state)(table) for table in tables), *events
     return eqx.tree_at(parts, none, new, is_leaf=_is_none)
+
+
+def _states(ys):
+    """The states of a series; counted angles beside them have no tangents."""
+    return ys.states if isinstance(ys, Counted) else ys
 
 
 def _of_rows(rows, along):

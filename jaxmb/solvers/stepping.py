@@ -19,7 +19,8 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import PyTree
 
-from .._compat import any_of_batch, buffer_set, save_states, while_loop
+from .._compat import any_of_batch, buffer_set, save_states, while_loop, with_save_states
+from .turning import Counted, turning_of
 
 _RESULTS = diffrax.RESULTS
 # A step that would end within this many rounding errors of the end of the run ends there.
@@ -61,6 +62,15 @@ def loop(*, init_state: Any, outer_while_loop: Callable[..., Any], **given: Any)
     return ended(stepped(init_state, outer_while_loop, constants, **given), constants, **given), {}
 
 
+def with_tables_of_angles(state: Any) -> Any:
+    """The state before the loop, with tables for the angles that its controller counts, if any."""
+    turning = turning_of(state.controller_state)
+    if turning is None:
+        return state
+    table = lambda saved: jnp.full((*saved.ts.shape, turning.angles.shape[1]), jnp.inf, turning.angles.dtype)
+    return with_save_states(state, lambda saved: dataclasses.replace(saved, ys=Counted(saved.ys, table(saved))))
+
+
 def constant_fields(state: Any, **given: Any) -> dict[str, Any]:
     """The fields of the state that are the same constants in all steps, by name: for example, that nothing fails and
     that there are no jumps. The compiler then knows them.
@@ -85,7 +95,7 @@ def stepped(state: Any, outer_while_loop: Callable[..., Any], constants: dict[st
     solve = _Solve(**given)
     if solve.saveat.dense:
         state = dataclasses.replace(state, dense_ts=state.dense_ts.at[0].set(solve.t0))
-    at_start = lambda sub, saved: _saved(solve, sub, saved, solve.t0, state.y) if sub.t0 else saved
+    at_start = lambda sub, saved: _saved(solve, sub, saved, state, solve.t0, state.y) if sub.t0 else saved
     state = dataclasses.replace(state, save_state=solve.on_series(at_start, state.save_state))
     proceed = lambda state: _proceeds(solve, dataclasses.replace(state, **constants))
     advance = lambda state: _advanced(solve, dataclasses.replace(state, **constants))
@@ -102,10 +112,8 @@ def ended(last: Any, constants: dict[str, Any], **given: Any) -> Any:
         find = lambda: _time_of_event(solve, last, happened)
         t, y, result = lax.cond(any_of_batch(happened), find, lambda: (t, y, result))
         saved = solve.on_series(lambda _, saved: _until(saved, t), saved)
-    saved = solve.on_series(lambda sub, saved: _without_steps(solve, sub, saved, y), saved)
-    saved = solve.on_series(
-        lambda sub, saved: _with_end(solve, sub, saved, last.num_accepted_steps, (t, y), finds), saved
-    )
+    saved = solve.on_series(lambda sub, saved: _without_steps(solve, sub, saved, last, y), saved)
+    saved = solve.on_series(lambda sub, saved: _with_end(solve, sub, saved, last, (t, y), finds), saved)
     last = dataclasses.replace(last, **constants | {"save_state": saved})
     result = _RESULTS.where(_proceeds(solve, last), _RESULTS.max_steps_reached, result)
     return dataclasses.replace(last, result=result)
@@ -171,8 +179,8 @@ def _advanced(solve: _Solve, state: Any) -> Any:
         num_rejected_steps=state.num_rejected_steps + jnp.where(keep, 0, 1),
     )
     within = solve.solver.interpolation_cls(t0=start, t1=end, **dense)
-    saved = solve.on_series(lambda sub, saved: _with_times(solve, sub, saved, within, end, keep), state.save_state)
-    saved = solve.on_series(lambda sub, saved: _with_step(solve, sub, saved, accepted, (tprev, y), keep), saved)
+    saved = solve.on_series(lambda sub, saved: _with_times(solve, sub, saved, new, within, end, keep), state.save_state)
+    saved = solve.on_series(lambda sub, saved: _with_step(solve, sub, saved, new, (tprev, y), keep), saved)
     new = dataclasses.replace(new, save_state=saved)
     if solve.saveat.dense:
         place = state.dense_save_index
@@ -210,16 +218,22 @@ def _share(t0, t, t1):
     return jnp.where(same, 0.0, t - t0) / jnp.where(same, 1.0, t1 - t0)
 
 
-def _saved(solve: _Solve, sub: diffrax.SubSaveAt, saved: Any, t: Any, y: PyTree, times: int = 1) -> Any:
+def _seen(solve: _Solve, sub: diffrax.SubSaveAt, state: Any, t: Any, y: PyTree) -> PyTree:
+    """What a series saves of a state at a time in the last accepted step."""
+    seen, turning = sub.fn(t, y, solve.args), turning_of(state.controller_state)
+    return seen if turning is None else Counted(seen, turning.at(t))
+
+
+def _saved(solve: _Solve, sub: diffrax.SubSaveAt, saved: Any, state: Any, t: Any, y: PyTree, times: int = 1) -> Any:
     """A series with a further state, written `times` times."""
     write = lambda table, x: lax.dynamic_update_slice_in_dim(
         table, jnp.broadcast_to(x, (times, *jnp.shape(x))), saved.save_index, axis=0
     )
-    ys = jax.tree.map(write, saved.ys, sub.fn(t, y, solve.args))
+    ys = jax.tree.map(write, saved.ys, _seen(solve, sub, state, t, y))
     return dataclasses.replace(saved, ts=write(saved.ts, t), ys=ys, save_index=saved.save_index + times)
 
 
-def _with_times(solve, sub, saved, within, end, keep):
+def _with_times(solve, sub, saved, state, within, end, keep):
     """A series with the states at its times in a step, if the step is kept."""
     if sub.ts is None:
         return saved
@@ -231,7 +245,7 @@ def _with_times(solve, sub, saved, within, end, keep):
     def save(saved):
         t = sub.ts[saved.saveat_ts_index]
         place = saved.save_index
-        y = sub.fn(t, within.evaluate(t), solve.args)
+        y = _seen(solve, sub, state, t, within.evaluate(t))
         ys = jax.tree.map(lambda x, table: table.at[place].set(x), y, saved.ys)
         ts = saved.ts.at[place].set(t)
         return dataclasses.replace(saved, ts=ts, ys=ys, save_index=place + 1, saveat_ts_index=saved.saveat_ts_index + 1)
@@ -240,12 +254,12 @@ def _with_times(solve, sub, saved, within, end, keep):
     return while_loop(is_due, save, saved, max_steps=count, buffers=tables, kind="lax")
 
 
-def _with_step(solve, sub, saved, accepted, at, keep):
+def _with_step(solve, sub, saved, state, at, keep):
     """A series with the state at the end of a step, if it is saved."""
     if sub.steps == 0:
         return saved
-    here = keep & (accepted % sub.steps == 0)
-    value = lambda: sub.fn(*at, solve.args)
+    here = keep & (state.num_accepted_steps % sub.steps == 0)
+    value = lambda: _seen(solve, sub, state, *at)
     if sub.steps == 1:
         y = value()
     else:
@@ -257,29 +271,29 @@ def _with_step(solve, sub, saved, accepted, at, keep):
     return dataclasses.replace(saved, ts=ts, ys=ys, save_index=place + jnp.where(here, 1, 0))
 
 
-def _without_steps(solve, sub, saved, y):
+def _without_steps(solve, sub, saved, state, y):
     """A series of a run without steps, which ends where it starts: all its times are the start."""
     if sub.ts is None:
         return saved
     is_empty = solve.t0 == solve.t1
 
     def fill():
-        filled = _saved(solve, sub, saved, solve.t0, y, len(sub.ts))
+        filled = _saved(solve, sub, saved, state, solve.t0, y, len(sub.ts))
         return jax.tree.map(lambda new, old: jnp.where(is_empty, new, old), filled, saved)
 
     return lax.cond(any_of_batch(is_empty), fill, lambda: saved)
 
 
-def _with_end(solve, sub, saved, accepted, at, finds):
+def _with_end(solve, sub, saved, state, at, finds):
     """A series with the end of the run, unless the last step saved it, and without states after an event."""
-    by_step = sub.steps == 1 if sub.steps < 2 else accepted % sub.steps == 0
+    by_step = sub.steps == 1 if sub.steps < 2 else state.num_accepted_steps % sub.steps == 0
     if finds:
         here = sub.t1 | by_step
     else:
         here = sub.t1 and (not by_step if sub.steps < 2 else ~by_step)
     if here is False:
         return saved
-    with_end = _saved(solve, sub, saved, *at)
+    with_end = _saved(solve, sub, saved, state, *at)
     if here is True:
         return with_end
     ts, ys = jax.tree.map(lambda new, old: jnp.where(here, new, old), (with_end.ts, with_end.ys), (saved.ts, saved.ys))

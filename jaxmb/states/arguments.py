@@ -63,7 +63,23 @@ def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
         system.with_unit_attitudes(_vector(f"{function}: guess.q", guess.q, system.guess.q)),
         _vector(f"{function}: guess.u", guess.u, system.guess.u),
         z,
+        guess.angles,
     )
+
+
+def counted_angles(system: AbstractSystem, guess: State, values: Mapping[str, Any]) -> Any:
+    """The angles of a state [rad], which tell its full turns: of the guess, and prescribed `values`; None if all are
+    within half a turn.
+    """
+    places = {name: k for k, name in enumerate(system.wrapped_angle_names()) if name in values} if values else {}
+    within = lambda value: not is_traced(value) and abs(float(value)) <= np.pi
+    if guess.angles is None and all(within(values[name]) for name in places):
+        return None
+    dtype = guess.q.dtype
+    angles = np.zeros(len(system.wrapped_angle_names()), dtype) if guess.angles is None else guess.angles
+    for name, k in places.items():
+        angles = replaced(angles, np.array([k]), jnp.asarray(values[name], dtype)[None])
+    return angles
 
 
 def checked_time(function: str, t: Scalar, dtype: Any) -> Any:

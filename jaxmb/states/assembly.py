@@ -27,6 +27,7 @@ from .arguments import (
     check_system,
     checked_guess,
     checked_time,
+    counted_angles,
     holding,
     prescribe,
     split_coordinates,
@@ -92,6 +93,7 @@ def assemble(
     t = checked_time("assemble", t, guess.q.dtype)
     z, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_coordinates(system, fix)
+    angles = counted_angles(system, guess, of_joints)
     rates, rates_of_joints = split_rates(system, rates)
     u, fixed_rates = prescribe("rate", rates_of(system.rate_names()) if rates else {}, rates, guess.u)
     if not is_traced(u):
@@ -116,13 +118,13 @@ def assemble(
         if ok and ok_rates:
             if of_bodies and not is_traced((system, u)):
                 _warn_of_changed_velocities(system, guess.u, u)
-            return State(q, u, z)
+            return State(q, u, z, angles)
     ok = ok & ok_rates
     if throw:
         q = eqx.error_if(
             q, ~ok, "The mechanism cannot be assembled; call assemble outside jit to see which joints are violated."
         )
-    state = State(q, u, z)
+    state = State(q, u, z, angles)
     return state if throw else nan_where(jnp.logical_not(ok), state, (system, guess, fix, rates, t))
 
 

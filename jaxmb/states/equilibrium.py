@@ -108,6 +108,7 @@ def equilibrium(
     time = checked_time("equilibrium", t, guess.q.dtype)
     z, fix = split_internal_states(system, guess.z, fix)
     fix, of_joints = split_coordinates(system, fix)
+    angles = counted_angles(system, guess, of_joints)
     system = holding(system if z is None else system.with_states(z), of_joints, {}, time)
     raises = throw is not False
     start, fixed, assembled = configuration(system, guess.q, fix, time, raises)
@@ -134,17 +135,17 @@ def equilibrium(
     if errors and not np.all(steady):
         raise ValueError(_changing(at, np.asarray(steady)))
     if errors:
-        return State(q, u, z)
+        return State(q, u, z, angles)
     ok = ok & at_rest & assembled & jnp.all(jnp.asarray(steady)) & ~jnp.any(overlaps | pulls)
     if raises and not is_traced(ok) and ok:
-        return State(q, u, z)
+        return State(q, u, z, angles)
     if throw:
         q = eqx.error_if(
             q,
             ~ok,
             "No static equilibrium was found; call equilibrium outside jit to see the coordinates at fault.",
         )
-    state = State(q, u, z)
+    state = State(q, u, z, angles)
     return state if throw else nan_where(jnp.logical_not(ok), state, (system, guess, fix, time))
 
 

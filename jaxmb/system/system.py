@@ -123,6 +123,14 @@ class AbstractSystem(AbstractEquation):
         """The coordinates of joints, by name; each has a `shape`."""
         return self.catalogue.joint_coordinates()
 
+    def wrapped_angle_names(self) -> tuple[str, ...]:
+        """The names of the angles of joints that are known up to full turns, such as `"hinge.angle"` in space."""
+        return ()
+
+    def wrapped_angles(self, t: Scalar, q: Coordinates) -> Float[Array, "k"]:
+        """These angles [rad], each within half a turn of zero."""
+        return jnp.zeros(0, q.dtype)
+
     def holding(self, values: Mapping[str, Array], rates: Mapping[str, Array], t: Scalar) -> Self:
         """The same system with coordinates of joints held at `values` at time t; the values change at `rates`."""
         del values, rates, t

@@ -16,6 +16,7 @@ import numpy as np
 from ...linalg.rotations import conjugate, cross, dot, from_axis_angle, multiply, rotate, unrotate
 from .. import fields
 from ..base import AbstractAxisJoint, AbstractJoint, AbstractSpatialPart, PathKind, Quantities
+from ..coordinate_parts import turns
 from ..elements import coincident, in_planes, perpendicular
 from ..shapes import ball, pin, sleeve
 from ..space import nearest_to_origin, separation
@@ -345,7 +346,7 @@ class Screw(AbstractSliding):
 
     Its coordinates are `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
     given poses, unless these are given; and `displacement` [m], from A to B along the axis, zero at the given poses if
-    a world `point` gives both.
+    a world `point` gives both. The displacement tells the full turns of the angle, in every state.
 
     With the angle θ, the displacement s and ψ = θ − 2π (s − offset)/pitch, the last row is `pitch/2π · 2 sin(ψ/2) = 0`
     with ψ in (−π, π]. It is periodic in θ and in s, like the screw, and holds for any number of turns; near zero its
@@ -361,10 +362,19 @@ class Screw(AbstractSliding):
     offset: fields.Number = fields.parameter(unit="m", optional=True)
     rows: ClassVar[int] = 5
 
+    @property
+    def periodic(self):
+        return frozenset()
+
     def complete(self, space, poses):
         part = measured_from_given_poses(self, space, poses)
         advance = part.pitch * angle(space, part, poses) / (2 * np.pi)
         return part.filled(offset=part.axis_a @ offset_in_a(space, part, poses) - advance)
+
+    def coordinates(self, space, poses):
+        out = super().coordinates(space, poses)
+        near = (out["displacement"] - self.offset) * (2 * np.pi) / self.pitch
+        return out | {"angle": out["angle"] + turns(near - out["angle"])}
 
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
