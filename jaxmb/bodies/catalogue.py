@@ -12,7 +12,7 @@ from ..parts.drivers import AbstractDriver
 from ..system.catalogue import Catalogue
 from ..system.quantities import Measure, entries_along, view_of_motion
 from ..system.structures import of_structure
-from .joint_coordinates import joint_coordinates, joint_measures
+from .joint_coordinates import beyond_half_turns, joint_coordinates, joint_measures
 from .motion import body_measures, body_motion, frame_measures, scalar_measures
 from .picture import picture
 from .reactions import applied_wrenches, joint_places, lifted_ropes, places, reaction_measures, reactions
@@ -35,8 +35,9 @@ class SceneCatalogue(Catalogue):
         out |= joint_measures(self.joint_coordinates()) | frame_measures(system.frames, system.layout)
         return out | _drive_measures(system)
 
-    def cautions(self, motion):
-        return lifted_ropes(self.system, motion)
+    def cautions(self, motion, reach):
+        turned = [] if reach is None else beyond_half_turns(self.system, np.asarray(reach))
+        return lifted_ropes(self.system, motion) + turned
 
     @of_structure
     def joint_coordinates(self):

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from .._compat import default_float
 from .._types import Scalar
-from ..parts.coordinate_parts import JointDriver
+from ..parts.coordinate_parts import AbstractCoordinatePart, JointDriver
 from ..solvers.turning import nearest_turn
 from ..system.quantities import Measure, view_of_motion
 from .groups import BodyPoses, ConstraintGroup, CoordinateGroup, Group
@@ -117,6 +117,29 @@ def _continued(ts, angles, rates):
     # Entries after the end of a run are not finite; earlier entries do not depend on them.
     turns = lax.stop_gradient(jnp.where(jnp.isfinite(turns), turns, 0.0))
     return angles + 2 * np.pi * jnp.concatenate([jnp.zeros(1, angles.dtype), jnp.cumsum(turns)])
+
+
+def beyond_half_turns(system: Any, reach: np.ndarray) -> list[str]:
+    """A sentence for each force whose angle turned beyond the half turn to either side within which it is known."""
+    places = {name: k for k, name in enumerate(system.wrapped_angle_names())}
+    out = []
+    for group in system.forces.groups:
+        part, joints = group.group.part, dict(group.group.inner).get(("joints", "0"))
+        middles = part.middle_of_turn() if joints and isinstance(part, AbstractCoordinatePart) else None
+        if middles is None or not part.is_periodic():
+            continue
+        for name, joint, middle in zip(group.group.names, joints, np.asarray(middles).reshape(-1), strict=True):
+            coordinate = f"{joint}.{part.within[0]}"
+            start, least, largest = reach[:, places[coordinate]]
+            # The turn in which the angle starts is the part's own.
+            middle = middle + 2 * np.pi * np.round((start - middle) / (2 * np.pi))
+            if max(largest - middle, middle - least) > np.pi:
+                out.append(
+                    f"{name!r} jumps where {coordinate!r} is half a turn from {middle:.6g} rad, and the angle went "
+                    f"from {least:.6g} to {largest:.6g}: let it act on 'winding.length' of a tendon that counts turns, "
+                    f"jaxmb.FixedTendon('winding', ({coordinate!r},), coefficients=(1.0,))."
+                )
+    return out
 
 
 def held_groups(

@@ -350,6 +350,8 @@ class RigidBodySystem(AbstractSystem):
         return None if is_traced((self, t)) else host_scene(self, t)
 
     def wrapped_angle_names(self):
+        if not self.spatial:
+            return ()
         return tuple(name for name, known in self.joint_coordinates().items() if known.place is not None)
 
     def wrapped_angles(self, t, q):

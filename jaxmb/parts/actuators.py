@@ -139,6 +139,10 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
         force = jnp.dot(self.gain, terms) * control + jnp.dot(self.bias, terms)
         return _clipped(force, self.force_range)
 
+    def middle_of_turn(self):
+        reads_angle = (self.gain[..., 1] != 0) | (self.bias[..., 1] != 0)
+        return jnp.where(reads_angle, self.middle, jnp.nan)
+
     def wrenches(self, space, poses, velocities, t):
         def law(x, v):
             x = self.near(x, self.middle)

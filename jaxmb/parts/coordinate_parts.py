@@ -187,6 +187,12 @@ class AbstractCoordinatePart(AbstractOfCoordinates):
         """The value; an angle known up to full turns is wrapped to within half a turn of `middle`."""
         return middle.reshape(-1) + self.difference(value, middle) if self.is_periodic() else value
 
+    def middle_of_turn(self) -> Float[Array, "*n"] | None:
+        """Hook: the angle [rad] half a turn away from which the part's force jumps; None if it does not jump, NaN for
+        a member of stacked parts that does not.
+        """
+        return None
+
     def _check_shape(self, field: str, given: np.ndarray) -> None:
         shape = np.shape(getattr(self, field))
         if shape != given.shape:
@@ -222,7 +228,8 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
     **Arguments:** `stiffness` [N m/rad, N/m] ≥ 0; `damping` [N m s/rad, N s/m] ≥ 0; `free` [rad, m], where the spring
     exerts no force, default the coordinate at the given poses. In space the spring of an angle takes the shortest way
     to `free`, up to half a turn. With `middle` [rad], the middle of its range, the angle is instead wrapped to within
-    half a turn of `middle`.
+    half a turn of `middle`. A run that goes beyond, where the force jumps, warns. On the length of a `FixedTendon`
+    along the angle, a spring winds up through any number of turns.
     """
 
     stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")
@@ -242,6 +249,9 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
         if self.middle is None:
             return self.difference(value, self.free)
         return self.near(value, self.middle) - self.free.reshape(-1)
+
+    def middle_of_turn(self):
+        return self.free if self.middle is None else self.middle
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -self.stiffness * self._stretch(x) - self.damping * v
@@ -363,6 +373,9 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
 
     def gaps(self, space, poses, t):
         return self._gaps(self.measured(space, poses))
+
+    def middle_of_turn(self):
+        return 0.5 * (self.lower + self.upper)
 
     @property
     def gap_width(self):

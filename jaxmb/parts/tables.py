@@ -38,8 +38,11 @@ class TableSpring(AbstractScalarPart, AbstractPotentialForce):
     def numbers_agree(self):
         return jnp.all(jnp.diff(self.values) > 0)
 
+    def middle_of_turn(self):
+        return 0.5 * (self.values[..., 0] + self.values[..., -1])
+
     def _in_table(self, value):
-        return self.near(value, 0.5 * (self.values[0] + self.values[-1]))[0]
+        return self.near(value, self.middle_of_turn())[0]
 
     def wrenches(self, space, poses, velocities, t):
         law = lambda x, v: -local_spline.value(self.values, self.forces, self._in_table(x))[None]

@@ -58,7 +58,8 @@ class Outcome(NamedTuple):
 
     **Fields:** `flags`, as one array in the order of `Flags`; the last time `t` and state `y`; `step`: the length of
     the next step, None if the controller does not know it; `coupling` of friction with its own reactions if it caused a
-    failure, None without friction; `evidence` by which the manifold diagnoses a failure.
+    failure, None without friction; `evidence` by which the manifold diagnoses a failure; `reach`: counted angles at the
+    start, the least and the largest, shape (3, k), None if none are counted.
     """
 
     flags: Any
@@ -67,6 +68,7 @@ class Outcome(NamedTuple):
     step: Any
     coupling: Any
     evidence: Any
+    reach: Any
 
 
 def about_friction(system, coupling) -> str:
@@ -115,9 +117,9 @@ def warn_of_stiffness(stats) -> None:
     )
 
 
-def warn_of_parts(system, motion) -> None:
-    """Warn of parts that a concrete motion uses beyond their model, if it saves states."""
-    cautions = system.catalogue.cautions(motion) if isinstance(motion.ys, State) else ()
+def warn_of_parts(system, motion, reach) -> None:
+    """Warn of parts that a concrete motion uses beyond their model, if it saves states; `reach` as in `Outcome`."""
+    cautions = system.catalogue.cautions(motion, reach) if isinstance(motion.ys, State) else ()
     for caution in cautions:
         warnings.warn(caution, stacklevel=5)
 

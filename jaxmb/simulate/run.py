@@ -192,7 +192,7 @@ class Run:
                 trajectory = trajectory.result.error_if(trajectory, ended.outcome.flags[0])
         else:
             trajectory = self._explained(ended)
-            warn_of_parts(ended.problem.system, trajectory)
+            warn_of_parts(ended.problem.system, trajectory, ended.outcome.reach)
         if asked.error:
             closer = self._closer(ended.problem)
             trajectory = eqx.tree_at(lambda t: t.closer, trajectory, closer, is_leaf=lambda leaf: leaf is None)

@@ -21,7 +21,7 @@ from ..manifold.manifold import normalize_state
 from ..solvers import AbstractMultistep
 from ..solvers.controller import intended_step
 from ..solvers.events import NO_STATE, events_found
-from ..solvers.turning import Counted, TurningController
+from ..solvers.turning import Counted, TurningController, turning_of
 from ..states.consistency import is_consistent
 from ..system import AbstractSystem
 from ..system.inputs import inputs_ended
@@ -198,7 +198,9 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     wrong = stats.get("wrong_derivative", False)
     flags = Flags(failed, ~jnp.asarray(start.consistent), stuck, complete, ran_out, long, wrong)
     evidence = method.policy.evidence(solution.solver_state)
-    outcome = Outcome(jnp.stack([jnp.asarray(x) for x in flags]), end.t, end.y, end.step, coupling, evidence)
+    turning = turning_of(solution.controller_state)
+    reach = None if turning is None else turning.reach
+    outcome = Outcome(jnp.stack([jnp.asarray(x) for x in flags]), end.t, end.y, end.step, coupling, evidence, reach)
     fields = {
         "formulation": method.formulation,
         "ts": ts,

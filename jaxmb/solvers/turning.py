@@ -15,6 +15,9 @@ from jaxtyping import Array, Float, PyTree
 
 from .controller import AbstractControllerAround, states_inside
 
+# The fields of `Turning` that change with accepted steps only.
+_COUNTED = ("times", "angles", "rates", "jumps", "reach")
+
 
 class Counted(NamedTuple):
     """The saved states of a series, and the counted `angles` [rad] there, shape (times, k)."""
@@ -27,7 +30,8 @@ class Turning(eqx.Module):
     """The state of a `TurningController`.
 
     **Fields:** `inner`: the state of the controller inside; the `times` of the ends of the last accepted step, with
-    the counted `angles` and their `rates` there, shape (2, k); whether a jump follows it (`jumps`).
+    the counted `angles` and their `rates` there, shape (2, k); whether a jump follows it (`jumps`); the `reach` of the
+    angles so far: at the start, and the least and the largest at the ends of steps.
     """
 
     inner: Any
@@ -35,6 +39,7 @@ class Turning(eqx.Module):
     angles: Float[Array, "2 k"]
     rates: Float[Array, "2 k"]
     jumps: Any
+    reach: Float[Array, "3 k"]
 
     def at(self, t: Any) -> Float[Array, "k"]:
         """The angles at a time in the last step, by the cubic polynomial through both ends."""
@@ -67,7 +72,8 @@ class TurningController(AbstractControllerAround):
         angles, rates = self._seen(t0, y0)
         angles = nearest_turn(angles, self.given)
         twice = lambda x: jnp.stack([x, x])
-        return end, Turning(inner, twice(t0), twice(angles), twice(rates), jnp.array(False))
+        start = jnp.stack([angles, angles, angles])
+        return end, Turning(inner, twice(t0), twice(angles), twice(rates), jnp.array(False), start)
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
         last: Turning = controller_state
@@ -83,9 +89,10 @@ class TurningController(AbstractControllerAround):
             jnp.stack([last.angles[1], angles]),
             jnp.stack([leaving, rates]),
             jnp.asarray(made_jump),
+            jnp.stack([last.reach[0], jnp.minimum(last.reach[1], angles), jnp.maximum(last.reach[2], angles)]),
         )
         kept = lambda new, old: jnp.where(keep, new, old)
-        new = Turning(inner, *(kept(getattr(new, x), getattr(last, x)) for x in ("times", "angles", "rates", "jumps")))
+        new = Turning(inner, *(kept(getattr(new, x), getattr(last, x)) for x in _COUNTED))
         return keep, start, end, made_jump, new, result
 
     def _seen(self, t, y):

@@ -47,9 +47,13 @@ class Catalogue:
             out[f"{name}.force"] = Measure((self.system.nu,), _force_along, self._rows_of(name), of_forces=True)
         return out
 
-    def cautions(self, motion: Any) -> list[str]:
-        """Sentences about saved states of a concrete motion in which a part is used beyond its model."""
-        del motion
+    def cautions(self, motion: Any, reach: Any) -> list[str]:
+        """Sentences about a concrete motion in which a part is used beyond its model.
+
+        **Arguments:** `reach`: of the `wrapped_angles` at the start, the least and the largest, shape (3, k); None if
+        they were not counted.
+        """
+        del motion, reach
         return []
 
     @of_structure

@@ -426,6 +426,8 @@ def test_the_state_of_the_loop_of_diffrax(compat):
     assert [{field.name for field in dataclasses.fields(one)} for one in series] == 2 * [
         {"saveat_ts_index", "ts", "ys", "save_index"}
     ]
+    doubled = compat.with_save_states(state, lambda one: dataclasses.replace(one, ys=(one.ys, one.ts)))
+    assert [len(one.ys) for one in compat.save_states(doubled)] == [2, 2]
 
 
 def solve(solver, rate=-1.0, t1=1.0, *, adjoint=None, controller=None, saveat=None):

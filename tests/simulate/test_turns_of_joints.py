@@ -184,3 +184,18 @@ def test_identification_from_few_samples(wheel):
     ts = np.array([1.0, 3.0])
     fit = mb.identify(wheel, {"hinge.angle": 3.2 * ts**2}, ts=ts, free={"motor.force": 2.0})
     assert fit.parameters["motor.force"] == pytest.approx(1.6, rel=1e-6)
+
+
+def test_a_spring_that_is_turned_beyond_its_half_turn(wheel):
+    """Its moment jumps there, of which the run warns; within the half turn about `middle` it does not."""
+    middle = mb.JointSpring("coil", "hinge.angle", stiffness=1e-6, free=0.5, middle=2.0)
+    near = mb.JointSpring("coil", "hinge.angle", stiffness=1e-6, free=0.5)
+    motor = mb.JointForce("motor", "hinge.angle", force=2.0)
+    for spring, warns in ((near, True), (middle, False)):
+        system = mb.Scene([rotor("rotor0")], joints=[JOINTS["hinge"]], forces=[motor, spring]).compile()
+        start = mb.assemble(system)
+        if warns:
+            with pytest.warns(UserWarning, match=r"'coil' jumps where 'hinge.angle' is half a turn from 0.5 rad.*to 4"):
+                mb.simulate(system, start, t1=1.0)
+        else:
+            mb.simulate(system, start, t1=1.0)

@@ -56,7 +56,8 @@ def recorded(system: AbstractSystem, motion: Trajectory) -> Course:
         if missing:
             raise ValueError(f"required_forces: the trajectory has no values of {', '.join(missing)}.")
         z = motion.ys.z[:, np.concatenate([known[name] for name in system.state_names()])]
-    ys = State(motion.ys.q, motion.ys.u, z)
+    same = motion.system.wrapped_angle_names() == system.wrapped_angle_names()
+    ys = State(motion.ys.q, motion.ys.u, z, motion.ys.angles if same else None)
     nothing = jnp.zeros((motion.ts.size, 0), ys.q.dtype)
     return Course(motion.ts, ys, motion.accelerations, nothing, jnp.ones(motion.ts.size, bool), ())
 
