@@ -453,6 +453,8 @@ class AbstractPointPair(AbstractPair):
 
     point_a: fields.Number = fields.point(body=0, default="origin")
     point_b: fields.Number = fields.point(body=1, default="origin")
+    # Whether it is a spring along the line between its points, whose motion ratio a suspension has.
+    is_spring: ClassVar[bool] = False
 
 
 class AbstractConstraint(AbstractLink):

@@ -69,6 +69,7 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
     damping: fields.Number = fields.parameter(unit="N s/m", sign="non-negative", default=0.0)
     free_length: fields.Number = fields.parameter(unit="m", sign="non-negative", optional=True)
     path_kind: ClassVar[PathKind] = "coil"
+    is_spring: ClassVar[bool] = True
 
     def complete(self, space, poses):
         return self if self.free_length is not None else self.filled(free_length=norm(separation(space, self, poses)))

@@ -128,6 +128,111 @@ def test_steering_axis_of_a_wishbone_goes_through_its_balls():
         np.testing.assert_allclose(found.kingpin_inclination[i, j], np.arctan2(-y, z), rtol=1e-10)
 
 
+def constant():
+    """A spring of the lower arm whose upper end is above its axis, and whose lower end is on the axis."""
+    P = suspensions.arrays(suspensions.WISHBONE)
+    on_axis = 0.5 * (P["lower_front"] + P["lower_rear"])
+    of_arm = (P["lower_front"] + P["lower_rear"] + P["lower_ball"]) / 3
+    ends = {"point_a": on_axis + np.array([0.0, 0.0, 0.2]), "point_b": on_axis - of_arm}
+    return spatial.SpringDamper("constant", "ground", "lower", stiffness=100.0, **ends)
+
+
+def anti_roll(body="upright"):
+    """A spring that steering stretches if it is on the upright."""
+    at = {"point_a": (-0.2, 0.55, 0.1), "point_b": (-0.15, -0.1, -0.05)}
+    return spatial.SpringDamper("anti_roll", "ground", body, stiffness=2e4, **at)
+
+
+def steered_by(forces, joints="ideal", **changes):
+    """Curves of the double wishbone with other forces, at three travels."""
+    scene = library("double_wishbone", **({} if joints == "ideal" else {"joints": joints})).scene
+    system = mb.Scene(scene.bodies, joints=scene.joints, forces=forces(scene.forces)).compile()
+    small = {"travel": np.linspace(-0.05, 0.05, 3), "steer": {"tie_rod.point_a[1]": np.array([-0.01, 0.0, 0.01])}}
+    return curves_of(system, **(small | changes))
+
+
+AXIS = ("caster", "kingpin_inclination", "scrub_radius", "caster_trail")
+
+
+def ball_axis(travel, steer):
+    """Caster and kingpin inclination of the line through both ball joints."""
+    P = suspensions.arrays(suspensions.WISHBONE)
+    _, R, _ = suspensions.wishbone(suspensions.WISHBONE, travel, steer)
+    x, y, z = R @ (P["upper_ball"] - P["lower_ball"])
+    return np.arctan2(-x, z), np.arctan2(-y, z)
+
+
+def test_steering_axis_of_springs_at_a_dead_centre_and_on_the_upright():
+    """The first springs keep no travel: the axis goes through the ball joints all the same."""
+    with_others = lambda forces: [anti_roll(), constant(), *forces]
+    found = steered_by(with_others, travel=0.02, steer={"tie_rod.point_a[1]": 0.01})
+    assert list(found.motion_ratio) == ["anti_roll", "constant", "spring"]
+    expected = ball_axis(0.02, 0.01)
+    np.testing.assert_allclose([found.caster, found.kingpin_inclination], expected, rtol=1e-9)
+    assert abs(found.motion_ratio["constant"]) < 1e-12
+
+
+# Forces of the double wishbone with hinges, and the springs that are named, None for all.
+ORDERS = {
+    "the constant spring first": (lambda forces: [constant(), *forces], None),
+    "the constant spring last": (lambda forces: [*forces, constant()], None),
+    "only a constant spring": (lambda forces: [constant(), *forces[1:]], None),
+    "the anti-roll spring first": (lambda forces: [anti_roll(), *forces], None),
+    "the anti-roll spring last": (lambda forces: [*forces, anti_roll()], None),
+    "two springs of one arm": (lambda forces: [anti_roll("lower"), *forces], None),
+    "no spring": (lambda forces: forces[1:], None),
+    "a torsion bar": (
+        lambda forces: [mb.JointSpring("bar", "lower_hinge.angle", stiffness=1e3), *forces[1:]],
+        ["lower_hinge.angle"],
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ORDERS)
+def test_steering_axis_does_not_depend_on_springs_between_rigid_arms(name):
+    forces, springs = ORDERS[name]
+    found, expected = steered_by(forces, springs=springs), steered_by(list)
+    for own in (*AXIS, "toe", "camber"):
+        np.testing.assert_allclose(getattr(found, own), getattr(expected, own), rtol=0, atol=1e-10)
+    balls = [[ball_axis(z, s) for s in (-0.01, 0.0, 0.01)] for z in (-0.05, 0.0, 0.05)]
+    np.testing.assert_allclose(np.stack([found.caster, found.kingpin_inclination], axis=-1), balls, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_bushings_are_no_springs():
+    """In any order; and with bushings alone."""
+    first = steered_by(list, "bushings")
+    last = steered_by(lambda forces: forces[::-1], "bushings")
+    assert list(first.motion_ratio) == list(last.motion_ratio) == ["spring"]
+    alone = steered_by(lambda forces: [part for part in forces if part.name != "spring"], "bushings")
+    assert not alone.motion_ratio
+    rigid = steered_by(list)
+    for own in AXIS:
+        np.testing.assert_allclose(getattr(last, own), getattr(first, own), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(getattr(alone, own), getattr(rigid, own), rtol=0, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_steering_axis_without_springs():
+    scene = library("double_wishbone").scene
+    system = scene.extended(without=["spring"]).compile()
+    ball = mb.parameters(system)["upper_ball.point_b"]
+
+    def axis(x):
+        changed = mb.with_parameters(system, {"upper_ball.point_b": ball + x * jnp.array([0.3, -0.2, 0.1])})
+        steer = {"tie_rod.point_a[1]": jnp.asarray(0.01)}
+        found = curves_of(changed, travel=jnp.array([0.0, 0.04]), steer=steer)
+        return jnp.stack([getattr(found, own) for own in AXIS])
+
+    values, slopes = jax.jit(jax.vmap(lambda x: jax.jvp(axis, (x,), (jnp.ones_like(x),))))(1e-4 * np.arange(-2.0, 3.0))
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=slopes.shape[1:]))
+    reverse = jax.jit(jax.grad(lambda x: jnp.vdot(weights, axis(x))))(0.0)
+    np.testing.assert_allclose(reverse, jnp.vdot(weights, slopes[2]), rtol=1e-10)
+    differences = (8 * (values[3] - values[1]) - (values[4] - values[0])) / 12e-4
+    np.testing.assert_allclose(slopes[2], differences, rtol=1e-7, atol=1e-9)
+
+
 # Arms and tie rod turn about x, the tie rod as the lower arm.
 FLAT = {
     "lower_front": (0.15, 0.36, 0.24),

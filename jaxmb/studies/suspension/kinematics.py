@@ -15,6 +15,7 @@ from ...linalg.arrays import is_traced
 from ...linalg.failure import nan_where
 from ...linalg.jitted import jitted
 from ...linalg.rotations import norm
+from ...parts.base import AbstractPointPair
 from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_no_states, check_system, checked_guess, checked_time
 from ...states.refusals import violated_joints
@@ -163,11 +164,8 @@ def _position(rig: Rig, springs: tuple[Spring, ...], inputs: Inputs) -> _Curves:
 
     values, rates, q = seen(now), jax.jacfwd(seen)(now), at.shifted(rig, x).q
     axis = None
-    if rig.steering is not None and springs:
-        # While the first spring keeps its length, travel follows steering.
-        of_spring = rates.lengths[0]
-        turning = rates.pose[:, 1] - rates.pose[:, 0] * of_spring[1] / of_spring[0]
-        axis = rig.wheel.steering_axis(rig.system, q, turning)
+    if rig.steering is not None:
+        axis = rig.wheel.steering_axis(rig.system, q, rates.pose[:, :2], rates.lengths[:, :2])
     steers = jnp.max(jnp.abs(rates.pose[:, 1]))
     moved = values.patch - rig.wheel.attitude(rig.system, rig.guess).patch
     return _Curves(at, q, values.toe, values.camber, values.patch, moved, rates, axis, steers)
@@ -302,19 +300,17 @@ def _check_freedoms(rig: Rig):
 
 def _springs(system, springs) -> dict[str, Spring]:
     """The places of springs by name."""
-    known, linear = {}, []
+    joints = system.joint_coordinates()
+    known = {name: Spring(0, 0, joint) for name, joint in joints.items() if joint.shape == ()}
+    usual = []
     for g, group in enumerate(system.forces.groups):
-        part = group.group.part
-        if hasattr(part, "point_a") and hasattr(part, "point_b"):
+        if isinstance(group.group.part, AbstractPointPair):
             known |= {name: Spring(g, k) for k, name in enumerate(group.group.names)}
-            # Springs are the usual choice, other forces between points are not.
-            linear += group.group.names if hasattr(part, "stiffness") else ()
+            usual += group.group.names if group.group.part.is_spring else ()
     if springs is None:
-        return {name: known[name] for name in linear}
+        return {name: known[name] for name in usual}
     if isinstance(springs, str):
         raise ValueError(f"{_NAME}: springs names springs in a sequence, [{springs!r}], also a single one.")
-    joints = system.joint_coordinates()
-    known |= {name: Spring(0, 0, joint) for name, joint in joints.items() if joint.shape == ()}
     for name in springs:
         if name not in known:
             raise unknown("spring", name, known, _NAME)

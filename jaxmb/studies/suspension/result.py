@@ -32,9 +32,10 @@ class KinematicsAndCompliance(Printed, eqx.Module):
     - `roll_centre` [m]: its height above the ground, where the other wheel is the mirror image in the plane y = 0.
     - `motion_ratio` by the names of springs: shortening of the spring per wheel travel [1].
     - `caster` [rad], top rearward, and `kingpin_inclination` [rad], top inward; `scrub_radius` and `caster_trail` [m],
-        from the steering axis to the contact patch on the ground, outward and rearward. The steering axis is the
-        instantaneous screw axis of the carrier while the first spring keeps its length. None without steering or
-        springs.
+        from the steering axis to the contact patch on the ground, outward and rearward. None without steering. The
+        steering axis is the instantaneous screw axis of the carrier while a spring keeps its length: the spring with
+        which the carrier turns most nearly about an axis, without a shift along it. Without springs the carrier turns
+        about the axis. Where joints hold two points of it, such as ball joints, the axis goes through both.
     - `compliance["lateral_force"]["toe"]` [rad/N]: derivatives of `toe`, `camber`, `track` and `wheelbase` by a load on
         the wheel at the contact patch. Loads are "longitudinal_force" [N] along x, "lateral_force" [N] along y and
         "aligning_moment" [N m] about z, with the axle locked. Zero if the constraints determine the position.

@@ -13,6 +13,8 @@ from ...linalg.rotations import angular_velocity, cross, norm
 from ...parts.space import separation
 
 _UP = np.array([0.0, 0.0, 1.0])
+# A spring that shortens by less than this part of travel is at its dead centre.
+_MOVES = 1e-6
 
 
 class Wheel(eqx.Module):
@@ -60,14 +62,22 @@ class Wheel(eqx.Module):
 
         return jax.grad(power)(jnp.zeros(system.nu, q.dtype))
 
-    def steering_axis(self, system: Any, q: Coordinates, rates: Float[Array, "7"]) -> "SteeringAxis":
-        """The instantaneous screw axis of the carrier, from the rates of its pose."""
+    def steering_axis(
+        self, system: Any, q: Coordinates, rates: Float[Array, "7 2"], lengths: Float[Array, "springs 2"]
+    ) -> "SteeringAxis":
+        """The instantaneous screw axis of the carrier in steering.
+
+        **Arguments:** derivatives of the carrier's pose (`rates`) and of the `lengths` of springs by travel and steer.
+        """
         space, pose = system.layout.space, self.pose(system, q)
-        turning = space.direction(pose, angular_velocity(pose[3:], rates[3:]))
+        turnings = jax.vmap(lambda rate: space.direction(pose, angular_velocity(pose[3:], rate)))(rates[3:].T)
+        by_travel, by_steer = (Twist(turnings[k], rates[:3, k]) for k in range(2))
+        travel = _travel_of_a_held_spring(_travel_of_a_rotation(by_travel, by_steer), lengths)
+        turning, velocity = (steer - travel * rise for rise, steer in zip(by_travel, by_steer, strict=True))
         square = jnp.dot(turning, turning)
         turns = square > 0
         # The point of the axis that is nearest to the mass centre.
-        point = pose[:3] + cross(turning, rates[:3]) / jnp.where(turns, square, 1.0)
+        point = pose[:3] + cross(turning, velocity) / jnp.where(turns, square, 1.0)
         upward = turning * jnp.where(turning[2] < 0, -1.0, 1.0)
         upward = jnp.where(turns, upward, _UP)
         patch = self.attitude(system, q).patch
@@ -81,6 +91,42 @@ class Wheel(eqx.Module):
             jnp.dot(patch - ground, outward),
             jnp.dot(ground - patch, forward),
         )
+
+
+class Twist(NamedTuple):
+    """Derivatives of a body's rotation (`turning`, a vector) and of its mass centre (`velocity`)."""
+
+    turning: Float[Array, "3"]
+    velocity: Float[Array, "3"]
+
+
+def _travel_of_a_rotation(by_travel: Twist, by_steer: Twist) -> Float[Array, ""]:
+    """The λ nearest to zero at which `by_steer − λ by_travel` is a rotation about an axis, without a shift along it:
+    `(ω_s − λ ω_t) · (v_s − λ v_t) = 0`. If there is none, λ of the least shift times turning.
+    """
+    (turning_t, velocity_t), (turning_s, velocity_s) = by_travel, by_steer
+    squared = jnp.dot(turning_t, velocity_t)
+    linear = jnp.dot(turning_s, velocity_t) + jnp.dot(turning_t, velocity_s)
+    constant = jnp.dot(turning_s, velocity_s)
+    discriminant = linear**2 - 4 * squared * constant
+    exists = discriminant > 0
+    root = jnp.where(exists, jnp.sqrt(jnp.where(exists, discriminant, 1.0)), 0.0)
+    # The other root is large where travel hardly turns the carrier.
+    divisor = linear + jnp.where(linear < 0, -root, root)
+    return jnp.where(divisor != 0, 2 * constant / jnp.where(divisor != 0, divisor, 1.0), 0.0)
+
+
+def _travel_of_a_held_spring(free: Float[Array, ""], lengths: Float[Array, "springs 2"]) -> Float[Array, ""]:
+    """The λ of `_travel_of_a_rotation` nearest to `free` at which a spring keeps its length; without springs, and where
+    travel changes no length, `free`.
+    """
+    if not lengths.shape[0]:
+        return free
+    by_travel, by_steer = lengths.T
+    moves = jnp.abs(by_travel) > _MOVES
+    held = by_steer / jnp.where(moves, by_travel, 1.0)
+    nearest = jnp.argmin(jnp.where(moves, jnp.abs(held - free), jnp.inf))
+    return jnp.where(jnp.any(moves), held[nearest], free)
 
 
 class Attitude(NamedTuple):
