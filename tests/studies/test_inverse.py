@@ -241,6 +241,179 @@ def test_batches_are_their_members():
     np.testing.assert_allclose(jax.vmap(torque)(masses), [jax.jit(torque)(mass) for mass in masses], rtol=1e-12)
 
 
+# Blades and rolling
+
+
+BEHIND, SPEED, ANGLE, INERTIA = 0.4, 1.5, 0.8, 0.3
+
+
+@functools.cache
+def sleigh():
+    """A body on a blade behind its mass centre."""
+    body = planar.Body("body", mass=2.0, inertia=INERTIA, angle=ANGLE)
+    return mb.Scene([body], joints=[planar.KnifeEdge("blade", "body", point=(-BEHIND, 0.0))]).compile()
+
+
+def pulled(ts, behind=BEHIND, speed=SPEED, angle=ANGLE):
+    """The mass centre of the sleigh is pulled along the axis x: heading and forces."""
+    system = mb.with_parameters(sleigh(), {"blade.point": jnp.stack([-behind, jnp.zeros_like(behind)])})
+    start = mb.State(jnp.stack([jnp.zeros_like(angle), jnp.zeros_like(angle), angle]), jnp.zeros(3))
+    path = {"body.x": lambda t: speed * (t - ts[0]), "body.y": lambda t: 0.0 * t}
+    found = mb.required_forces(system, path, ts=ts, by=["body.x", "body.y"], guess=start)
+    return jnp.stack([found.quantity("body.angle"), found["body.x"], found["body.y"]])
+
+
+def tractrix(ts):
+    """The same by `θ' = −(v / b) sin θ` and the blade's force `−J θ'' / b`."""
+    angle = 2 * np.arctan(np.tan(ANGLE / 2) * np.exp(-SPEED / BEHIND * (ts - ts[0])))
+    turning = -SPEED / BEHIND * np.sin(angle)
+    blade = INERTIA * SPEED / BEHIND**2 * np.cos(angle) * turning
+    return np.stack([angle, blade * np.sin(angle), -blade * np.cos(angle)])
+
+
+def test_positions_that_a_blade_leaves_do_not_depend_on_the_times_asked_for():
+    numbers = jnp.asarray(BEHIND), jnp.asarray(SPEED), jnp.asarray(ANGLE)
+    fine, coarse = jnp.linspace(0.0, 1.0, 5), jnp.array([0.0, 0.25, 0.3, 0.9, 1.0])
+    for ts in (fine, coarse):
+        np.testing.assert_allclose(pulled(ts, *numbers), tractrix(np.asarray(ts)), rtol=0, atol=1e-8)
+
+
+def sum_of_pull(ts, numbers):
+    """A number of the motion that weighs the sleigh's heading and forces."""
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(3, ts.size)))
+    return jnp.vdot(weights, pulled(ts, *numbers))
+
+
+@pytest.mark.slow
+def test_derivatives_through_positions_that_a_blade_leaves():
+    """By the blade's place, the speed, the heading at the start, and the times; under `jit` and `vmap`."""
+    sleigh()  # Compiled outside of traces.
+    numbers, ts = jnp.array([BEHIND, SPEED, ANGLE]), jnp.linspace(0.0, 1.0, 5)
+    directions = [(ts * 0.0, row) for row in jnp.eye(3)] + [(jnp.array([0.3, -0.2, 0.1, 0.2, -0.4]), jnp.zeros(3))]
+    along = lambda move, step: sum_of_pull(ts + step * move[0], numbers + step * move[1])
+    slopes = jax.jit(jax.grad(sum_of_pull, argnums=(0, 1)))(ts, numbers)
+    moves = tuple(jnp.stack(rows) for rows in zip(*directions, strict=True))
+    both = lambda move, step: jax.jvp(lambda step: along(move, step), (step,), (jnp.ones_like(step),))
+    steps = 1e-3 * jnp.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    values, forward = jax.jit(jax.vmap(jax.vmap(both, (None, 0)), (0, None)))(moves, steps)
+    reverse = [jnp.vdot(slopes[0], a) + jnp.vdot(slopes[1], b) for a, b in directions]
+    np.testing.assert_allclose(reverse, forward[:, 2], rtol=1e-10)
+    differences = (8 * (values[:, 3] - values[:, 1]) - (values[:, 4] - values[:, 0])) / 12e-3
+    np.testing.assert_allclose(forward[:, 2], differences, rtol=1e-6)
+
+
+# Contacts
+
+
+def hung(part):
+    """An arm on a pin with a unilateral constraint of its own."""
+    arm = planar.Body("arm", mass=1.0, inertia=1.0 / 12.0, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "arm", point=(0.0, 0.0))
+    return mb.Scene([arm], joints=[pin, part], forces=[mb.Gravity((0.0, -9.81))]).compile()
+
+
+def turned(system, law, ts):
+    return mb.required_forces(system, {"pin.angle": law}, by=["pin.angle"], ts=ts)["pin.angle"]
+
+
+def test_a_motion_may_touch_a_stop_and_not_pass_through_it():
+    system = hung(mb.Stop("stop", "pin.angle", lower=-0.5))
+    # It turns back at the stop, which bears nothing.
+    ts = np.array([0.0, 1.0, 2.0])
+    torques = turned(system, lambda t: -0.25 + 0.25 * (t - 1.0) ** 2 - 0.25, ts)
+    expected = 0.5 / 3.0 + 0.5 * 9.81 * np.cos(-0.5 + 0.25 * (ts - 1.0) ** 2)
+    np.testing.assert_allclose(torques, expected, rtol=1e-10)
+    with pytest.raises(ValueError, match=r"at t = 1 the motion passes through stop by 0\.2 "):
+        turned(system, lambda t: -0.7 + 0.25 * (t - 1.0) ** 2, ts)
+    with pytest.raises(ValueError, match=r"at t = 0 the motion passes through stop by 0\.1 "):
+        turned(system, lambda t: -0.6 + 0.25 * t**2, ts)
+    with pytest.raises(ValueError, match=r"at t = 0 stop bears a force"):
+        resting = mb.assemble(system, fix={"stop.mode": 1})
+        mb.required_forces(system, {"pin.angle": jnp.sin}, by=["pin.angle"], ts=ts, guess=resting)
+
+
+# Each is closed at an angle of -0.5 rad: there the tip is at (0.878, -0.479), the distance to (0, 1) is 1.721.
+LOWEST, FARTHEST = -np.sin(0.5), np.hypot(np.cos(0.5), 1 + np.sin(0.5))
+UNILATERAL = {
+    "RigidContact": lambda: mb.RigidContact(
+        "closed", "arm", terrain=mb.terrain.Flat(LOWEST - 0.1), radius=0.1, centre=(0.5, 0.0)
+    ),
+    "RigidBallContact": lambda: mb.RigidBallContact(
+        "closed",
+        "ground",
+        "arm",
+        radius_a=0.1,
+        radius_b=0.2,
+        point_a=(np.cos(0.5) - 0.3 * np.sin(0.5), LOWEST - 0.3 * np.cos(0.5)),
+        point_b=(0.5, 0.0),
+    ),
+    "RigidPlaneContact": lambda: mb.RigidPlaneContact(
+        "closed", "ground", "arm", normal=(0.0, 1.0), point_a=(0.0, LOWEST), point_b=(0.5, 0.0)
+    ),
+    "Slack": lambda: mb.Slack("closed", "ground", "arm", length=FARTHEST, point_a=(0.0, 1.0), point_b=(0.5, 0.0)),
+    "Rope": lambda: mb.Rope("closed", [("ground", (0.0, 1.0)), ("arm", (0.5, 0.0))], length=FARTHEST, slack=True),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", UNILATERAL)
+def test_every_unilateral_part_bounds_a_motion(name):
+    system = hung(UNILATERAL[name]())
+    ts = np.array([0.0, 1.0, 2.0])
+    at = lambda lowest: lambda t: lowest + 0.1 * (t - 1.0) ** 2
+    expected = 0.2 / 3.0 + 0.5 * 9.81 * np.cos(-0.499 + 0.1 * (ts - 1.0) ** 2)
+    np.testing.assert_allclose(turned(system, at(-0.499), ts), expected, rtol=1e-10)
+    with pytest.raises(ValueError, match=r"at t = 1 the motion passes through closed by "):
+        turned(system, at(-0.52), ts)
+    with pytest.raises(ValueError, match=r"at t = 0 the motion passes through closed by "):
+        turned(system, at(-0.7), ts)
+    traced = jax.jit(lambda x: turned(system, at(x), ts))
+    assert np.all(np.isnan(traced(-0.52))) and np.all(np.isfinite(traced(-0.499)))
+
+
+@pytest.mark.slow
+def test_a_motion_that_lands_has_a_contact_force_that_is_not_sought():
+    ball = planar.Body("ball", mass=1.0, inertia=0.01, position=(0.0, 0.3))
+    floor = mb.RigidContact("floor", "ball", terrain=mb.terrain.Flat(), radius=0.1)
+    system = mb.Scene([ball], joints=[floor], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    ts = np.array([0.0, 0.1, 0.25, 0.5])
+    motion = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=ts)
+    by = ["ball.x", "ball.y", "ball.angle"]
+    with pytest.raises(ValueError, match=r"at t = 0\.25 floor bears a force, .*put a joint in its place"):
+        mb.required_forces(system, motion, by=by)
+    falls = mb.simulate(system, mb.assemble(system), t1=0.1, saveat=ts[:2])
+    found = mb.required_forces(system, falls, by=by)
+    np.testing.assert_allclose(found["ball.y"], 0.0, atol=1e-10)
+
+
+# Machines with fewer freedoms of velocities than of positions: coordinates that determine the velocities, and forces.
+ROLLING = {
+    "chaplygin_sleigh": (("sleigh.x", "sleigh.y"), ("sleigh.x", "sleigh.y")),
+    "rolling_disc": (("disc.orientation",), ("disc.wx", "disc.wy", "disc.wz")),
+    "roller_racer": (("theta", "phi"), ("u0", "u1")),
+    "appell_hamel": (("x", "y"), ("x", "y")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROLLING)
+def test_rolling_by_coordinates_as_simulated(name):
+    """Without forces but those of the machine, along splines through a simulated motion, at few of its times."""
+    (coordinates, forces), machine, ts = ROLLING[name], mechanisms.get(name), np.linspace(0.0, 0.5, 401)
+    system = machine.system
+    motion = mb.simulate(system, machine.state, t1=0.5, saveat=ts, rtol=1e-11, atol=1e-13)
+    index = system.coordinate_names()
+    take = lambda own: np.squeeze(np.asarray(motion.ys.q)[:, np.array(index[own])])
+    path = {own: mb.Series(ts, take(own), "cubic") for own in coordinates}
+    few = ts[[0, 120, 160, 400]]
+    found = mb.required_forces(system, path, ts=few, by=forces, guess=machine.state)
+    at = np.searchsorted(ts, few)
+    np.testing.assert_allclose(found.ys.q, motion.ys.q[at], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.ys.u, motion.ys.u[at], rtol=0, atol=1e-5)
+    for own in forces:
+        np.testing.assert_allclose(found[own], 0.0, atol=1e-2)
+
+
 @functools.cache
 def two_bars():
     """An arm of two bars, and a cart that a driver holds."""

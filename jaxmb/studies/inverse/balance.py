@@ -45,15 +45,16 @@ Drives = tuple[Drive, ...]
 class Found(NamedTuple):
     """What was found out at each time.
 
-    **Fields:** violations of `positions`, `velocities` and `accelerations`, relative to the sizes of the motion;
-    whether the constraints are `regular`; which actuators drive by themselves (`drives`), and which velocities are not
-    free (`bound`); which actuators the constraints have `held`; whether friction `failed` to be determined; whether
-    forces are `proportional` to the parameters.
+    **Fields:** violations of `positions`, `velocities` and `accelerations`, relative to the sizes of the motion; the
+    `gaps` of contacts, relative to the system's size; whether the constraints are `regular`; which actuators drive by
+    themselves (`drives`), and which velocities are not free (`bound`); which actuators the constraints have `held`;
+    whether friction `failed` to be determined; whether forces are `proportional` to the parameters.
     """
 
     positions: Float[Array, "*times mp"]
     velocities: Float[Array, "*times mv"]
     accelerations: Float[Array, "*times m"]
+    gaps: Float[Array, "*times contacts"]
     regular: Bool[Array, "*times"]
     drives: Bool[Array, "*times k"]
     bound: Bool[Array, "*times nu"]
@@ -65,6 +66,7 @@ class Found(NamedTuple):
         """At which times there is no solution."""
         within = lambda x: jnp.all(jnp.abs(x) <= tolerance, axis=1)
         made = within(self.positions) & within(self.velocities) & within(self.accelerations) & within(path.off)
+        made = made & jnp.all(self.gaps >= -tolerance, axis=1)
         driven = self.regular & jnp.all(self.bound, axis=1) & ~self.failed & self.proportional
         return ~(made & path.met & driven)
 
@@ -126,7 +128,16 @@ def _seen(at: Instant, B, udot) -> tuple[Found, Factor]:
     moved = jnp.abs(B @ factor.null_space) * scale[search.order.columns[rank:]][None, :]
     held = jnp.max(moved, axis=1, initial=0.0) <= _HELD * norm(B * scale[None, :])
     fine = jnp.array(True)
-    return Found(*_violations(at, udot, scale), regular, has_pivot[m:], bound, held, ~fine, fine), factor
+    return Found(*_violations(at, udot, scale), _gaps(at), regular, has_pivot[m:], bound, held, ~fine, fine), factor
+
+
+def _gaps(at: Instant):
+    """The gaps of contacts, relative to the system's size."""
+    contacts = at.system.contacts
+    if not contacts.n:
+        return jnp.zeros(0, at.q.dtype)
+    sizes = at.with_(q=contacts.bound(at.q)).row_sizes()[np.array(contacts.rows[: contacts.n])]
+    return contacts.gaps(at.system, at.t, at.q) / sizes
 
 
 def _violations(at: Instant, udot, scale):

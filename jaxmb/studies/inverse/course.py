@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,8 +19,13 @@ from ...linalg.jitted import jitted
 from ...parts.coordinate_parts import shortest
 from ...parts.names import unknown
 from ...parts.series import AbstractSignal, Series, as_signal
+from ...simulate.integrate import integrated
+from ...simulate.room import Room
+from ...solvers import Adams, MultistepController
+from ...solvers.tangent import TangentControl
 from ...states.arguments import holding
 from ...states.assembly import configuration
+from ...states.closest import tolerance
 from ...system import AbstractSystem
 from ...system.quantities import directions
 from ...trajectory import Trajectory
@@ -26,6 +33,8 @@ from ..identify.measurements import have_times
 
 # The number of corrections of velocities for constraints that are not linear in them.
 _CORRECTIONS = 8
+# The largest number of steps along positions that constraints on velocities leave.
+_MOST_STEPS = 4**8
 
 
 class Course(NamedTuple):
@@ -58,6 +67,7 @@ def recorded(system: AbstractSystem, motion: Trajectory) -> Course:
         z = motion.ys.z[:, np.concatenate([known[name] for name in system.state_names()])]
     same = motion.system.wrapped_angle_names() == system.wrapped_angle_names()
     ys = State(motion.ys.q, motion.ys.u, z, motion.ys.angles if same else None)
+    _check_contacts(system, motion.ts, ys.q)
     nothing = jnp.zeros((motion.ts.size, 0), ys.q.dtype)
     return Course(motion.ts, ys, motion.accelerations, nothing, jnp.ones(motion.ts.size, bool), ())
 
@@ -90,6 +100,7 @@ def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Cours
         raise ValueError(f"required_forces: ts must be a vector of times, got shape {ts.shape}.")
     # In the order that compiled functions see.
     signals = {name: _signal(system, name, motion[name], ts) for name in sorted(motion, key=str)}
+    _check_contacts(system, ts[:1], guess.q[None])
     _check_freedoms(system, signals, guess, ts)
     q, u, udot, off, met = _followed(system, signals, guess, ts)
     return Course(ts, State(q, u), udot, off, met, _components(system, signals))
@@ -185,26 +196,104 @@ class _Kinematics(NamedTuple):
 
 @jitted
 def _followed(system, signals, guess, ts):
-    """q, u, u̇, the distance from prescribed coordinates, and whether a state was found, position after position."""
+    """q, u, u̇, the distance from prescribed coordinates, and whether a state was found, at all times."""
     joints = system.joint_coordinates()
-    of_joints = [name for name in signals if name in joints]
     periodic = np.array([n in joints and joints[n].periodic for n in _components(system, signals)], bool)
+
+    def motion(t, q):
+        """q with u, u̇, the distance, and whether the velocities are determined."""
+        at = _Kinematics(system, signals, t, q)
+        u, udot, determined = at.solved(guess.u)
+        off = at.values(t, q) - at.wanted(t)
+        return q, u, udot, jnp.where(periodic, shortest(off), off), determined
 
     def advance(carry, t):
         before, q, qdot = carry
-        values = {name: signal(t).astype(q.dtype) for name, signal in signals.items()}
-        held = holding(system, {name: values[name] for name in of_joints}, {}, t)
-        fix = {name: value for name, value in values.items() if name not in joints}
-        q, _, met = configuration(held, system.normalize(t, q + (t - before) * qdot), fix, t, False)
-        kinematics = _Kinematics(system, signals, t, q)
-        u, udot, determined = kinematics.solved(guess.u)
-        off = kinematics.values(t, q) - kinematics.wanted(t)
-        off = jnp.where(periodic, shortest(off), off)
-        # The position before is only where the search for the next one starts.
-        carry = lax.stop_gradient((t, q, system.rates(t, q, u)))
-        return carry, (q, u, udot, off, met & determined)
+        q, met = _positioned(system, signals, t, q + (t - before) * qdot)
+        *found, determined = motion(t, q)
+        # The constraints determine the position; the position before is only where the search for it starts.
+        return lax.stop_gradient((t, q, system.rates(t, q, found[1]))), (*found, met & determined)
 
-    return lax.scan(advance, lax.stop_gradient((ts[0], guess.q, jnp.zeros_like(guess.q))), ts)[1]
+    def corrected(t, q):
+        q, met = _positioned(system, signals, t, q)
+        *found, determined = motion(t, q)
+        return *found, met & determined
+
+    if system.nq - system.coordinate_rank == system.nu - system.velocity_rank:
+        return lax.scan(advance, lax.stop_gradient((ts[0], guess.q, jnp.zeros_like(guess.q))), ts)[1]
+    *found, met = lax.map(lambda at: corrected(*at), _rolled(system, signals, guess, ts))
+    return *found, met
+
+
+def _positioned(system, signals, t, near):
+    """The position nearest to another in which coordinates are prescribed, and whether it was found."""
+    joints, near = system.joint_coordinates(), system.normalize(t, near)
+    values = {name: signal(t).astype(near.dtype) for name, signal in signals.items()}
+    held = holding(system, {name: value for name, value in values.items() if name in joints}, {}, t)
+    fix = {name: value for name, value in values.items() if name not in joints}
+    q, _, met = configuration(held, near, fix, t, False)
+    return q, met
+
+
+class _Rates(eqx.Module):
+    """The rates of all coordinates in a motion in prescribed coordinates; `near`: see `_Kinematics.solved`."""
+
+    system: Any
+    signals: dict[str, AbstractSignal]
+    near: Velocities
+
+    def __call__(self, t, q, args):
+        del args
+        u, *_ = _Kinematics(self.system, self.signals, t, q).solved(self.near)
+        return self.system.rates(t, q, u)
+
+
+def _rolled(system, signals, guess, ts) -> tuple[Array, Array]:
+    """All times, and positions at these up to errors of integration, from the first; NaN from where a step failed.
+
+    Constraints on velocities, such as rolling, leave positions that prescribed coordinates do not determine. They are
+    integrated with error control, whatever times are asked for.
+    """
+    first, _ = _positioned(system, signals, ts[0], guess.q)
+    if ts.size == 1:
+        return ts, first[None]
+    rates, still = _Rates(system, signals, guess.u), lax.stop_gradient(ts)
+    precision, scale = tolerance(first.dtype), lax.stop_gradient(system.coordinate_scale())
+    # No step passes over a feature of the motion that the times resolve.
+    control = MultistepController(precision, precision * scale, dtmax=jnp.max(jnp.diff(still)))
+    options = {
+        "y0": first - (ts[0] - still[0]) * rates(still[0], first, None),
+        "t0": still[0],
+        "t1": still[-1],
+        "dt0": None,
+        "saveat": diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=still)]),
+        "stepsize_controller": control,
+    }
+    problem = diffrax.ODETerm(rates), Adams(), options
+    watched = TangentControl(scale, (first.size,))
+    ys = integrated(problem, watched, Room(_MOST_STEPS, np.asarray(_MOST_STEPS), None), False, False).ys[0]
+    ys = jnp.where(jnp.isfinite(ys), ys, jnp.nan)
+    return ts, ys + jax.vmap(lambda t, q, ahead: ahead * rates(t, q, None))(still, ys, ts - still)
+
+
+def _check_contacts(system, ts, positions):
+    """Raise a `ValueError` for positions in which contacts are closed or friction sticks."""
+    contacts = system.contacts
+    if not contacts or is_traced((ts, positions)):
+        return
+
+    def bears_force(q):
+        modes = contacts.modes(q)
+        return jnp.concatenate([modes.shut, modes.held])
+
+    bears = np.asarray(jax.vmap(bears_force)(positions))
+    if bears.any():
+        k = int(np.argmax(bears.any(axis=1)))
+        names = ", ".join(dict.fromkeys(name for name, bad in zip(contacts.names, bears[k], strict=True) if bad))
+        raise ValueError(
+            f"required_forces: at t = {float(ts[k]):g} {names} bears a force, since a contact is closed or friction "
+            "sticks; required_forces finds none. Leave such times out, or put a joint in its place."
+        )
 
 
 def _check_freedoms(system, signals, guess, ts):

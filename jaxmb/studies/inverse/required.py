@@ -222,6 +222,13 @@ def _refusal(rest, drives: Drives, path: Course, found: Found, k: int, tolerance
                 f"{lead} the machine cannot make the motion: its {kind} violate {listed(rest, violated, residual)}, "
                 "relative to its size, speed or accelerations. Correct the motion, or raise tolerance."
             )
+    beyond = here.gaps < -tolerance
+    if beyond.any():
+        q = path.ys.q[k]
+        gaps = np.asarray(rest.contacts.gaps(rest, path.ts[k], rest.normalize(q)))
+        named = zip(rest.contacts.contact_names, gaps, beyond, strict=True)
+        through = ", ".join(f"{name} by {-gap:.3g}" for name, gap, bad in named if bad)
+        return f"{lead} the motion passes through {through} [m, rad]. Correct the motion, or raise tolerance."
     if not here.regular:
         return f"{lead} the position is singular: fewer constraint rows are independent than elsewhere."
     labels = [drive.name for drive in drives for _ in range(drive.size)]
