@@ -15,7 +15,7 @@ from jax import lax
 
 from ..linalg.arrays import is_traced
 from ..parts.base import AbstractPart
-from ..parts.fields import Declaration, entry, in_range, inner_parts, paths
+from ..parts.fields import Declaration, entry, in_range, inner_parts, paths, warn_of_angles
 from ..parts.series import AbstractSignal
 from ..system.design_variables import variables_in_range
 from ..system.parameter_table import ParameterTable
@@ -113,7 +113,10 @@ class SceneParameters(ParameterTable):
             for k, name in enumerate(group.group.names):
                 if name in parts and not is_traced(group):
                     single = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], group)
-                    single.part(name).check(dimension)
+                    part = single.part(name)
+                    part.check(dimension)
+                    fields = {other.partition(".")[2] for other in names if other.split(".")[0] == name}
+                    warn_of_angles(part, part, fields, stacklevel=3)
 
     def in_range(self):
         ok: Any = True

@@ -35,7 +35,7 @@ from ..parts.base import (
 )
 from ..parts.boundary import captured, check_kernels
 from ..parts.dry_friction import AbstractDryFriction, AbstractStickSlip
-from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of
+from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of, warn_of_angles
 from ..parts.forces import Gravity
 from ..parts.frames import AbstractFrame, frames_by_name
 from ..parts.modes import STICK
@@ -69,6 +69,8 @@ _TRACED = (
     "A scene cannot be compiled within a function that JAX traces, such as one under jit: compile it before, and "
     "change its numbers there with jaxmb.with_parameters."
 )
+# The user's place, counted from `Scene.compile`: equinox calls the methods of a module.
+_USER = 3
 
 
 def _as_tuple(parts: Any) -> tuple[Any, ...]:
@@ -180,6 +182,8 @@ class Scene(eqx.Module):
                 raise ValueError(f"{part.label} has a number that JAX traces. {_TRACED}")
         for body in self.bodies:
             _call(body, "check")
+        for part in (*self.bodies, *self.frames):
+            warn_of_angles(part, part, stacklevel=_USER)
         space = SPACE if self.bodies[0].dimension == 3 else PLANE
         layout, index, of_parts = _placed(self, space)
         guess = _given_state(self, layout)
@@ -290,6 +294,9 @@ def _settled(scene: Scene, resolved: KnownParts, layout: Layout):
         gravity.check(layout.space.dimension)
     for part in sorted(acting, key=_stage):
         settled, bodies = _call(part, "settled", resolved)
+        if bodies and all(k >= layout.bodies for k in bodies):
+            raise ValueError(f"{part.label} acts on the ground alone, which does not move; name a body.")
+        warn_of_angles(settled, part, stacklevel=_USER + 1)
         if isinstance(settled, AbstractNonIdeal):
             laws.append((settled, bodies))
             continue

@@ -60,6 +60,11 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
         if self.mode == "speed" and np.any(self.damping):
             raise ValueError(f"{self.label}: damping belongs to the mode 'position'; with 'speed' use gain.")
 
+    def is_angle(self, field, unit):
+        if field == "command":
+            return self.mode == "position" and super().is_angle(field, ("rad", "m"))
+        return super().is_angle(field, unit)
+
     def with_numbers(self, given):
         self._check_shape("command", given)
         part = self.filled(gain=0.0)

@@ -132,6 +132,13 @@ class AbstractPart(eqx.Module):
         """
         del field
 
+    def is_angle(self, field: str, unit: fields.Unit) -> Any:
+        """Hook: whether a number of this unit is an angle [rad], for each component if they differ."""
+        if not isinstance(unit, tuple):
+            return unit == "rad"
+        of_length = self.is_of_length(field) if unit[0] == "rad" else None
+        return False if of_length is None else np.logical_not(of_length)
+
     def filled(self, **values: Any) -> Self:
         """A copy with these numbers in fields that are None."""
         current = fields.values_of(self)

@@ -16,7 +16,7 @@ to keep parameters positive, and pictures and reactions to find where a part act
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
@@ -26,6 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .._arguments import warn_of_degrees
 from .._compat import default_float, is_weakly_typed, with_values
 from ..linalg.arrays import is_traced
 from .module_weights import ModuleWeights, as_weights
@@ -557,6 +558,42 @@ def check_numbers(part: Any, label: str, dimension: int, prefix: str = "") -> No
             _check_finite(value, label, shown)
         elif declared.is_number and value is not None and not is_traced(value):
             _check_number(declared, label, shown, np.asarray(value), dimension)
+
+
+def warn_of_angles(part: Any, given: Any, names: Collection[str] | None = None, *, stacklevel: int) -> None:
+    """Warn of a number of a part that is an angle in degrees, by all appearances.
+
+    Angles of joints count turns, so the warning is for multiples of five beyond a full turn; for the initial guess of a
+    body it is for any angle beyond.
+
+    **Arguments:** the `part` in a scene, and the `given` part, whose omitted numbers do not count; `names` of its
+    numbers, `"field"` or `"law.field"`, None for all; `stacklevel`: the user's place, counted from the caller.
+    """
+    for shown, declared, angles in _angles(part, given):
+        if names is not None and shown not in names:
+            continue
+        is_guess = declared.kind == "state"
+        beyond = angles[(np.abs(angles) > 2 * np.pi) & (is_guess | (angles % 5 == 0))]
+        if beyond.size:
+            warn_of_degrees(part.label if is_guess else f"{part.label}, {shown}", beyond[0], stacklevel + 1)
+            return
+
+
+def _angles(part: Any, given: Any, prefix: str = "") -> Iterator[tuple[str, Declaration, np.ndarray]]:
+    """The given angles of a part and of its laws, each with the number's name and declaration."""
+    values = values_of(given)
+    for field, declared in declarations(type(given)).items():
+        value = values[field]
+        if value is None or is_traced(value):
+            continue
+        if declared.kind == "law":
+            yield from _angles(None, value, f"{prefix}{field}.")
+        elif declared.is_number:
+            # The numbers of laws have one unit.
+            is_angle = declared.unit == "rad" if part is None else part.is_angle(field, declared.unit)
+            if np.any(is_angle):
+                value = np.asarray(value)
+                yield prefix + field, declared, value[np.broadcast_to(is_angle, value.shape)]
 
 
 def _check_finite(value: Any, label: str, shown: str) -> None:

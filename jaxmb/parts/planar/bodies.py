@@ -5,7 +5,6 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from ..._arguments import warn_of_degrees
 from ...linalg.rotations import rotate_2d
 from .. import fields
 from ..base import AbstractBody, AbstractPlanarPart
@@ -28,11 +27,6 @@ class AbstractRigidBody(AbstractPlanarPart, AbstractBody):
     velocity: fields.Number = fields.guess(shape=(2,), unit="m/s", default=(0.0, 0.0))
     angular_velocity: fields.Number = fields.guess(unit="rad/s", default=0.0)
     rotates: ClassVar[bool] = True
-
-    def validate(self):
-        # A system's bodies of one kind share their numbers, and have no guess.
-        if self.angle is not None:
-            warn_of_degrees(self.label, self.angle, stacklevel=2)
 
     def pose(self):
         return np.append(self.position, self.angle)
