@@ -78,7 +78,7 @@ class Series(AbstractSignal):
     - `ts` [s], shape (n,), ascending, n ≥ 2; `values`, shape (n, …): numbers, vectors or matrices, in SI units.
     - `interpolation`: `"linear"`; `"cubic"`, the not-a-knot spline, whose first two derivatives are continuous;
         `"clamped"`, the spline that starts and ends at rest, with the rate zero at the first and the last time;
-        `"held"`, each value until the next time.
+        `"held"`, each value until the next time. Both splines may pass their values, `"linear"` and `"held"` do not.
 
     A call before the first or after the last time returns the first or the last value; as an input of a motion a series
     must last as long as the motion. `ts` and `values` may be traced: motions can be differentiated with respect to

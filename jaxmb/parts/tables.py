@@ -1,6 +1,7 @@
 """Springs, dampers and motors on the coordinates of joints, by tables of measured forces.
 
 Between its points a table is a curve with two continuous derivatives, by `local_spline`; beyond them a straight line.
+Points that never fall give a curve that never falls, and likewise for points that never rise.
 """
 
 import jax.numpy as jnp
@@ -21,9 +22,10 @@ class TableSpring(AbstractScalarPart, AbstractPotentialForce):
     system = jaxmb.Scene([bar], joints=[pin, cord], forces=[spring]).compile()
     ```
 
-    The curve has two continuous derivatives. Beyond the first and the last point it continues as a straight line,
-    through this point and its neighbour. The energy is its integral from the first point. In space an angle counts
-    within half a turn of the middle of the table.
+    The curve has two continuous derivatives. Where the points rise it never falls, and where they fall it never rises;
+    next to a highest or a lowest point it may pass that point. Beyond the first and the last point it continues as a
+    straight line, through this point and its neighbour. The energy is its integral from the first point. In space an
+    angle counts within half a turn of the middle of the table.
 
     **Arguments:** `values` [rad, m] of the coordinate, shape (n,), ascending, n ≥ 3; `forces` [N m, N], shape (n,),
     positive where the spring pulls towards smaller values.
@@ -92,7 +94,8 @@ class TableMotor(AbstractScalarPart, AbstractDynamicForce):
 
     With the speed `gear ẋ` of the coordinate x, the generalized force is `gear control f(speed)`. A negative control
     drives backwards, with the torque at `f(−speed)`. The curve f is as in `TableSpring`, with straight lines beyond its
-    ends: beyond the speed of no torque the motor brakes.
+    ends: beyond the speed of no torque the motor brakes, the faster the more, as a direct-current motor does. A last
+    pair of points with one torque bounds it.
 
     With a `lag` an internal state, the `activation`, takes the place of the control and follows it, `lag ·
     d(activation)/dt = control − activation`.

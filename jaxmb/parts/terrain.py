@@ -155,11 +155,11 @@ class Ramp(AbstractTerrain):
 
 
 class Spline(AbstractTerrain):
-    """A profile through measured points; C² and local: a height depends on the four nearest points only.
+    """A profile through measured points; C² and local: a height depends on the six nearest points only.
 
     Between two points the profile is a polynomial of degree five. Its slope and curvature at each point are taken from
-    the parabola through the point and its two neighbours. Beyond the first and the last point it continues as a
-    straight line.
+    the parabola through the point and its two neighbours, and reduced where the profile would overshoot: where the
+    points rise it never falls. Beyond the first and the last point it continues as a straight line.
 
     **Arguments:** `x` [m], shape (n,), ascending, n ≥ 3; `heights` [m], shape (n,).
     """

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from derivative_checks import central_differences
 from scipy.integrate import quad, solve_ivp
+from scipy.interpolate import BPoly
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -44,6 +45,76 @@ def test_the_integral_of_the_spline():
     rates = jax.jit(jax.vmap(lambda s: jnp.stack([jax.grad(one)(s), jax.grad(jax.grad(one))(s)])))
     np.testing.assert_allclose(rates(X - 1e-9), rates(X + 1e-9), rtol=0, atol=1e-4)
     np.testing.assert_allclose(value(x, y, np.array([-1.7, 2.1])), [Y[0] - np.diff(Y)[0] / 0.8, 17.0], rtol=1e-12)
+
+
+def steep_tables(number):
+    """Random tables whose points never fall, with chords that differ by up to eight powers of ten, and plateaus."""
+    rng = np.random.default_rng(number)
+    x = np.cumsum(rng.exponential(1.0, (number, 9)) ** rng.uniform(0.5, 3.0, (number, 1)) + 1e-3, axis=1)
+    steps = 10.0 ** rng.uniform(-4.0, 4.0, (number, 9)) * (rng.random((number, 9)) > 0.2)
+    return x, np.cumsum(steps, axis=1)
+
+
+def test_points_that_never_fall_give_a_curve_that_never_falls():
+    """Two hundred tables; with the sign changed, and with a fall beyond the neighbours of an interval."""
+    x, y = steep_tables(200)
+    at = x[:, :1] - 0.1 + (x[:, -1:] - x[:, :1] + 0.2) * np.linspace(0.0, 1.0, 1001)
+    curve = jax.jit(jax.vmap(jax.vmap(local_spline.value, in_axes=(None, None, 0))))
+    size = np.ptp(y, axis=1, keepdims=True)
+    for sign in (1, -1):
+        assert np.min(sign * np.diff(curve(x, sign * y, at)) / size) >= -1e-14
+    # Where the four points around an interval rise, the curve rises there, whatever the others do.
+    y[:, -1] = y[:, -2] - size[:, 0]
+    rising = at < x[:, 6:7]
+    falls = np.where(rising[:, 1:], np.diff(curve(x, y, at)) / size, 0.0)
+    assert np.min(falls) >= -1e-14
+
+
+def test_a_table_that_does_not_overshoot_is_the_spline_by_parabolas():
+    """By SciPy's polynomials; convex and concave points, chords that differ by 2.9 times, and a vertex inside."""
+    x = np.array([-1.0, -0.4, 0.0, 0.5, 1.5, 2.5, 3.0])
+    for y in (x**2, np.exp(x), np.sin(x), np.array([0.0, 0.6, 1.76, 2.26, 5.16, 6.16, 7.61])):
+        chords, h = np.diff(y) / np.diff(x), np.diff(x)
+        slopes = (chords[:-1] * h[1:] + chords[1:] * h[:-1]) / (h[1:] + h[:-1])
+        curvatures = 2 * np.diff(chords) / (h[1:] + h[:-1])
+        slopes, curvatures = np.array([chords[0], *slopes, chords[-1]]), np.array([0.0, *curvatures, 0.0])
+        spline = BPoly.from_derivatives(x, np.stack([y, slopes, curvatures], axis=1))
+        s = np.linspace(x[0], x[-1], 101)
+        np.testing.assert_allclose(value(jnp.asarray(x), jnp.asarray(y), s), spline(s), rtol=0, atol=1e-13)
+
+
+def test_derivatives_by_the_points_of_a_steep_table():
+    """Of the curve and its integral; two continuous derivatives of the curve, also on its plateau."""
+    x, y = np.array([0.0, 0.1, 0.2, 1.0, 1.3, 1.5]), np.array([1.0, 100.0, 101.0, 102.0, 102.0, 140.0])
+    at = jnp.array([0.05, 0.13, 0.17, 0.7])
+
+    def seen(y):
+        one = lambda s: jnp.stack([f(jnp.asarray(x), y, s) for f in (local_spline.value, local_spline.integral)])
+        return jax.vmap(one)(at).ravel()
+
+    forward, reverse = jax.jit(jax.jacfwd(seen))(y), jax.jit(jax.jacrev(seen))(y)
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-12)
+    # The curve up to the plateau is a smooth function of the points before it.
+    expected = central_differences(jax.jit(seen), y, step=1e-4)
+    np.testing.assert_allclose(forward[:, :3], expected[:, :3], rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(value(jnp.asarray(x), jnp.asarray(y), np.linspace(1.0, 1.3, 7)), 102.0, rtol=1e-14)
+    one = lambda s: local_spline.value(jnp.asarray(x), jnp.asarray(y), s)
+    rates = jax.jit(jax.vmap(lambda s: jnp.stack([jax.grad(one)(s), jax.grad(jax.grad(one))(s)])))
+    np.testing.assert_allclose(rates(x - 1e-12), rates(x + 1e-12), rtol=0, atol=1e-4)
+
+
+def test_a_damper_and_a_spring_of_a_table_with_a_knee():
+    """The force stays between its points, so the damper dissipates ever more, and the spring's energy is convex."""
+    knee = np.array([0.0, 0.1, 0.2, 1.0]), np.array([0.0, 100.0, 101.0, 102.0])
+    rates = jnp.linspace(0.1, 0.2, 11)
+    system = wheel(planar, mb.TableDamper("part", "pin.angle", rates=knee[0], forces=knee[1]))
+    drag = jax.jit(jax.vmap(lambda v: -system.force(0.0, system.guess.q, jnp.zeros(3).at[2].set(v))[2]))(rates)
+    assert np.all(np.diff(drag) > 0)
+    np.testing.assert_allclose(drag[jnp.array([0, -1])], (100.0, 101.0), rtol=1e-12)
+    system = wheel(planar, mb.TableSpring("part", "pin.angle", values=knee[0], forces=knee[1]))
+    energy = jax.jit(jax.vmap(jax.value_and_grad(lambda a: system.potential_energy(0.0, jnp.zeros(3).at[2].set(a)))))
+    _, slopes = energy(rates)
+    np.testing.assert_allclose(slopes, drag, rtol=1e-12)
 
 
 def wheel(space, *forces, rate=0.0, angle=0.0):
