@@ -18,6 +18,7 @@ from ..linalg.inertia import DiagonalInertia
 from ..linalg.jitted import on_host
 from ..linalg.rotations import unrotate
 from ..states.closest import largest_residual, meet_in_blocks, tolerance
+from ..states.headings import check_headings
 from ..states.redundancy import (
     ZERO,
     DependentRows,
@@ -52,6 +53,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     accelerations, or if the given pose is singular.
     """
     invariants = system.coordinate_rows - system.position_rows
+    check_headings(system, 0.0, system.guess.q, "the given pose")
     if not system.acceleration_rows:
         return dataclasses.replace(system, ranks=Ranks(0, invariants, 0, 0))
     other_rows = tuple(range(system.position_rows, system.acceleration_rows))

@@ -4,11 +4,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..linalg.rotations import cross, dot
+from ..linalg.arrays import is_traced
+from ..linalg.rotations import cross, dot, norm
 from . import fields
 from .base import AbstractVelocityConstraint
 from .shapes import Ground, along, sleeve
 from .space import with_drift
+
+# The sine of the angle between blade and normal below which the blade binds nothing.
+_ALONG = 1e-6
 
 
 class KnifeEdge(AbstractVelocityConstraint):
@@ -45,7 +49,16 @@ class KnifeEdge(AbstractVelocityConstraint):
     def complete(self, space, poses):
         axes = np.eye(space.dimension)
         part = self.filled(axis=axes[0])
-        return part if space.dimension == 2 else part.filled(normal=axes[2])
+        if space.dimension == 2:
+            return part
+        part = part.filled(normal=axes[2])
+        ahead = space.direction(poses[0], part.axis)
+        if not is_traced((part, poses)) and norm(cross(part.normal, ahead)) < _ALONG:
+            raise ValueError(
+                f"{self.label}: the blade stands along the normal of its plane at the given pose, and binds nothing "
+                "there; give another axis, normal or pose."
+            )
+        return part
 
     def residual(self, space, poses, velocities, t):
         ahead = space.direction(poses[0], self.axis)

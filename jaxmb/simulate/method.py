@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
@@ -70,6 +71,12 @@ class Method(NamedTuple):
         """Whether steps must not pass over a force that acts in a gap; steps of fixed length may."""
         return system.has_gaps and adapts(self.controller)
 
+    def headings(self, system: AbstractSystem) -> Any:
+        """The headings of parts as a function of time and state; None without any, and with steps of fixed length."""
+        if not (system.lost_headings and adapts(self.controller)):
+            return None
+        return eqx.Partial(_headings_at, system)
+
     def prepared(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for the term."""
         term, solver = self.policy.prepare(system.prepared(), self.formulation, self.solver, self.rtol)
@@ -88,6 +95,10 @@ class Method(NamedTuple):
                 controller = diffrax.PIDController(self.rtol, absolute, dtmax=self.dtmax)
                 controller = OneStepController.around(controller, scales)
         return with_counted(controller, counted_components(system))
+
+
+def _headings_at(system, t, y):
+    return system.headings(jnp.asarray(t, y.q.dtype), y.q)
 
 
 def adapts(controller: Any) -> bool:

@@ -16,6 +16,7 @@ from ..linalg.recent import Recent
 from ..manifold.impulse import find_jumps
 from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction
+from ..states.headings import about_headings, are_short
 from ..states.refusals import LostRank, lost_rank, violated_joints
 from .span import Span
 
@@ -165,6 +166,11 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
         return f"{how_far(outcome, span)} {about_friction(system, outcome.coupling)}"
     if result == RESULTS.contacts_undetermined:
         return about_contacts(system, outcome)
+    if system.lost_headings and (lost := about_headings(system, are_short(system, outcome.t, outcome.y.q))):
+        return (
+            f"{how_far(outcome, span)} There {lost}, so the motion beyond is not determined. With `throw=False` the "
+            "motion up to there is kept."
+        )
     if result == RESULTS.max_steps_reached:
         return about_steps(outcome, span, stats, is_stiff_at_end(probe, stats, solver))
     if not np.all(np.isfinite(np.concatenate(jax.tree.leaves(outcome.y)))):

@@ -23,6 +23,7 @@ from ..solvers.controller import intended_step
 from ..solvers.events import NO_STATE, events_found
 from ..solvers.turning import Counted, TurningController, turning_of
 from ..states.consistency import is_consistent
+from ..states.headings import are_short
 from ..system import AbstractSystem
 from ..system.inputs import inputs_ended
 from ..system.instant import Instant
@@ -64,7 +65,7 @@ class Problem(NamedTuple):
         system, method = self.system, self.method
         contacts, gaps = bool(system.contacts), method.watches_gaps(system)
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
-        controller = self.stops.around(controller, contacts, gaps)
+        controller = self.stops.around(controller, contacts, gaps, method.headings(system))
         if self.angles is not None:
             controller = TurningController(controller, WrappedAngles(system), self.angles)
         return {
@@ -283,6 +284,8 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     """
     system = problem.system.prepared()
     result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck)
+    if system.lost_headings:
+        result = RESULTS.where(stuck & jnp.any(are_short(system, t, y.q)), RESULTS.singular_configuration, result)
     if not system.friction_rows.size:
         return result, None
     return diagnose_friction(Instant.of(system, t, y), problem.method.formulation, result, stuck)

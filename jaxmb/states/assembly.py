@@ -35,6 +35,7 @@ from .arguments import (
     split_rates,
 )
 from .closest import closest_configuration, closest_velocities
+from .headings import check_headings
 from .refusals import cannot_assemble, cannot_move
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
@@ -116,6 +117,8 @@ def assemble(
         if not ok_rates and not traced:
             raise ValueError(cannot_move(at.with_(u=u), fixed_rates))
         if ok and ok_rates:
+            if not traced:
+                check_headings(system, t, q, "the assembled pose")
             if of_bodies and not is_traced((system, u)):
                 _warn_of_changed_velocities(system, guess.u, u)
             return State(q, u, z, angles)

@@ -264,6 +264,18 @@ class AbstractEquation(eqx.Module):
         """The gaps of forces that act only at closed gaps."""
         raise ValueError(f"{type(self).__name__} has no forces with gaps.")
 
+    # Headings
+
+    @property
+    def lost_headings(self) -> tuple[str, ...]:
+        """For each of the `headings` what it means that it vanishes, for messages."""
+        return ()
+
+    def headings(self, t: Scalar, q: Coordinates) -> Float[Array, "headings d"]:
+        """Vectors whose directions the equations need; a motion ends where one of them vanishes."""
+        del t
+        return jnp.zeros((0, 0), q.dtype)
+
     # Unilateral constraints
 
     @property

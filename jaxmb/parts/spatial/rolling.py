@@ -80,20 +80,26 @@ class RollingDisc(AbstractDisc, AbstractCompound):
     ```
 
     The contact point is the lowest point of the rim, at `ρ = −r (e − (e·n) n) / |e − (e·n) n|` from the centre, with
-    the normal e of the plane and the axle n. The disc must never lie flat. The part has no coordinates.
+    the normal e of the plane and the axle n. A disc that lies flat has no contact point: such a pose is refused, and a
+    motion that comes to it ends there as a singular configuration. The part has no coordinates.
     """
 
     def components(self):
         disc = {"radius": self.radius, "axis": self.axis, "centre": self.centre}
         disc |= {"point": self.point, "normal": self.normal}
-        return (DiscContact(self.name, self.body, **disc), DiscRolling(self.name, self.body, **disc))
+        return (DiscOnPlane(self.name, self.body, **disc), DiscRolling(self.name, self.body, **disc))
 
 
-class DiscContact(AbstractDisc, AbstractConstraint):
+class DiscOnPlane(AbstractDisc, AbstractConstraint):
     """A disc that touches a plane. Rows 1: `e·(C + ρ − point) = 0`, C its centre."""
 
     rows: ClassVar[int] = 1
     rheonomic: ClassVar[bool] = False
+    lost_heading: ClassVar[str | None] = "the disc {name} lies flat on its plane, and has no contact point"
+
+    def heading(self, space, poses):
+        m, square, _ = _uphill(space, self, poses[0])
+        return m / square
 
     def residual(self, space, poses, t):
         _, square, length = _uphill(space, self, poses[0])
