@@ -298,8 +298,9 @@ def of_starts(
             # Negligible misfits do not distinguish minima.
             small = 0.5 * count * 1e-6
             ratio = count * np.log((objective + small) / (best + small))
-        apart = np.abs(others - estimates) / deviations
-        apart[~np.isfinite(apart)] = 0.0
+        # An estimate without a deviation decides nothing.
+        known = np.isfinite(deviations) & (deviations > 0)
+        apart = np.where(known, np.abs(others - estimates), 0.0) / np.where(known, deviations, 1.0)
         k = int(np.argmax(apart))
         if ratio < _AS_WELL and apart[k] > _APART:
             yield (

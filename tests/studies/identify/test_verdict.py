@@ -368,6 +368,10 @@ def test_starts_that_contradict_each_other():
     # One that fits worse; one that ends at the same estimates; data without noise, where only rounding is left.
     assert not tell([(10.0, best), (50.0, others)]) and not tell([(10.0, best), (10.0, best + 0.01)])
     assert not tell([(1e-20, best), (1e-2, others)], count=100) and tell([(1e-20, best), (1e-16, others)], count=100)
+    # Estimates that are exact, or without a deviation, decide nothing.
+    for deviation in (0.0, np.nan, np.inf):
+        ends = [(10.0, best), (10.5, others)]
+        assert not list(verdict.of_starts(ends, ("a", "b"), np.array([deviation, 0.01]), None, 1.0))
 
 
 def test_outliers_are_marked(system, exact):
