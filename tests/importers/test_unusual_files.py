@@ -152,6 +152,12 @@ def test_a_limit_of_the_force_at_a_joint_holds_behind_a_gear():
     np.testing.assert_allclose(part(found, "n").force_range, [-3, 5])
 
 
+def test_a_limit_of_the_force_at_a_joint_does_not_matter_without_a_gear():
+    bar = rod("a", '<joint name="hip" axis="0 1 0" actuatorfrcrange="-1 2"/>')
+    found = importers.mjcf(file(bar, '<actuator><motor name="m" joint="hip" gear="0"/></actuator>'))
+    assert part(found, "m").force_range is None and part(found, "m").gear == 0
+
+
 # URDF
 
 
