@@ -282,7 +282,7 @@ class Trajectory(eqx.Module):
     @_view
     def potential_energy(self) -> Float[Array, "times"]:
         """Potential energy [J] of gravity and conservative forces."""
-        return jax.vmap(lambda t, y: self.system.at(y).potential_energy(t, y.q))(self.ts, self.ys)
+        return jax.vmap(lambda t, y: self.system.at(y).energy_in_motion(t, y.q, y.u))(self.ts, self.ys)
 
     @property
     def energy(self) -> Float[Array, "times"]:

@@ -75,6 +75,10 @@ class ForceSet(eqx.Module):
         """Potential energy [J] of conservative force elements."""
         return sum((g.energy(t, poses) for g in self.groups), start=jnp.zeros((), poses.dtype))
 
+    def energy_in_motion(self, now: Kinematics) -> Float[Array, ""]:
+        """The energy [J] that conservative force elements store, which may depend on velocities."""
+        return sum((g.energy_in_motion(now) for g in self.groups), start=jnp.zeros((), now.poses.dtype))
+
     # Internal states
 
     @property

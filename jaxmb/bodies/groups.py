@@ -242,6 +242,16 @@ class AbstractGroup(eqx.Module):
         """The coordinates of the parts, by name within the part."""
         return self._map(lambda at, x: self.group.coordinates(at(t), x), poses)
 
+    def headings(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts d"]:
+        """The vectors whose directions the parts need."""
+        kernel = self.group.kernel("heading")
+
+        def single(at, x):
+            part = at(t)
+            return kernel(part, part.seen_poses(self._space, x))
+
+        return self._map(single, poses)
+
     def given_in_time(self, now: Kinematics) -> Float[Array, "n"]:
         """Values of the parts' functions of time while nothing moves.
 
@@ -556,6 +566,12 @@ class ForceGroup(AbstractGroup):
             return self.group.kernel("energy")(part, part.seen_poses(self._space, x), t)
 
         return jnp.sum(self._map(single, poses))
+
+    def energy_in_motion(self, now: Kinematics) -> Float[Array, ""]:
+        part = self.group.part
+        if part.conservative and part.stores_by_speed:
+            return jnp.sum(self._of_motion("energy_in_motion", now))
+        return self.energy(now.t, now.poses)
 
 
 class NonIdealGroup(AbstractGroup):

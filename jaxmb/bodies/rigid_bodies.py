@@ -13,6 +13,7 @@ from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced
 from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.jacobian import DenseJacobian
+from ..parts.base import AbstractLink
 from ..parts.unilateral import AbstractUnilateralConstraint
 from ..solvers.manifold_term import GapsSeen
 from ..system.contact_set import ContactNumbers, ContactSet
@@ -204,7 +205,13 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def potential_energy(self, t, q):
-        energy = self.forces.energy(t, self.bodies.prepared_poses(q))
+        return self._with_gravity(self.forces.energy(t, self.bodies.prepared_poses(q)), q)
+
+    @eqx.filter_jit
+    def energy_in_motion(self, t, q, u):
+        return self._with_gravity(self.forces.energy_in_motion(self.kinematics(t, q, u)), q)
+
+    def _with_gravity(self, energy, q):
         gravity = self.forces.gravity
         return energy if gravity is None else energy + self.bodies.potential_energy(q, gravity)
 
@@ -325,6 +332,22 @@ class RigidBodySystem(AbstractSystem):
             jnp.concatenate([x.ravel() for x in values]) for values in zip(*seen, strict=True)
         )
         return GapsSeen(gaps, rates, widths, jnp.max(paces))
+
+    @property
+    def _with_headings(self):
+        groups = (*self.constraints.groups, *self.forces.groups)
+        return [g for g in groups if isinstance(g.group.part, AbstractLink) and g.group.part.lost_heading is not None]
+
+    @property
+    def lost_headings(self):
+        return tuple(
+            g.group.part.lost_heading.format(name=repr(name)) for g in self._with_headings for name in g.group.names
+        )
+
+    @eqx.filter_jit
+    def headings(self, t, q):
+        poses = self.bodies.prepared_poses(q)
+        return jnp.concatenate([g.headings(t, poses) for g in self._with_headings])
 
     @eqx.filter_jit
     def friction_reactions(self, t, q, u, multipliers):

@@ -7,7 +7,8 @@ from ..parts.contact import AbstractContact
 
 class WheelContact(AbstractContact):
     """Contact with ground of small slopes, as in the vehicle's published equations: depth and damping along the
-    vertical, friction along the horizontal, and damping in proportion to the depth up to `damping_depth`.
+    vertical, friction along the horizontal by the load of the normal law at the depth, and damping in proportion to the
+    depth up to `damping_depth`, which may pull while a wheel separates.
 
     **Arguments:** as in `planar.Contact`.
     """
@@ -20,3 +21,7 @@ class WheelContact(AbstractContact):
 
     def onset(self, depth):
         return jnp.clip(depth, 0.0, 1.0)
+
+    def pressing(self, spring, damping, load):
+        del spring
+        return damping, load

@@ -320,6 +320,14 @@ class AbstractLink(AbstractActor):
     has_tension: ClassVar[bool] = False
     # Names of the coordinates whose rates are the slip, if the bodies slide over each other in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
+    # How a pose at which `heading` vanishes is told, with the part's {name}; None for parts without a heading.
+    lost_heading: ClassVar[str | None] = None
+
+    def heading(self, space: AbstractSpace, poses: Poses) -> Float[Array, "d"]:
+        """Hook, of a class with `lost_heading`: a vector whose direction the part needs, with a length of one where the
+        pose is far from one at which it vanishes. A motion in which it vanishes ends there.
+        """
+        raise NotImplementedError(f"{self.kind} says lost_heading, and needs a method heading.")
 
     def is_length(self, coordinate: str) -> bool | None:
         """Whether a coordinate is a length, otherwise an angle; None if it is not known."""
@@ -616,10 +624,21 @@ class AbstractPotentialForce(AbstractForce):
     """A force law with a potential energy; it may also dissipate or supply power."""
 
     conservative = True
+    # Whether the stored energy depends on velocities, as `energy_in_motion` gives it.
+    stores_by_speed: ClassVar[bool] = False
 
     @abc.abstractmethod
     def energy(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, ""]:
-        """Potential energy [J]."""
+        """Potential energy [J], at rest."""
+
+    def energy_in_motion(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
+    ) -> Float[Array, ""]:
+        """Hook, of a class with `stores_by_speed = True`: the stored energy [J], such as of a tyre that its rotation
+        stiffens.
+        """
+        del velocities
+        return self.energy(space, poses, t)
 
 
 class AbstractDynamicForce(AbstractForce):

@@ -31,7 +31,7 @@ from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
 from .forces import over_ground
 from .shapes import Ground
-from .smooth import dry_friction, ramp, step
+from .smooth import dry_friction, ramp, step, without_pull
 from .space import round_shapes
 from .terrain import AbstractTerrain, distance, outward, pace_over
 
@@ -172,8 +172,8 @@ class Janosi(AbstractFrictionLaw):
 
 
 class AbstractContact(AbstractPotentialForce):
-    """Base class of contacts with one terrain. Subclasses define the distance from the ground (`distance`, `outward`)
-    and the onset of damping (`onset`); fields as in `Contact`.
+    """Base class of contacts with one terrain. Subclasses define the distance from the ground (`distance`, `outward`),
+    the onset of damping (`onset`) and the force that presses (`pressing`); fields as in `Contact`.
     """
 
     name: str = fields.name()
@@ -202,6 +202,13 @@ class AbstractContact(AbstractPotentialForce):
     @abc.abstractmethod
     def onset(self, depth: Number) -> Number:
         """Fraction of the damping, from 0 to 1, at a depth relative to `damping_depth`."""
+
+    @abc.abstractmethod
+    def pressing(self, spring: Number, damping: Number, load: Number) -> tuple[Number, Number]:
+        """The force of damping along the normal that acts, and the load of friction [N].
+
+        **Arguments:** the forces of spring and damper along the normal; the `load` of the normal law at the depth.
+        """
 
     def complete(self, space, poses):
         part, n, d = self.filled(centres=np.zeros(space.dimension)), len(self.bodies), space.dimension
@@ -259,10 +266,11 @@ class AbstractContact(AbstractPotentialForce):
         travel = over_ground(self, centre, space.point_velocity(pose, velocity, point))
         depth, gradient = jax.value_and_grad(self._depth)(centre, radius)
         load, normal = self.normal.force(depth), self.outward(centre)
-        engaged = self.onset(depth / self.damping_depth)
+        engaged, spring = self.onset(depth / self.damping_depth), -load * gradient
+        damping = -self.damping * engaged * jnp.dot(travel, normal)
+        damping, load = self.pressing(jnp.dot(spring, normal), damping, load)
         # A normal force has the same wrench at the centre as at the lowest point.
-        resistance = self.damping * engaged * jnp.dot(travel, normal)
-        wrench = space.point_force(pose, point, -load * gradient - resistance * normal)
+        wrench = space.point_force(pose, point, spring + damping * normal)
         if self.friction is None:
             return wrench
         lowest = space.body_point(pose, centre - radius * normal)
@@ -284,7 +292,8 @@ class Contact(AbstractContact):
 
     The penetration depth is smoothed, `δ = ½ (d + √(d² + smoothing²))` for a distance d below the ground, and has a
     potential, the energy of `normal`. The contact also exerts normal damping, with the coefficient
-    `damping step(δ / damping_depth)`, and friction at the body's lowest point. Damping may pull while a body separates.
+    `damping step(δ / damping_depth)`, and friction at the body's lowest point. While a body separates, damping is at
+    most as large as the force of the spring, so that the ground never pulls. The load of friction is the sum of both.
 
     The distance d is normal to the terrain, exact on even ground and to first order in its curvature; the function
     `step` has two continuous derivatives.
@@ -309,3 +318,8 @@ class Contact(AbstractContact):
 
     def onset(self, depth):
         return step(depth)
+
+    def pressing(self, spring, damping, load):
+        del load
+        damping = without_pull(spring, damping)
+        return damping, spring + damping

@@ -25,7 +25,7 @@ from .base import (
 from .drivers import AbstractDriver
 from .forces import generalized_force
 from .names import unknown
-from .smooth import ramp
+from .smooth import ramp, without_pull
 from .space import rate_of, with_drift
 
 
@@ -335,7 +335,8 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     ```
 
     The depth δ beyond a stop is a smooth ramp, `δ = ½ (d + √(d² + smoothing²))` with d = lower − value or value −
-    upper. The potential is `½ stiffness δ²`, and the dissipated power `damping δ̇²`. With an `exponent` the stop is
+    upper. The potential is `½ stiffness δ²`, and the dissipated power `damping δ̇²`; while the coordinate leaves a
+    stop, damping is at most as large as the elastic force, so that a stop never pulls. With an `exponent` it is
     progressive: the potential is `stiffness δ^(exponent + 1) / (exponent + 1)`. Beyond the bend the elastic force is
     nearly `stiffness d`, or `stiffness d^exponent`.
 
@@ -394,7 +395,7 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
             push = self.stiffness * (depth if self.exponent is None else depth**self.exponent)
             if self.damping is not None:
                 _, rate = jax.jvp(self._depths, (x,), (v,))
-                push += self.damping * with_drift(self, rate, lambda part: part._depths(x))
+                push += without_pull(push, self.damping * with_drift(self, rate, lambda part: part._depths(x)))
             return -pull(push)[0]
 
         return self.force_along(space, poses, velocities, law)

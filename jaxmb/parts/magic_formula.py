@@ -26,6 +26,9 @@ _DIGRESSION = 10.0
 _LEAST_LOAD = 1e-3
 # Of the square of an angle, so that its root has derivatives at zero.
 _TINY = 1e-20
+# Added to coefficients of friction, and to peaks over the nominal load, that divide (ε of 4.E16, 26, 37, 40): the road
+# may be without friction. Rounding hides it elsewhere.
+_EPSILON = 1e-17
 # Of the radius: the least relaxation length, of a contact that is about to lift off.
 _LEAST_RELAXATION = 0.1
 
@@ -137,7 +140,7 @@ class Point:
         friction = (c.PDX1 + c.PDX2 * dfz) * (1 + c.PPX3 * dpi + c.PPX4 * dpi**2) * (1 - c.PDX3 * gamma**2) * mu
         peak = friction * self.load  # (4.E12, 13)
         curvature = (c.PEX1 + c.PEX2 * dfz + c.PEX3 * dfz**2) * (1 - c.PEX4 * jnp.sign(x)) * c.LEX  # (4.E14)
-        slope = self.longitudinal_stiffness() / (shape * peak)  # (4.E16)
+        slope = self.longitudinal_stiffness() / (shape * peak + _EPSILON * self.nominal)  # (4.E16)
         offset = self.load * (c.PVX1 + c.PVX2 * dfz) * c.LVX * self._digressive(mu) * offsets  # (4.E18)
         return peak * jnp.sin(shape * _angle(x, slope, curvature)) + offset  # (4.E9)
 
@@ -159,9 +162,10 @@ class Point:
         peak = friction * self.load  # (4.E22, 23)
         skew = 1 + c.PEY5 * gamma**2 - (c.PEY3 + c.PEY4 * gamma) * jnp.sign(y)
         curvature = (c.PEY1 + c.PEY2 * dfz) * skew * c.LEY  # (4.E24)
-        slope = stiffness / (shape * peak)  # (4.E26)
+        least = jnp.where(c.PDY1 < 0, -_EPSILON, _EPSILON) * self.nominal
+        slope, turn = stiffness / (shape * peak + least), stiffness / (peak + least)  # (4.E26)
         force = peak * jnp.sin(shape * _angle(y, slope, curvature)) + offset  # (4.E19)
-        return Lateral(force, friction, stiffness, slope * shape, shift + offset / stiffness)
+        return Lateral(force, friction, stiffness, turn, shift + offset / stiffness)
 
     def _digressive(self, mu):
         return _DIGRESSION * mu / (1 + (_DIGRESSION - 1) * mu) if self.is_newer else mu  # (4.E8)
@@ -196,7 +200,7 @@ class Point:
 
         angle = alpha + c.QHZ1 + c.QHZ2 * dfz + (c.QHZ3 + c.QHZ4 * dfz) * gamma  # (4.E34, 35)
         slope = c.QBZ1 + c.QBZ2 * dfz + c.QBZ3 * dfz**2
-        slope = slope * (1 + c.QBZ4 * gamma + c.QBZ5 * jnp.abs(gamma)) * c.LKY / mu  # (4.E40)
+        slope = slope * (1 + c.QBZ4 * gamma + c.QBZ5 * jnp.abs(gamma)) * c.LKY / (mu + _EPSILON)  # (4.E40)
         size = (c.QDZ1 + c.QDZ2 * dfz) * (1 - c.PPZ1 * self.dpi) * (1 + c.QDZ3 * gamma + c.QDZ4 * gamma**2)
         size = size * self.load * self.radius / self.nominal * c.LTR  # (4.E42, 43)
         curvature = c.QEZ1 + c.QEZ2 * dfz + c.QEZ3 * dfz**2
@@ -207,7 +211,7 @@ class Point:
         residual = (c.QDZ6 + c.QDZ7 * dfz) * c.LRES
         by_camber = (c.QDZ8 + c.QDZ9 * dfz) * (1 + c.PPZ2 * self.dpi) + (c.QDZ10 + c.QDZ11 * dfz) * jnp.abs(gamma)
         residual = residual + by_camber * gamma * c.LKZC  # (4.E47)
-        turn = c.QBZ9 * c.LKY / mu + c.QBZ10 * lateral.turn  # (4.E45)
+        turn = c.QBZ9 * c.LKY / (mu + _EPSILON) + c.QBZ10 * lateral.turn  # (4.E45)
         fading = _cos_arctan(turn * equivalent(alpha + lateral.shift))  # (4.E37, 75)
         residual = residual * self.load * self.radius * mu * along * fading
 

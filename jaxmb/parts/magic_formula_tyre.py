@@ -21,8 +21,9 @@ from .tyre import AbstractTyre
 
 _POSITIVE = (
     *("UNLOADED_RADIUS", "Q_RE0", "FNOMIN", "LONGVL", "NOMPRES", "PCX1", "PDX1", "PCY1"),
-    *("VERTICAL_STIFFNESS", "LONGITUDINAL_STIFFNESS", "LATERAL_STIFFNESS"),
+    *("VERTICAL_STIFFNESS", "LONGITUDINAL_STIFFNESS", "LATERAL_STIFFNESS", "LFZO", "LKY"),
 )
+_NON_NEGATIVE = ("LMUX", "LMUY", "LCX", "LCY", "LKX")
 _NONZERO = ("PKX1", "PDY1", "PKY1", "PKY2", "PTY2")
 # A change of these would move the circle.
 _LENGTHS = ("UNLOADED_RADIUS", "Q_RE0")
@@ -31,14 +32,14 @@ _LENGTHS = ("UNLOADED_RADIUS", "Q_RE0")
 class _Rolling(NamedTuple):
     """A wheel in contact.
 
-    **Fields:** the `gradient` of the depth with respect to the pose; the elastic `load` and the `damping` force
-    [N]; the `normal`, and the directions `along` the ground; the vector `up` [m] from the lowest point of the circle to
-    the contact's centre, and the contact's `centre` [m] in the body's frame; the `slip` velocity [m/s], the velocity
-    forwards `rolling` and the regularised `speed`; the `point` of the Magic Formula.
+    **Fields:** the wrench `push` of the elasticity; along the `normal` its force `spring` and the `damping` force [N];
+    the directions `along` the ground; the vector `up` [m] from the lowest point of the circle to the contact's
+    centre, and the contact's `centre` [m] in the body's frame; the `slip` velocity [m/s], the velocity forwards
+    `rolling` and the regularised `speed`; the `point` of the Magic Formula.
     """
 
-    gradient: Any
-    load: Any
+    push: Any
+    spring: Any
     damping: Any
     normal: Any
     along: Any
@@ -70,11 +71,16 @@ class MagicFormulaTyre(AbstractTyre):
     The tread deflects in each direction as in `Tyre`, `ḋ = −v_s − (V/σ) d`. The slip velocity v_s belongs to the
     wheel's point at the effective rolling radius below the centre. The slips `κ = d/σ_κ` and `α = −arctan(d/σ_α)` enter
     the Magic Formula. The relaxation lengths σ depend on the load: in version 5.2 by PTX and PTY, in 6.1 as slip
-    stiffness over the stiffness of the carcass. They are at least a tenth of the radius.
+    stiffness over the stiffness of the carcass. They are at least a tenth of the radius. The load is everywhere the
+    force along the normal, of elasticity and damping.
 
     Slips, inclination, load and pressure are clipped at the limits of the file (KPUMIN, ALPMIN, CAMMIN, FZMIN, PRESMIN,
     …). Below FZMIN, and below a thousandth of FNOMIN, forces and moments are proportional to the load. Near standstill
     the offsets of forces at zero slip, the pneumatic trail and rolling resistance vanish. Turn slip is not modelled.
+
+    A load that depends on the speed of rotation, by Q_V1 and Q_V2, has no potential. `potential_energy` of a motion
+    contains the elastic energy at the speed of the moment, which is right while this speed does not change; with a
+    change of it the tyre takes or gives energy without a force.
 
     The coefficients, and all scaling factors, are parameters, `"tyre.PDY1"`; `"tyre.mirror"` is −1 for a mirrored tyre.
 
@@ -95,6 +101,7 @@ class MagicFormulaTyre(AbstractTyre):
     mirror: fields.Number = fields.parameter(unit="1", sign="nonzero")
     pressure: fields.Number = fields.parameter(unit="Pa", sign="positive", optional=True)
     normal: AbstractNormalLaw | None = fields.law(AbstractNormalLaw | None, what="a law from jaxmb.contact")
+    stores_by_speed: ClassVar[bool] = True
     dimensions: ClassVar[tuple[int, ...]] = (3,)
 
     def __init__(
@@ -134,12 +141,14 @@ class MagicFormulaTyre(AbstractTyre):
     def validate(self):
         # Of numbers that are not traced; operations on JAX arrays would compile here.
         c = {key: float(value) for key, value in self.coefficients.items() if not is_traced(value)}
-        for key in (*_POSITIVE, *_NONZERO):
-            value = c.get(key, 1.0)
-            if value == 0 or (value < 0 and key in _POSITIVE):
-                raise ValueError(
-                    f"{self.label}: {key} must be {'positive' if key in _POSITIVE else 'nonzero'}, got {value:g}."
-                )
+        for keys, what, holds in (
+            (_POSITIVE, "positive", lambda value: value > 0),
+            (_NON_NEGATIVE, "at least 0", lambda value: value >= 0),
+            (_NONZERO, "nonzero", lambda value: value != 0),
+        ):
+            for key in keys:
+                if not holds(value := c.get(key, 1.0)):
+                    raise ValueError(f"{self.label}: {key} must be {what}, got {value:g}.")
         if "Q_FZ1" not in self.coefficients and c.keys() >= {"VERTICAL_STIFFNESS", "UNLOADED_RADIUS", "FNOMIN"}:
             stiffness = c["VERTICAL_STIFFNESS"] * c["UNLOADED_RADIUS"] / c["FNOMIN"]
             if stiffness**2 <= 4 * c.get("Q_FZ2", 0.0):
@@ -162,13 +171,15 @@ class MagicFormulaTyre(AbstractTyre):
         along, normal = wheel.along, wheel.normal
         force = fx * along[0] + fy * along[1] + wheel.damping * normal
         # The load acts at the contact's centre, not at the lowest point of the circle.
-        moment = mx * along[0] + my * along[1] + mz * normal + cross(wheel.up, wheel.load * normal)
-        wrench = space.pull_back(poses[0], -wheel.load * wheel.gradient)
-        return (wrench + space.point_force(poses[0], wheel.centre, force) + space.moment(poses[0], moment))[None]
+        moment = mx * along[0] + my * along[1] + mz * normal + cross(wheel.up, wheel.spring * normal)
+        return (wheel.push + space.point_force(poses[0], wheel.centre, force) + space.moment(poses[0], moment))[None]
 
     def energy(self, space, poses, t):
-        depth = self._depth(space, poses[0])
-        return self._elastic(depth)[1] if self.normal is None else self.normal.energy(depth)
+        return self._elastic(self._depth(space, poses[0]))[1]
+
+    def energy_in_motion(self, space, poses, velocities, t):
+        factor, growth = self._by_spin(space, poses[0], velocities[0])
+        return self._elastic(self._depth(space, poses[0], growth), factor)[1]
 
     def state_rates(self, space, poses, velocities, t):
         wheel = self._rolling(space, poses[0], velocities[0])
@@ -177,28 +188,35 @@ class MagicFormulaTyre(AbstractTyre):
     def state_sizes(self):
         return {"deflection": 0.03 * self.radius}
 
-    def _elastic(self, depth):
-        return magic_formula.elastic(self.coefficients, self.pressure, depth)
+    def _by_spin(self, space, pose, velocity):
+        spin = jnp.dot(space.turning(pose, velocity), space.direction(pose, self.axis))
+        return magic_formula.by_spin(self.coefficients, spin)
+
+    def _elastic(self, depth, factor: Any = 1.0):
+        """The load and the elastic energy at a depth, with the factor of the load by spin."""
+        if self.normal is not None:
+            return self.normal.force(depth), self.normal.energy(depth)
+        load, energy = magic_formula.elastic(self.coefficients, self.pressure, depth)
+        return factor * load, factor * energy
 
     def _rolling(self, space, pose, velocity) -> _Rolling:
         axle = space.direction(pose, self.axis)
-        factor, growth = magic_formula.by_spin(self.coefficients, jnp.dot(space.turning(pose, velocity), axle))
+        factor, growth = self._by_spin(space, pose, velocity)
         depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose, growth))(pose)
-        load = factor * self._elastic(depth)[0] if self.normal is None else self.normal.force(depth)
-        radius = self.radius + growth
+        push = space.pull_back(pose, -self._elastic(depth, factor)[0] * gradient)
+        normal, spring, damping = self._normal_forces(space, pose, velocity, depth, push)
+        load, radius = spring + damping, self.radius + growth
         reach = magic_formula.rolling_radius(self.version, self.coefficients, self.pressure, radius, depth, load)
-        normal, along, _, slip, rolling = self._contact(space, pose, velocity, reach)
-        damping = self._damping_force(space, pose, velocity, normal, depth)
+        along, _, slip, rolling = self._contact(space, pose, velocity, normal, reach)
         upright = norm(cross(axle, normal))
         inclination = self.mirror * jnp.arctan2(jnp.dot(axle, normal), upright)
         loaded = radius - depth / upright
         upwards = self._upwards(space, pose, normal)
         centre = space.body_point(pose, space.point(pose, self.centre) - loaded * upwards)
-        pressed = jnp.maximum(load + damping, 0.0)
-        point = magic_formula.Point(self.version, self.coefficients, pressed, inclination, self.pressure)
+        point = magic_formula.Point(self.version, self.coefficients, load, inclination, self.pressure)
         up = (self.radius - loaded) * upwards
         speed = self._speed(rolling)
-        return _Rolling(gradient, load, damping, normal, along, up, centre, slip, rolling, speed, point)
+        return _Rolling(push, spring, damping, normal, along, up, centre, slip, rolling, speed, point)
 
     def _forces(self, wheel: _Rolling) -> magic_formula.Forces:
         """Forces and moments at the contact's centre, along its axes."""

@@ -31,6 +31,11 @@ def ramp(d: Float[Array, "*n"], width: Scalar) -> Float[Array, "*n"]:
     return jnp.where(d > 0, 0.5 * (d + root), 0.5 * width * width / (root - jnp.where(d > 0, 0.0, d)))
 
 
+def without_pull(load: Float[Array, "*n"], damping: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """A force of damping beside a load that presses, reduced so that both together press or vanish, and never pull."""
+    return jnp.where(damping > -load, damping, -load)
+
+
 def step(s: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """A C² step from 0 at s ≤ 0 to 1 at s ≥ 1."""
     return quintic(clipped(s, 0.0, 1.0))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..linalg.arrays import is_traced
 from ..linalg.rotations import cross, norm
 from . import fields
 from .base import AbstractDynamicForce, AbstractPotentialForce
@@ -17,13 +18,17 @@ from .boundary import check_returns
 from .contact import AbstractNormalLaw
 from .forces import over_ground
 from .shapes import Ground, wheel
-from .smooth import dry_friction, ramp, step
+from .smooth import dry_friction, ramp, step, without_pull
 from .terrain import AbstractTerrain, distance, outward, pace_over
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
+
+
+# The sine of the angle between axle and normal of a wheel that lies flat.
+_FLAT = 1e-6
 
 
 class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
@@ -36,7 +41,8 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     - `axis`, unit, shape (3,), in space: the axle fixed in the body, pointing to the left of a wheel that rolls
         forwards, default the y axis. The wheel must not lie flat.
     - `terrain`, from `jaxmb.terrain`; `smoothing` [m] > 0 of the depth, `½ (δ + √(δ² + smoothing²))`.
-    - `damping_depth` [m] > 0: damping against the rate of the depth is full from there on.
+    - `damping_depth` [m] > 0: damping against the rate of the depth is full from there on. While the wheel rebounds,
+        damping is at most as large as the elastic load, so that the ground never pulls.
     - `transition_speed` [m/s] > 0: rolling speeds below it are regularised.
     - `deflection` [m], (d − 1,), an internal state: the deflection of the tread in the contact relative to the rim,
         forwards and, in space, to the left; initially zero. Off the ground it follows the slip as well, without a
@@ -70,7 +76,16 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         place = np.zeros(count, np.asarray(self.radius).dtype)
         check_returns(self.label, "terrain.height", (), self.terrain.height, place)
         part = self if space.dimension == 2 else self.filled(axis=np.eye(3)[1])
+        part._check_upright(space, poses)
         return part.with_fields(deflection=fields.as_parameter(np.broadcast_to(self.deflection, (count,))))
+
+    def _check_upright(self, space, poses):
+        if space.dimension == 2 or is_traced((self.terrain, self.axis, poses)):
+            return
+        # One program, not one for each operation.
+        axle, normal = space.direction(poses[0], self.axis), jax.jit(lambda: self._normal(space, poses[0]))()
+        if not norm(cross(axle, normal)) > _FLAT:
+            raise ValueError(f"{self.label}: the wheel lies flat at the given pose; tilt it, or give another axis.")
 
     def may_vary(self, keys):
         return keys[0] not in ("radius", "centre", "axis")
@@ -122,25 +137,33 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         """The velocity of a point fixed in the body over the ground."""
         return over_ground(self, space.point(pose, self.centre), space.point_velocity(pose, velocity, point))
 
-    def _contact(self, space, pose, velocity, reach):
-        """The ground's normal, the directions along the ground, the point [m] in the body's frame at a distance below
-        the centre, the slip velocities [m/s] of this point, and the velocity of the centre forwards.
+    def _normal(self, space, pose):
+        """The ground's normal below the centre, in world axes."""
+        return outward(self.terrain, space.point(pose, self.centre))
+
+    def _contact(self, space, pose, velocity, normal, reach):
+        """The directions along the ground, the point [m] in the body's frame at a distance below the centre, the slip
+        velocities [m/s] of this point, and the velocity of the centre forwards.
         """
         centre = space.point(pose, self.centre)
-        normal = outward(self.terrain, centre)
         point = space.body_point(pose, centre - reach * self._upwards(space, pose, normal))
         along = self._directions(space, pose, normal)
         slip = along @ self._velocity(space, pose, velocity, point)
-        return normal, along, point, slip, jnp.dot(along[0], self._velocity(space, pose, velocity, self.centre))
+        return along, point, slip, jnp.dot(along[0], self._velocity(space, pose, velocity, self.centre))
 
     def _speed(self, rolling):
         """The rolling speed [m/s], regularised."""
         return jnp.sqrt(rolling**2 + self.transition_speed**2)
 
-    def _damping_force(self, space, pose, velocity, normal, depth):
-        """Force [N] along the normal against the rate of the depth."""
-        approach = jnp.dot(self._velocity(space, pose, velocity, self.centre), normal)
-        return -self.damping * step(depth / self.damping_depth) * approach
+    def _normal_forces(self, space, pose, velocity, depth, push):
+        """The ground's normal; the forces along it of the spring and against the rate of the depth [N], of which the
+        sum is the load of friction; from the wrench `push` of the spring.
+        """
+        normal = self._normal(space, pose)
+        spring = jnp.dot(push[: space.dimension], normal)
+        rising = jnp.dot(self._velocity(space, pose, velocity, self.centre), normal)
+        damping = -self.damping * step(depth / self.damping_depth) * rising
+        return normal, spring, without_pull(spring, damping)
 
 
 class Tyre(AbstractTyre):
@@ -156,8 +179,9 @@ class Tyre(AbstractTyre):
     The tread deflects in each direction as `ḋ = −v_s − (V/σ) d`, with the slip velocity v_s of the wheel's lowest point
     and the rolling speed `V = √(v² + transition_speed²)` of its centre. In steady rolling the slips `d/σ` are thus
     `−v_s/V`; the lateral slip is the tangent of the slip angle. With `s = c d/(σ μ)`, the force on the wheel at its
-    lowest point is `μ N tanh(|s|) s/|s|`, with the load N: `c N d/σ` for small slips, and friction for large ones. The
-    wheel's inclination only moves the contact; there is no aligning torque or rolling resistance.
+    lowest point is `μ N tanh(|s|) s/|s|`: `c N d/σ` for small slips, and friction for large ones. The load N is the
+    force along the normal, of spring and damping. The wheel's inclination only moves the contact; there is no aligning
+    torque or rolling resistance.
 
     **Arguments:**
 
@@ -180,20 +204,20 @@ class Tyre(AbstractTyre):
     def wrenches(self, space, poses, velocities, t):
         pose, velocity = poses[0], velocities[0]
         depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose))(pose)
-        load = self.normal.force(depth)
-        wrench = space.pull_back(pose, -load * gradient)
-        normal, along, point, *_ = self._contact(space, pose, velocity, self.radius)
+        wrench = space.pull_back(pose, -self.normal.force(depth) * gradient)
+        normal, spring, damping = self._normal_forces(space, pose, velocity, depth, wrench)
+        along, point, *_ = self._contact(space, pose, velocity, normal, self.radius)
         sliding = self.slip_stiffness * self.deflection / (self.relaxation_length * self.coefficient)
         # The law of dry friction, with the deflection in the place of slip.
-        friction = dry_friction(self.coefficient * load, -sliding, 1.0)
-        force = friction @ along + self._damping_force(space, pose, velocity, normal, depth) * normal
-        return (wrench + space.point_force(pose, point, force))[None]
+        friction = dry_friction(self.coefficient * (spring + damping), -sliding, 1.0)
+        return (wrench + space.point_force(pose, point, friction @ along + damping * normal))[None]
 
     def energy(self, space, poses, t):
         return self.normal.energy(self._depth(space, poses[0]))
 
     def state_rates(self, space, poses, velocities, t):
-        *_, slip, rolling = self._contact(space, poses[0], velocities[0], self.radius)
+        normal = self._normal(space, poses[0])
+        *_, slip, rolling = self._contact(space, poses[0], velocities[0], normal, self.radius)
         return {"deflection": -slip - self._speed(rolling) / self.relaxation_length * self.deflection}
 
     def state_sizes(self):

@@ -158,7 +158,12 @@ class AbstractSystem(AbstractEquation):
 
     @abc.abstractmethod
     def potential_energy(self, t: Scalar, q: Coordinates) -> Float[Array, ""]:
-        """Potential energy [J] of gravity and of every conservative force."""
+        """Potential energy [J] of gravity and of every conservative force, at rest."""
+
+    def energy_in_motion(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, ""]:
+        """Hook: the potential energy [J] with that of forces whose stored energy depends on velocities."""
+        del u
+        return self.potential_energy(t, q)
 
     def linear_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "d"]:
         """`Σ m v` [kg m/s], world axes."""

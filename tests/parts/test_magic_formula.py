@@ -175,6 +175,37 @@ def test_derivatives_are_finite_everywhere(version):
         assert np.all(np.isfinite(leaf))
 
 
+@VERSIONS
+def test_a_road_without_friction(version):
+    """At zero of each factor of friction and shape the forces and derivatives are finite, and the limits of those next
+    to zero; without any friction there are only the parts that need none.
+    """
+    names, base = ("LMUX", "LMUY", "LCX", "LCY"), data(version)
+    slips = jnp.array([(0.05, -0.02, 0.03), (0.0, 0.04, 0.0), (-0.2, 0.0, -0.05)])
+
+    def seen(factors, slip):
+        own = base | dict(zip(names, factors, strict=True))
+        return forces(version, own, *slip, 4200.0)
+
+    each = jnp.concatenate([jnp.ones((4, 4)) - np.eye(4), jnp.zeros((1, 4))])
+    both = jax.jit(jax.vmap(jax.vmap(lambda *x: (seen(*x), jax.jacrev(seen)(*x)), (None, 0)), (0, None)))
+    values, slopes = both(each, slips)
+    near, near_slopes = both(jnp.where(each == 0, 1e-9, each), slips)
+    assert np.all(np.isfinite(values)) and np.all(np.isfinite(slopes))
+    np.testing.assert_allclose(values, near, rtol=0, atol=1e-4)
+    # By the factors that are zero, at slips that are not.
+    zero = np.broadcast_to((each == 0)[:, None, None, :], slopes.shape) & (np.asarray(slips) != 0).any(1)[:, None, None]
+    np.testing.assert_allclose(slopes[zero], near_slopes[zero], rtol=1e-4, atol=0.5)
+    np.testing.assert_allclose(values[-1, :, :2], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("key, value", [("LMUX", -0.1), ("LCY", -1.0), ("LKY", 0.0), ("LFZO", 0.0)])
+def test_factors_out_of_their_range_are_refused(key, value):
+    own = data("5.2") | {"FITTYP": 6, key: value}
+    with pytest.raises(ValueError, match=f"'tyre': {key} must be"):
+        spatial.MagicFormulaTyre("tyre", "wheel", own, terrain=mb.terrain.Flat()).check(3)
+
+
 @pytest.mark.slow
 @VERSIONS
 def test_derivatives_by_slip_load_and_coefficients(version):

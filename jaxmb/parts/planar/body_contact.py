@@ -18,7 +18,7 @@ from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce
 from ..contact import AbstractFrictionLaw, AbstractNormalLaw
-from ..smooth import ramp, step
+from ..smooth import ramp, step, without_pull
 from ..space import round_shapes
 
 Number = Float[Array, ""]
@@ -130,13 +130,16 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         elastic = -space.direction(pose, jax.grad(self._energy)(place, surface))
         normal = space.direction(pose, jax.grad(self.distance)(place, surface))
         share, depth = self.share(place, surface), self._depth(place, surface)
-        on_disc, on_others = self._losses(space, disc, pose[None], velocity[None], normal, share, depth)
+        engaged, spring = share * step(depth / self.damping_depth), jnp.dot(elastic, normal)
+        on_disc, on_others = self._losses(space, disc, pose[None], velocity[None], normal, engaged, spring)
         on_disc = on_disc + space.point_force(disc.pose, self.centre, elastic)
         return on_disc, on_others[0] + space.point_force(pose, place, -elastic)
 
-    def _losses(self, space, disc, poses, velocities, normal, share, depth):
+    def _losses(self, space, disc, poses, velocities, normal, engaged, spring):
         """Wrenches of damping and friction on the disc's body, and, in equal parts, on the bodies that form the
         surface.
+
+        **Arguments:** the fraction `engaged` of the damping; the force of the `spring` along the normal [N].
         """
         equal = 1.0 / len(poses)
 
@@ -147,18 +150,17 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
         def reactions(x, force):
             return jax.vmap(lambda pose: space.point_force(pose, space.body_point(pose, x), -equal * force))(poses)
 
-        engaged = share * step(depth / self.damping_depth)
         relative = disc.velocity_at(disc.middle) - surface_velocity(disc.middle)
         # Normal forces pass through the centre: their wrench is the same there as at the deepest point.
-        push = -self.damping * engaged * jnp.dot(relative, normal) * normal
+        damping = without_pull(spring, -self.damping * engaged * jnp.dot(relative, normal))
+        push = damping * normal
         on_disc, on_others = disc.wrench(disc.middle, push), reactions(disc.middle, push)
         if self.friction is None:
             return on_disc, on_others
         touching = disc.middle - self.radius * normal
         along = lambda v: v - jnp.dot(v, normal) * normal
         slip = disc.velocity_at(touching) - surface_velocity(touching)
-        load = share * self.normal.force(depth)
-        rub = self.friction.force(load, engaged, along(slip), along(relative))
+        rub = self.friction.force(spring + damping, engaged, along(slip), along(relative))
         return on_disc + disc.wrench(touching, rub), on_others + reactions(touching, rub)
 
     def _rows(self, value, shape):
@@ -301,8 +303,11 @@ class PlateContact(AbstractBodyContact):
         slopes = jax.grad(self._corner_energy, (0, 1, 2))(first, second, way, starts, ends)
         on_first, on_second = (space.direction(pose, slope) for pose, slope in zip(poses, slopes[:2], strict=True))
         share, depth = self._corner_share(first, second, starts, ends), self._corner_depth(way)
-        on_disc, losses = self._losses(space, disc, poses, velocities, way / norm(way), share, depth)
-        on_disc = on_disc + disc.wrench(disc.middle, -(on_first + on_second + slopes[2]))
+        engaged, normal = share * step(depth / self.damping_depth), way / norm(way)
+        elastic = -(on_first + on_second + slopes[2])
+        spring = jnp.dot(elastic, normal)
+        on_disc, losses = self._losses(space, disc, poses, velocities, normal, engaged, spring)
+        on_disc = on_disc + disc.wrench(disc.middle, elastic)
 
         def on_plate(pose, place, push, tip):
             return space.point_force(pose, place, push) + space.point_force(pose, tip, 0.5 * slopes[2])

@@ -176,6 +176,54 @@ def test_a_wheel_is_quiet_at_rest_and_off_the_ground(version):
     np.testing.assert_allclose(still[4:, 2], -400.0 * 9.81, rtol=2e-3)
 
 
+@pytest.mark.slow
+def test_one_load_and_its_energy():
+    """At any speed of rotation the force along the normal is the slope of the energy with damping left out, and with
+    damping it does not pull; the Magic Formula has the same load.
+    """
+    width, own = 2e-3, rolling_on("6.1", Q_V1=0.002, Q_V2=0.5, VERTICAL_DAMPING=2e4)
+    system = scene(part(own, smoothing=width), position=(0.0, 0.0, 0.315))
+    q, z = system.guess.q, jnp.array([0.0, -0.02])
+
+    def seen(damping, rise, spin):
+        numbers = mb.with_parameters(system, {"tyre.VERTICAL_DAMPING": damping}).with_states(z)
+        u = jnp.array([20.0, 0.0, rise, 0.0, spin, 0.0])
+        slope = jax.grad(lambda q: numbers.energy_in_motion(0.0, q, u))(q)
+        return numbers.force(0.0, q, u)[:3], slope[2], numbers.potential_energy(0.0, q)
+
+    cases = jnp.array([(0.0, 0.0, 0.0), (0.0, 0.0, 66.0), (0.0, 0.0, 120.0), (2e4, 0.05, 66.0), (2e4, 5.0, 66.0)])
+    force, slope, energy = jit_quickly(jax.vmap(seen))(*cases.T)
+    np.testing.assert_allclose(force[:3, 2], -slope[:3], rtol=1e-9)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-14)
+    assert force[1, 2] > 1.3 * force[0, 2] and 0 < force[3, 2] < force[1, 2] - 50.0
+    np.testing.assert_allclose(force[4], 0.0, atol=1e-9)
+    # The lateral force of the equations at the load that presses, and at the slip of the deflection.
+    for found in np.array(force[:4]):
+        at = lambda alpha, load=found[2]: oracle.version_61(own, load, 0.0, alpha, 0.0, 2.2e5, 20.0)
+        *_, sigma = at(0.0)
+        expected, *_ = at(np.arctan(0.02 / sigma))
+        np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_derivatives_on_a_road_without_friction():
+    """By the friction at zero: forwards, backwards, and by one-sided differences of a finer solution."""
+    system = scene(part(rolling_on("5.2"), smoothing=1e-3), forces=[GRAVITY], position=(0.0, 0.0, 0.3))
+    start = mb.assemble(system)
+    state = mb.State(start.q, jnp.array([10.0, 0.4, 0.0, 0.0, 34.5, 0.0]), start.z)
+
+    def speeds(mu, rtol=1e-8):
+        own = mb.with_parameters(system, {"tyre.LMUX": mu, "tyre.LMUY": mu})
+        return mb.simulate(own, state, t1=0.1, rtol=rtol).ys.u[-1]
+
+    zero = jnp.zeros(())
+    forward, reverse = jit_quickly(lambda mu: (jax.jacfwd(speeds)(mu), jax.jacrev(speeds)(mu)))(zero)
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-10)
+    still, near, far = jit_quickly(jax.vmap(lambda mu: speeds(mu, 1e-11)))(jnp.array([0.0, 1e-4, 2e-4]))
+    np.testing.assert_allclose(forward, (4 * near - 3 * still - far) / 2e-4, rtol=2e-3, atol=2e-3)
+    assert np.all(np.abs(forward[:2]) > 0.1)
+
+
 def turning(version):
     """A wheel that rolls, drifts and leans, on its own."""
     start = {"velocity": (12.0, 0.6, -0.1), "orientation": leaning(0.05, 0.04), "position": (0.0, 0.0, 0.302)}

@@ -1,0 +1,137 @@
+"""Compliant one-sided forces with damping: they press and never pull, and friction is of the force that presses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial
+from jaxmb.parts import contact, terrain
+from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.parts.spatial.kinematics import SPACE
+
+STIFFNESS, DAMPING, DEPTH, WIDTH, FULL, FRICTION = 2e5, 3e4, 0.004, 2e-3, 0.01, 0.6
+# Speeds [m/s] of separation, from a fast approach to a fast rebound.
+SPEEDS = jnp.linspace(-2.0, 3.0, 101)
+LAWS = {"normal": contact.Linear(STIFFNESS), "damping": DAMPING, "damping_depth": FULL, "smoothing": WIDTH}
+SLIDES = {"friction": contact.Coulomb(FRICTION, transition_speed=1e-3)}
+GRIP = {"coefficient": FRICTION, "slip_stiffness": 15.0, "relaxation_length": 0.2}
+
+
+def pressing():
+    """The force along the normal, of a smoothed spring and a damper, at the speeds; in NumPy."""
+    root = np.hypot(DEPTH, WIDTH)
+    depth = 0.5 * (DEPTH + root)
+    s = min(depth / FULL, 1.0)
+    spring = STIFFNESS * depth * 0.5 * (1 + DEPTH / root)
+    return np.maximum(spring - DAMPING * s**3 * (10 - 15 * s + 6 * s * s) * np.asarray(SPEEDS), 0.0)
+
+
+def disc_in(space, up=1):
+    """Poses and velocities of a disc or ball of radius 0.1 that is as deep in a surface at rest, and slides along."""
+    pose = np.array(space.ground)
+    pose[up] = 0.1 - DEPTH
+    velocities = jnp.zeros((len(SPEEDS), 2, space.velocity_size)).at[:, 0, up].set(SPEEDS).at[:, 0, 0].set(1.0)
+    return jnp.stack([jnp.asarray(pose), jnp.asarray(space.ground)]), velocities
+
+
+def forces(part, space, up=1):
+    """Along the ground and along its normal, on the first body, at the speeds."""
+    poses, velocities = (x[..., : len(part.bodies), :] for x in disc_in(space, up))
+    part = part.resolve(space, poses)
+    wrenches = jax.jit(jax.vmap(lambda v: part.wrenches(space, poses, v, 0.0)[0]))(velocities)
+    return wrenches[:, 0], wrenches[:, up]
+
+
+@pytest.mark.parametrize("name", ["Contact", "PlateContact", "DiscContact", "ball"])
+def test_a_contact_presses_and_its_friction_is_of_this_force(name):
+    bodies, sizes = ("disc", "plate"), LAWS | SLIDES | {"radius": 0.1}
+    part, space, up = {
+        "Contact": lambda: (planar.Contact("touch", "disc", terrain=terrain.Flat(), **sizes), PLANE, 1),
+        "PlateContact": lambda: (
+            planar.PlateContact("touch", bodies, start=(-1.0, 0.0), end=(1.0, 0.0), **sizes),
+            PLANE,
+            1,
+        ),
+        "DiscContact": lambda: (planar.DiscContact("touch", bodies, radii=1e7, centres=(0.0, -1e7), **sizes), PLANE, 1),
+        "ball": lambda: (spatial.Contact("touch", "disc", terrain=terrain.Flat(), **sizes), SPACE, 2),
+    }[name]()
+    along, normal = forces(part, space, up)
+    expected = pressing()
+    assert expected.min() == 0.0 and np.sum(expected == 0.0) > 10
+    np.testing.assert_allclose(normal, expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(along, -FRICTION * expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("space, kind", [(PLANE, planar.Tyre), (SPACE, spatial.Tyre)])
+def test_a_tyre_is_never_pulled_and_grips_by_the_force_that_presses(space, kind):
+    up = space.dimension - 1
+    # The tread is deflected far beyond its grip.
+    tyre = kind("tyre", "disc", radius=0.1, terrain=terrain.Flat(), **LAWS, **GRIP, deflection=[-1.0, 0.0][:up])
+    along, normal = forces(tyre, space, up)
+    np.testing.assert_allclose(normal, pressing(), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(along, -FRICTION * pressing(), rtol=1e-9, atol=1e-9)
+
+
+def test_the_ground_does_not_hold_a_wheel_that_rebounds():
+    """The derivative by the damping, which is zero beyond, is that of the force on both sides of the limit."""
+    pose, velocities = (x[..., :1, :] for x in disc_in(PLANE))
+
+    def lift(damping, velocity):
+        laws = LAWS | {"damping": damping}
+        part = planar.Contact("touch", "disc", terrain=terrain.Flat(), radius=0.1, **laws).resolve(PLANE, pose)
+        return part.wrenches(PLANE, pose, velocity, 0.0)[0, 1]
+
+    slopes = jax.jit(jax.vmap(jax.grad(lift), (None, 0)))(DAMPING, velocities)
+    expected = np.where(pressing() > 0, (pressing() - pressing()[40]) / DAMPING, 0.0)
+    # The speed of entry 40 is zero.
+    np.testing.assert_allclose(slopes, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_stops_and_draft_gears_never_pull():
+    bar = planar.Body("bar", mass=1.0, inertia=0.1)
+    slide = planar.Prismatic("slide", "ground", "bar", point=(0.0, 0.0), axis=(1.0, 0.0))
+    ends = {"lower": -1.0, "upper": 0.5, "stiffness": 1e4, "damping": 500.0}
+    stops = [
+        mb.JointStop("linear", "slide.displacement", **ends),
+        mb.JointStop("progressive", "slide.displacement", **ends, exponent=1.5),
+        planar.DraftGear("gear", "ground", "bar", point_b=(5.0, 0.0), damping=1e6, free_length=5.0, slack=0.0),
+    ]
+    for stop in stops:
+        system = mb.Scene([bar], joints=[slide], forces=[stop]).compile()
+        at = lambda v, system=system: system.force(0.0, jnp.array([0.51, 0.0, 0.0]), jnp.array([v, 0.0, 0.0]))[0]
+        force = np.array(jax.jit(jax.vmap(at))(10 * SPEEDS))
+        # Beyond the upper end it pushes back: the faster the bar enters the more, and not at all when it leaves fast.
+        assert np.all(force <= 1e-6) and abs(force[0]) < 1e-6 and force[-1] < -1000.0, stop.name
+        assert np.max(np.abs(np.diff(force, 2))) < 0.2 * np.max(np.abs(force))
+
+
+@pytest.mark.slow
+def test_derivatives_through_a_rebound_that_the_damping_does_not_hold():
+    """Of a hammer that strikes a table with a damper so strong that the force of rebound is limited: forwards,
+    backwards and by differences of a finer solution, in a batch.
+    """
+    body = planar.Body("disc", mass=1.0, inertia=0.01, position=(0.0, 0.1), velocity=(1.0, -2.0))
+    laws = LAWS | SLIDES | {"damping": 1e3, "damping_depth": 1e-3}
+    touch = planar.Contact("touch", "disc", terrain=terrain.Flat(), radius=0.1, **laws)
+    table = {"rates": (-3.0, -2.0, -0.2, -0.1, 0.0, 3.0), "forces": (-6.2, -6.1, -6.0, -5.0, 0.0, 1.0)}
+    height = mb.Tendon("height", [("ground", (0.0, 1.0)), ("disc", (0.0, 0.0))])
+    drag = mb.TableDamper("drag", "height.length", **table)
+    system = mb.Scene([body], joints=[height], forces=[touch, drag, mb.Gravity((0.0, -9.81))]).compile()
+    state, names = mb.assemble(system), ("touch.damping", "touch.normal.stiffness", "touch.friction.coefficient")
+
+    def ends(numbers, rtol=1e-8):
+        own = dict(zip(names, numbers, strict=True)) | {"drag.forces": jnp.asarray(table["forces"]) * numbers[3]}
+        motion = mb.simulate(mb.with_parameters(system, own), state, t1=0.04, rtol=rtol, atol=rtol * 1e-3)
+        return jnp.concatenate([motion.ys.q[-1], motion.ys.u[-1]])
+
+    numbers = jnp.array([1e3, STIFFNESS, FRICTION, 1.0])
+    both = jnp.stack([numbers, 1.2 * numbers])
+    forward, reverse = (jax.jit(jax.vmap(way(ends)))(both) for way in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * np.max(np.abs(forward)))
+    moved = numbers * (1 + 1e-4 * jnp.concatenate([jnp.eye(4), -jnp.eye(4)]))
+    values = np.array(jax.jit(jax.vmap(lambda x: ends(x, 1e-11)))(moved))
+    differences = (values[:4] - values[4:]).T / (2e-4 * np.asarray(numbers))
+    size = np.max(np.abs(differences), axis=1, keepdims=True) + 1e-9
+    np.testing.assert_allclose(forward[0] / size, differences / size, rtol=0, atol=2e-4)
