@@ -83,6 +83,7 @@ def test_a_table_that_does_not_overshoot_is_the_spline_by_parabolas():
         np.testing.assert_allclose(value(jnp.asarray(x), jnp.asarray(y), s), spline(s), rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_points_of_a_steep_table():
     """Of the curve and its integral; two continuous derivatives of the curve, also on its plateau."""
     x, y = np.array([0.0, 0.1, 0.2, 1.0, 1.3, 1.5]), np.array([1.0, 100.0, 101.0, 102.0, 102.0, 140.0])

@@ -175,6 +175,7 @@ def test_derivatives_are_finite_everywhere(version):
         assert np.all(np.isfinite(leaf))
 
 
+@pytest.mark.slow("6.1")
 @VERSIONS
 def test_a_road_without_friction(version):
     """At zero of each factor of friction and shape the forces and derivatives are finite, and the limits of those next

@@ -80,14 +80,16 @@ def test_a_disc_that_falls_flat_ends_its_motion(solver):
     tilt = 1.1
     system = scene(disc(tilt=tilt), disc("upright", np.pi / 2, place=1.0)).compile()
     state, expected = mb.assemble(system), falls(tilt)
-    with pytest.raises(RuntimeError, match=f"t = {expected:.4f}.*There the disc 'rolling coin' lies flat on its plane"):
+    with pytest.raises(
+        RuntimeError, match=r"came to t = 0\.22.* of 1\. There the disc 'rolling coin' lies flat on its plane"
+    ):
         mb.simulate(system, state, t1=1.0, solver=solver, rtol=1e-8)
     motion = mb.simulate(system, state, t1=1.0, solver=solver, rtol=1e-8, throw=False)
     assert motion.result == mb.RESULTS.singular_configuration
     np.testing.assert_allclose(motion.ts[-1], expected, rtol=1e-6)
     # Up to there the motion is whole, and nothing is refused.
     ends = mb.simulate(system, state, t1=0.99 * expected, solver=solver, rtol=1e-8)
-    np.testing.assert_allclose(ends.energy[-1], mb.simulate(system, state, t1=1e-9).energy[-1], rtol=1e-6)
+    np.testing.assert_allclose(ends.energy[-1], system.potential_energy(0.0, state.q), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -95,13 +97,17 @@ def test_a_disc_that_whirls_next_to_the_ground_is_not_stopped():
     """With some spin a falling disc turns round quickly and rises again; in a batch one that falls flat fails alone."""
     system = scene(disc(tilt=1.1)).compile()
     still = mb.assemble(system)
-    spinning = mb.assemble(system, rates={"coin.angular_velocity[2]": 1.0})
+    spinning = mb.assemble(system, mb.State(still.q, jnp.zeros(6).at[5].set(1.0), still.z))
     motion = mb.simulate(system, spinning, t1=0.6, rtol=1e-8, saveat=np.linspace(0.0, 0.6, 61))
     heights = np.asarray(motion["coin"].position[:, 2])
     assert np.min(heights) < 0.03 and heights[-1] > 0.05
     np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-6)
     both = jax.tree.map(lambda *x: jnp.stack(x), still, spinning)
-    run = lambda state: mb.simulate(system, state, t1=0.6, rtol=1e-8, throw=False)
-    batch = jax.jit(jax.vmap(lambda state: (run(state).result == mb.RESULTS.successful, run(state).ys.q[-1])))(both)
-    assert batch[0].tolist() == [False, True]
-    np.testing.assert_allclose(batch[1][1], motion.ys.q[-1], rtol=0, atol=1e-6)
+
+    def run(state):
+        end = mb.simulate(system, state, t1=0.6, rtol=1e-8, throw=False)
+        return end.result == mb.RESULTS.successful, end.ys.q[-1]
+
+    successful, ends = jax.jit(jax.vmap(run))(both)
+    assert successful.tolist() == [False, True]
+    np.testing.assert_allclose(ends[1], motion.ys.q[-1], rtol=0, atol=1e-6)
