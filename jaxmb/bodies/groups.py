@@ -30,8 +30,8 @@ BodyPoses: TypeAlias = Float[Array, "b_ground p"]
 BodyVelocities: TypeAlias = Float[Array, "b_ground v"]
 
 
-# For more parts than this, `given_in_time` gives one combination of the parts' functions of time.
-_MOST_OF_TIME = 32
+# For more parts than this, `turning` gives one combination of the parts' functions of time.
+_MOST_TURNING = 32
 
 # Wrenches of parts, shape (parts, k, v), and the indices of the loaded bodies, shape (parts, k).
 Acting: TypeAlias = tuple[Float[Array, "parts k v"], np.ndarray]
@@ -102,7 +102,8 @@ class Group(eqx.Module):
     **Fields:** `part`: the structure of one part, with a leading axis on every number; `names` and `bodies` of the
     parts; the `layout`; `inputs`, which replace numbers by functions of time; `inner`: for parts within the parts, the
     keys that lead there and the inner parts' names; `kernels` of a user's class by name, captured when the scene was
-    compiled; `chosen`: the indices of the parts, None for all parts.
+    compiled; `of_time`: names of kernels that depend on time through functions of the user; `chosen`: the indices of
+    the parts, None for all parts.
     """
 
     part: Any
@@ -112,6 +113,7 @@ class Group(eqx.Module):
     inputs: tuple[Input, ...] = ()
     inner: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = eqx.field(static=True, default=())
     kernels: tuple[tuple[str, Captured], ...] = eqx.field(static=True, default=())
+    of_time: tuple[str, ...] = eqx.field(static=True, default=())
     chosen: Int[Array, "parts"] | None = None
 
     def only(self, member: Any) -> Self:
@@ -193,8 +195,8 @@ def stack(
         if key not in groups:
             if check is not None:
                 check(part, layout.space, len(bodies))
-            part_now, kernels = captured(anonymous(part), layout.space, len(bodies))
-            structures[key] = jtu.tree_structure(part_now), tuple(kernels.items())
+            part_now, kernels, of_time = captured(anonymous(part), layout.space, len(bodies))
+            structures[key] = jtu.tree_structure(part_now), {"kernels": tuple(kernels.items()), "of_time": of_time}
         groups.setdefault(key, []).append((leaves, part.name, bodies, list(inner_parts(part))))
     out = []
     for key, members in groups.items():
@@ -203,8 +205,8 @@ def stack(
         leaves = [jax.device_put(np.stack([np.asarray(leaf) for leaf in column])) for column in columns]
         names, bodies = tuple(m[1] for m in members), tuple(m[2] for m in members)
         inner = tuple((keys, tuple(m[3][k][1].name for m in members)) for k, (keys, _) in enumerate(members[0][3]))
-        structure, kernels = structures[key]
-        out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout, inner=inner, kernels=kernels))
+        structure, traced = structures[key]
+        out.append(Group(jtu.tree_unflatten(structure, leaves), names, bodies, layout, inner=inner, **traced))
     return tuple(out)
 
 
@@ -252,17 +254,36 @@ class AbstractGroup(eqx.Module):
 
         return self._map(single, poses)
 
-    def given_in_time(self, now: Kinematics) -> Float[Array, "n"]:
-        """Values of the parts' functions of time while nothing moves.
+    def in_time(self, now: Kinematics) -> Float[Array, "parts n"]:
+        """Values of the parts' functions of time, kernel by kernel."""
+        return jnp.concatenate([self._raveled(self._kernel_in_time(name, now)) for name in self.group.of_time], axis=1)
+
+    def turning(self, in_time: Float[Array, "parts n"]) -> Float[Array, "k"]:
+        """The values of `in_time` at whose turns steps end.
 
         Many parts give a combination of their values, with random weights so that no two values cancel.
         """
-        given = self._of_motion("given_in_time", now)
-        parts = given.shape[0]
-        if parts <= _MOST_OF_TIME:
-            return given.ravel()
-        weights = np.random.default_rng(0).uniform(1.0, 2.0, parts).astype(given.dtype)
-        return weights @ given.reshape(parts, -1)
+        parts = in_time.shape[0]
+        if parts <= _MOST_TURNING:
+            return in_time.ravel()
+        weights = np.random.default_rng(0).uniform(1.0, 2.0, parts).astype(in_time.dtype)
+        return weights @ in_time
+
+    @property
+    def ends_at_turns(self) -> bool:
+        """Whether steps end where a function of time turns, even if they would not pass over it."""
+        return getattr(self.group.part, "of_time", False)
+
+    def _kernel_in_time(self, name, now):
+        if name == "gaps":
+            kernel = self.group.kernel(name)
+            return self._map(lambda at, x: kernel(at(now.t), at(now.t).seen_poses(self._space, x), now.t), now.poses)
+        return self._of_motion(name, now)
+
+    @staticmethod
+    def _raveled(of_parts):
+        leaves = jax.tree.leaves(of_parts)
+        return jnp.concatenate([leaf.reshape(leaf.shape[0], -1) for leaf in leaves], axis=1)
 
     @property
     def _space(self):
@@ -391,6 +412,14 @@ class ConstraintGroup(AbstractConstraintGroup):
     def residual(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts rows"]:
         return self._map(lambda at, x: self._residual(at, t, x), poses)
 
+    @property
+    def ends_at_turns(self):
+        # Programs of servos are followed by accelerations.
+        return super().ends_at_turns and self.is_position
+
+    def _kernel_in_time(self, name, now):
+        return self.residual(now.t, now.poses) if name == "residual" else super()._kernel_in_time(name, now)
+
     def along(self, t: Scalar, poses: BodyPoses, moves: Float[Array, "b_ground n p"]) -> Float[Array, "parts rows k n"]:
         """Derivatives along `n` motions of every body. One body moves, the others rest."""
 
@@ -508,8 +537,9 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
 def servo_group(group: Group) -> ConstraintGroup:
     """The programs of stacked servos with their gains."""
     part = group.part
-    program = dataclasses.replace(group, part=part.program.with_fields(body_frames=part.body_frames))
-    return ConstraintGroup(program, part.damping, part.stiffness)
+    of_time = ("given_in_time",) if group.of_time and part.program.of_time else group.of_time
+    program = part.program.with_fields(body_frames=part.body_frames)
+    return ConstraintGroup(dataclasses.replace(group, part=program, of_time=of_time), part.damping, part.stiffness)
 
 
 class ForceGroup(AbstractGroup):
@@ -604,6 +634,10 @@ class NonIdealGroup(AbstractGroup):
         kernel = self.group.kernel(name)
         single = lambda at, x, reaction: kernel(at(now.t), at(now.t).seen_poses(self._space, x), reaction)
         return self._map(single, now.poses, per_part=(reactions,))
+
+    def _kernel_in_time(self, name, now):
+        # Any reactions show the time in a law.
+        return self.wrenches(now, jnp.ones((len(self.group.names), len(self.group.bodies[0]), now.velocities.shape[1])))
 
     def wrenches(self, now: Kinematics, reactions: Array) -> Float[Array, "parts k v"]:
         """Wrenches of the laws on the bodies of their joints, from the joints' `reactions`."""

@@ -1,7 +1,9 @@
 """Rigid bodies joined by constraints and forces: the compiled form of a scene."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +21,7 @@ from ..solvers.manifold_term import GapsSeen
 from ..system.contact_set import ContactNumbers, ContactSet
 from ..system.design_variables import DesignVariables
 from ..system.equation import Ranks
-from ..system.system import AbstractSystem
+from ..system.system import AbstractSystem, GivenInTime
 from .body_set import BodySet
 from .catalogue import SceneCatalogue
 from .constraint_set import ConstraintSet
@@ -27,7 +29,7 @@ from .contact_rows import contact_set
 from .describe import describe_scene
 from .field_jacobian import motion_jacobian
 from .force_set import ForceSet
-from .groups import ConstraintGroup, CoordinateGroup, FrameGroup, Kinematics
+from .groups import AbstractGroup, ConstraintGroup, CoordinateGroup, FrameGroup, Kinematics, joined
 from .host import host_scene
 from .joint_coordinates import held_groups, wrapped_angles
 from .joint_graph import extended_joint_order
@@ -430,15 +432,30 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def of_time(self):
-        return any(group.group.part.of_time for group in self._acting)
+        return bool(self._in_time)
 
     def given_in_time(self, t, q, u):
         now = self.kinematics(t, q, u)
-        return jnp.concatenate([g.given_in_time(now) for g in self._acting if g.group.part.of_time])
+        groups = [where(self) for where in self._in_time]
+        values = [g.in_time(now) for g in groups]
+        turning = [g.turning(of_group) for g, of_group in zip(groups, values, strict=True) if g.ends_at_turns]
+        return GivenInTime(joined(turning, q.dtype), joined(values, q.dtype))
+
+    def with_strengths(self, change):
+        parts = lambda system: [where(system).group.part for where in self._in_time]
+        return eqx.tree_at(parts, self, change(parts(self)))
 
     @property
-    def _acting(self):
-        return (*self.constraints.position, *self.constraints.velocity, *self.forces.groups)
+    def _in_time(self) -> list[Callable[[Any], AbstractGroup]]:
+        """Accessors of the groups with functions of time."""
+        paths = (
+            *(f"constraints.{kind}" for kind in ("position", "velocity", "servos", "nonideal")),
+            "forces.groups",
+        )
+        numbered = [(path, k, g) for path in paths for k, g in enumerate(attrgetter(path)(self))]
+        return [
+            lambda system, path=path, k=k: attrgetter(path)(system)[k] for path, k, g in numbered if g.group.of_time
+        ]
 
 
 def _of_rows(values: Array, count: int) -> Array:

@@ -419,7 +419,7 @@ def _check_rotation(part, components, bodies, layout, poses):
     space = layout.space
     for component in components if points else ():
         with traced_by_jax(part.label, "an argument"):
-            now, kernels = captured(anonymous(_loaded(component)), space, len(bodies))
+            now, kernels, _ = captured(anonymous(_loaded(component)), space, len(bodies))
             turned = _turned(now, space, poses, tuple(kernels.items()))
         if np.any(turned[points]):
             raise ValueError(

@@ -311,7 +311,8 @@ class AbstractLink(AbstractActor):
 
     # Index from which bodies may repeat, as several places on one body; None if all must differ.
     several_from: ClassVar[int | None] = None
-    # Whether it has a function of time, `given_in_time`, in which steps look for pulses.
+    # Whether `given_in_time` is its function of time, at whose turns steps end. Pulses are found without it as well, in
+    # all kernels that depend on time.
     of_time: ClassVar[bool] = False
     # The quantities of its coordinates; unknown without an entry.
     quantities: ClassVar[Quantities] = {}

@@ -3,7 +3,6 @@ are kept as JAX traces them then. Nothing is computed or compiled.
 """
 
 import dataclasses
-import functools
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._captured import Captured
-from .._compat import with_values
+from .._compat import used_inputs, with_values
 from .._dataflow import depends, shaken
 from .._traced_functions import NEED_NUMBERS, is_installed, note_of, traced_by_jax, with_note
 from ..linalg.jitted import on_host
@@ -32,6 +31,8 @@ from .fields import declarations, entry, internal_states
 from .space import AbstractSpace
 
 T = TypeVar("T")
+# The kernels in whose values a step must not pass over a pulse.
+_IN_TIME = ("given_in_time", "residual", "wrenches", "state_rates", "gaps")
 
 
 def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
@@ -88,16 +89,17 @@ def _at_rest(part, space, poses, t):
     return part.residual(space, poses, jnp.zeros((poses.shape[0], space.velocity_size), poses.dtype), t)
 
 
-def captured(part: T, space: AbstractSpace, bodies: int) -> tuple[T, dict[str, Captured]]:
+def captured(part: T, space: AbstractSpace, bodies: int) -> tuple[T, dict[str, Captured], tuple[str, ...]]:
     """A part whose kernels have been checked, with its functions as JAX traces them now.
 
-    **Returns:** the part; and for a part of a user's class its kernels by name, as functions of the part and of the
-    kernel's arguments after `space`.
+    **Returns:** the part; for a part of a user's class its kernels by name, as functions of the part and of the
+    kernel's arguments after `space`; and names of kernels that depend on time through functions of the user.
     """
     part, functions = with_captured(part)
     kernels = dict(_traced_kernels(part, space, bodies)) if functions or is_of_user(part) else {}
-    for kernel, given in kernels.values():
-        jax.eval_shape(functools.partial(kernel, part), *given)
+    of_time = [name for name, traced in kernels.items() if _depends_on_time(part, *traced) and name in _IN_TIME]
+    # A part's own account of its function of time counts in place of its kernels.
+    of_time = of_time[-1:] if "given_in_time" in of_time else of_time
     for function in functions:
         function.keep()
     out = {}
@@ -105,7 +107,13 @@ def captured(part: T, space: AbstractSpace, bodies: int) -> tuple[T, dict[str, C
         out[name] = Captured(kernel)
         out[name].trace(part, *given)
         out[name].keep()
-    return part, out
+    return part, out, tuple(of_time)
+
+
+def _depends_on_time(part: Any, kernel: Callable[..., Any], given: list[Any]) -> bool:
+    """Whether the data flow of a kernel, which this traces, leads from the time, its last argument, to its values."""
+    used = used_inputs(lambda given: kernel(part, *given), given)
+    return bool(given) and used[-1]
 
 
 def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[Any, list[Any]]]]:

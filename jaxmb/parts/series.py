@@ -28,9 +28,14 @@ def sample_times(t0: Scalar, t1: Scalar) -> Float[Array, "n"]:
 
 
 class AbstractSignal(eqx.Module):
-    """A value as a function of time; `of_arrays`: whether signals of one structure differ in their arrays alone."""
+    """A value as a function of time.
+
+    `of_arrays`: whether signals of one structure differ in their arrays alone; `given_at_samples`: whether the value is
+    given at its samples.
+    """
 
     of_arrays: ClassVar[bool] = False
+    given_at_samples: ClassVar[bool] = False
 
     @abc.abstractmethod
     def __call__(self, t: Scalar) -> Array:
@@ -94,6 +99,7 @@ class Series(AbstractSignal):
     slopes: Float[Array, "n *shape"] | None
     interpolation: str = eqx.field(static=True)
     of_arrays: ClassVar[bool] = True
+    given_at_samples: ClassVar[bool] = True
 
     def __init__(self, ts: VectorLike, values: VectorLike, interpolation: Interpolation = "linear"):
         if interpolation not in get_args(Interpolation):

@@ -8,21 +8,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._traced_functions import traced_by_jax
 from .._types import Scalar, State
+from ..linalg.arrays import is_traced
 from ..parts.names import unknown
 from ..parts.series import AbstractSignal, as_signal, of_one_kind, sample_times
 from ..solvers.evaluation import freeze
 from .parameters import parameters
+from .pulses import on_straight_lines, pulses_at_knots, pulses_of_samples, turned
 from .system import AbstractSystem
 
 System = TypeVar("System", bound=AbstractSystem)
-# The largest excursion of an input that may be missed between two steps, relative to its range.
-_HIDDEN = 0.1
 # The largest number of coordinates, over all times, for which functions of time are computed in one batch.
 _AT_ONCE = 2**17
+# Looks at functions of time: the first at the state of the run, the others displaced from it by these multiples of the
+# system's size. The last two see other strengths as well.
+_DISPLACED, _OTHER_STRENGTHS = np.array([0.0, 1.0, 1e-3, 1.0]), np.array([False, False, True, True])
+# The relative change of strengths. It shows terms that cancel, and moves no pulse by more than this fraction.
+_CHANGE = 1e-4
 
 Signals = Mapping[str, AbstractSignal | Callable[[Scalar], Array]]
 
@@ -94,9 +100,13 @@ def inputs_ended(system: AbstractSystem, t0: Scalar, t1: Scalar) -> Any:
 def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) -> Float[Array, "n"] | None:
     """Times [s] at which steps must end so that no pulse of an input or function of time is missed.
 
-    A machine at rest or in free flight allows steps of any length, and a long step may skip a pulse. Between two of
-    these times no input makes an excursion of more than a tenth of its range from `t0` to `t1`. A series is sampled at
-    its values, a function at 513 times.
+    A machine at rest or in free flight allows steps of any length, and a long step may skip a pulse. Each function is
+    looked at by itself from `t0` to `t1`: a series at its values, and all functions at 513 times, also at other states
+    and with other strengths than those of the run, which may be zero. The times are those where
+
+    - an input, a driver, a `Force` or a constraint turns: it has made an excursion of a tenth of its range;
+    - a function is at the peak of a pulse that stands out of the values beside it, however small it is;
+    - a series on a straight line has a value that is traced: the motion may be differentiated by it.
 
     **Returns:** sorted times, padded by infinity; None if nothing depends on time.
     """
@@ -105,40 +115,86 @@ def turning_times(system: AbstractSystem, state: State, t0: Scalar, t1: Scalar) 
     signals = [signal for signal, binding in pairs if not signal.break_times(of_rates=binding).size]
     if not signals and not system.of_time:
         return None
-    return _turning_times(of_one_kind(signals), system.at(state) if system.of_time else None, state, t0, t1)
+    kinds = [(len(numbers) > 1, is_traced(signal), signal) for numbers, signal in of_one_kind(signals)]
+    return _turning_times(kinds, system.at(state) if system.of_time else None, state, t0, t1)
 
 
 @eqx.filter_jit
-def _turning_times(signals, system, state, t0, t1):
-    signals, system, state, t0, t1 = freeze((signals, system, state, t0, t1))
-    first, last = jnp.minimum(t0, t1), jnp.maximum(t0, t1)
-    at_once = max(_AT_ONCE // state.q.size, 1)
-
-    def turns(ts, function):
-        at = lambda t: jnp.ravel(function(t))
-        values = lax.map(at, jnp.clip(ts, first, last), batch_size=min(at_once, ts.size))
-        turned = _has_turned(values)
-        return jnp.where(turned & (ts[:-1] > first) & (ts[:-1] < last), ts[:-1], jnp.inf)
-
-    of_kind = lambda function, numbers: function if len(numbers) == 1 else jax.vmap(function)
-    sampled = lambda signal: signal.samples(t0, t1)
-    kinds = [(of_kind(sampled, numbers)(signal), signal, of_kind(turns, numbers)) for numbers, signal in signals]
+def _turning_times(kinds, system, state, t0, t1):
+    kinds, system, state, t0, t1 = freeze((kinds, system, state, t0, t1))
+    ts = sample_times(t0, t1)
+    turns, columns, of_knots = jnp.zeros(ts.shape, bool), [], []
+    for several, traced, signal in kinds:
+        each = jax.vmap if several else lambda function: function
+        if signal.given_at_samples:
+            times = jnp.ravel(each(lambda signal, traced=traced: _times_at_knots(signal, traced, ts))(signal))
+            of_knots.append(times)
+            values = [each(lambda signal: _at(signal, ts))(signal)]
+            values = [jnp.moveaxis(x.reshape(-1, *x.shape[-2:]), 1, 0).reshape(ts.size, -1) for x in values]
+        else:
+            values = [_at(_changed(signal, number) if number else signal, ts) for number in _numbers_of(signal)]
+            turns = turns | turned(values[0])
+        columns.extend(values)
     if system is not None:
-        kinds.append((sample_times(t0, t1), lambda t: system.given_in_time(t, state.q, state.u), turns))
-    times = [jnp.ravel(turned(ts, function)) for ts, function, turned in kinds]
-    return jnp.sort(jnp.concatenate(times))
+        turning, each = _looks(system, state, ts)
+        turns = turns | turned(turning)
+        columns.append(each)
+    times = jnp.concatenate([ts[:1], ts[-1:], *of_knots])
+    shown = turns.at[jnp.searchsorted(ts, times - 0.5 * (ts[1] - ts[0]))].set(True, mode="drop")
+    pulses = pulses_of_samples(ts, jnp.concatenate(columns, axis=1), shown) & ~shown
+    inside = (turns | pulses) & (ts > ts[0]) & (ts < ts[-1])
+    return jnp.sort(jnp.concatenate([*of_knots, jnp.where(inside, ts, jnp.inf)]))
 
 
-def _has_turned(values):
-    """At which values some column has turned since the last turn: its path is longer than the net change."""
-    range_ = jnp.max(values, axis=0) - jnp.min(values, axis=0)
-    rounding = 16 * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), axis=0)
-    most = jnp.where(range_ > rounding, _HIDDEN * range_, jnp.inf)
+def _at(function, ts):
+    """The values of a function at some times, one row for each time."""
+    return lax.map(lambda t: jnp.ravel(function(t)), ts, batch_size=min(_AT_ONCE, ts.size))
 
-    def passed(carry, value):
-        start, before, way = carry
-        step = jnp.abs(value - before)
-        turned = jnp.any(way + step - jnp.abs(value - start) > most)
-        return (jnp.where(turned, before, start), value, jnp.where(turned, step, way + step)), turned
 
-    return lax.scan(passed, (values[0], values[0], jnp.zeros_like(most)), values[1:])[1]
+def _times_at_knots(series, traced, ts):
+    """Times at which a series turns or has the peak of a pulse; other times are infinite."""
+    knots, (first, last) = series.samples(ts[0], ts[-1]), (ts[0], ts[-1])
+    values = _at(series, jnp.clip(knots, first, last))
+    ended = pulses_at_knots(knots, lambda times: _at(series, times), (first, last), turned(values))
+    ended = ended | on_straight_lines(knots, values) if traced else ended
+    return jnp.where(ended & (knots > first) & (knots < last), knots, jnp.inf)
+
+
+def _looks(system, state, ts):
+    """The functions of time of a system at some times: those that may turn, and each of them in several looks."""
+    in_q, in_u = system.coordinate_scale(), system.velocity_scale()
+
+    def look(number, t):
+        by = jnp.asarray(_DISPLACED, state.q.dtype)[number]
+        other = jnp.asarray(_OTHER_STRENGTHS)[number]
+        strengths = lambda parts: jax.tree.map(lambda a, b: jnp.where(other, a, b), _changed(parts, number), parts)
+        q = system.normalize(t, state.q + by * in_q * _random(state.q.size, number, state.q.dtype))
+        u = state.u + by * in_u * _random(state.u.size, number + 1, state.u.dtype)
+        return jnp.concatenate(system.with_strengths(strengths).given_in_time(t, q, u))
+
+    first = jax.eval_shape(system.given_in_time, ts[0], state.q, state.u).turning.size
+    looks = jnp.arange(_DISPLACED.size)
+    at_once = min(max(_AT_ONCE // (looks.size * state.q.size), 1), ts.size)
+    given = lax.map(lambda t: jax.vmap(lambda number: look(number, t))(looks), ts, batch_size=at_once)
+    return given[:, 0, :first], given[:, :, first:].reshape(ts.size, -1)
+
+
+def _numbers_of(signal):
+    """The looks at a function of time: with its own strengths, and with other ones if it has any."""
+    return (0, 1) if jax.tree.leaves(eqx.filter(signal, eqx.is_inexact_array)) else (0,)
+
+
+def _changed(tree, number):
+    """Other strengths: random numbers in place of zeros, and small changes of other numbers."""
+    numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
+    with jax.numpy_dtype_promotion("standard"):
+        flat, unravel = ravel_pytree(numbers)
+        random = _random(flat.size, number, flat.dtype)
+        changed = unravel(jnp.where(flat == 0, random, flat * (1 + _CHANGE * random)))
+    return eqx.combine(changed, rest)
+
+
+def _random(size, number, dtype):
+    """Positive numbers around one without a pattern, always the same."""
+    places = jnp.arange(1, size + 1, dtype=dtype) * (number + 1)
+    return 1.5 + jnp.cos(places * places)

@@ -1,8 +1,8 @@
 """A model: an equation of motion whose numbers have names."""
 
 import abc
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +22,17 @@ else:
     from equinox import AbstractVar
 
 _NO_MOMENTUM = "Momentum is defined for bodies; this system has none. Compute momentum from the coordinates."
+
+
+class GivenInTime(NamedTuple):
+    """Values of functions of time at one time.
+
+    **Fields:** `turning`: those at whose turns steps end, with a combination in place of many functions of one kind;
+    `each`: of every function.
+    """
+
+    turning: Float[Array, "k"]
+    each: Float[Array, "n"]
 
 
 class AbstractSystem(AbstractEquation):
@@ -143,12 +154,14 @@ class AbstractSystem(AbstractEquation):
         """Whether parts have functions of time from the user, for `given_in_time`."""
         return False
 
-    def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "k"]:
-        """Values of the functions of time, such as a prescribed motion or a force, while nothing moves.
+    def given_in_time(self, t: Scalar, q: Coordinates, u: Velocities) -> GivenInTime:
+        """Values of the functions of time, such as a prescribed motion or a force, while nothing moves."""
+        return GivenInTime(jnp.zeros(0, q.dtype), jnp.zeros(0, q.dtype))
 
-        Many parts of one kind give a combination of their values. Empty if `of_time` is False.
-        """
-        return jnp.zeros(0, q.dtype)
+    def with_strengths(self, change: Callable[[Any], Any]) -> Self:
+        """The same system; `change` gets the numbers of its functions of time, a pytree, and returns other ones."""
+        del change
+        return self
 
     # Energy
 
