@@ -78,6 +78,9 @@ class ContactEvents(eqx.Module):
     motion.events.times, motion.events.impulses, motion.events.kinetic_energy_lost
     ```
 
+    Parts that change at the same time share an event. Its time has the derivative of the first of them; impulses and
+    energies have those of their own times.
+
     Impacts at `t0` and at announced `jumps` are part of the motion and are not listed. A state that is saved just at an
     event may be the state before it or after it. Times, impulses and energies have first derivatives; `rest` counts as
     a constant.

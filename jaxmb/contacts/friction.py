@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ..linalg.complementarity import independent_components
+from ..linalg.complementarity import independent_components, reduced
 from ..linalg.elimination import solve
 from ..linalg.pairs import for_both, of_pairs, placed_pairs
 from ..linalg.rotations import norm
@@ -219,8 +219,5 @@ def with_implied(W: Float[Array, "n_m n_m"], answers: Answers) -> Answers:
     """The answers with as many laws of stick as are independent of each other and of the contacts."""
     n, sticks = answers.closed.size, answers.sticks
     closed = jnp.concatenate([answers.closed, jnp.zeros_like(sticks)])
-    columns = jnp.where(closed[:, None], W, 0.0)
-    matrix = jnp.where(closed[:, None] & closed[None, :], W, jnp.eye(W.shape[0], dtype=W.dtype))
-    reduced = (W - columns.T @ solve(matrix, columns))[n:, n:]
-    independent = independent_components(reduced, sticks)
+    independent = independent_components(reduced(W, closed)[n:, n:], sticks)
     return answers._replace(sticks=independent, implied=sticks & ~independent)

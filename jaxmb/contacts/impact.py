@@ -30,8 +30,10 @@ from ..formulations import AbstractFormulation
 from ..linalg.pairs import of_pairs
 from ..linalg.pushed import dense, push
 from ..linalg.sums import with_entries
+from ..system.contact_set import ContactSet
 from ..system.equation import AbstractEquation
 from .forces import contact_forces, largest_force, reserves
+from .groups import least_in_group
 from .impacting import Event, find_event
 from .phases import Phases
 from .tolerance import ContactTolerance
@@ -117,26 +119,81 @@ def _impact_jvp(primals, tangents):
     dlate = _later(event, (system, t, y.q, y.u), (dsystem, dt, dq, du))
     if dated or any(contacts.releases):
         dlate = dlate + _release(system, tolerance, event, (t, y), (dsystem, dt, dy))
-    q = contacts.with_modes(y.q, event.modes[1])
-    rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
-    dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
-
-    impulses, change = Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du).changes()
-    at, along = (system, t, y.q), (dsystem, dt, dq)
-    kinetic = lambda system, t, q, u: 0.5 * jnp.dot(u, system.inertia(t, q, u).product(u))
-    energy = push(kinetic, (*at, event.at), (*along, du)) - push(kinetic, (*at, event.u), (*along, change))
-    dq, du = dq - dlate * rates[1], change - dlate * event.after
+    dz = None if y.z is None else dense(dy.z, y.z)
+    change = _together if event.group is None else _apart
+    (dq, du, dz), *of_event = change(system, t, y, event, dlate, (dsystem, dt, dq, du, dz))
     dq = jnp.where(np.isin(np.arange(system.nq), contacts.places), 0.0, dq)
-    dz = None
-    if y.z is not None:
-        jump = system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u)
-        dz = dense(dy.z, y.z) + dlate * jump
-    devent = jax.tree.map(lambda _: None, event)._replace(late=dlate, impulses=impulses, energy=energy)
+    late, impulses, energy = of_event
+    devent = jax.tree.map(lambda _: None, event)._replace(late=late, impulses=impulses, energy=energy)
     return (after, event), (State(dq, du, dz), devent)
 
 
+def _together(system, t, y, event: Event, dlate, along):
+    """The tangents of the state after the event, of its time, of its impulses and of the energy lost, if all laws are
+    in one group, with one time.
+    """
+    dsystem, dt, dq, du, dz = along
+    q = system.contacts.with_modes(y.q, event.modes[1])
+    rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
+    dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
+    impulses, change, energy = _struck(Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du))
+    if dz is not None:
+        dz = dz + dlate * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
+    return (dq - dlate * rates[1], change - dlate * event.after, dz), dlate, impulses, energy
+
+
+def _apart(system, t, y, event: Event, dlate, along):
+    """The same for several groups, each with its own time. The equations of motion change group by group."""
+    dsystem, dt, dq, du, dz = along
+    heads, (before, after) = jnp.asarray(system.contacts.heads), event.modes
+    phases = Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du)
+    together = _struck(phases)
+    still = jax.tree.map(lambda _: None, system)
+    onwards = still, jnp.ones_like(t), system.rates(t, y.q, event.at)
+
+    def alone(group):
+        own = phases.of_group(group, onwards, event.before)
+        return own.event.u - event.at, *_struck(own)
+
+    moved, *by_time = jax.vmap(alone)(heads)
+
+    def rates(u, modes):
+        q = system.contacts.with_modes(y.q, modes)
+        udot, _ = contact_forces(system, t, q, u)
+        return system.rates(t, q, u), udot, None if dz is None else system.state_rates(t, q, u)
+
+    # The rates before the first group, and after each group.
+    later = jnp.cumsum(moved[::-1], axis=0)[::-1] - moved
+    velocities = jnp.concatenate([event.at[None], event.u[None] - later])
+    in_turn = jax.vmap(lambda head: jnp.where(event.group <= head, after, before))(heads)
+    of_motion = jax.vmap(rates)(velocities, jnp.concatenate([before[None], in_turn]))
+    dlate = dlate[system.contacts.heads]
+    left, ahead, of_states = jax.tree.map(lambda x: dlate @ (x[:-1] - x[1:]), of_motion)
+    impulses, change, energy = (x + dlate @ each for x, each in zip(together, by_time, strict=True))
+    change = change - jnp.sum(dlate) * event.before + ahead
+    dz = None if dz is None else dz + of_states
+    return (dq + left, change, dz), _of_first(system.contacts, event, dlate), impulses, energy
+
+
+def _of_first(contacts: ContactSet, event: Event, dlate):
+    """The derivative of the time of the first group in which a gap or slip is zero, or else a mode changes."""
+    before, after = (contacts.as_modes(numbers).kinds for numbers in event.modes)
+    _, changes = least_in_group(event.group, before != after, before)
+    rank = jnp.where(event.hits, 2, jnp.where(changes, 1, 0))
+    return dlate[jnp.argmax(rank[contacts.heads])]
+
+
+def _struck(phases: Phases):
+    """The derivatives of the impulses of an impact, of the velocities after it, and of the energy lost."""
+    event, at, along = phases.event, phases.at, phases.tangents
+    impulses, change = phases.changes()
+    kinetic = lambda system, t, q, u: 0.5 * jnp.dot(u, system.inertia(t, q, u).product(u))
+    energy = push(kinetic, (*at, event.at), (*along, phases.du)) - push(kinetic, (*at, event.u), (*along, change))
+    return impulses, change, energy
+
+
 def _later(event: Event, at, along):
-    """The derivative of the time at which a gap, or a slip, is zero."""
+    """The derivative of the time at which a gap, or a slip, is zero; with groups for each law."""
     (system, t, q, _), contacts = at, at[0].contacts
     zero, rate = push(contacts.gaps, at[:3], along[:3]), contacts.rates(system, t, q, event.at)
     if contacts.m:
@@ -154,7 +211,7 @@ def _later(event: Event, at, along):
 
 def _release(system, tolerance, event, at, along):
     """The derivative of the time at which a force reaches its limit: zero for a contact that opens, the limit of
-    sticking for friction that begins to slip.
+    sticking for friction that begins to slip; with groups for each law.
     """
     (t, y), (dsystem, dt, dy) = at, along
     before, after = map(system.contacts.as_modes, event.modes)
@@ -166,7 +223,7 @@ def _release(system, tolerance, event, at, along):
         return reserves(system, t, y.q, y.u, multipliers), largest_force(system, t, y, multipliers)
 
     reserve_at_event, largest = reserve(system, t, y)
-    k = jnp.argmin(jnp.where(released, jnp.abs(reserve_at_event), jnp.inf))
+    k, releases = least_in_group(event.group, released, jnp.abs(reserve_at_event))
     least = lambda system, t, y: reserve(system, t, y)[0][k]
     z = None if y.z is None else system.state_rates(t, y.q, y.u)
     motion = State(system.rates(t, y.q, y.u), event.before, z)
@@ -175,7 +232,7 @@ def _release(system, tolerance, event, at, along):
     # A contact that an impact opens, or sets in motion, is not at its limit before. Balanced forces may leave no size
     # of comparison: then the time to the limit is compared with the time.
     is_zero = jnp.abs(reserve_at_event[k]) <= jnp.maximum(tolerance.near * largest, _AT_ONCE * jnp.abs(rate * t))
-    at_limit = jnp.any(released) & ~event.hits & is_zero & (rate < 0)
+    at_limit = releases & ~event.hits & is_zero & (rate < 0)
     return jnp.where(at_limit, -value / jnp.where(at_limit, rate, 1.0), 0.0)
 
 

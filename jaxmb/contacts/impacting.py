@@ -23,6 +23,7 @@ from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .dry_laws import Answers
 from .forces import directions, free_accelerations, friction_coefficients
+from .groups import group_sums, groups_of, least_in_group, of_contacts
 from .problem import Laws, Problem, is_implied
 from .tolerance import REST, ContactTolerance
 
@@ -36,15 +37,19 @@ _TRIALS, _GAIN = 40, 1e-12
 class Event(NamedTuple):
     """The numbers of an event, for its derivative as well.
 
-    **Fields:** `late`: the time until the event; `first`: the gap or slip that is zero first, none if `hits` is false;
-    accelerations `before` and `after`; velocities before (`at`) and after (`u`); `held`: contacts whose gaps have the
-    rates of the impact, and friction whose slip is zero; `low`: contacts that would bounce lower than the resolution;
-    `slips`: the direction of slip in the impact, or zero; `share` of the rebounds at which no energy is gained;
-    `compression` of an impact by Poisson's law, after which `held` and `slips` belong to the expansion; see `Impact`
-    for the others.
+    **Fields:** `late`: the time until the event; accelerations `before` and `after`; velocities before (`at`) and after
+    (`u`); `held`: contacts whose gaps have the rates of the impact, and friction whose slip is zero; `low`: contacts
+    that would bounce lower than the resolution; `slips`: the direction of slip in the impact, or zero; `compression` of
+    an impact by Poisson's law, after which `held` and `slips` belong to the expansion; see `Impact` for the others.
+
+    Each law has a `group`, None if there can be one only (`groups_of`); among the impulses alone, `balance` is the
+    group with one energy balance. `first`: the gap or slip that is zero first, none if `hits` is false; `share` of the
+    rebounds at which no energy is gained: single numbers for one group, otherwise those of each law's group.
     """
 
     late: Float[Array, ""]
+    group: Int[Array, "laws"] | None
+    balance: Int[Array, "laws"] | None
     first: Any
     hits: Any
     before: Float[Array, "nu"]
@@ -59,7 +64,7 @@ class Event(NamedTuple):
     rest: Float[Array, "contacts"]
     energy: Float[Array, ""]
     solvable: Bool[Array, ""]
-    share: Float[Array, ""]
+    share: Float[Array, "*laws"]
     compression: "Phase | None"
 
 
@@ -75,7 +80,8 @@ class Phase(NamedTuple):
 class When(NamedTuple):
     """The time of the event, see `Event`.
 
-    **Fields:** the velocities `u` then, before it; the rates `at` of gaps and slips; which contacts are `touching`.
+    **Fields:** the velocities `u` then, before it; the rates `at` of gaps and slips; which contacts are `touching`;
+    `zeros`: see `Impacting.zeros`, None if there is one group only.
     """
 
     late: Float[Array, ""]
@@ -85,17 +91,18 @@ class When(NamedTuple):
     u: Float[Array, "nu"]
     at: Float[Array, "laws"]
     touching: Bool[Array, "contacts"]
+    zeros: tuple[Float[Array, "laws"], Bool[Array, "laws"]] | None
 
 
 class Trial(NamedTuple):
-    """The search for the largest `share` of the rebounds at which an impact gains no energy.
+    """The search for the largest `share` of the rebounds at which an impact gains no energy; with groups for each law.
 
     **Fields:** the `bracket` of the share, with the energy gained; `again`: whether the search goes on.
     """
 
-    share: Float[Array, ""]
+    share: Float[Array, "*laws"]
     bracket: Bracket
-    again: Bool[Array, ""]
+    again: Bool[Array, "*laws"]
 
 
 def next_trial(trial: Trial, gained, size, k) -> Trial:
@@ -124,7 +131,7 @@ class Struck(NamedTuple):
     **Fields:** `answers`: the laws that hold in it; its `impulses`; the velocities `u` after it, and the `rate` of gaps
     and slips; the accelerations `udot` there without contacts and friction; contacts that are `resting`, and friction
     whose slip has `ended`; `gained`: twice the energy gained by the impulses, and the size of its summands; the
-    `share`.
+    `share`. Energies and shares are those of each law's group.
     """
 
     answers: Answers
@@ -134,8 +141,9 @@ class Struck(NamedTuple):
     udot: Float[Array, "nu"]
     resting: Bool[Array, "contacts"]
     ended: Bool[Array, "frictions"]
-    gained: tuple[Float[Array, ""], Float[Array, ""]]
-    share: Float[Array, ""]
+    balance: Int[Array, "laws"] | None
+    gained: tuple[Float[Array, "*laws"], Float[Array, "*laws"]]
+    share: Float[Array, "*laws"]
 
 
 class Round(NamedTuple):
@@ -235,6 +243,11 @@ class Impacting:
         return self.laws.influence
 
     @property
+    def in_groups(self) -> bool:
+        """Whether there can be several groups."""
+        return self.contacts.heads.size > 1
+
+    @property
     def phases(self) -> int:
         """The number of phases of an impact."""
         return 2 if any(self.contacts.by_poisson) else 1
@@ -279,7 +292,8 @@ class Impacting:
         closes = about_to[:n] & (np.arange(n) == first)
         touching = self.modes.shut | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
         at = self.u + late * before
-        return When(late, first, hits, before, at, self.rates_at(at), touching)
+        zeros = (until, about_to) if self.in_groups else None
+        return When(late, first, hits, before, at, self.rates_at(at), touching, zeros)
 
     def zeros(self, curve):
         """The times until gaps and slips are zero, and which are about to be zero.
@@ -324,6 +338,7 @@ class Impacting:
         """The problem of the impulses. Contacts that are `low` do not bounce, others bounce with a share of the whole
         rebound; by Poisson's law none bounces at the end of compression.
         """
+        share = of_contacts(share, self.contacts.n)
         back = jnp.where(low | np.array(self.contacts.by_poisson, bool), 0.0, share * self.bounces(when))
         approach = when.at + self.moves.rows @ self.moves.jump - jnp.pad(back, (0, self.contacts.m))
         if self.contacts.pairs:
@@ -340,7 +355,7 @@ class Impacting:
         when = before.when
         again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]
         pushes = np.array(self.contacts.by_poisson, bool) & ~before.low
-        again = jnp.where(pushes, before.trial.share * again, 0.0)
+        again = jnp.where(pushes, of_contacts(before.trial.share, self.contacts.n) * again, 0.0)
         u = self.moved(k, when, impulses)
         free = before.problem.free + self.influence @ impulses
         free = jnp.where(jnp.abs(free) <= REST * self.sizes_of_rates(u, when.u), 0.0, free)
@@ -359,15 +374,29 @@ class Impacting:
             impulses, solvable = before.pushed + impulses, solvable & before.solvable
         after = self.moved(k, when, impulses)
         rate = self.rates_at(after)
-        gained = jnp.dot(impulses, when.at + rate)
-        size = jnp.dot(jnp.abs(impulses), jnp.abs(when.at) + jnp.abs(rate))
         udot, opening, reactions = self.accelerated(after)
         sizes = self.sizes_of_rates(after, when.u)
         resting = when.touching & ((rate[:n] <= REST * sizes[:n]) | before.low)
         ended, slips = self.slips_left(rate[n:], sizes[n:])
-        struck = Struck(answers, impulses, after, rate, udot, resting, ended, (gained, size), before.trial.share)
+        balance = self.groups(when.touching, resting, ended, jnp.zeros_like(ended))
+        gained = group_sums(balance, impulses * (when.at + rate))
+        size = group_sums(balance, jnp.abs(impulses) * (jnp.abs(when.at) + jnp.abs(rate)))
+        of_share = balance, (gained, size), before.trial.share
+        struck = Struck(answers, impulses, after, rate, udot, resting, ended, *of_share)
         forces = self.laws.of_forces(opening, reactions, resting, slips, self.modes, before.forces)
         return before._replace(problem=forces, struck=struck, solvable=solvable)
+
+    def groups(self, touching, resting, ended, turned):
+        """The group of each law in an event, if there can be several.
+
+        **Arguments:** contacts that are `touching`, and `resting` after it; friction whose slip has `ended`; friction
+        in joints whose mode has `turned`. Other friction in joints passes nothing on.
+        """
+        if not self.in_groups:
+            return None
+        acting = jnp.concatenate([touching, jnp.where(self.contacts.in_joints, turned, self.laws.may(touching))])
+        stays = jnp.concatenate([self.modes.shut & resting, self.modes.held & ended])
+        return groups_of(self.contacts, self.influence, acting, stays)
 
     def slips_left(self, rate, sizes):
         """Which friction no longer slips, and the directions of the other slips."""
@@ -427,19 +456,22 @@ class Impacting:
         """The state before the first round."""
         n, m, in_joints = self.contacts.n, self.contacts.m, self.contacts.in_joints.any()
         none, one, yes = jnp.zeros(n + m, self.q.dtype), jnp.ones((), self.q.dtype), jnp.array(True)
+        each, balance, zeros = one, None, None
+        if self.in_groups:
+            each, balance, zeros = 1 + none, jnp.zeros(n + m, int), (none, none > 0)
         no, idle = Answers(none[:n] > 0, none[n:] > 0, none[n:], yes, none[n:] > 0), none[:n] > 0
         reactions = jax.tree.map(jnp.zeros_like, jax.eval_shape(self.accelerated, self.u)[2])
         return Round(
             problem=self.laws.of_impulses(none, idle, reactions),
-            when=When(0 * one, jnp.argmin(none), ~yes, self.u, self.u, self.rates, idle),
+            when=When(0 * one, jnp.argmin(none), ~yes, self.u, self.u, self.rates, idle, zeros),
             low=idle,
             rest=none[:n],
-            struck=Struck(no, none, self.u, none, self.u, idle, none[n:] > 0, (one, one), one),
+            struck=Struck(no, none, self.u, none, self.u, idle, none[n:] > 0, balance, (each, each), each),
             answers=no,
             forces=none,
             solvable=yes,
             rounds=jnp.array(_ROUNDS if in_joints else 1),
-            trial=Trial(one, Bracket(0 * one, one, 0 * one, one, jnp.array(0)), ~yes),
+            trial=Trial(each, Bracket(0 * each, each, 0 * each, each, jnp.zeros(each.shape, int)), each < 0),
             compression=Phase(self.u, none > 0, none[n:], none) if self.phases == 2 else None,
             pushed=none if self.phases == 2 else None,
         )
@@ -448,7 +480,7 @@ class Impacting:
         """Whether the round has further turns, or another round follows."""
         k, last = carry
         extra_rounds = k // self.turns - 1 - last.rounds
-        return (k % self.turns != 0) | (extra_rounds < 0) | (last.trial.again & (extra_rounds < _TRIALS))
+        return (k % self.turns != 0) | (extra_rounds < 0) | (jnp.any(last.trial.again) & (extra_rounds < _TRIALS))
 
     def advance(self, carry):
         """The next turn; the program for impulses or forces is compiled once."""
@@ -470,10 +502,13 @@ class Impacting:
         held, lost = self.lost(settled, implied)
         after = struck.u + lost @ self.moves.by_unit
         kinetic = lambda u: jnp.dot(u, self.inertia.product(u))
+        group, first, hits = self.firsts(settled, modes)
         return Event(
             late=when.late,
-            first=when.first,
-            hits=when.hits,
+            group=group,
+            balance=struck.balance,
+            first=first,
+            hits=hits,
             before=when.before,
             after=struck.udot + settled.forces @ self.moves.by_unit,
             at=when.u,
@@ -489,6 +524,21 @@ class Impacting:
             share=struck.share,
             compression=self.compressed(settled.compression),
         )
+
+    def firsts(self, settled: Round, modes):
+        """The group of each law, the gap or slip that is zero first in it, and whether there is one."""
+        when, struck, contacts = settled.when, settled.struck, self.contacts
+        if when.zeros is None:
+            return None, when.first, when.hits
+        after = contacts.as_modes(modes)
+        group = self.groups(
+            when.touching,
+            struck.resting & after.shut,
+            struck.ended & after.held,
+            self.modes.kinds[contacts.n :] != after.kinds[contacts.n :],
+        )
+        until, about_to = when.zeros
+        return group, *least_in_group(group, about_to & jnp.concatenate([when.touching, struck.ended]), until)
 
     def seen(self, impulses, sizes):
         """The impulses, with zeros for rounding errors."""

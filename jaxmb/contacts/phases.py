@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..linalg.complementarity import solved_components
 from ..linalg.elimination import solve
 from ..linalg.pairs import of_pairs
 from ..linalg.pushed import push
@@ -19,6 +20,7 @@ from ..linalg.sums import with_entries
 from ..system.contact_set import ContactSet
 from ..system.instant import Instant
 from .forces import directions, friction_coefficients
+from .groups import HOLDS, group_sums, of_contacts
 from .impacting import Event, Phase
 
 
@@ -50,15 +52,45 @@ class Phases:
         projector = jacobian.projector(system.inertia(t, contacts.with_modes(q, 0.0), event.u))
         moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
         rebound = ~event.low & ~np.array(contacts.by_poisson, bool)
-        coefficient = change = jnp.zeros(0, q.dtype)
-        if contacts.m:
-            coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
-            coefficient, change = coefficients(*at), push(coefficients, at, tangents)
-        return cls(event, at, tangents, du, rows, projector, moves, rebound, (coefficient, change))
+        coefficients = _coefficients(event, at, tangents)
+        return cls(event, at, tangents, du, rows, projector, moves, rebound, coefficients)
 
     @property
     def contacts(self) -> ContactSet:
         return self.at[0].contacts
+
+    def of_group(self, group: Any, tangents, du) -> "Phases":
+        """The phases of an impact of one group alone, with tangents of their own."""
+        event, influence = self.event, self.rows @ self.moves.T
+        own, holds = event.group == group, event.group == HOLDS
+        with_own = lambda held: held & (own | holds)
+
+        def impulses(phase_impulses, held):
+            # Laws that hold bodies answer to the impulses of the group.
+            alone = jnp.where(own, phase_impulses, 0.0)
+            return alone + solved_components(influence, influence @ alone, held & holds)
+
+        slips = lambda slips: jnp.where(own[self.contacts.n :], slips, 0.0)
+        alone, compression = impulses(event.impulses, event.held), event.compression
+        if compression is not None:
+            pushed = impulses(compression.impulses, compression.held)
+            at_end = event.at + pushed @ self.moves
+            compression = Phase(at_end, with_own(compression.held), slips(compression.slips), pushed)
+        event = event._replace(
+            u=event.at + alone @ self.moves,
+            held=with_own(event.held),
+            slips=slips(event.slips),
+            impulses=alone,
+            share=jnp.where(own, event.share, 1.0),
+            compression=compression,
+        )
+        coefficients = _coefficients(event, self.at, tangents)
+        return dataclasses.replace(self, event=event, tangents=tangents, du=du, coefficients=coefficients)
+
+    @property
+    def share(self) -> Float[Array, "*contacts"]:
+        """The share of the rebounds of each contact."""
+        return of_contacts(self.event.share, self.contacts.n)
 
     def changes(self) -> tuple[Float[Array, "laws"], Float[Array, "nu"]]:
         """The derivatives of all impulses, and of the velocities after them."""
@@ -73,21 +105,25 @@ class Phases:
         both = rates + contacts.rates(*at, event.u)
         changed = push(contacts.rates, (*at, event.at), (*self.tangents, self.du))
         changed = changed + push(contacts.rates, (*at, event.u), (*self.tangents, change))
-        gained = jnp.dot(impulses, both) + jnp.dot(event.impulses, changed)
-        slope = jnp.dot(by_share, both) + jnp.dot(event.impulses, self.rows @ (by_share @ self.moves))
-        less = event.share < 1
-        less = jnp.where(less, -gained / jnp.where(less, slope, 1.0), 0.0) * by_share
+        group, one = event.balance, jnp.ones_like(event.share)
+        gained = group_sums(group, impulses * both + event.impulses * changed)
+        less = by_share(one)
+        slope = group_sums(group, less * both + event.impulses * (self.rows @ (less @ self.moves)))
+        is_less = event.share < 1
+        factor = jnp.where(is_less, -gained / jnp.where(is_less, slope, 1.0), 0.0)
+        # Laws that hold bodies answer to all groups.
+        less = factor * less if group is None else by_share(factor)
         return impulses + less, change + less @ self.moves
 
     def in_one(self, bounce):
         """The derivatives of impulses and velocities at a fixed share of the rebounds, and the derivative of the
-        impulses by that share. `bounce`: the rates of the whole rebounds.
+        impulses by that share as a function of its change. `bounce`: the rates of the whole rebounds.
         """
         event = self.event
         last = Phase(event.u, event.held, event.slips, event.impulses)
         none = jnp.zeros(self.contacts.n, event.u.dtype)
         impulses, change, matrix = self.solved(event.at, self.du, last, none)
-        return impulses, change, solve(matrix, jnp.where(event.held, bounce, 0.0))
+        return impulses, change, lambda dshare: solve(matrix, jnp.where(event.held, dshare * bounce, 0.0))
 
     def in_two(self, bounce):
         """The same for an impact by Poisson's law."""
@@ -96,17 +132,21 @@ class Phases:
         n, m = self.contacts.n, self.contacts.m
         none = jnp.zeros(n, event.u.dtype)
         first, between, matrix = self.solved(event.at, self.du, compression, none)
-        first_by_share = solve(matrix, jnp.where(compression.held, bounce, 0.0))
+        first_by_share = lambda dshare: solve(matrix, jnp.where(compression.held, dshare * bounce, 0.0))
         pushes = ~event.low & np.array(self.contacts.by_poisson, bool)
-        again = lambda system, impulses: jnp.where(pushes, event.share * _restitution(system) * impulses[:n], 0.0)
+        again = lambda system, impulses: jnp.where(pushes, self.share * _restitution(system) * impulses[:n], 0.0)
         normal = push(again, (system, compression.impulses), (self.tangents[0], first))
         last = Phase(event.u, event.held, event.slips, event.impulses - compression.impulses)
-        second, change, matrix = self.solved(compression.u, between, last, normal)
-        normal = _restitution(system) * (compression.impulses + event.share * first_by_share)[:n]
-        normal = jnp.where(pushes, normal, 0.0)
-        closing = bounce - self.rows @ (first_by_share @ self.moves)
-        by_share = solve(matrix, jnp.where(event.held, closing, jnp.pad(normal, (0, m))))
-        return first + second, change, first_by_share + by_share
+        second, change, last_matrix = self.solved(compression.u, between, last, normal)
+
+        def by_share(dshare):
+            first = first_by_share(dshare)
+            normal = dshare * compression.impulses + event.share * first
+            normal = jnp.where(pushes, _restitution(system) * normal[:n], 0.0)
+            closing = dshare * bounce - self.rows @ (first @ self.moves)
+            return first + solve(last_matrix, jnp.where(event.held, closing, jnp.pad(normal, (0, m))))
+
+        return first + second, change, by_share
 
     def solved(self, before, dbefore, phase: Phase, normal):
         """The derivatives of the impulses of a phase and of the velocities at its end, and the matrix of the equations
@@ -123,7 +163,7 @@ class Phases:
         **Arguments:** the velocities `before` the phase, and their derivative; `normal`: the changes of the normal
         impulses of contacts that are not held.
         """
-        event, (system, t, q), contacts = self.event, self.at, self.contacts
+        (system, t, q), contacts = self.at, self.contacts
         rows, n = np.array(contacts.rows), contacts.n
         asked = self.projector.jacobian.product(phase.u - before)
         _, multipliers = self.projector.solve(phase.impulses @ self.rows, asked)
@@ -133,12 +173,12 @@ class Phases:
             """The remaining rates, and the unbalanced momentum."""
             rates = Instant(system, t, q, phase.u).velocity_rows
             bounce = _restitution(system) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
-            bounce = jnp.where(phase.held[:n] & self.rebound, event.share * bounce, 0.0)
+            bounce = jnp.where(phase.held[:n] & self.rebound, self.share * bounce, 0.0)
             rates = rates.at[rows[:n]].add(-bounce)
             momentum = system.inertia(t, q, u).product(phase.u - u)
             return rates, momentum - system.constraint_force(t, q, phase.u, multipliers)
 
-        point = system, t, contacts.bound(q), event.at, before
+        point = system, t, contacts.bound(q), self.event.at, before
         rates, forces = push(unmet, point, (*self.tangents, self.du, dbefore))
         # Rows of modes have no right-hand side.
         plain, _ = self.projector.solve(-forces, jnp.where(np.isin(np.arange(rates.size), rows), 0.0, -rates))
@@ -167,6 +207,15 @@ class Phases:
             law = law.at[laws].add(by @ self.rows[laws] @ self.moves.T, unique_indices=True)
             right = right.at[laws].add(-by @ (turned + self.rows[laws] @ plain), unique_indices=True)
         return law, right
+
+
+def _coefficients(event: Event, at, tangents):
+    """The coefficients of friction, and their derivatives."""
+    system, _, q = at
+    if not system.contacts.m:
+        return jnp.zeros(0, q.dtype), jnp.zeros(0, q.dtype)
+    coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
+    return coefficients(*at), push(coefficients, at, tangents)
 
 
 def _restitution(system):

@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..linalg.complementarity import positive_components, solved_components
+from ..linalg.complementarity import positive_components, reduced, solved_components
 from ..linalg.elimination import solve
 from ..linalg.pairs import sizes_of
 from ..linalg.rotations import norm
@@ -73,7 +73,7 @@ class Laws(NamedTuple):
         **Arguments:** `approach`: the rates before the impact, minus the rates of the rebounds.
         """
         reactions = jax.tree.map(jnp.zeros_like, reactions)
-        none, may = jnp.zeros(self.contacts.m, approach.dtype), self._may(touching) & ~self.contacts.in_joints
+        none, may = jnp.zeros(self.contacts.m, approach.dtype), self.may(touching) & ~self.contacts.in_joints
         return Problem(approach, jnp.concatenate([touching, may]), self.coefficient, none, none, reactions)
 
     def of_expansion(self, free, again, touching, reactions) -> Problem:
@@ -101,7 +101,7 @@ class Laws(NamedTuple):
         if reactions is not None:
             normal = norm(reactions[0] + jnp.tensordot(forces, reactions[1:], 1))
             bounds = jnp.where(self.contacts.in_joints, coefficient * normal, 0.0)
-        among = jnp.concatenate([staying, self._may(staying)])
+        among = jnp.concatenate([staying, self.may(staying)])
         return Problem(opening, among, coefficient, slips, bounds, reactions)
 
     def answers(self, problem: Problem) -> Answers:
@@ -142,7 +142,7 @@ class Laws(NamedTuple):
         linear = solve(matrix, right)
         return jnp.where(act, lax.fori_loop(0, _CORRECTIONS, correct, linear), 0.0)
 
-    def _may(self, staying):
+    def may(self, staying):
         """Which friction may have a force."""
         if not self.contacts.m:
             return jnp.zeros(0, bool)
@@ -157,7 +157,4 @@ def is_implied(influence, closed):
     if not closed.size:
         return closed
     influence, closed = lax.stop_gradient((influence, closed))
-    columns = jnp.where(closed[:, None], influence, 0.0)
-    matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(closed.size, dtype=influence.dtype))
-    reduced = influence - columns.T @ solve(matrix, columns)
-    return jnp.diag(reduced) <= REST * jnp.diag(influence)
+    return jnp.diag(reduced(influence, closed)) <= REST * jnp.diag(influence)

@@ -91,6 +91,13 @@ def independent_components(W: Float[Array, "k k"], among: Bool[Array, "k"]) -> B
     return lax.fori_loop(0, among.size, advance, first)[1]
 
 
+def reduced(W: Float[Array, "k k"], given: Bool[Array, "k"]) -> Float[Array, "k k"]:
+    """W after the elimination of `given` components, whose columns are independent: the others with these at zero."""
+    columns = jnp.where(given[:, None], W, 0.0)
+    matrix = jnp.where(given[:, None] & given[None, :], W, jnp.eye(given.size, dtype=W.dtype))
+    return W - columns.T @ solve(matrix, columns)
+
+
 def solved_components(W: Float[Array, "k k"], b: Float[Array, "k"], positive: Bool[Array, "k"]) -> Float[Array, "k"]:
     """x with `W x + b = 0` in these components and zero in the others; differentiable."""
     both = positive[:, None] & positive[None, :]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, Velocities
 from ..linalg.pairs import of_pairs
@@ -95,6 +95,21 @@ class ContactSet:
     def in_pairs(self) -> Bool[np.ndarray, "frictions"]:
         """Which directions of friction belong to a pair."""
         return np.isin(np.arange(self.m), of_pairs(self.pairs))
+
+    @functools.cached_property
+    def linked(self) -> Bool[np.ndarray, "laws laws"]:
+        """Which laws always act on each other: a contact and its friction, and both directions of friction."""
+        first = np.arange(self.n + self.m)
+        for k, contact in enumerate(self.contact_of):
+            first[self.n + k] = contact if contact >= 0 else first[self.n + k]
+        for k in self.pairs:
+            first[self.n + k + 1] = first[self.n + k]
+        return first[:, None] == first[None, :]
+
+    @functools.cached_property
+    def heads(self) -> Int[np.ndarray, "units"]:
+        """The first laws of those that are linked: contacts, and friction in joints."""
+        return np.flatnonzero(np.argmax(self.linked, axis=1) == np.arange(self.n + self.m))
 
     def at_rows(self, values: Float[Array, "acceleration_rows *k"]) -> Float[Array, "laws *k"]:
         """Values of the laws, from values of all rows of A."""
