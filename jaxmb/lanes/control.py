@@ -55,17 +55,24 @@ def _while(lanes, equation, values):
     for_cond, for_body, start = values[:of_cond], values[of_cond : of_cond + of_body], values[of_cond + of_body :]
     carried = lambda arrays: [Value(*pair) for pair in zip(arrays, varies, strict=True)]
 
+    # A `vmap` within a member gives the condition axes, which are the first axes of all carried values.
+    axes = range(len(params["cond_jaxpr"].out_avals[0].shape))
+
     def goes_on(arrays):
-        (out,) = lanes.run(params["cond_jaxpr"], for_cond + carried(arrays))
-        return out.array
+        (out,) = lanes.outputs(params["cond_jaxpr"], for_cond + carried(arrays), [goes_on_varies])
+        return out
+
+    def where(going, new, old):
+        along = [*axes, new.ndim - 1] if goes_on_varies else axes
+        return lax.select(lax.broadcast_in_dim(going, new.shape, along), new, old)
 
     def body(arrays):
         new = lanes.outputs(params["body_jaxpr"], for_body + carried(arrays), varies)
         new = [x.astype(old.dtype) for x, old in zip(new, arrays, strict=True)]
-        if not goes_on_varies:
+        if not goes_on_varies and not axes:
             return new
         going = goes_on(arrays)
-        return [jnp.where(going, x, old) for x, old in zip(new, arrays, strict=True)]
+        return [where(going, x, old) for x, old in zip(new, arrays, strict=True)]
 
     arrays = [_first(lanes, value, spread) for value, spread in zip(start, varies, strict=True)]
     out = lax.while_loop(lambda arrays: jnp.any(goes_on(arrays)), body, arrays)
