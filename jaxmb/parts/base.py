@@ -316,6 +316,8 @@ class AbstractLink(AbstractActor):
     of_time: ClassVar[bool] = False
     # The quantities of its coordinates; unknown without an entry.
     quantities: ClassVar[Quantities] = {}
+    # Whether bodies touch each other, the ground or a road in it, as in a contact and a tyre.
+    touches: ClassVar[bool] = False
     # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or the value of the kernel
     # `tension` of a force.
     has_tension: ClassVar[bool] = False

@@ -190,6 +190,7 @@ class AbstractContact(AbstractPotentialForce):
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
     has_gaps: ClassVar[bool] = True
+    touches: ClassVar[bool] = True
 
     @abc.abstractmethod
     def distance(self, centre: Vector) -> Number:

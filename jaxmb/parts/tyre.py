@@ -66,6 +66,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     of_directions: ClassVar[tuple[str, ...]] = ("deflection",)
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
     has_gaps: ClassVar[bool] = True
+    touches: ClassVar[bool] = True
 
     def complete(self, space, poses):
         count = space.dimension - 1

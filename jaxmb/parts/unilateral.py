@@ -166,6 +166,8 @@ class AbstractRigidContact(AbstractGeometricContact):
     moves away.
     """
 
+    touches: ClassVar[bool] = True
+
     @abc.abstractmethod
     def touching(self, space: AbstractSpace, poses: Poses) -> Float[Array, "d"]:
         """The world point [m] at which the bodies touch where the gap is zero, from the poses of the bodies."""

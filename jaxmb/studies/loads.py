@@ -16,10 +16,8 @@ from .._printed import Printed
 from ..linalg.arrays import add_up, is_traced
 from ..linalg.jitted import jitted
 from ..linalg.rotations import cross, norm
-from ..parts.base import AbstractForce
 from ..parts.coordinate_parts import AbstractCoordinatePart
 from ..parts.names import unknown
-from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system import with_parameters
 from ..system.instant import Instant
 from ..trajectory import Trajectory
@@ -54,9 +52,10 @@ class Loads(Printed, eqx.Module):
     worst.to_csv("bar.csv")
     ```
 
-    **Fields:** the `body`; `names` and `kinds` of its loads: "joint", "contact", "friction", "force", "gravity" and
-    "inertia"; `undetermined`: names of joints and contacts with redundant rows, which share the force of the others;
-    `ts` [s], shape (times,); `points` [m], `forces` [N] and `moments` [N m] about the points, in body axes, shape
+    **Fields:** the `body`; `names` and `kinds` of its loads: "joint", also of a rigid stop or rope, "contact" of bodies
+    that touch and of a tyre, "friction", "force", "gravity" and "inertia"; `undetermined`: names of joints and contacts
+    with redundant rows, which share the force of the others; `ts` [s], shape (times,); `points` [m], `forces` [N] and
+    `moments` [N m] about the points, in body axes, shape
     (times, loads, 3); the `mass_centre` [m] in the body's frame, shape (3,). The plane is z = 0.
     """
 
@@ -179,13 +178,12 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
         raise ValueError("loads takes a single motion; jax.vmap(lambda motion: …)(motions) takes each of a batch.")
     number, drives, machine = system.body_names.index(body), (), system
     given: tuple[Any, ...] = ()
-    result: Any = motion
-    # Only inverse dynamics has actuators apart from the system.
-    if hasattr(result, "machine"):
-        machine, given = result.machine, tuple(result.forces.values())
-        drives = drives_of(machine, result.forces)
+    # A concrete class: only inverse dynamics has actuators apart from the system.
+    if isinstance(motion, RequiredForces):
+        machine, given = motion.machine, tuple(motion.forces.values())
+        drives = drives_of(machine, motion.forces)
     else:
-        motion = result.trimmed()
+        motion = motion.trimmed()
     parts, acting = _parts_on(system, number), _drives_on(machine, drives, number)
     points, forces, moments, centre = _along(
         (system, machine),
@@ -246,7 +244,7 @@ def _kind(system, name: str, entry: _Entry) -> str:
     rubbing = {name for pairs in of_joints for name, joint in pairs if name != joint}
     if entry.of == "laws" or (entry.of == "constraints" and name in rubbing):
         return "friction"
-    if isinstance(part, AbstractUnilateralConstraint) or (isinstance(part, AbstractForce) and part.has_gaps):
+    if part.touches:
         return "contact"
     return "force" if entry.of == "forces" else "joint"
 

@@ -108,13 +108,51 @@ def test_a_body_with_friction_a_stop_a_motor_and_its_frame_elsewhere():
     motion = through(mb.Scene([rod], joints=[pin], forces=forces).compile())
     on_rod = mb.loads(motion, "rod")
     kinds = dict(zip(on_rod.names, on_rod.kinds, strict=True))
-    assert kinds["rub"] == "friction" and kinds["stop"] == "contact" and kinds["motor"] == "force"
+    assert kinds["rub"] == "friction" and kinds["stop"] == "force" and kinds["motor"] == "force"
     np.testing.assert_allclose(on_rod.mass_centre, [0.5, 0.1, 0.0])
     np.testing.assert_allclose(on_rod["wind"].point, [[1.0, 0.2, 0.0]], atol=1e-15)
     np.testing.assert_allclose(on_rod["wind"].force, [body_axes(float(motion["rod"].angle[0]), [3.0, 1.0])], rtol=1e-12)
     np.testing.assert_allclose(on_rod["wind"].moment, 0.0, atol=1e-13)
     np.testing.assert_allclose(on_rod["motor"].moment, [[0.0, 0.0, 1.5]], atol=1e-12)
     check_balance(motion)
+
+
+@pytest.mark.slow
+def test_only_bodies_that_touch_are_in_contact():
+    """A part that acts where a gap is closed, or on one side only, may be a rope, a coupler or a stop."""
+    rod = planar.Body("rod", mass=2.0, inertia=0.3, position=(0.5, 0.0))
+    car = planar.Body("car", mass=2.0, inertia=0.3, position=(3.0, 0.0))
+    terrain, push = mb.terrain.Flat(-5.0), mb.contact.Linear(1e4)
+    joints = [
+        planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0)),
+        mb.Stop("stop", "pin.angle", lower=-2.0),
+        mb.Slack("slack", "ground", "rod", length=3.0),
+        mb.Rope("rope", [("ground", (0.0, 2.0)), ("rod", (0.5, 0.0))], stiffness=100.0, length=3.0),
+        mb.RigidContact("rigid", "rod", terrain=terrain, radius=0.1),
+    ]
+    forces = [
+        mb.JointStop("compliant_stop", "pin.angle", lower=-1.0, upper=1.0, stiffness=10.0),
+        planar.DraftGear("gear", "rod", "car"),
+        planar.Contact("compliant", "rod", terrain=terrain, radius=0.1, normal=push),
+        planar.Tyre(
+            "tyre",
+            "car",
+            terrain=terrain,
+            radius=0.3,
+            normal=push,
+            coefficient=0.9,
+            slip_stiffness=8.0,
+            relaxation_length=0.3,
+        ),
+    ]
+    motion = through(mb.Scene([rod, car], joints=joints, forces=forces).compile())
+    kinds: dict[str, str] = {}
+    for body in ("rod", "car"):
+        loads = mb.loads(motion, body)
+        kinds |= dict(zip(loads.names, loads.kinds, strict=True))
+    assert {name for name, kind in kinds.items() if kind == "contact"} == {"rigid", "compliant", "tyre"}
+    assert {name for name, kind in kinds.items() if kind == "joint"} == {"pin", "stop", "slack"}
+    assert {name for name, kind in kinds.items() if kind == "force"} == {"compliant_stop", "rope", "gear"}
 
 
 def lifted(space, *, driven=False):

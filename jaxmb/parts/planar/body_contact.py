@@ -72,6 +72,7 @@ class AbstractBodyContact(AbstractPlanarPart, AbstractPotentialForce):
     damping_depth: fields.Number = fields.parameter(unit="m", sign="positive", default=0.01)
     smoothing: fields.Number = fields.parameter(unit="m", sign="positive", default=1e-3)
     has_gaps: ClassVar[bool] = True
+    touches: ClassVar[bool] = True
 
     several_from = 1
 
