@@ -99,8 +99,8 @@ def pendulum(*more):
 
 def stops(count):
     """With one end, and with two."""
-    one = [mb.Stop(f"end{k}", "pin.angle", lower=-50.0 - k, restitution=0.5) for k in range(count)]
-    return [*one, *(mb.Stop(f"ends{k}", "pin.angle", lower=-60.0, upper=50.0 + k) for k in range(count))]
+    one = [mb.Stop(f"end{k}", "pin.angle", lower=-50.5 - k, restitution=0.5) for k in range(count)]
+    return [*one, *(mb.Stop(f"ends{k}", "pin.angle", lower=-60.5, upper=50.5 + k) for k in range(count))]
 
 
 PENDULUM, AMONG_STOPS = pendulum(), pendulum(*stops(4))
@@ -167,7 +167,7 @@ def test_stops_change_no_step_beside_internal_states():
     bar = planar.Body("bar", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
     pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-0.5, 0.0))
     steps = []
-    for own in ([], [mb.Stop(f"end{k}", "pin.angle", lower=-50.0 - k) for k in range(2)]):
+    for own in ([], [mb.Stop(f"end{k}", "pin.angle", lower=-50.5 - k) for k in range(2)]):
         system = mb.Scene([bar], joints=[pin, *own], forces=[mb.Gravity((0.0, -9.81)), drive]).compile()
         start = mb.assemble(system, fix={"bar.angle": 0.5})
         steps.append(int(mb.simulate(system, start, t1=4.0, rtol=1e-6).stats["num_steps"]))

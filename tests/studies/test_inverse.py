@@ -212,6 +212,18 @@ def test_a_motor_and_its_force():
         mb.required_forces(system, {"pin.angle": lambda t: 0.2}, ts=[0.0, 1.0], by=["pin.angle"])
 
 
+@pytest.mark.slow
+def test_an_input_that_is_sought():
+    """The parameter of a force that drove the motion as a function of time."""
+    engine = spatial.Torque("engine", "bar", torque=(0.0, 0.0, 0.0))
+    system = mb.with_inputs(driven_bar(engine=engine), {"engine.torque": lambda t: jnp.sin(t) * jnp.eye(3)[1]})
+    state = mb.assemble(system, rates={"pin.angle": 0.4}, t=0.7)
+    motion = motion_of(system, [0.7], state.q[None], state.u[None])
+    weights = {"engine.torque": 1.0}
+    found = mb.required_forces(system, motion, by=["engine.torque"], weights=weights)
+    np.testing.assert_allclose(found["engine.torque"], [[0.0, np.sin(0.7), 0.0]], atol=1e-10)
+
+
 def torque_of(parameters, values):
     system = mb.with_parameters(four_bar(), parameters)
     motion = {"crank.angle": mb.Series(np.linspace(0.0, 1.0, 9), values, "cubic")}
@@ -451,6 +463,7 @@ REFUSED: dict[str, tuple[dict, str]] = {
     "unknown coordinate": ({"motion": {"elbow": jnp.cos}}, "'elbow.angle'"),
     "linear": ({"motion": {"elbow.angle": mb.Series([0.0, 1.0], [0.0, 1.0])}}, "'cubic'"),
     "no times": ({"ts": None}, "ts is missing"),
+    "times": ({"ts": [0.5, 0.0]}, "ts must be ascending"),
     "shape": ({"motion": {"elbow.angle": lambda t: jnp.ones(2) * t}}, "shape"),
     "weights": ({"weights": {"elbow.angle": 1.0}}, "missing for shoulder.angle"),
 }

@@ -98,6 +98,8 @@ def planned(system: AbstractSystem, motion: Any, ts: Any, guess: State) -> Cours
     ts = jnp.asarray(ts)
     if ts.ndim != 1 or not ts.size:
         raise ValueError(f"required_forces: ts must be a vector of times, got shape {ts.shape}.")
+    if not is_traced(ts) and np.any(np.diff(ts) < 0):
+        raise ValueError("required_forces: ts must be ascending.")
     # In the order that compiled functions see.
     signals = {name: _signal(system, name, motion[name], ts) for name in sorted(motion, key=str)}
     _check_contacts(system, ts[:1], guess.q[None])
@@ -260,13 +262,14 @@ def _rolled(system, signals, guess, ts) -> tuple[Array, Array]:
     rates, still = _Rates(system, signals, guess.u), lax.stop_gradient(ts)
     precision, scale = tolerance(first.dtype), lax.stop_gradient(system.coordinate_scale())
     # No step passes over a feature of the motion that the times resolve.
-    control = MultistepController(precision, precision * scale, dtmax=jnp.max(jnp.diff(still)))
+    longest = jnp.max(jnp.diff(still))
+    control = MultistepController(precision, precision * scale, dtmax=jnp.where(longest > 0, longest, 1.0))
     options = {
         "y0": first - (ts[0] - still[0]) * rates(still[0], first, None),
         "t0": still[0],
         "t1": still[-1],
         "dt0": None,
-        "saveat": diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=still)]),
+        "saveat": diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=still)], solver_state=True),
         "stepsize_controller": control,
     }
     problem = diffrax.ODETerm(rates), Adams(), options

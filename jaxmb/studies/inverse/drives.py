@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...bodies.groups import together
 from ...parts.coordinate_parts import AbstractCoordinatePart
 from ...parts.drivers import AbstractDriver
 from ...parts.names import unknown
@@ -167,6 +168,22 @@ def without_drives(system: Any, drives: Iterable[Drive]) -> Any:
         implied=tuple(row for row in system.implied if names.isdisjoint((row.name, *row.by))),
         elimination=None,
     )
+
+
+def released(system: Any, drives: Iterable[Drive]) -> Any:
+    """The system with constant numbers in place of the inputs that are sought."""
+    inputs = system.parameter_table.input_names()
+    names = frozenset(drive.where for drive in drives if drive.of == "parameter" and drive.where in inputs)
+    if not names:
+        return system
+
+    def constant(group):
+        singles = [single for several in group.group.inputs for single in several.alone()]
+        kept = together([single for single in singles if names.isdisjoint(single.names)])
+        return dataclasses.replace(group, group=dataclasses.replace(group.group, inputs=kept))
+
+    groups = tuple(map(constant, system.forces.groups))
+    return dataclasses.replace(system, forces=dataclasses.replace(system.forces, groups=groups))
 
 
 def _kept(group, names) -> tuple[Any, ...]:

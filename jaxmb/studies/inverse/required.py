@@ -21,7 +21,7 @@ from ...system.quantities import Reaction, Solved
 from ...trajectory import Trajectory
 from .balance import Drives, Found, balanced, searched
 from .course import Course, free_names, planned, recorded
-from .drives import drives_of, without_drives
+from .drives import drives_of, released, without_drives
 
 
 class RequiredForces(eqx.Module):
@@ -98,6 +98,13 @@ def required_forces(
     The machine may have closed loops, redundant joints and rolling. It needs as many forces as it has freedoms without
     its named drives; of more forces `weights` chooses the solution.
 
+    Coordinates as functions of time determine velocities. Positions that rolling or a blade leaves are integrated with
+    error control from the first time on, where `guess` gives them; so they do not depend on the other times. No step is
+    longer than the longest interval of `ts`.
+
+    Rigid contacts, stops and ropes are open along a motion: it may touch them at the times `ts`, not pass through them,
+    and they bear no force.
+
     **Arguments:**
 
     - `motion`: a `Trajectory`; or by the names of coordinates, `"pin.angle"` of a joint or `"crank.angle"` of a body,
@@ -108,10 +115,11 @@ def required_forces(
         ignored. A force on a coordinate, such as a `Motor` or `JointForce`, is replaced by the sought force. On a
         coordinate of a joint, a body or a `LagrangianSystem`, `"pin.angle"`, `"hull.x"`, `"theta"`, a force is added. A
         parameter that forces are proportional to, `"engine.torque"` of a `Torque`, `"push.force"` or `"servo.control"`,
-        has the sought value.
+        has the sought value, also in place of an input.
     - `ts` [s]: ascending times, default the times of the first `Series`; not with a `Trajectory`.
     - `weights` > 0, by all names of `by`: the solution has the least sum of `weight × force²`.
-    - `guess`: a state near the first position of a motion by coordinates, default that of the system.
+    - `guess`: a state near the first position of a motion by coordinates, default that of the system; positions that
+        rolling leaves begin there.
     - `tolerance`: the largest violation of constraints by the motion, relative to the system's size, to the speeds and
         to the accelerations.
     - `throw`: whether to raise an error without a solution. By default an error is raised, except under `jit`, `vmap`
@@ -122,10 +130,12 @@ def required_forces(
     actuator puts into the machine.
 
     **Raises:** `ValueError` naming freedoms without a force, coordinates that the constraints hold, actuators that
-    cannot produce the motion, and joints that the motion violates, with residuals and time.
+    cannot produce the motion, joints that the motion violates, with residuals and time, contacts that it passes
+    through, and closed contacts of a `Trajectory`.
     """
     check_system("required_forces", system)
     drives = drives_of(system, by)
+    system = released(system, drives)
     rest = without_drives(system, drives)
     spread = _spread(drives, weights, rest.guess.q.dtype)
     # A concrete class: a trajectory has states, and other motions have coordinates.
@@ -211,6 +221,8 @@ def _refusal(rest, drives: Drives, path: Course, found: Found, k: int, tolerance
     here: Found = jax.tree.map(lambda x: np.asarray(x[k]), found)
     lead = f"required_forces: at t = {float(path.ts[k]):g}"
     off = np.abs(np.asarray(path.off[k]))
+    if not path.met[k] and not np.any(off > tolerance):
+        return f"{lead} the velocities are not determined, or positions that rolling leaves could not be integrated."
     if not path.met[k] or np.any(~(off <= tolerance)):
         names = ", ".join(f"{name} ({value:.3g})" for name, value in zip(path.names, off, strict=True))
         return f"{lead} the machine cannot reach the position. Distances from the given coordinates remain: {names}."
