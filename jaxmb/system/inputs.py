@@ -196,5 +196,5 @@ def _changed(tree, number):
 
 def _random(size, number, dtype):
     """Positive numbers around one without a pattern, always the same."""
-    places = jnp.arange(1, size + 1, dtype=dtype) * (number + 1)
+    places = jnp.arange(1, size + 1, dtype=dtype) * jnp.asarray(number + 1, dtype)
     return 1.5 + jnp.cos(places * places)

@@ -6,7 +6,7 @@ the pulse.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,22 +16,45 @@ from jaxtyping import Array, Bool, Float
 # The largest excursion of a function that may be missed between two steps, relative to its range.
 _HIDDEN = 0.1
 # A value is that of a pulse if it differs from the polynomial this many times more than the values beside the pulse.
-_STANDS_OUT = 8.0
+_STANDS_OUT = 4.0
 # Differences below this many units in the last place of the largest value are rounding errors.
 _ROUNDING = 64
-# The places of the values beside a pulse, in units of its half width; the unmet part of these values and, in the last
-# row, the value in their middle, by the cubic polynomial nearest to them.
-_BESIDE = np.array([-3.0, -2.5, -2.0, -1.5, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0])
-_POWERS = np.vander(_BESIDE, 4)
-_FIT = np.linalg.pinv(_POWERS)
-_POLYNOMIAL = np.concatenate([np.eye(_BESIDE.size) - _POWERS @ _FIT, _FIT[-1:]])
-# Half widths of pulses, in samples of a function. Even numbers, so that the values beside are at samples.
-_WIDTHS = np.array([2, 4, 6, 8, 12, 16, 24, 32, 48, 64])
+# The places of the values on either side of a pulse, in units of its half width; irregular, so that no wave looks alike
+# at all of them.
+_BESIDE = np.array([1.0, 1.27, 1.6, 1.9, 2.13, 2.61, 3.0])
+# Half widths of pulses, in samples of a function.
+_WIDTHS = np.array([2, 3, 4, 6, 9, 13, 20, 30, 45, 64])
 # Functions that are judged at the same time.
 _TOGETHER = 64
 
-# The half width of a pulse at each time, and the values beside it.
-Beside = tuple[Float[Array, "n"], Float[Array, "n 10 columns"]]
+
+def _rows(places):
+    """In the rows: how far values at some places are off the nearest cubic polynomial, in ten directions, and the
+    polynomial's value at zero.
+    """
+    powers = np.vander(places / np.max(places), 4)
+    return np.concatenate([np.linalg.svd(powers)[0][:, 4:].T, np.linalg.pinv(powers)[-1:]])
+
+
+def _both_sides(places):
+    return np.concatenate([-places[::-1], places])
+
+
+def _offsets(width):
+    """The places beside a pulse of samples, as whole numbers that differ."""
+    nearest, order = np.round(width * _BESIDE).astype(int), np.arange(_BESIDE.size)
+    return _both_sides(np.maximum.accumulate(nearest - order) + order)
+
+
+_OFFSETS = np.array([_offsets(width) for width in _WIDTHS])
+
+
+class _Beside(NamedTuple):
+    """The half `width` of a pulse around each time; the `values` beside it; the `rows` of the polynomial."""
+
+    width: Float[Array, "n"]
+    values: Float[Array, "14 n columns"]
+    rows: Float[Array, "11 14"]
 
 
 def turned(values: Float[Array, "n columns"]) -> Bool[Array, "n"]:
@@ -55,21 +78,23 @@ def pulses_of_samples(
 ) -> Bool[Array, "n"]:
     """At which of equidistant times some column is at the peak of a pulse; or where steps are `ended` anyway."""
     # Other states than those of the run may make a function infinite.
-    values = jnp.where(jnp.all(jnp.isfinite(values), axis=0), values, 0.0)
-    (n, columns), most = values.shape, int(np.max(_WIDTHS * _BESIDE[-1]))
+    values = jnp.where(jnp.all(jnp.isfinite(values), axis=0, keepdims=True), values, 0.0)
+    (n, columns), most = values.shape, int(np.max(_OFFSETS))
     together = min(columns, _TOGETHER)
     blocks = jnp.pad(values, ((0, 0), (0, -columns % together))).reshape(n, -1, together)
-    places = jnp.arange(n)[:, None] + most
+    rows = np.array([_rows(offsets) for offsets in _OFFSETS]).astype(values.dtype)
 
     def of_block(ended, block):
-        before, after = 2 * block[0] - block[most:0:-1], 2 * block[-1] - block[-2 : -most - 2 : -1]
+        before, after = 2 * block[:1] - block[most:0:-1], 2 * block[-1:] - block[-2 : -most - 2 : -1]
         extended = jnp.concatenate([before, block, after])
 
-        def beside(width):
-            offsets = (width * (2 * _BESIDE).astype(int)) // 2
-            return jnp.broadcast_to(width * (ts[1] - ts[0]), ts.shape), extended[places + offsets]
+        def beside(of_width):
+            width, offsets, rows = of_width
+            places = offsets[:, None] + jnp.arange(most, most + n)[None]
+            return _Beside(width * jnp.full_like(ts, ts[1] - ts[0]), extended[places], rows)
 
-        return _pulses(ts, block, beside, jnp.asarray(_WIDTHS), ended), None
+        widths = jnp.asarray(_WIDTHS, ts.dtype), jnp.asarray(_OFFSETS), jnp.asarray(rows)
+        return _pulses(ts, block, beside, widths, ended), None
 
     return lax.scan(of_block, ended, jnp.moveaxis(blocks, 1, 0))[0]
 
@@ -85,16 +110,20 @@ def pulses_at_knots(
     # Wider pulses of long series are seen in samples.
     widest = min(max(n // 3, 1), max(8, n // 128))
     reaches = 2 ** np.arange(int(np.log2(widest)) + 1)
-    at_ends, known = function(jnp.stack([first, last])), function(jnp.clip(ts, first, last))
+    known = function(jnp.clip(ts, first, last))
+    before, after = 2 * function(jnp.stack([first, last]))[:, None, None]
+    sides = _both_sides(_BESIDE)
+    rows = jnp.asarray(_rows(sides), known.dtype)
 
     def beside(reach):
         knots = jnp.clip(jnp.arange(n) + reach, 0, n - 1)
         width = jnp.abs(ts[knots] - ts)
-        at = ts[:, None] + width[:, None] * _BESIDE.astype(ts.dtype)
+        at = ts[None] + width[None] * jnp.asarray(sides, ts.dtype)[:, None]
         inside = jnp.clip(jnp.where(at < first, 2 * first - at, jnp.where(at > last, 2 * last - at, at)), first, last)
         values = function(inside.reshape(-1)).reshape(*at.shape, -1)
         early, late = (at < first)[..., None], (at > last)[..., None]
-        return width, jnp.where(early, 2 * at_ends[0] - values, jnp.where(late, 2 * at_ends[1] - values, values))
+        values = jnp.where(early, before - values, jnp.where(late, after - values, values))
+        return _Beside(width, values, rows)
 
     return _pulses(ts, known, beside, jnp.asarray(np.concatenate([reaches, -reaches])), ended)
 
@@ -106,28 +135,28 @@ def on_straight_lines(ts: Float[Array, "n"], values: Float[Array, "n columns"]) 
     return jnp.pad(jnp.any(off <= _rounding(values), axis=1), 1)
 
 
-def _pulses(ts, values, beside: Callable[[Any], Beside], widths, ended):
+def _pulses(ts, values, beside: Callable[[Any], _Beside], widths, ended):
     """At which times some column is at the peak of a pulse of one of the widths; or where steps are `ended` anyway."""
-    rounding, polynomial = _rounding(values), _POLYNOMIAL.astype(values.dtype)
+    rounding = _rounding(values)
 
     def look(ended, of_width):
-        half, around = beside(of_width)
-        out = jnp.einsum("kj,njc->knc", polynomial, around)
+        width, around, rows = beside(of_width)
+        out = jnp.tensordot(rows, around, 1)
         height = jnp.abs(values - out[-1])
-        stands_out = height > _STANDS_OUT * jnp.max(jnp.abs(out[:-1]), axis=0) + rounding
+        stands_out = height > _STANDS_OUT * jnp.sqrt(jnp.sum(out[:-1] ** 2, axis=0)) + rounding
         height = jnp.where(stands_out, height, 0.0)
-        highest = jnp.max(height, axis=0)
+        highest = jnp.max(height, axis=0, keepdims=True)
         relative = jnp.max(height / jnp.where(highest > 0, highest, 1.0), axis=1)
         padded = jnp.pad(relative, 1)
         peak = (relative > padded[:-2]) & (relative >= padded[2:])
         # A step that ends near the peak shows the pulse.
-        count = jnp.cumsum(jnp.pad(ended, (1, 0)).astype(int))
-        near = lambda time, side: count[jnp.searchsorted(ts, time, side=side)]
-        shown = near(ts + 0.5 * half, "right") > near(ts - 0.5 * half, "left")
+        before = lax.cummax(jnp.where(ended, ts, -jnp.inf))
+        after = lax.cummin(jnp.where(ended, ts, jnp.inf), reverse=True)
+        shown = jnp.minimum(ts - before, after - ts) <= 0.5 * width
         return ended | (peak & ~shown), None
 
     return lax.scan(look, ended, widths)[0]
 
 
 def _rounding(values):
-    return _ROUNDING * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), axis=0)
+    return _ROUNDING * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values), axis=0, keepdims=True)
