@@ -22,6 +22,7 @@ from ._types import State
 from .contacts.events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation
 from .formulations.laws import accelerations_at
+from .formulations.shares import least_multipliers
 from .linalg.arrays import ARRAYS, is_traced
 from .linalg.jitted import jitted
 from .linalg.members import vmap_states
@@ -313,13 +314,17 @@ class Trajectory(eqx.Module):
 
     @property
     def multipliers(self) -> Float[Array, "times rows"]:
-        """Multipliers λ of every row, `M u̇ = F + Aᵀλ`; zero for implied rows."""
+        """Multipliers λ of every row, `M u̇ = F + Aᵀλ`; of redundant rows the least ones."""
         return self._solved[1]
 
     @property
     @_view
     def _solved(self):
-        single = lambda t, y: accelerations_at(Instant.of(self.system, t, y), self.formulation)
+        def single(t, y):
+            at = Instant.of(self.system, t, y)
+            udot, multipliers = accelerations_at(at, self.formulation)
+            return udot, least_multipliers(at, multipliers)
+
         return vmap_states(single, self.system.acceleration_rows * self.system.nu)(self.ts, self.ys)
 
     @property
@@ -327,9 +332,22 @@ class Trajectory(eqx.Module):
         """Forces of the joints of rigid bodies by name, each a `Reaction`.
 
         `reactions["A"].force` [N], shape (times, d), in world axes, acts on the last of the joint's bodies that is not
-        the ground; `.moment` [N m] about the joint's point; `.multipliers`.
+        the ground; `.moment` [N m] about the joint's point; `.multipliers`. Redundant joints have the shares of least
+        norm, smooth in time; `motion.undetermined_reactions` names them.
         """
         return _ByName("joint", self.system.catalogue.joint_names(), self._reaction)
+
+    @property
+    def undetermined_reactions(self) -> tuple[str, ...]:
+        """Names of the joints and contacts whose shares of a force the equations leave open.
+
+        Each row counts by its constraint force, with forces multiplied by the system's size. The shares of redundant
+        joints have the least sum of squares of these. Of closed contacts, as many take the force as are independent.
+        """
+        if self.ts.ndim != 1:
+            raise ValueError("undetermined_reactions is of a single motion, not of a batch.")
+        motion = self.trimmed()
+        return self.system.catalogue.undetermined(motion.ts, motion.ys)
 
     def _reaction(self, name):
         return self.system.catalogue.reaction(name, self.ts, self.ys, self.multipliers)

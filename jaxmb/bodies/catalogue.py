@@ -15,7 +15,15 @@ from ..system.structures import of_structure
 from .joint_coordinates import beyond_half_turns, joint_coordinates, joint_measures
 from .motion import body_measures, body_motion, frame_measures, scalar_measures
 from .picture import picture
-from .reactions import applied_wrenches, joint_places, lifted_ropes, places, reaction_measures, reactions
+from .reactions import (
+    applied_wrenches,
+    joint_places,
+    lifted_ropes,
+    places,
+    reaction_measures,
+    reactions,
+    undetermined,
+)
 
 
 class SceneCatalogue(Catalogue):
@@ -55,6 +63,9 @@ class SceneCatalogue(Catalogue):
 
     def reaction(self, name, ts, ys, multipliers):
         return reactions(self.system, joint_places(self.system.constraints, name), ts, ys, multipliers)
+
+    def undetermined(self, ts, ys):
+        return undetermined(self.system, ts, ys)
 
     def force_names(self):
         groups = (*self.system.forces.groups, *self.system.constraints.nonideal)

@@ -9,12 +9,16 @@ import numpy as np
 from jaxtyping import Array
 
 from .._types import State
-from ..linalg.arrays import add_up
+from ..linalg.arrays import add_up, is_traced
 from ..linalg.rotations import cross
+from ..parts.modes import IMPLIED, IMPLIED_STICK
+from ..system.instant import Instant
 from ..system.quantities import Measure, Reaction, view_of_motion
 from .constraint_set import ConstraintSet
 from .groups import AbstractGroup, Group
 
+# Shares of unit rows below this are zero.
+_SHARES = 1e-6
 # A negative angle [rad] of rope beyond rounding.
 _LIFTED = 1e-6
 
@@ -161,6 +165,38 @@ def applied_wrenches(system: Any, place: Any, ts: Any, ys: State, multipliers: A
         return add_up(values[np.array(at.on_bodies)] for values, at in zip(of_parts, of_laws or of_forces, strict=True))
 
     return jax.vmap(single)(ts, ys, multipliers)
+
+
+def undetermined(system: Any, ts: Any, ys: State) -> tuple[str, ...]:
+    """Names of the parts that share forces which the equations leave open: joints with redundant rows; and closed
+    contacts, and friction that sticks, that other parts imply in a saved state of a concrete motion.
+    """
+    names = {name for row in system.implied for name in (row.name, *row.by)}
+    contacts = system.contacts
+    if contacts and not is_traced((system, ts, ys)):
+        modes = np.asarray(jax.vmap(lambda q: contacts.modes(system.normalize(q)).kinds)(ys.q))
+        alone = np.repeat([IMPLIED, IMPLIED_STICK], [contacts.n, contacts.m])
+        _, first = np.unique(modes, axis=0, return_index=True)
+        for k in first[np.any(modes[first] == alone, axis=1)]:
+            at = Instant(system, ts[k], ys.q[k], ys.u[k])
+            names |= _sharing(at, modes[k] == alone)
+    return tuple(sorted(names))
+
+
+def _sharing(at: Instant, implied: np.ndarray) -> set[str]:
+    """Names of the rows that imply the contacts and the friction that are `implied`, and of these."""
+    system: Any = at.system
+    contacts = system.contacts
+    bound = contacts.bound(at.q)
+    modes = jnp.where(implied, contacts.modes(bound).numbers, contacts.modes(at.q).numbers)
+    jacobian = np.asarray(at.with_(q=contacts.with_modes(at.q, modes)).jacobian) * np.asarray(system.velocity_scale())
+    sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    jacobian = jacobian / np.maximum(sizes, np.finfo(sizes.dtype).tiny)
+    rows = np.array(contacts.rows)[implied]
+    others = np.setdiff1d(np.arange(len(jacobian)), rows)
+    shares = np.linalg.lstsq(jacobian[others].T, jacobian[rows].T, rcond=None)[0]
+    sharing = [*rows, *others[np.any(np.abs(shares) > _SHARES, axis=1)]]
+    return {system.rows[k][0] for k in sharing}
 
 
 def _reaction(constraints, places, now, multipliers) -> Reaction:

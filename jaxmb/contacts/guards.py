@@ -102,16 +102,17 @@ class ContactGuards(AbstractGuards):
 
     def begins(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
-        contacts = system.contacts
-        if not contacts.m:
-            return None
-        t = jnp.asarray(t, y.q.dtype)
+        contacts, touch, t = system.contacts, self.touch * system.length, jnp.asarray(t, y.q.dtype)
         q = system.normalize(t, y.q)
-        modes, rates = contacts.modes(q), contacts.rates(system, t, q, y.u)[contacts.n :]
-        begins = modes.slides & (modes.of_friction * rates <= self.touch * system.length)
+        modes = contacts.modes(q)
+        opens = modes.open & (contacts.gaps(system, t, q) <= touch)
+        if not contacts.m:
+            return opens
+        rates = contacts.rates(system, t, q, y.u)[contacts.n :]
+        begins = modes.slides & (modes.of_friction * rates <= touch)
         if contacts.pairs:
             begins = for_first(contacts.pairs, modes.in_plane.begun, begins)
-        return jnp.pad(begins, (contacts.n, 0))
+        return jnp.concatenate([opens, begins])
 
     def rates(self, t, y):
         system, y = lax.stop_gradient((self.system, y))

@@ -18,6 +18,7 @@ from ..solvers.manifold_term import AbstractVectorField
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .compliant_gaps import compliant_gaps
+from .implied import check_watched, violated
 from .manifold import AbstractManifold, normalize_state
 
 
@@ -46,11 +47,15 @@ class Baumgarte(AbstractManifold):
 
     def prepare(self, system, formulation, solver, rtol):
         check_mass(system, formulation)
+        check_watched(system, "Baumgarte")
         return diffrax.ODETerm(StabilisedField(system, formulation, self.rate)), solver
 
     def correction(self, interpolated):
         # The distance from the constraints is of interest, and stays.
         return normalize_state
+
+    def violated(self, system, t, y, rtol):
+        return violated(system, t, y, rtol)
 
 
 class StabilisedField(AbstractVectorField):

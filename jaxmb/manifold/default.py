@@ -7,6 +7,7 @@ import diffrax
 from ..formulations import AbstractFormulation
 from ..solvers import AbstractMultistep
 from ..system.equation import AbstractEquation
+from .implied import check_watched, violated
 from .manifold import AbstractManifold, VectorField
 from .orthogonal_projection import project_normalized
 from .partition import Partition
@@ -25,11 +26,15 @@ class Unconstrained(AbstractManifold):
     takes_impulses: ClassVar[bool] = False
 
     def prepare(self, system, formulation, solver, rtol):
+        check_watched(system, "Unconstrained")
         return diffrax.ODETerm(VectorField(system, formulation)), solver
 
     def correction(self, interpolated):
         # Steps do not end on the constraints, and Euler parameters are not of unit length.
         return project_normalized
+
+    def violated(self, system, t, y, rtol):
+        return violated(system, t, y, rtol)
 
 
 # Defaults, made once: their construction takes as long as the rest of a call.

@@ -82,9 +82,12 @@ class AbstractManifold(eqx.Module):
         del solver_state
         return {}
 
-    def violated(self, system: AbstractEquation, t: Scalar, y: State) -> Any:
-        """Whether the end of a simulation violates constraint rows that the policy omits; False if it omits none."""
-        del system, t, y
+    def violated(self, system: AbstractEquation, t: Scalar, y: State, rtol: Scalar) -> Any:
+        """Whether the end of a simulation violates constraint rows that the policy omits; False if it omits none.
+
+        **Arguments:** `rtol`: the tolerance of integration.
+        """
+        del system, t, y, rtol
         return False
 
     def evidence(self, solver_state: Any) -> PyTree[Array]:
@@ -93,14 +96,21 @@ class AbstractManifold(eqx.Module):
         return None
 
     def diagnose(
-        self, system: AbstractEquation, t: Scalar, y: State, evidence: PyTree[Array], result: Any, failed: Any
+        self,
+        system: AbstractEquation,
+        t: Scalar,
+        y: State,
+        evidence: PyTree[Array],
+        result: Any,
+        failed: Any,
+        rtol: Scalar,
     ) -> Any:
         """The outcome of a simulation that failed, made precise if the policy knows the reason.
 
         **Arguments:** `t`, `y`: the last state; `evidence` of the solver there; `result`: a `RESULTS`; `failed`:
-        whether it is a failure that starts from finite numbers.
+        whether it is a failure that starts from finite numbers; `rtol`: the tolerance of integration.
         """
-        del system, t, y, evidence, failed
+        del system, t, y, evidence, failed, rtol
         return result
 
 

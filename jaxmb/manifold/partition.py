@@ -38,7 +38,7 @@ from ..linalg.sums import unchecked_take
 from ..solvers import AbstractMultistep
 from ..solvers.manifold_term import ManifoldEvaluation
 from ..system.equation import AbstractEquation
-from ..system.instant import Instant, drops_rows
+from ..system.instant import Instant
 from .constraints import (
     AbstractConstraints,
     RestoredState,
@@ -47,6 +47,16 @@ from .constraints import (
     restore,
 )
 from .diagnosis import diagnose
+from .implied import (
+    DroppedRows,
+    contradiction_ahead,
+    drops_accelerations,
+    drops_positions,
+    independent_parts,
+    tolerance_of_dropped,
+    violation_of_accelerations,
+    watched,
+)
 from .manifold import AbstractManifold, newton_tolerance
 from .orthogonal_projection import project_normalized
 from .split import AbstractSplit, Independent, kind_of_split, quality_of, restore_positions
@@ -78,9 +88,10 @@ _ROW_GROWTH = 4.0
 # length, ends at a third of the distance, and the next step crosses. (Linkages that lie flat several times, 60 speeds:
 # without this bound nine end there at rtol 1e-10, and energies are off by up to 7e-4 at 1e-6; with this bound none ends
 # there, and energies are off by up to 2e-6.)
-_NEARER = 8.0
-# Redundant rows may be violated by this multiple of Newton's tolerance, or of the pivots that count as zero.
-_ALLOWED = 8.0
+_NEARER = (
+    8.0  # At a prediction, the gradient of a row may be independent of the others by this multiple of the tolerance.
+)
+_UNRESOLVED = 100.0
 
 
 class ConstrainedAcceleration(eqx.Module):
@@ -88,7 +99,8 @@ class ConstrainedAcceleration(eqx.Module):
 
     **Fields:** `u`, `udot`; the `factor` of the velocities' Jacobian; the factor of `every` row of A, None if no row
     binds accelerations only; the `memory` of the system's laws; `failed`: whether the laws failed to determine the
-    accelerations. The factors have no derivatives.
+    accelerations; `independent`: the `independent_parts` of rows of Φ, None if the split's own matrix has them. The
+    factors have no derivatives.
     """
 
     u: Velocities
@@ -97,6 +109,7 @@ class ConstrainedAcceleration(eqx.Module):
     every: Factor | None
     memory: Memory
     failed: Bool[Array, ""]
+    independent: Float[Array, "position_rows"] | None
 
 
 # A nested program, so that it is traced once for all its uses.
@@ -109,7 +122,7 @@ def acceleration(at: Instant, formulation: AbstractFormulation, split: AbstractS
     out = _acceleration(*lax.stop_gradient((at, formulation, split)))
     linearise = eqx.Partial(_at_coordinates, split, out.factor, out.every)
     solution = implicitly(linearise, at, RestoredState(at.q, out.u, out.udot, out.memory))
-    return ConstrainedAcceleration(solution.u, solution.udot, out.factor, out.every, solution.multipliers, out.failed)
+    return dataclasses.replace(out, u=solution.u, udot=solution.udot, memory=solution.multipliers)
 
 
 def _acceleration(at, formulation, split):
@@ -125,7 +138,12 @@ def _acceleration(at, formulation, split):
         jacobian = DenseJacobian(at.jacobian, every, every.rows)
     laws = laws_of(system)
     udot, multipliers, failed = laws.solve(at, formulation, jacobian, at.gamma)
-    return ConstrainedAcceleration(at.u, udot, factor, every, laws.remembered(at, multipliers), failed)
+    independent = None
+    if drops_positions(system) and not split.ages:
+        rows = before.jacobian[: system.position_rows]
+        independent = independent_parts(rows, factor, split.velocity, system.velocity_scale())
+    memory = laws.remembered(at, multipliers)
+    return ConstrainedAcceleration(at.u, udot, factor, every, memory, failed, independent)
 
 
 def _at_coordinates(split, factor, every, at):
@@ -278,6 +296,7 @@ class Partition(AbstractManifold):
             )
         check_mass(system, formulation)
         tolerances = newton_tolerance(self.newton_tol, rtol), self.contact_tolerance(system, rtol)
+        tolerances = *tolerances, tolerance_of_dropped(system, rtol)
         term = PartitionTerm if system.acceleration_rows else FreeTerm
         return term(system, formulation, self.max_influence, *tolerances), solver
 
@@ -292,22 +311,17 @@ class Partition(AbstractManifold):
 
     def evidence(self, solver_state):
         chart = solver_state.chart
-        return chart.singular, None if chart.redundant is None else chart.redundant.violation
+        return chart.singular, None if chart.redundant is None else chart.redundant.suspected
 
-    def diagnose(self, system, t, y, evidence, result, failed):
-        singular, violation = evidence
-        result = diagnose(Instant.of(system, t, y), singular, result, failed)
+    def diagnose(self, system, t, y, evidence, result, failed, rtol):
+        (singular, violation), at = evidence, Instant.of(system, t, y)
+        result = diagnose(at, singular, result, failed)
         if violation is None:
             return result
         # Steps were refused until they reached the allowed violation.
+        if drops_accelerations(system):
+            violation = jnp.maximum(violation, contradiction_ahead(*lax.stop_gradient((at, rtol))))
         return RESULTS.where(failed & (violation > 0.5), RESULTS.inconsistent_constraints, result)
-
-
-class RedundantRows(eqx.Module):
-    """The `sizes` of the rows of ψ, and the `violation` of redundant rows in units of the allowed one."""
-
-    sizes: Float[Array, "velocity_rows"]
-    violation: Float[Array, ""]
 
 
 class Chart(eqx.Module):
@@ -320,7 +334,7 @@ class Chart(eqx.Module):
         of the kept rows; and the `nearness` to a loss of rank.
     - `fresh`: the quality of the chart when it was made, with the `nearness` when the position factor was made.
     - `counters`: see the properties.
-    - `redundant`: None if all rows are independent.
+    - `redundant`: the watch of dropped rows, None if all rows are independent.
     - `multipliers`: the memories of the system's laws at the prediction of the last step and at its end, None without
         any.
     """
@@ -329,7 +343,7 @@ class Chart(eqx.Module):
     quality: Float[Array, "k"]
     fresh: Float[Array, "k"]
     counters: Int[Array, "5"]
-    redundant: RedundantRows | None = None
+    redundant: DroppedRows | None = None
     multipliers: Float[Array, "2 k"] | None = None
 
     @property
@@ -370,20 +384,24 @@ class Chart(eqx.Module):
 
 
 class AbstractChartTerm(AbstractConstrainedTerm):
-    """A system as a term with charts."""
+    """A system as a term with charts.
+
+    **Fields:** `rtol`: the tolerance of integration, None if all rows are independent.
+    """
 
     # The error is measured on all components: if dependent ones change fast, the error of the independent ones alone
     # shows it too late. (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a
     # spatial slider-crank 3107 against 3867.)
 
     max_influence: AbstractVar[float]
+    rtol: AbstractVar[Float[Array, ""] | None]
 
     def init_chart(self, t, y, args):
         # A useless chart, so that charts are chosen in one place.
         at = lax.stop_gradient(self.at(t, y))
         choose = lambda at: _choose(at, at.coordinate_jacobian)
         split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, at))
-        redundant = RedundantRows(at.row_sizes(), jnp.zeros((), y.q.dtype)) if drops_rows(self.system) else None
+        redundant = None if self.rtol is None else DroppedRows.at_start(at)
         memory = laws_of(self.system).remembered(at, jnp.zeros(self.system.acceleration_rows, y.q.dtype))
         unknown, none = jnp.full_like(quality, jnp.inf), jnp.zeros(5, int)
         return Chart(split, unknown, quality, none, redundant, _both(memory, memory))
@@ -434,12 +452,6 @@ class AbstractChartTerm(AbstractConstrainedTerm):
     def update_chart(self, t, y, chart, args):
         return _updated(*lax.stop_gradient((self.at(t, y), chart)), self.max_influence)
 
-    def after_step(self, t, y, chart, args):
-        if chart.redundant is None:
-            return chart
-        violation = _violation(*lax.stop_gradient((self.at(t, y), chart.redundant.sizes, self.newton_tol)))
-        return eqx.tree_at(lambda chart: chart.redundant.violation, chart, violation)
-
     def refuses(self, chart, before):
         nearer = (chart.nearness > _NEARER * before.nearness) & (chart.charts == before.charts)
         return nearer if chart.redundant is None else nearer | (chart.redundant.violation > 1)
@@ -453,12 +465,18 @@ class PartitionTerm(AbstractChartTerm):
     max_influence: float = eqx.field(static=True)
     newton_tol: Float[Array, ""]
     at_contact: ContactTolerance | None = None
+    rtol: Float[Array, ""] | None = None
 
-    def _evaluate(self, at, chart):
+    def _evaluate(self, at, chart: Any):
         out = acceleration(at, self.formulation, chart.split)
         split = chart.split.at_evaluation(out.factor)
         quality = _velocity_quality(self.system, out.factor, split.velocity)
         chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=_both(out.memory, out.memory))
+        if out.independent is not None and self.rtol is not None:
+            # The state is off the constraints by an error of the prediction.
+            independent = out.independent / chart.redundant.sizes[: self.system.position_rows]
+            independent = jnp.maximum(independent - _UNRESOLVED * self.rtol, 0.0)
+            chart = eqx.tree_at(lambda chart: chart.redundant.independent, chart, independent)
         near = SolvedState(ChartConstraints(out.factor, split, out.every, chart.outdated), out.udot, out.memory)
         return self.evaluated(at.with_(u=out.u), out.udot, chart, chart.singular | out.failed, near)
 
@@ -468,6 +486,13 @@ class PartitionTerm(AbstractChartTerm):
         memory = _both(near.multipliers, out.multipliers)
         chart = dataclasses.replace(_counted(chart, out.iterations), multipliers=memory)
         return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart, out.failed | chart.singular)
+
+    def after_step(self, t, y, chart, args):
+        if self.rtol is None:
+            return chart
+        tolerances = self.newton_tol, self.rtol
+        redundant = _watched(*lax.stop_gradient((self.at(t, y), chart.split, chart.redundant, tolerances)))
+        return dataclasses.replace(chart, redundant=redundant)
 
     def _kept(self, chart, k):
         return chart.split.orders(), jax.tree.map(lambda memories: memories[k], chart.multipliers)
@@ -485,6 +510,7 @@ class FreeTerm(AbstractChartTerm):
     max_influence: float = eqx.field(static=True)
     newton_tol: Float[Array, ""]
     at_contact: ContactTolerance | None = None
+    rtol: Float[Array, ""] | None = None
 
     def _evaluate(self, at, chart):
         return self.evaluated(at, at.inertia.solve(at.force), chart, chart.singular)
@@ -523,7 +549,11 @@ def _updated(at, chart, max_influence):
         def renew(chart):
             split, fresh, singular = _choose(at, jacobian)
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
-            return dataclasses.replace(chart, split=split, quality=fresh, fresh=fresh, counters=counters)
+            chart = dataclasses.replace(chart, split=split, quality=fresh, fresh=fresh, counters=counters)
+            if chart.redundant is None or chart.redundant.independent is None:
+                return chart
+            # Other rows may be dropped: their gradients are compared again with the next factor.
+            return eqx.tree_at(lambda chart: chart.redundant.independent, chart, replace_fn=jnp.zeros_like)
 
         return cond_of_lanes(worse(chart), renew, lambda chart: chart, chart)
 
@@ -533,11 +563,15 @@ def _updated(at, chart, max_influence):
 
     def refresh(chart):
         jacobian = at.coordinate_jacobian
-        split, of_coordinates = chart.split.refreshed(at.system, jacobian)
+        split, of_coordinates, factor = chart.split.refreshed(at.system, jacobian)
         quality = chart.quality.at[:-1].max(of_coordinates)
         # Only a refreshed chart can be worse.
         fresh, counters = chart.fresh.at[-1].set(chart.nearness), chart.counters.at[0].set(0)
         refreshed = dataclasses.replace(chart, split=split, quality=quality, fresh=fresh, counters=counters)
+        if drops_positions(at.system):
+            of_rows = jacobian[: at.system.position_rows], factor, split.coordinate, at.system.coordinate_scale()
+            independent = independent_parts(*of_rows) / chart.redundant.sizes[: at.system.position_rows]
+            refreshed = eqx.tree_at(lambda chart: chart.redundant.independent, refreshed, independent)
         return renewed(refreshed, jacobian)
 
     def keep(chart):
@@ -547,10 +581,15 @@ def _updated(at, chart, max_influence):
 
 
 @eqx.filter_jit
-def _violation(at, sizes, newton_tol):
-    """The violation of redundant rows relative to the allowance for the solution of the others."""
-    allowed = _ALLOWED * jnp.maximum(newton_tol, jnp.finfo(at.q.dtype).eps ** 0.5)
-    return at.violation_of_dropped_rows(sizes) / allowed
+def _watched(at, split, redundant, tolerances):
+    """The dropped rows at a state, with their violation."""
+    system, (newton_tol, rtol) = at.system, tolerances
+    redundant = watched(at, redundant, newton_tol, rtol)
+    if not drops_accelerations(system):
+        return redundant
+    every = eliminate(at.jacobian, split.acceleration, system.acceleration_rank)
+    contradiction = violation_of_accelerations(at, every.right_inverse @ at.gamma, rtol)
+    return eqx.tree_at(lambda rows: rows.violation, redundant, jnp.maximum(redundant.violation, contradiction))
 
 
 def _choose(at, of_coordinates):

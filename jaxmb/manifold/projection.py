@@ -22,9 +22,10 @@ from ..solvers import AbstractMultistep, AbstractMultistepState
 from ..solvers.events import cond_of_jumps, crossing
 from ..solvers.manifold_term import ManifoldEvaluation
 from ..system.equation import AbstractEquation
-from ..system.instant import Instant, drops_rows
+from ..system.instant import Instant
 from .constraints import SolvedState, restore
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
+from .implied import check_watched, drops_rows, tolerance_of_dropped, violation_without_chart
 from .impulse import after_jump
 from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
 from .orthogonal_projection import (
@@ -40,8 +41,6 @@ from .term import AbstractConstrainedTerm
 _FAILED: Any = diffrax.RESULTS.nonlinear_divergence
 # The size of omitted corrections, as a power of eps: 1e-12 in double precision.
 _LEFT_OUT = 0.77
-# Redundant rows may be violated by this multiple of the pivots that count as zero.
-_ALLOWED = 8.0
 
 
 class Projection(AbstractManifold):
@@ -84,7 +83,8 @@ class Projection(AbstractManifold):
         check_mass(system, formulation)
         if not isinstance(solver, AbstractMultistep):
             guards = contact_guards(system, formulation, self.contact_tolerance(system, rtol))
-            return diffrax.ODETerm(VectorField(system, formulation)), ProjectedSolver(solver, guards)
+            solver = ProjectedSolver(solver, guards, tolerance_of_dropped(system, rtol))
+            return diffrax.ODETerm(VectorField(system, formulation)), solver
         _check_multistep(system, formulation, type(solver).__name__)
         if solver.solves_implicitly and not system.has_field_jacobian:
             raise ValueError(
@@ -110,10 +110,12 @@ class Projection(AbstractManifold):
         chart: Any = solver_state.chart if isinstance(solver_state, AbstractMultistepState) else None
         return {} if chart is None else {"newton_iterations": chart}
 
-    def violated(self, system, t, y):
-        return _violated(lax.stop_gradient(Instant.of(system, t, y))) if drops_rows(system) else False
+    def violated(self, system, t, y, rtol):
+        if tolerance_of_dropped(system, rtol) is None:
+            return False
+        return _violated(*lax.stop_gradient((Instant.of(system, t, y), rtol)))
 
-    def diagnose(self, system, t, y, evidence, result, failed):
+    def diagnose(self, system, t, y, evidence, result, failed, rtol):
         if system.elimination is None:
             return diagnose(Instant.of(system, t, y), jnp.array(False), result, failed)
         # The rank of constraints that are eliminated along the graph of joints is not examined.
@@ -130,9 +132,9 @@ def _returned(system, t, y):
 
 
 @eqx.filter_jit
-def _violated(at):
+def _violated(at, rtol):
     """Whether redundant rows are violated at a state on the others."""
-    return at.violation_of_dropped_rows(at.row_sizes()) > _ALLOWED * jnp.finfo(at.q.dtype).eps ** 0.5
+    return violation_without_chart(at, rtol) > 1
 
 
 def _check_multistep(system, formulation, solver):
@@ -147,7 +149,8 @@ def _check_multistep(system, formulation, solver):
             f"Projection with {solver} finds accelerations by Multipliers(), got {type(formulation).__name__}(); leave "
             "the formulation out, or use Partition()."
         )
-    if system.elimination is None and system.acceleration_rank < system.acceleration_rows:
+    check_watched(system, f"Projection with {solver}")
+    if system.elimination is None and drops_rows(system):
         raise ValueError(
             f"Of {system.acceleration_rows} constraint rows only {system.acceleration_rank} are independent, and "
             f"Projection with {solver} drops none; use Partition()."
@@ -238,10 +241,12 @@ class ProjectedSolver(WrappedSolver):
     """A Runge–Kutta solver whose steps end with a projection on the constraints of the term's system, or at events of
     contacts.
 
-    **Fields:** the `guards` of the contacts, None without any.
+    **Fields:** the `guards` of the contacts, None without any; `rtol`: the tolerance of integration, None if all rows
+    are independent.
     """
 
     guards: ContactGuards | None
+    rtol: Float[Array, ""] | None = None
 
     def init(self, terms, t0, t1, y0, args):
         return self.solver.init(terms, t0, t1, y0, args)
@@ -263,9 +268,9 @@ class ProjectedSolver(WrappedSolver):
         y1, dense_info = jax.tree.map(unknown, (y1, dense_info))
         error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed, NOT_PROJECTED, result)
-        if drops_rows(system):
+        if self.rtol is not None:
             # diffrax discards the result of a rejected step.
-            violated = _violated(lax.stop_gradient(Instant.of(system, t1, y1)))
+            violated = _violated(*lax.stop_gradient((Instant.of(system, t1, y1), self.rtol)))
             result = diffrax.RESULTS.where(violated, _FAILED, result)
         if self.guards is not None:
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate

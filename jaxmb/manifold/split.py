@@ -174,7 +174,7 @@ class Separate(AbstractSplit):
     def chosen(cls, at, of_coordinates: Any, orders, solved, quality):
         system = at.system
         pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
-        split, of_split = cls(*orders, pivots.order, jnp.zeros(())).refreshed(system, of_coordinates)
+        split, of_split, _ = cls(*orders, pivots.order, jnp.zeros(())).refreshed(system, of_coordinates)
         return split, quality.at[:-1].max(of_split), pivots.rank < system.coordinate_rank
 
     def independent(self, system):
@@ -202,11 +202,11 @@ class Separate(AbstractSplit):
 
     def refreshed(
         self, system: AbstractEquation, jacobian: Float[Array, "mq nq"]
-    ) -> tuple["Separate", Float[Array, "k"]]:
-        """The split with the matrix of a state, from the coordinates' Jacobian there, and its quality."""
+    ) -> tuple["Separate", Float[Array, "k"], Factor]:
+        """The split with the matrix of a state, from the coordinates' Jacobian there; its quality and its factor."""
         solved = eliminate(jacobian, self.coordinate, system.coordinate_rank)
         quality = quality_of(system, solved, system.coordinate_scale(), self.coordinate, system.coordinate_rank)
-        return dataclasses.replace(self, right_inverse=solved.right_inverse), quality
+        return dataclasses.replace(self, right_inverse=solved.right_inverse), quality, solved
 
     def orders(self):
         return eqx.tree_at(lambda split: split.right_inverse, self, None)

@@ -248,7 +248,7 @@ def _verdict(problem, interval, start, end, solution, lost, outside):
         evidence = policy.evidence(solution.solver_state)
         result, coupling = diagnosed(problem, end.t, end.y, evidence, result, stuck)
     reasons = [
-        (policy.violated(system.prepared(), end.t, end.y), RESULTS.inconsistent_constraints),
+        (policy.violated(system.prepared(), end.t, end.y, problem.method.rtol), RESULTS.inconsistent_constraints),
         (has_failed(result), result),
         (lost, RESULTS.newton_failed),
         (inputs_ended(system, span.t0, span.t1) if problem.traced else False, RESULTS.input_ended),
@@ -283,7 +283,7 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     reactions there, None without friction.
     """
     system = problem.system.prepared()
-    result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck)
+    result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck, problem.method.rtol)
     if system.lost_headings:
         result = RESULTS.where(stuck & jnp.any(are_short(system, t, y.q)), RESULTS.singular_configuration, result)
     if not system.friction_rows.size:

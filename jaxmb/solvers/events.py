@@ -177,7 +177,9 @@ def crossing(
         points = jnp.where(search.phase == _LOOK, _POINTS.astype(t0.dtype), search.s)
         values, rates, begins = jax.vmap(guarded)(points)
         if begins is not None:
-            begins = jnp.where(search.phase == _LOOK, begins[2], search.begins)
+            # A guard grows if it rises in the middle and at the end.
+            begins = begins[2] & (rates[0] > 0) & (rates[1] > 0)
+            begins = jnp.where(search.phase == _LOOK, begins, search.begins)
         search = search._replace(begins=begins, count=search.count + 1)
         phases = [_looked, _least_found, _dipped, _risen, _zero_found]
         phases = [lambda *given, at_phase=at_phase: layout.packed(at_phase(*given)) for at_phase in phases]

@@ -107,7 +107,8 @@ class AbstractGuards(eqx.Module):
     def begins(self, t: Any, y: PyTree[Array]) -> Bool[Array, "guards"] | None:
         """Which guards begin to grow from zero at the start of a step; None if no guard does.
 
-        Such a guard may be smaller than the error of the step between its ends, so it counts only at the step's end.
+        Such a guard may be smaller than the error of the step between its ends. So it counts only at the step's end, as
+        long as its rate is positive.
         """
         del t, y
         return None

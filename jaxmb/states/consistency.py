@@ -19,6 +19,8 @@ from ..system.instant import Instant
 # power of eps, 3e-4 in single precision.
 _TOLERANCE = 1e-5
 _ROUNDING = 0.5
+# The independent part of a row that is not implied, as a power of eps.
+_IMPLIED = 3 / 8
 
 
 def consistent(system: AbstractSystem, t: Any, state: State) -> State:
@@ -73,13 +75,33 @@ def constraints_depend_on(system: AbstractSystem, t: Any, state: State, names: I
 def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
     """A message about violated implied rows at the end of a motion."""
     at = Instant.of(system, t, state)
-    residual = np.abs(np.asarray(at.velocity_residual))
-    residual[: system.position_rows] = np.abs(np.asarray(at.position_residual))
-    names = listed(system, residual > 1e-3 * np.max(residual), residual)
-    return (
+    positions, velocities = (np.asarray(x) for x in (at.position_residual, at.velocity_residual))
+    jacobian = np.asarray(at.jacobian) * np.asarray(system.velocity_scale())
+    jacobian = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
+    residual = np.abs(np.append(positions, velocities[system.position_rows :]))
+    what = "are violated"
+    if np.max(residual, initial=0.0) <= np.finfo(residual.dtype).eps ** 0.75 or not system.velocity_rows:
+        what, residual = "ask for other accelerations", _unmet_accelerations(at)
+    names = listed(system, residual > 1e-3 * np.max(residual, initial=0.0), residual)
+    text = (
         f"At t = {float(t):g} the constraints {names} contradict the others: rows of them, which others implied when "
-        "the system was compiled, are violated. Remove them, or make dimensions and prescribed motions agree."
+        f"the system was compiled, {what}. Remove them, or make dimensions and prescribed motions agree."
     )
+    rows = jacobian[: system.position_rows]
+    if np.linalg.matrix_rank(rows, np.finfo(rows.dtype).eps ** _IMPLIED) <= system.position_rank:
+        return text
+    return (
+        f"{text} If they agree, the compiled pose is a bifurcation: beside it, as here, these rows are independent, so "
+        "the other rows admit motions that all rows together do not. Compile the scene at a pose beside it."
+    )
+
+
+def _unmet_accelerations(at):
+    """The residuals of rows of A after least squares, just after a time."""
+    later = float(at.t) + 64 * np.finfo(float).eps * max(abs(float(at.t)), 1.0)
+    at = Instant(at.system, jnp.asarray(later, at.q.dtype), at.q, at.u, at.z)
+    jacobian, gamma = np.asarray(at.jacobian), np.asarray(at.gamma)
+    return np.abs(jacobian @ np.linalg.lstsq(jacobian, gamma, rcond=None)[0] - gamma)
 
 
 def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:

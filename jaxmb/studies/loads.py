@@ -54,7 +54,7 @@ class Loads(Printed, eqx.Module):
 
     **Fields:** the `body`; `names` and `kinds` of its loads: "joint", also of a rigid stop or rope, "contact" of bodies
     that touch and of a tyre, "friction", "force", "gravity" and "inertia"; `undetermined`: names of joints and contacts
-    with redundant rows, which share the force of the others; `ts` [s], shape (times,); `points` [m], `forces` [N] and
+    that share forces which the equations leave open; `ts` [s], shape (times,); `points` [m], `forces` [N] and
     `moments` [N m] about the points, in body axes, shape
     (times, loads, 3); the `mass_centre` [m] in the body's frame, shape (3,). The plane is z = 0.
     """
@@ -158,9 +158,9 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     point, as in a contact, at the mass centre. With `required_forces`, the needed forces of actuators are loads by
     their names in `by`; of a parameter, `"engine.torque"`, the load has the name of the part.
 
-    The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Shares of
-    redundant joints depend on the rows that were dropped, and `undetermined` names these joints. The loads are
-    differentiable, so that a design can bound them.
+    The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Redundant joints
+    have the shares of least norm. Of closed contacts, as many take the force as are independent. `undetermined` names
+    both; under a trace it names joints only. The loads are differentiable, so that a design can bound them.
 
     **Arguments:** the `motion` of bodies, from `simulate` or `required_forces`; the name of the `body`.
 
@@ -196,7 +196,7 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     own = {} if system.forces.gravity is None else {system.forces.gravity_name: "gravity"}
     kinds = {name: _kind(system, name, entries[0]) for name, entries in parts.items()}
     kinds |= {drives[k].name: "force" for k, *_ in acting} | own | {"inertia": "inertia"}
-    shared = {name for row in system.implied for name in (row.name, *row.by)}
+    shared = system.catalogue.undetermined(motion.ts, motion.ys)
     undetermined = tuple(name for name in parts if name in shared)
     values = motion.ts, points, forces, moments, centre
     return Loads(body, tuple(kinds), tuple(kinds.values()), undetermined, *values)

@@ -98,6 +98,10 @@ class Catalogue:
         """Reactions of one joint."""
         raise ValueError(_NO_REACTIONS)
 
+    def undetermined(self, ts: Float[Array, "times"], ys: State) -> tuple[str, ...]:
+        """Names of the joints and contacts whose shares of a force the equations leave open; without derivatives."""
+        raise ValueError(_NO_REACTIONS)
+
     def force_names(self) -> tuple[str, ...]:
         """Names of the force elements."""
         raise ValueError(_NO_FORCES)

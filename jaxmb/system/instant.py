@@ -178,16 +178,3 @@ class Instant(eqx.Module, Keeper):
         positions = jnp.abs(self.position_residual) / sizes[: self.system.position_rows]
         # At rest there are only rounding errors to compare.
         return positions, jnp.where(rate > jnp.finfo(rate.dtype).eps ** 0.75, rate / speed, 0.0)
-
-    def violation_of_dropped_rows(self, sizes: Float[Array, "mv"]) -> Float[Array, ""]:
-        """The largest violation of a state that satisfies the independent rows, so the violation of dropped rows."""
-        (positions, velocities), system = self.violations(sizes), self.system
-        # If all dropped rows are position constraints, their velocities follow.
-        follow = system.velocity_rank - system.position_rank == system.velocity_rows - system.position_rows
-        largest = jnp.max(positions, initial=0.0)
-        return largest if follow else jnp.maximum(largest, jnp.max(velocities))
-
-
-def drops_rows(system: AbstractEquation) -> bool:
-    """Whether implied rows of ψ are dropped."""
-    return system.velocity_rank < system.velocity_rows

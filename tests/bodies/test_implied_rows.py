@@ -16,7 +16,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import lagrangian, mechanisms, planar, spatial
 from jaxmb.bodies.independence import JointBlocks
-from jaxmb.manifold import Baumgarte
+from jaxmb.manifold import Baumgarte, Projection
 
 GRAVITY = mb.Gravity((0.0, -9.81))
 
@@ -275,6 +275,152 @@ def test_redundancy_at_a_coarse_tolerance_is_no_singularity():
     bricard = mechanisms.get("bricard")
     motion = mb.simulate(bricard.system, bricard.state, t1=0.5, rtol=1e-4)
     assert motion.result == mb.RESULTS.successful
+
+
+# Rows between accelerations
+
+
+def servo(name, angle=jnp.sin, **gains):
+    numbers = {"motion": lambda t, p: p["size"] * angle(t), "parameters": {"size": 1.0}}
+    return mb.Servo(planar.Driver(name, "ground", "crank", quantity="angle", **numbers), **gains)
+
+
+def servos(*programs, **options):
+    return crank(*programs, angular_velocity=1.0, velocity=(0.0, 0.0), **options).compile()
+
+
+def test_a_second_servo_is_followed_or_refused():
+    gains = {"damping": 2.0, "stiffness": 4.0}
+    system = servos(servo("first", **gains), servo("second", **gains))
+
+    def run(size, stiffness, rate):
+        changed = mb.with_parameters(system, {"second.size": size, "second.stiffness": stiffness})
+        state = mb.assemble(changed, rates={"crank.angle": rate})
+        motion = mb.simulate(changed, state, t1=1.0, throw=False)
+        return motion.result == mb.RESULTS.inconsistent_constraints, motion["crank"].angle[-1]
+
+    # The same programs; one is larger; gains differ on the program, and off it.
+    cases = jnp.array([[1.0, 4.0, 1.0], [1.001, 4.0, 1.0], [1.0, 5.0, 1.0], [1.0, 5.0, 0.5]])
+    wrong, angle = jax.jit(jax.vmap(run))(*cases.T)
+    assert wrong.tolist() == [False, True, False, True]
+    np.testing.assert_allclose(angle[::2], np.sin(1.0), atol=1e-8)
+
+
+CONTRADICTING = {
+    "two programs": (lambda: servos(servo("first"), servo("second", lambda t: t)), {}),
+    "programs that differ from a time on": (
+        lambda: servos(
+            servo("first", lambda t: t), servo("second", lambda t: jnp.where(t < 0.5, t, t + (t - 0.5) ** 2))
+        ),
+        {},
+    ),
+    "a servo beside a driver": (lambda: servos(driver("first", lambda t: t), servo("second")), {}),
+    "Runge and Kutta": (lambda: servos(servo("first"), servo("second", lambda t: t)), {"solver": diffrax.Tsit5()}),
+    "an implicit method": (
+        lambda: servos(servo("first"), servo("second", lambda t: t)),
+        {"solver": mb.solvers.Hermite()},
+    ),
+}
+
+
+@pytest.mark.slow(but=("two programs",))
+@pytest.mark.parametrize("case", CONTRADICTING)
+def test_programs_that_begin_to_differ_are_named(case):
+    make, options = CONTRADICTING[case]
+    system = make()
+    with pytest.raises(
+        RuntimeError, match=r"constraints (first|second) \(.*(first|second).*ask for other accelerations"
+    ):
+        mb.simulate(system, mb.assemble(system, rates={"crank.angle": 1.0}), t1=2.0, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-8, 1e-11])
+def test_servos_with_different_gains_follow_the_same_program(rtol):
+    gains = {"damping": 20.0, "stiffness": 100.0}, {"damping": 200.0, "stiffness": 1e4}
+    system = servos(servo("first", **gains[0]), servo("second", **gains[1]))
+    state = mb.assemble(system, rates={"crank.angle": 1.0})
+    for solver in (None, mb.solvers.Hermite(), diffrax.Tsit5()):
+        motion = mb.simulate(system, state, t1=2.0, rtol=rtol, solver=solver)
+        np.testing.assert_allclose(motion["crank"].angle[-1], np.sin(2.0), atol=10 * rtol)
+
+
+@pytest.mark.slow
+def test_constraints_between_accelerations_are_watched():
+    row = lambda name, right: lagrangian.AccelerationConstraint(
+        name, lambda t, q, v, p: jnp.array([[1.0, 0.0]]), lambda t, q, v, p: jnp.array([right(t)])
+    )
+    own = {"kinetic": lambda t, q, v, p: 0.5 * v @ v, "q": [0.0, 0.0]}
+    pair = lagrangian.LagrangianSystem(**own, constraints=[row("a", jnp.cos), row("b", jnp.cos)])
+    assert mb.simulate(pair, mb.assemble(pair), t1=1.0).ys.u[-1, 0] == pytest.approx(np.sin(1.0), abs=1e-8)
+    pair = lagrangian.LagrangianSystem(**own, constraints=[row("a", jnp.ones_like), row("b", jnp.cos)])
+    with pytest.raises(RuntimeError, match=r"constraints (a|b) \(.*, (a|b) \("):
+        mb.simulate(pair, mb.assemble(pair), t1=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("manifold", [Baumgarte(), Projection()])
+def test_other_manifolds_do_not_watch_servos(manifold):
+    system = servos(servo("first"), servo("second"))
+    with pytest.raises(ValueError, match=r"Of 4 constraint rows only 3 .*does not watch implied rows of servos"):
+        mb.simulate(system, mb.assemble(system, rates={"crank.angle": 1.0}), t1=1.0, manifold=manifold)
+
+
+@pytest.mark.slow
+def test_drivers_that_contradict_each_other_are_refused_with_stabilised_constraints():
+    second = planar.Driver(
+        "second", "ground", "crank", quantity="angle", motion=lambda t, p: p["rate"] * t**2, parameters={"rate": 1.0}
+    )
+    system = crank(driver("first", lambda t: t**2), second).compile()
+    options = {"manifold": Baumgarte(), "solver": diffrax.Tsit5()}
+    mb.simulate(system, mb.assemble(system), t1=1.0, **options)
+    changed = mb.with_parameters(system, {"second.rate": 2.0})
+    with pytest.raises(RuntimeError, match=r"constraints second \(1\) contradict the others"):
+        mb.simulate(changed, mb.assemble(changed), t1=1.0, **options)
+
+
+# Rows that are implied to a higher order
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-8])
+def test_a_row_that_is_implied_to_the_fifth_order(rtol):
+    """Together the rows admit no motion. The displacement x that one of them admits violates the other by x⁵, so by
+    5e-8 in the end, and by a displacement of x / 5.
+    """
+    bead = particle(lambda t, q, p: q[1], lambda t, q, p: q[1] - q[0] ** 5)
+    motion = mb.simulate(bead, mb.State(bead.guess.q, jnp.array([1.0, 0.0])), t1=0.035, rtol=rtol, throw=False)
+    assert (motion.result == mb.RESULTS.successful) == (rtol == 1e-3)
+
+
+@functools.cache
+def box_on_ropes():
+    corners = [(0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5)]
+    box = spatial.Body("box", mass=1.0, inertia=spatial.box(1.0, 1.0, 1.0, 1.0), position=(0.0, 0.0, 2.0))
+    ropes = [
+        spatial.Distance(f"rope{k}", "ground", "box", point_a=(x, y, 5.0), point_b=(x, y, 0.5), length=2.5)
+        for k, (x, y) in enumerate(corners)
+    ]
+    return mb.Scene([box], joints=ropes, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-11])
+def test_a_box_that_yaws_and_sways_on_four_ropes(rtol):
+    """At home three rows are independent, and beside it four: the fourth binds the pitch by the third order only."""
+    system = box_on_ropes()
+    rates = {"box.velocity": (0.3, 0.0, 0.0), "box.angular_velocity": (0.0, 0.0, 0.3)}
+    with pytest.raises(RuntimeError, match=r"rope\d \(.*contradict.*If they agree, the compiled pose is a bifurcation"):
+        mb.simulate(system, mb.assemble(system, rates=rates), t1=5.0, rtol=rtol)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-8, 1e-11])
+def test_a_box_that_sways_on_four_ropes(rtol):
+    """It is a spherical pendulum, and the ropes stay parallel."""
+    system, rates = box_on_ropes(), {"box.velocity": (0.3, 0.1, 0.0)}
+    motion = mb.simulate(system, mb.assemble(system, rates=rates), t1=5.0, rtol=rtol)
+    energy = 0.5 * jnp.sum(motion["box"].velocity[-1] ** 2) + 9.81 * (motion["box"].position[-1, 2] - 2.0)
+    np.testing.assert_allclose(energy, 0.05, atol=max(rtol, 1e-12))
 
 
 # States off the constraints

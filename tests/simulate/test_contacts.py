@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 import jaxmb as mb
 from jaxmb import manifold, planar, spatial, terrain
 from jaxmb.manifold import Projection
-from jaxmb.solvers import restarts
+from jaxmb.solvers import Hermite, restarts
 
 G = 9.81
 
@@ -518,6 +518,101 @@ def test_a_particle_at_rest_lifts_off_when_it_is_pulled():
     inputs = {"pull.force": lambda t: jnp.stack([0.0 * t, 15.0 * jnp.sin(2 * jnp.pi * t)])}
     motion = mb.simulate(system, mb.assemble(system), t1=1.0, inputs=inputs)
     np.testing.assert_allclose(motion.events.times[0], np.arcsin(2 / 3) / (2 * np.pi), rtol=1e-8)
+
+
+def lifted(place=0.2, level=0.0, space=planar):
+    """A ball of 2 kg at rest on level ground, with its centre at this height, and a force on it."""
+    up = (0.0, 1.0) if space is planar else (0.0, 0.0, 1.0)
+    along = lambda size: tuple(size * x for x in up)
+    inertia = 0.1 if space is planar else (0.1, 0.1, 0.1)
+    floor = mb.RigidContact("floor", "ball", terrain=terrain.Flat(level), radius=place - level)
+    forces = [mb.Gravity(along(-G)), space.PointForce("lift", "ball", force=along(0.0))]
+    ball = space.Body("ball", mass=2.0, inertia=inertia, position=along(place))
+    return mb.Scene([ball], joints=[floor], forces=forces).compile()
+
+
+def risen(force, duration):
+    """The height after a lift from rest, of a ball of 2 kg."""
+    return 0.5 * jnp.maximum(force / 2 - G, 0.0) * duration**2
+
+
+LIFTED = lifted()
+
+
+def test_a_ball_that_is_lifted_from_the_start():
+    """The error of the first step is larger than the height that it reaches."""
+    forces = jnp.array([0.0, 19.0, 19.621, 30.0, 1000.0])
+
+    def end(force, rtol):
+        system = mb.with_parameters(LIFTED, {"lift.force": jnp.stack([0.0, force])})
+        state = mb.State(LIFTED.guess.q, jnp.zeros(LIFTED.nu))
+        return mb.simulate(system, state, t1=0.3, rtol=rtol, max_steps=200, max_events=2)["ball"].position[-1, 1]
+
+    run = jit_quickly(jax.vmap(jax.value_and_grad(end), in_axes=(0, None)))
+    heights, slopes = run(forces, 1e-8)
+    np.testing.assert_allclose(heights, 0.2 + risen(forces, 0.3), atol=1e-8)
+    np.testing.assert_allclose(slopes, jnp.where(forces > 2 * G, 0.25 * 0.09, 0.0), atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [None, Hermite(), diffrax.Tsit5()], ids=str)
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_lift_from_closed_and_open_contacts(solver, closed):
+    system = mb.with_parameters(LIFTED, {"lift.force": (0.0, 30.0)})
+    state = mb.assemble(system, fix={"floor.mode": 1} if closed else {})
+    motion = mb.simulate(system, state, t1=0.3, solver=solver, max_steps=3000)
+    np.testing.assert_allclose(motion["ball"].position[-1, 1], 0.2 + risen(30.0, 0.3), atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [1e-3, 7.0, 1e3, 1e6])
+@pytest.mark.parametrize("space", [planar, spatial], ids=["planar", "spatial"])
+@pytest.mark.parametrize("on_a_level", [False, True])
+def test_lifts_at_all_places(place, space, on_a_level):
+    """Errors of integration scale with the place, and rounding errors of the gap as well."""
+    system = lifted(place + 0.5 * on_a_level, place if on_a_level else 0.0, space)
+    up = 2 if space is spatial else 1
+    for force in (19.7, 30.0, 1000.0):
+        forced = mb.with_parameters(system, {"lift.force": (0.0,) * up + (force,)})
+        motion = mb.simulate(forced, mb.assemble(forced), t1=0.3, max_steps=1000)
+        height = motion["ball"].position[-1, up] - system.guess.q[up]
+        np.testing.assert_allclose(height, risen(force, 0.3), atol=1e-8 * max(place, 1.0))
+
+
+@pytest.mark.slow
+def test_a_lift_after_an_event():
+    """The ball falls on the ground without a rebound, rests, and is lifted by a force that jumps."""
+    system = mb.Scene(
+        [planar.Body("ball", mass=2.0, inertia=0.1, position=(0.0, 1.2))],
+        joints=[mb.RigidContact("floor", "ball", terrain=terrain.Flat(), radius=0.2)],
+        forces=[
+            mb.Gravity((0.0, -G)),
+            mb.Force("lift", "ball", lambda x, v, t, p: jnp.array([0.0, 30.0 * (t > 1), 0])),
+        ],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=1.3, jumps=[1.0])
+    np.testing.assert_allclose(motion["ball"].position[-1, 1], 0.2 + risen(30.0, 0.3), atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [1e-3, 0.7, 123.4, 1e6])
+def test_stops_and_ropes_that_open_at_the_start(place):
+    """A slide is pulled off its stop, and a ball up to the point from which it hangs."""
+    body = planar.Body("body", mass=2.0, inertia=0.1, position=(place, 0.0))
+    slide = planar.Prismatic("slide", "ground", "body", point=(0.0, 0.0), axis=(1.0, 0.0))
+    stop = mb.Stop("stop", "slide.displacement", lower=0.0)
+    push = planar.PointForce("push", "body", force=(3.0, 0.0))
+    system = mb.Scene([body], joints=[slide, stop], forces=[push]).compile()
+    moved = mb.simulate(system, mb.assemble(system), t1=0.3, max_steps=1000)["body"].position[-1, 0] - place
+    np.testing.assert_allclose(moved, 0.5 * 1.5 * 0.09, atol=1e-8 * max(place, 1.0))
+
+    ball = planar.PointMass("ball", mass=2.0, position=(0.0, -place))
+    rope = mb.Rope("rope", [("ground", (0.0, 0.0)), ("ball", (0.0, 0.0))], length=place, slack=True)
+    lift = planar.PointForce("lift", "ball", force=(0.0, 30.0))
+    system = mb.Scene([ball], joints=[rope], forces=[mb.Gravity((0.0, -G)), lift]).compile()
+    t1 = min(0.3, 0.5 * np.sqrt(place))
+    moved = mb.simulate(system, mb.assemble(system), t1=t1, max_steps=1000)["ball"].position[-1, 1] + place
+    np.testing.assert_allclose(moved, risen(30.0, t1), atol=1e-8 * max(place, 1.0))
 
 
 @pytest.mark.slow

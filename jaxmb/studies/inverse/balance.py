@@ -22,6 +22,7 @@ from ..._compat import with_rest_computed
 from ..._types import Scalar, State
 from ...formulations.friction import find_multipliers
 from ...formulations.laws import laws_of
+from ...formulations.shares import least_multipliers
 from ...linalg.elimination import Factor, eliminate, full_pivot, solve
 from ...linalg.jitted import jitted
 from ...linalg.members import vmap_states
@@ -94,7 +95,7 @@ def balanced(
 
         tau, multipliers, failed = _with_friction(at, balance)
         found = found._replace(failed=failed, proportional=_is_proportional(at, drives, B, tau))
-        return tau, tau * (B @ at.u), multipliers, found
+        return tau, tau * (B @ at.u), least_multipliers(at, multipliers), found
 
     numbers = (rest.acceleration_rows + spread.size) * rest.nu
     return vmap_states(single, numbers)(path.ts, path.ys, path.accelerations)
