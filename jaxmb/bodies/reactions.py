@@ -174,7 +174,7 @@ def undetermined(system: Any, ts: Any, ys: State) -> tuple[str, ...]:
     names = {name for row in system.implied for name in (row.name, *row.by)}
     contacts = system.contacts
     if contacts and not is_traced((system, ts, ys)):
-        modes = np.asarray(jax.vmap(lambda q: contacts.modes(system.normalize(q)).kinds)(ys.q))
+        modes = np.asarray(jax.vmap(lambda q: contacts.modes(q).kinds)(ys.q))
         alone = np.repeat([IMPLIED, IMPLIED_STICK], [contacts.n, contacts.m])
         _, first = np.unique(modes, axis=0, return_index=True)
         for k in first[np.any(modes[first] == alone, axis=1)]:

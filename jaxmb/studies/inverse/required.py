@@ -237,7 +237,7 @@ def _refusal(rest, drives: Drives, path: Course, found: Found, k: int, tolerance
     beyond = here.gaps < -tolerance
     if beyond.any():
         q = path.ys.q[k]
-        gaps = np.asarray(rest.contacts.gaps(rest, path.ts[k], rest.normalize(q)))
+        gaps = np.asarray(rest.contacts.gaps(rest, path.ts[k], rest.normalize(path.ts[k], q)))
         named = zip(rest.contacts.contact_names, gaps, beyond, strict=True)
         through = ", ".join(f"{name} by {-gap:.3g}" for name, gap, bad in named if bad)
         return f"{lead} the motion passes through {through} [m, rad]. Correct the motion, or raise tolerance."
