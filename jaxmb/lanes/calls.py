@@ -13,6 +13,7 @@ _PROGRAMS = {
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
     "checkpoint": "jaxpr",
+    "remat2": "jaxpr",
     # Functions with their own rule for batches.
     "custom_vmap_call": "call",
 }

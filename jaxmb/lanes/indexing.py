@@ -22,8 +22,8 @@ def _in_range(index, largest):
 def _dynamic_slice(lanes, equation, values):
     (table, *indices), sizes = values, equation.params["slice_sizes"]
     if not any(index.varies for index in indices):
-        start = _starts(indices)
-        return apart(lambda array, *start: lax.dynamic_slice(array, start, (*sizes, lanes.size)))(table.array, *start)
+        take = lambda *operands: equation.primitive.bind(*operands, slice_sizes=(*sizes, lanes.size))
+        return apart(take)(table.array, *_starts(indices))
     shape = equation.invars[0].aval.shape
     if max(n - k + 1 for n, k in zip(shape, sizes, strict=True)) > _SELECTED:
         if not table.varies or math.prod(sizes) <= 2 * _SELECTED:
@@ -46,7 +46,11 @@ def _dynamic_slice(lanes, equation, values):
 
 
 def _starts(indices):
-    """Start indices that members share, followed by zero for the axis of the members."""
+    """Start indices that members share, followed by zero for the axis of the members.
+
+    They are those of the operation itself, which brings them into range. `jax.lax` would count negative ones from the
+    end of the axis once more.
+    """
     start = [jnp.asarray(index.array) for index in indices]
     return [*start, jnp.zeros((), start[0].dtype)]
 
@@ -55,7 +59,7 @@ def _starts(indices):
 def _dynamic_update_slice(lanes, equation, values):
     table, part, *indices = values
     if not any(index.varies for index in indices):
-        return lax.dynamic_update_slice(lanes.spread(table), lanes.spread(part), _starts(indices))
+        return equation.primitive.bind(lanes.spread(table), lanes.spread(part), *_starts(indices))
     shape, sizes = (atom.aval.shape for atom in equation.invars[:2])
     rows = all(k in (1, n) for n, k in zip(shape, sizes, strict=True))
     if not rows or math.prod(shape) > 64 * _SELECTED:

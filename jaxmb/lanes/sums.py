@@ -44,7 +44,7 @@ def _reduce(lanes, equation, values):
 @rule("cumsum", "cumprod", "cummax", "cummin")
 def _cumulative(lanes, equation, values):
     array, axis, backward = values[0].array, equation.params["axis"], equation.params["reverse"]
-    if array.shape[axis] > _SEARCHED:
+    if not 0 < array.shape[axis] <= _SEARCHED:
         return equation.primitive.bind(array, **equation.params)
     operation, entries = _OPERATIONS[equation.primitive.name], _entries(array, axis, keepdims=True)
     out = list(_accumulated(operation, entries[::-1] if backward else entries))

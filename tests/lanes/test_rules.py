@@ -34,7 +34,75 @@ def rare(x):
     return taken(x)
 
 
+def powers(x):
+    """The number of turns differs within a member, and is the same for all members."""
+    of_one = lambda n: lax.while_loop(lambda carry: carry[0] < n, lambda carry: (carry[0] + 1, carry[1] * x), (0, x))[1]
+    return jax.vmap(of_one)(jnp.arange(MEMBERS))
+
+
+def powers_twice(x):
+    """Of two axes, with values that are the same for all members beside values that are not."""
+    turn = lambda carry: (carry[0] + 1, carry[1] * 1.5, carry[2] * x)
+    of_two = lambda m, n: lax.while_loop(lambda carry: carry[0] < m + n, turn, (0, jnp.ones(3), x))
+    return jax.vmap(lambda m: jax.vmap(lambda n: of_two(m, n))(jnp.arange(MEMBERS)))(jnp.arange(3))
+
+
+def halved(x, size):
+    """The number of turns depends on the member as well."""
+    of_one = lambda a: lax.while_loop(lambda c: jnp.sum(c) > 1.0, lambda c: 0.5 * c, a * jnp.abs(x))
+    return jax.vmap(of_one)(jnp.arange(1.0, size + 1))
+
+
+def halved_within(x):
+    """A loop that ends at its own time, within a loop and a scan that do."""
+    inner = lambda c: lax.while_loop(lambda c: jnp.sum(c) > 1.0, lambda c: 0.5 * c, c)
+    outer = lambda n: lax.fori_loop(0, n, lambda k, c: inner(c + jnp.abs(x)), x)
+    rows = lambda n: lax.scan(lambda c, row: (inner(c + row**2), c), outer(n), jnp.stack([x, 2 * x]))
+    return jax.vmap(rows)(jnp.arange(MEMBERS))
+
+
+def derivatives_of_a_loop(x):
+    """Tangents have the axes of the condition as well, and rows of a Jacobian one more."""
+    of_one = lambda n, x: lax.fori_loop(0, n, lambda k, c: jnp.sin(c) * x, x)
+    return jax.vmap(lambda n: (jax.jacfwd(lambda x: of_one(n, x))(x), jax.jvp(lambda x: of_one(n, x), (x,), (x,))))(
+        jnp.arange(MEMBERS)
+    )
+
+
+def chosen_within(x, k):
+    """Loops within the branches of conditions, by members and by rows."""
+    loop = lambda n: lax.while_loop(lambda c: c[0] < n, lambda c: (c[0] + 1, c[1] * x), (0, x))[1]
+    every = lambda: jax.vmap(loop)(jnp.arange(3))
+    of_row = lambda n: lax.cond(n > 1, loop, lambda n: x, n)
+    return lax.cond(k > 1, every, lambda: jnp.zeros((3, 4)) + x[0]), jax.vmap(of_row)(jnp.arange(3) + k)
+
+
+def keys(x):
+    """Random keys in loops and conditions."""
+    key = jax.random.key(0)
+    of_one = lambda y: lax.while_loop(
+        lambda carry: carry[0] < 3 * y, lambda carry: (carry[0] + 1, jax.random.fold_in(carry[1], 5)), (0.0, key)
+    )[1]
+    return jax.random.uniform(jax.vmap(of_one)(x)[1], (2,))
+
+
+def read_before(a):
+    """Starts in front of a table, the same for all members, are brought into range."""
+    out = lax.fori_loop(0, 2, lambda k, c: c + lax.dynamic_slice(a, (k - 11, 0), (2, 3)), jnp.zeros((2, 3)))
+    return out, lax.fori_loop(0, 2, lambda k, c: lax.dynamic_update_slice(c, c[1:3], (k - 11, 0)), a)
+
+
 CASES = {
+    "powers": (powers, VECTORS),
+    "powers twice": (powers_twice, VECTORS),
+    "halved": (lambda x: (halved(x, MEMBERS), halved(x, 4), halved(x, 3)), VECTORS),
+    "halved within": (halved_within, VECTORS),
+    "derivatives of a loop": (derivatives_of_a_loop, VECTORS),
+    "chosen within": (chosen_within, VECTORS, PLACES),
+    "keys": (keys, VECTORS),
+    "read before": (read_before, MATRICES),
+    "no terms": (lambda a: (lax.cumsum(a[:0], 0), lax.cummax(a[:0], 0), a[:0].sum(0), jnp.sort(a[:0], 0)), MATRICES),
+    "recomputed": (lambda x: jax.checkpoint(lambda x: halved(jnp.sin(x), 3))(x), VECTORS),
     "products": (lambda a, b: (a @ b, a * 2, jnp.einsum("ij,ij->i", a, a)), MATRICES, OTHERS),
     "long products": (lambda a: (a @ a.T, a @ LARGE[0].T), LARGE),
     "no rows": (lambda a: a[:, :0] @ a[:, :0].T, MATRICES),
@@ -84,11 +152,30 @@ def both(function, *members):
     return [np.moveaxis(np.asarray(x), -1, 0) for x in found], jax.tree.leaves(jax.vmap(function)(*members))
 
 
+@pytest.mark.slow(
+    "powers twice", "halved within", "derivatives of a loop", "chosen within", "keys", "no terms", "recomputed"
+)
 @pytest.mark.parametrize("name", CASES)
 def test_rules_give_what_vmap_gives(name):
     for found, expected in zip(*both(*CASES[name]), strict=True):
         assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
         np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [3, MEMBERS])
+@pytest.mark.parametrize("name", CASES)
+def test_rules_give_what_vmap_gives_within_a_vmap(name, rows):
+    """With as many rows as members as well, where axes could be taken for each other."""
+    function, *members = CASES[name]
+    members = [np.stack([np.roll(x, k, 0) for k in range(rows)], 1) for x in members]
+    found, _ = both(jax.vmap(function), *members)
+    alone = jax.jit(function)
+    for k in range(MEMBERS):
+        for row in range(rows):
+            expected = jax.tree.leaves(alone(*[x[k, row] for x in members]))
+            for x, y in zip(found, expected, strict=True):
+                np.testing.assert_allclose(x[k, row], y, rtol=1e-12, atol=1e-12)
 
 
 def test_an_operation_without_a_rule_has_that_of_batches():
