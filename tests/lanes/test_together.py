@@ -1,5 +1,9 @@
 """Motions of several members side by side."""
 
+import subprocess
+import sys
+
+import batched_machines
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +61,24 @@ def test_a_vmap_has_members_side_by_side(monkeypatch):
     # Eleven members are two blocks of six.
     shapes = set(carried_shapes(together.trace(masses).jaxpr))
     assert any(shape[-1:] == (6,) for shape in shapes) and not any(shape[:1] == (11,) for shape in shapes)
+
+
+@pytest.mark.slow(but=("powers",))
+@pytest.mark.parametrize("name", batched_machines.MACHINES)
+def test_machines_in_batches_move_as_each_alone(name, monkeypatch):
+    monkeypatch.setattr(members, "computes_side_by_side", lambda: True)
+    assert max(batched_machines.differences(name).values()) < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["quickly", "for speed", "for batches", None])
+def test_batches_with_all_ways_to_compile(way, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = [] if way is None else ["--compile", way]
+    done = subprocess.run(
+        [sys.executable, batched_machines.__file__, "powers", "sliding", *options], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.slow
