@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float
 # The largest excursion of a function that may be missed between two steps, relative to its range.
 _HIDDEN = 0.1
 # A value is that of a pulse if it differs from the polynomial this many times more than the values beside the pulse.
-_STANDS_OUT = 4.0
+# Beside a pulse at a knot few values of a series differ, so it must stand out more.
+_STANDS_OUT, _AT_KNOTS = 4.0, 16.0
 # Differences below this many units in the last place of the largest value are rounding errors.
 _ROUNDING = 64
 # The places of the values on either side of a pulse, in units of its half width; irregular, so that no wave looks alike
@@ -94,7 +95,7 @@ def pulses_of_samples(
             return _Beside(width * jnp.full_like(ts, ts[1] - ts[0]), extended[places], rows)
 
         widths = jnp.asarray(_WIDTHS, ts.dtype), jnp.asarray(_OFFSETS), jnp.asarray(rows)
-        return _pulses(ts, block, beside, widths, ended), None
+        return _pulses(ts, block, beside, widths, ended, _STANDS_OUT), None
 
     return lax.scan(of_block, ended, jnp.moveaxis(blocks, 1, 0))[0]
 
@@ -125,7 +126,7 @@ def pulses_at_knots(
         values = jnp.where(early, before - values, jnp.where(late, after - values, values))
         return _Beside(width, values, rows)
 
-    return _pulses(ts, known, beside, jnp.asarray(np.concatenate([reaches, -reaches])), ended)
+    return _pulses(ts, known, beside, jnp.asarray(np.concatenate([reaches, -reaches])), ended, _AT_KNOTS)
 
 
 def on_straight_lines(ts: Float[Array, "n"], values: Float[Array, "n columns"]) -> Bool[Array, "n"]:
@@ -135,7 +136,7 @@ def on_straight_lines(ts: Float[Array, "n"], values: Float[Array, "n columns"]) 
     return jnp.pad(jnp.any(off <= _rounding(values), axis=1), 1)
 
 
-def _pulses(ts, values, beside: Callable[[Any], _Beside], widths, ended):
+def _pulses(ts, values, beside: Callable[[Any], _Beside], widths, ended, most):
     """At which times some column is at the peak of a pulse of one of the widths; or where steps are `ended` anyway."""
     rounding = _rounding(values)
 
@@ -143,7 +144,7 @@ def _pulses(ts, values, beside: Callable[[Any], _Beside], widths, ended):
         width, around, rows = beside(of_width)
         out = jnp.tensordot(rows, around, 1)
         height = jnp.abs(values - out[-1])
-        stands_out = height > _STANDS_OUT * jnp.sqrt(jnp.sum(out[:-1] ** 2, axis=0)) + rounding
+        stands_out = height > most * jnp.sqrt(jnp.sum(out[:-1] ** 2, axis=0)) + rounding
         height = jnp.where(stands_out, height, 0.0)
         highest = jnp.max(height, axis=0, keepdims=True)
         relative = jnp.max(height / jnp.where(highest > 0, highest, 1.0), axis=1)
