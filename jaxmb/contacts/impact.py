@@ -23,6 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar, State
@@ -30,10 +31,9 @@ from ..formulations import AbstractFormulation
 from ..linalg.pairs import of_pairs
 from ..linalg.pushed import dense, push
 from ..linalg.sums import with_entries
-from ..system.contact_set import ContactSet
 from ..system.equation import AbstractEquation
 from .forces import contact_forces, largest_force, reserves
-from .groups import least_in_group
+from .groups import HOLDS, least_in_group
 from .impacting import Event, find_event
 from .phases import Phases
 from .tolerance import ContactTolerance
@@ -143,44 +143,57 @@ def _together(system, t, y, event: Event, dlate, along):
 
 
 def _apart(system, t, y, event: Event, dlate, along):
-    """The same for several groups, each with its own time. The equations of motion change group by group."""
+    """The same for several groups, each with its own time."""
     dsystem, dt, dq, du, dz = along
-    heads, (before, after) = jnp.asarray(system.contacts.heads), event.modes
+    heads = system.contacts.heads
     phases = Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du)
-    together = _struck(phases)
+    impulses, change, energy = _struck(phases)
+    # A group with a zero comes before a group whose modes change.
+    before, after = (system.contacts.as_modes(numbers).kinds for numbers in event.modes)
+    _, changes = least_in_group(event.group, before != after, before)
+    rank = jnp.where(event.hits, 2, jnp.where(changes & (event.group != HOLDS), 1, 0))
+    by_time = _by_times(phases, y, rank > 0)
+    dlate = dlate[heads]
+    left, ahead, of_states, *of_impact = jax.tree.map(lambda x: dlate @ x, by_time)
+    dz = None if dz is None else dz + of_states
+    after_event = dq + left, change + ahead, dz
+    # The time of the event is the time of its first group.
+    return after_event, dlate[jnp.argmax(rank[heads])], impulses + of_impact[0], energy + of_impact[1]
+
+
+def _by_times(phases: Phases, y, acts):
+    """The derivatives of the state after the event, of its impulses and of the energy lost by the time of each group,
+    zero for groups none of whose laws `acts`. The equations of motion change group by group.
+    """
+    event, (system, t, _), (before, after) = phases.event, phases.at, phases.event.modes
+    assert event.group is not None
+    heads, leads = jnp.asarray(system.contacts.heads), acts & (event.group == jnp.arange(acts.size))
+    order, count = jnp.argsort(~leads[heads], stable=True), jnp.sum(leads)
     still = jax.tree.map(lambda _: None, system)
     onwards = still, jnp.ones_like(t), system.rates(t, y.q, event.at)
 
-    def alone(group):
-        own = phases.of_group(group, onwards, event.before)
-        return own.event.u - event.at, *_struck(own)
+    def of_states(q, u):
+        return None if y.z is None else system.state_rates(t, q, u)
 
-    moved, *by_time = jax.vmap(alone)(heads)
-
-    def rates(u, modes):
+    def advance(k, carry):
+        (u, modes), rates, table = carry
+        head = heads[order[k]]
+        own = phases.of_group(event.group == head, onwards, event.before)
+        impulses, change, energy = _struck(own)
+        u, modes = u + (own.event.u - event.at), jnp.where(event.group == head, after, modes)
         q = system.contacts.with_modes(y.q, modes)
-        udot, _ = contact_forces(system, t, q, u)
-        return system.rates(t, q, u), udot, None if dz is None else system.state_rates(t, q, u)
+        new = system.rates(t, q, u), contact_forces(system, t, q, u)[0], of_states(q, u)
+        left, ahead, of_z = jax.tree.map(lambda old, new: old - new, rates, new)
+        row = left, change - event.before + ahead, of_z, impulses, energy
+        return (u, modes), new, jax.tree.map(lambda table, x: table.at[order[k]].set(x), table, row)
 
-    # The rates before the first group, and after each group.
-    later = jnp.cumsum(moved[::-1], axis=0)[::-1] - moved
-    velocities = jnp.concatenate([event.at[None], event.u[None] - later])
-    in_turn = jax.vmap(lambda head: jnp.where(event.group <= head, after, before))(heads)
-    of_motion = jax.vmap(rates)(velocities, jnp.concatenate([before[None], in_turn]))
-    dlate = dlate[system.contacts.heads]
-    left, ahead, of_states = jax.tree.map(lambda x: dlate @ (x[:-1] - x[1:]), of_motion)
-    impulses, change, energy = (x + dlate @ each for x, each in zip(together, by_time, strict=True))
-    change = change - jnp.sum(dlate) * event.before + ahead
-    dz = None if dz is None else dz + of_states
-    return (dq + left, change, dz), _of_first(system.contacts, event, dlate), impulses, energy
-
-
-def _of_first(contacts: ContactSet, event: Event, dlate):
-    """The derivative of the time of the first group in which a gap or slip is zero, or else a mode changes."""
-    before, after = (contacts.as_modes(numbers).kinds for numbers in event.modes)
-    _, changes = least_in_group(event.group, before != after, before)
-    rank = jnp.where(event.hits, 2, jnp.where(changes, 1, 0))
-    return dlate[jnp.argmax(rank[contacts.heads])]
+    start = event.u - phases.alone(acts, event.impulses, event.held) @ phases.moves
+    rates = onwards[2], event.before, of_states(y.q, event.at)
+    row = *rates, event.impulses, event.energy
+    table = jax.tree.map(lambda x: jnp.zeros((heads.size, *x.shape), x.dtype), row)
+    # A loop over the groups that act, since it is mostly one.
+    carry = (start, jnp.where(acts, before, after)), rates, table
+    return lax.fori_loop(0, count, advance, carry)[2]
 
 
 def _struck(phases: Phases):

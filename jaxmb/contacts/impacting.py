@@ -379,6 +379,10 @@ class Impacting:
         resting = when.touching & ((rate[:n] <= REST * sizes[:n]) | before.low)
         ended, slips = self.slips_left(rate[n:], sizes[n:])
         balance = self.groups(when.touching, resting, ended, jnp.zeros_like(ended))
+        last = before.struck.balance
+        if balance is not None and last is not None:
+            # While shares are searched, their groups stay.
+            balance = jnp.where(jnp.any(before.trial.again), last, balance)
         gained = group_sums(balance, impulses * (when.at + rate))
         size = group_sums(balance, jnp.abs(impulses) * (jnp.abs(when.at) + jnp.abs(rate)))
         of_share = balance, (gained, size), before.trial.share

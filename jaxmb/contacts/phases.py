@@ -59,28 +59,26 @@ class Phases:
     def contacts(self) -> ContactSet:
         return self.at[0].contacts
 
-    def of_group(self, group: Any, tangents, du) -> "Phases":
-        """The phases of an impact of one group alone, with tangents of their own."""
-        event, influence = self.event, self.rows @ self.moves.T
-        own, holds = event.group == group, event.group == HOLDS
-        with_own = lambda held: held & (own | holds)
+    def alone(self, own: Bool[Array, "laws"], impulses, held) -> Float[Array, "laws"]:
+        """The impulses if those of some groups act alone: laws that hold bodies answer to them."""
+        alone, influence = jnp.where(own, impulses, 0.0), self.rows @ self.moves.T
+        return alone + solved_components(influence, influence @ alone, held & (self.event.group == HOLDS))
 
-        def impulses(phase_impulses, held):
-            # Laws that hold bodies answer to the impulses of the group.
-            alone = jnp.where(own, phase_impulses, 0.0)
-            return alone + solved_components(influence, influence @ alone, held & holds)
-
+    def of_group(self, own: Bool[Array, "laws"], tangents, du) -> "Phases":
+        """The phases of an impact of one group alone, its `own` laws, with tangents of its own."""
+        event, compression = self.event, self.event.compression
+        acts = own | (event.group == HOLDS)
         slips = lambda slips: jnp.where(own[self.contacts.n :], slips, 0.0)
-        alone, compression = impulses(event.impulses, event.held), event.compression
         if compression is not None:
-            pushed = impulses(compression.impulses, compression.held)
-            at_end = event.at + pushed @ self.moves
-            compression = Phase(at_end, with_own(compression.held), slips(compression.slips), pushed)
+            impulses = self.alone(own, compression.impulses, compression.held)
+            u = event.at + impulses @ self.moves
+            compression = Phase(u, compression.held & acts, slips(compression.slips), impulses)
+        impulses = self.alone(own, event.impulses, event.held)
         event = event._replace(
-            u=event.at + alone @ self.moves,
-            held=with_own(event.held),
+            u=event.at + impulses @ self.moves,
+            held=event.held & acts,
             slips=slips(event.slips),
-            impulses=alone,
+            impulses=impulses,
             share=jnp.where(own, event.share, 1.0),
             compression=compression,
         )
