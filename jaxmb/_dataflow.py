@@ -4,9 +4,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from ._compat import ClosedJaxpr, Jaxpr, Literal
+from .linalg.arrays import ARRAYS
 
 # Operations that are analytic where they are finite. A composition of these that vanishes at independent random numbers
 # vanishes everywhere.
@@ -16,7 +19,7 @@ _ANALYTIC = {
     *("sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "dot_general", "reduce_sum", "cumsum", "reduce_prod"),
     *("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "concatenate", "pad", "rev", "copy"),
     *("slice", "dynamic_slice", "dynamic_update_slice", "gather", "scatter", "scatter-add", "convert_element_type"),
-    *("stop_gradient", "optimization_barrier", "triangular_solve", "cholesky", "symmetric_product", "split"),
+    *("optimization_barrier", "triangular_solve", "cholesky", "symmetric_product", "split"),
 }
 # Operations that do what their inner program does.
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "custom_jvp_call", "custom_vjp_call"}
@@ -27,11 +30,10 @@ def depends(function: Callable[..., Any], arguments: tuple[Any, ...], *which: in
 
     A dependence with a factor of zero counts as well.
     """
-    closed = jax.make_jaxpr(function)(*arguments)
-    reached = _arguments_of(closed, arguments, which)
-    for _ in _reached(closed, reached):
+    program, reached = _traced(function, arguments, which)
+    for _ in _reached(program, reached):
         pass
-    return any(not isinstance(v, Literal) and v in reached for v in closed.jaxpr.outvars)
+    return any(not isinstance(v, Literal) and v in reached for v in program.outvars)
 
 
 def is_analytic(function: Callable[..., Any], arguments: tuple[Any, ...], *which: int) -> bool:
@@ -39,22 +41,21 @@ def is_analytic(function: Callable[..., Any], arguments: tuple[Any, ...], *which
 
     A comparison, a choice, a loop or an absolute value may behave otherwise for other numbers.
     """
-    closed = jax.make_jaxpr(function)(*arguments)
-    return all(map(_is_analytic, _reached(closed, _arguments_of(closed, arguments, which))))
+    return _is_analytic(*_traced(function, arguments, which))
 
 
 def shaken(values: Any, seed: int, share: float = 0.1) -> Any:
     """A pytree with independent random numbers: each number changes by up to this share of it, a zero becomes about 1.
 
-    Numbers that are traced are replaced by numbers of about 1.
+    Numbers that are traced are replaced by numbers of about 1; other leaves than real arrays stay.
     """
     random = np.random.default_rng(seed)
 
     def one(value):
-        if not np.issubdtype(np.dtype(value.dtype), np.floating):
+        if not isinstance(value, (*ARRAYS, jax.ShapeDtypeStruct)) or not jnp.issubdtype(value.dtype, jnp.floating):
             return value
         about_one = 1 + random.uniform(-0.5, 0.5, value.shape)
-        if isinstance(value, jax.core.Tracer | jax.ShapeDtypeStruct):
+        if isinstance(value, Tracer | jax.ShapeDtypeStruct):
             return about_one.astype(value.dtype)
         value = np.asarray(value)
         return np.where(value == 0, about_one, value * (1 + 2 * share * (about_one - 1))).astype(value.dtype)
@@ -62,22 +63,33 @@ def shaken(values: Any, seed: int, share: float = 0.1) -> Any:
     return jax.tree.map(one, values)
 
 
-def _arguments_of(closed, arguments, which):
+def _traced(function, arguments, which):
+    """The program of a function, and the variables of some of its arguments."""
+    program = jax.make_jaxpr(function)(*arguments).jaxpr
     owner = [k for k, argument in enumerate(arguments) for _ in jax.tree.leaves(argument)]
-    return {v for k, v in zip(owner, closed.jaxpr.invars, strict=True) if k in which}
+    return program, {v for k, v in zip(owner, program.invars, strict=True) if k in which}
 
 
-def _reached(closed: ClosedJaxpr, reached: set[Any]) -> Iterator[Any]:
+def _reached(program: Any, reached: set[Any]) -> Iterator[Any]:
     """The operations that some values reach; their results are added to these values."""
-    for equation in closed.jaxpr.eqns:
+    for equation in program.eqns:
         if any(not isinstance(v, Literal) and v in reached for v in equation.invars):
             reached.update(equation.outvars)
             yield equation
 
 
-def _is_analytic(equation: Any) -> bool:
-    if equation.primitive.name not in _CALLS:
-        return equation.primitive.name in _ANALYTIC
-    programs = [x for x in equation.params.values() if isinstance(x, ClosedJaxpr | Jaxpr)]
-    inner = [getattr(program, "jaxpr", program) for program in programs]
-    return bool(inner) and all(_is_analytic(e) for program in inner for e in program.eqns)
+def _is_analytic(program: Any, reached: set[Any]) -> bool:
+    for equation in _reached(program, reached):
+        name, given = equation.primitive.name, equation.invars
+        if name not in _CALLS:
+            # A real number may also be rounded to a whole one.
+            whole = name == "convert_element_type" and not jnp.issubdtype(equation.params["new_dtype"], jnp.floating)
+            if whole or name not in _ANALYTIC:
+                return False
+            continue
+        (inner,) = (x for x in equation.params.values() if isinstance(x, ClosedJaxpr | Jaxpr))
+        inner = getattr(inner, "jaxpr", inner)
+        of_inner = zip(given, inner.invars, strict=True)
+        if not _is_analytic(inner, {w for v, w in of_inner if not isinstance(v, Literal) and v in reached}):
+            return False
+    return True

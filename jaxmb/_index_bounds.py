@@ -29,9 +29,11 @@ class IndexOutOfBoundsError(ValueError):
     """A function indexes outside of an array."""
 
 
-def check_indices(program: ClosedJaxpr, what: str) -> None:
+def check_indices(program: Any, what: str) -> None:
     """Raise an `IndexOutOfBoundsError` if an index that is a number, not computed from the arguments, lies outside of
     its array.
+
+    **Arguments:** `program`: a closed jaxpr; `what` it computes, for the message.
     """
     wrong = _first_wrong(program.jaxpr, list(program.consts), [None] * len(program.jaxpr.invars))[0]
     if wrong is not None:
@@ -40,7 +42,7 @@ def check_indices(program: ClosedJaxpr, what: str) -> None:
         )
 
 
-def _first_wrong(program: Jaxpr, constants: list[Any], given: list[Any]) -> tuple[Any, list[Any]]:
+def _first_wrong(program: Any, constants: list[Any], given: list[Any]) -> tuple[Any, list[Any]]:
     """The first wrong index, with its axis and the size of the axis, or None; and the results that are known."""
     known: dict[Any, Any] = {}
     for v, value in zip((*program.constvars, *program.invars), (*constants, *given), strict=True):

@@ -151,12 +151,13 @@ class SceneParameters(ParameterTable):
         if not any(name in sized for name in names):
             return system
         values = [_accessor(*place)(system) for place in dict.fromkeys(sized.values())]
-        xp = jnp if is_traced((values, system.length)) else np
-        each = [xp.max(xp.abs(lax.stop_gradient(x)), initial=0.0) for x in values if x is not None]
-        size = functools.reduce(xp.maximum, each).astype(system.length.dtype)
+        old, values = lax.stop_gradient((system.length, [x for x in values if x is not None]))
+        xp = jnp if is_traced((old, values)) else np
+        old, *each = (xp.max(xp.abs(xp.asarray(x)), initial=0.0) for x in (old, *values))
+        size = functools.reduce(xp.maximum, each).astype(old.dtype)
         # A size that stays about the same keeps the tolerances of a family of designs.
-        other = (size > _OTHER_SIZE * system.length) | ((size > 0) & (_OTHER_SIZE * size < system.length))
-        length = xp.where(other, size, lax.stop_gradient(system.length))
+        other = (size > _OTHER_SIZE * old) | ((size > 0) & (_OTHER_SIZE * size < old))
+        length = xp.where(other, size, old)
         return eqx.tree_at(lambda s: s.length, system, length if xp is jnp else jax.device_put(length))
 
     @property

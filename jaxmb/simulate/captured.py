@@ -23,7 +23,7 @@ def captured_event(event: diffrax.Event | None, t: Any, state: State) -> diffrax
     """An event whose functions are identified by their present computation."""
     if event is None:
         return None
-    plain = dict.fromkeys(_OF_EVENTS)
+    plain: dict[str, Any] = dict.fromkeys(_OF_EVENTS)
     full = plain | {"terms": _TERMS} | dict.fromkeys(_NUMBERS, jax.ShapeDtypeStruct((), state.q.dtype))
     functions = jax.tree.map(lambda f: captured_call(f, t, state, None, named=(plain, full)), event.cond_fn)
     return changed(event, cond_fn=functions)

@@ -81,7 +81,7 @@ def independent_above(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.45
 
 
-def rounding_of(jacobian: Float[Array, "m n"], q: Coordinates) -> Float[Array, "m"]:
+def rounding_of(jacobian: Any, q: Any) -> Any:
     """The rounding errors of residuals far from the origin, from their derivatives."""
     xp = namespace(jacobian, q)
     return _ROUNDING * float(jnp.finfo(q.dtype).eps) * (xp.abs(jacobian) @ xp.abs(q))
@@ -108,7 +108,7 @@ def residual_size(
 # Gauss–Newton steps to the constraints
 
 
-def next_reach(reach: Any, before: Float[Array, "m"], after: Float[Array, "m"], share: Any) -> Any:
+def next_reach(reach: Any, before: Any, after: Any, share: Any) -> Any:
     """The largest size of the next step, in the scales of the coordinates.
 
     It doubles while residuals fall as their linearisation says, as along a slide, and else it is one: rotations by more

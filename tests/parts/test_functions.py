@@ -113,7 +113,7 @@ def test_indices_out_of_bounds_of_derived_arrays():
     far = lambda poses, velocities, t, p: jnp.stack([jnp.sin(poses)[0, 7], 0.0, 0.0])[None]
     with pytest.raises(ValueError, match="index 7 is out of bounds for axis 1 with size 3"):
         mb.Scene([BODY], forces=[mb.Force("far", "body", far)]).compile()
-    law = lambda t, measured, states, p: jnp.cos(jnp.stack([measured["x"], measured["x"]]))[4]
+    law = lambda t, measured, states, p: (jnp.cos(jnp.stack([measured["x"], measured["x"]]))[4], {})
     push = mb.Controller("push", law, {"x": "slide.displacement"}, "slide.displacement")
     slide = planar.Prismatic("slide", "ground", "body", point=(1.0, 0.0), axis=(1.0, 0.0))
     with pytest.raises(ValueError, match="index 4 is out of bounds for axis 0 with size 2"):
