@@ -47,8 +47,9 @@ def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool
 
     If states of steps are kept, the number is `max_steps` under a trace; otherwise the first takes little memory.
     """
-    # Dense output keeps, for each number of the state, the history of a multistep method.
-    kept = 16 if saveat.dense else int(saveat.subs[0].steps)
+    # Dense output keeps, for each number of the state, the history of a multistep method; `steps` one state of so many.
+    every = int(saveat.subs[0].steps)
+    kept = 16 if saveat.dense else 1 / every if every else 0
     if not kept:
         room, fewer = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9), kept_steps(state)
         if room <= fewer:

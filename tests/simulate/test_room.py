@@ -161,3 +161,10 @@ def test_room_counts_internal_states():
 
 def test_few_systems_are_remembered_as_long():
     assert 0 < room._long.maxlen < 100
+
+
+def test_states_of_every_tenth_step_take_a_tenth_of_the_memory():
+    state = mb.State(jnp.zeros(100), jnp.zeros(100))
+    saveat = lambda steps: diffrax.SaveAt(subs=(diffrax.SubSaveAt(steps=steps), diffrax.SubSaveAt(t1=True)))
+    one, eight = (room.rooms_for(2**30, saveat(steps), state, False, False)[0] for steps in (True, 8))
+    assert eight == 8 * one
