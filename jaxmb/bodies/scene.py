@@ -437,8 +437,10 @@ def _loaded(part):
     ones = {}
     for name, declared in declarations(type(part)).items():
         value = values_of(part)[name]
-        if isinstance(value, Mapping):
-            ones[name] = shaken(dict(value), 0)
+        if declared.kind in ("numbers", "module"):
+            ones[name] = shaken(value, 0)
+        elif isinstance(value, Mapping):
+            ones[name] = {key: filled(x) for key, x in value.items()}
         elif declared.unit in ("N", "N m", "Pa") and value is not None:
             ones[name] = filled(value)
     return _call(part, "with_fields", **ones) if ones else part
