@@ -1,6 +1,7 @@
 """Loads of a body along a motion: all forces on it in body axes, for strength and fatigue."""
 
 import csv
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -176,14 +177,7 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
         raise unknown("body", body, system.body_names, "loads")
     if motion.ts.ndim != 1:
         raise ValueError("loads takes a single motion; jax.vmap(lambda motion: …)(motions) takes each of a batch.")
-    number, drives, machine = system.body_names.index(body), (), system
-    given: tuple[Any, ...] = ()
-    # A concrete class: only inverse dynamics has actuators apart from the system.
-    if isinstance(motion, RequiredForces):
-        machine, given = motion.machine, tuple(motion.forces.values())
-        drives = drives_of(machine, motion.forces)
-    else:
-        motion = motion.trimmed()
+    number, (motion, machine, drives, given) = system.body_names.index(body), _actuated(motion)
     parts, acting = _parts_on(system, number), _drives_on(machine, drives, number)
     points, forces, moments, centre = _along(
         (system, machine),
@@ -200,6 +194,20 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     undetermined = tuple(name for name in parts if name in shared)
     values = motion.ts, points, forces, moments, centre
     return Loads(body, tuple(kinds), tuple(kinds.values()), undetermined, *values)
+
+
+@functools.singledispatch
+def _actuated(motion: Any) -> tuple[Any, Any, tuple[Drive, ...], tuple[Any, ...]]:
+    """The motion without padding, the machine with its actuators, these actuators and their forces.
+
+    Only inverse dynamics has actuators apart from the system.
+    """
+    return motion.trimmed(), motion.system, (), ()
+
+
+@_actuated.register
+def _(motion: RequiredForces):
+    return motion, motion.machine, drives_of(motion.machine, motion.forces), tuple(motion.forces.values())
 
 
 def _sets(system) -> dict[str, tuple[Any, ...]]:

@@ -81,8 +81,8 @@ def kinematics_and_compliance(
         `"tie_rod.point_a[1]"`; a variable of `design` moves along any direction.
     - `centre` [m] of the wheel, and `axis` of its spin, of either sense, in the carrier's frame.
     - `side`: "left" or "right", default the side of y = 0 on which the wheel's centre is.
-    - `springs`: names of springs between two points, or of coordinates, `"arm.angle"`, for motion ratios; default every
-        `SpringDamper`.
+    - `springs`: names of springs between two points, or of coordinates, `"arm.angle"`, for motion ratios and steering
+        axes; default every `SpringDamper`, and every part of your own with `is_spring = True` in its class.
     - `loads` on the wheel at the contact patch, by the names "longitudinal_force" and "lateral_force" [N], along x and
         y, and "aligning_moment" [N m], about z; default none.
     - `guess`: the state in design position, default the poses given with the bodies.

@@ -33,9 +33,10 @@ class KinematicsAndCompliance(Printed, eqx.Module):
     - `motion_ratio` by the names of springs: shortening of the spring per wheel travel [1].
     - `caster` [rad], top rearward, and `kingpin_inclination` [rad], top inward; `scrub_radius` and `caster_trail` [m],
         from the steering axis to the contact patch on the ground, outward and rearward. None without steering. The
-        steering axis is the instantaneous screw axis of the carrier while a spring keeps its length: the spring with
-        which the carrier turns most nearly about an axis, without a shift along it. Without springs the carrier turns
-        about the axis. Where joints hold two points of it, such as ball joints, the axis goes through both.
+        steering axis is the instantaneous screw axis of the carrier while a spring keeps its length. Of several springs
+        it is the spring with which the carrier turns most nearly without a shift along the axis; without springs that
+        travel moves, it turns without a shift. Where joints hold two points of the carrier, as two ball joints do, the
+        axis goes through both, whatever springs there are.
     - `compliance["lateral_force"]["toe"]` [rad/N]: derivatives of `toe`, `camber`, `track` and `wheelbase` by a load on
         the wheel at the contact patch. Loads are "longitudinal_force" [N] along x, "lateral_force" [N] along y and
         "aligning_moment" [N m] about z, with the axle locked. Zero if the constraints determine the position.

@@ -108,25 +108,22 @@ def _travel_of_a_rotation(by_travel: Twist, by_steer: Twist) -> Float[Array, ""]
     squared = jnp.dot(turning_t, velocity_t)
     linear = jnp.dot(turning_s, velocity_t) + jnp.dot(turning_t, velocity_s)
     constant = jnp.dot(turning_s, velocity_s)
-    discriminant = linear**2 - 4 * squared * constant
-    exists = discriminant > 0
-    root = jnp.where(exists, jnp.sqrt(jnp.where(exists, discriminant, 1.0)), 0.0)
     # The other root is large where travel hardly turns the carrier.
-    divisor = linear + jnp.where(linear < 0, -root, root)
-    return jnp.where(divisor != 0, 2 * constant / jnp.where(divisor != 0, divisor, 1.0), 0.0)
+    root = jnp.sqrt(jnp.maximum(linear**2 - 4 * squared * constant, jnp.finfo(linear.dtype).tiny))
+    return 2 * constant / (linear + jnp.where(linear < 0, -root, root))
 
 
 def _travel_of_a_held_spring(free: Float[Array, ""], lengths: Float[Array, "springs 2"]) -> Float[Array, ""]:
     """The λ of `_travel_of_a_rotation` nearest to `free` at which a spring keeps its length; without springs, and where
     travel changes no length, `free`.
     """
-    if not lengths.shape[0]:
-        return free
-    by_travel, by_steer = lengths.T
-    moves = jnp.abs(by_travel) > _MOVES
-    held = by_steer / jnp.where(moves, by_travel, 1.0)
-    nearest = jnp.argmin(jnp.where(moves, jnp.abs(held - free), jnp.inf))
-    return jnp.where(jnp.any(moves), held[nearest], free)
+    travel, off = free, jnp.full_like(free, jnp.inf)
+    for by_travel, by_steer in lengths:
+        moves = jnp.abs(by_travel) > _MOVES
+        held = by_steer / jnp.where(moves, by_travel, 1.0)
+        distance = jnp.where(moves, jnp.abs(held - free), jnp.inf)
+        travel, off = jnp.where(distance < off, held, travel), jnp.minimum(distance, off)
+    return travel
 
 
 class Attitude(NamedTuple):
