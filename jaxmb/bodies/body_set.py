@@ -57,6 +57,10 @@ class BodySet(eqx.Module):
         """Prepared poses and velocities, the arguments of kernels."""
         return Kinematics(jnp.asarray(t, q.dtype), self.prepared_poses(q), self.all_velocities(u))
 
+    def plain_poses(self, q: Coordinates) -> BodyPoses:
+        """Poses that are not prepared, in the order of `prepared_poses`: for few parts the fewer instructions."""
+        return jnp.concatenate([self._poses(q), jnp.asarray(self.layout.space.ground, q.dtype)[None]])
+
     def prepared_poses(self, q: Coordinates) -> BodyPoses:
         """Prepared poses of the bodies, of scalar coordinates and of the ground."""
         prepare = self.layout.space.prepare

@@ -348,7 +348,7 @@ class RigidBodySystem(AbstractSystem):
 
     @eqx.filter_jit
     def headings(self, t, q):
-        poses = self.bodies.prepared_poses(q)
+        poses = self.bodies.plain_poses(q)
         return jnp.concatenate([g.headings(t, poses) for g in self._with_headings])
 
     @eqx.filter_jit

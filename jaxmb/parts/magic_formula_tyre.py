@@ -203,8 +203,9 @@ class MagicFormulaTyre(AbstractTyre):
         axle = space.direction(pose, self.axis)
         factor, growth = self._by_spin(space, pose, velocity)
         depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose, growth))(pose)
-        push = space.pull_back(pose, -self._elastic(depth, factor)[0] * gradient)
-        normal, spring, damping = self._normal_forces(space, pose, velocity, depth, push)
+        load = self._elastic(depth, factor)[0]
+        push = space.pull_back(pose, -load * gradient)
+        normal, spring, damping = self._normal_forces(space, pose, velocity, depth, load)
         load, radius = spring + damping, self.radius + growth
         reach = magic_formula.rolling_radius(self.version, self.coefficients, self.pressure, radius, depth, load)
         along, _, slip, rolling = self._contact(space, pose, velocity, normal, reach)

@@ -156,12 +156,13 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         """The rolling speed [m/s], regularised."""
         return jnp.sqrt(rolling**2 + self.transition_speed**2)
 
-    def _normal_forces(self, space, pose, velocity, depth, push):
+    def _normal_forces(self, space, pose, velocity, depth, load):
         """The ground's normal; the forces along it of the spring and against the rate of the depth [N], of which the
-        sum is the load of friction; from the wrench `push` of the spring.
+        sum is the load of friction; from the `load` of the normal law at a depth.
         """
-        normal = self._normal(space, pose)
-        spring = jnp.dot(push[: space.dimension], normal)
+        normal, square = self._normal(space, pose), depth * depth
+        # With the slope of the ramp at this depth.
+        spring = load * square / (square + 0.25 * self.smoothing**2)
         rising = jnp.dot(self._velocity(space, pose, velocity, self.centre), normal)
         damping = -self.damping * step(depth / self.damping_depth) * rising
         return normal, spring, without_pull(spring, damping)
@@ -205,8 +206,9 @@ class Tyre(AbstractTyre):
     def wrenches(self, space, poses, velocities, t):
         pose, velocity = poses[0], velocities[0]
         depth, gradient = jax.value_and_grad(lambda pose: self._depth(space, pose))(pose)
-        wrench = space.pull_back(pose, -self.normal.force(depth) * gradient)
-        normal, spring, damping = self._normal_forces(space, pose, velocity, depth, wrench)
+        load = self.normal.force(depth)
+        wrench = space.pull_back(pose, -load * gradient)
+        normal, spring, damping = self._normal_forces(space, pose, velocity, depth, load)
         along, point, *_ = self._contact(space, pose, velocity, normal, self.radius)
         sliding = self.slip_stiffness * self.deflection / (self.relaxation_length * self.coefficient)
         # The law of dry friction, with the deflection in the place of slip.

@@ -39,7 +39,9 @@ class HeadingController(AbstractControllerAround):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        before, after = (lax.stop_gradient(self.headings(t * self.sign, y)) for t, y in ((t0, y0), (t1, y1_candidate)))
+        # Both ends at once, since XLA would compile the headings twice.
+        ends = jax.tree.map(lambda *x: jnp.stack(x), (t0 * self.sign, y0), (t1 * self.sign, y1_candidate))
+        before, after = lax.stop_gradient(jax.vmap(self.headings)(*ends))
         square = lambda v: jnp.sum(v * v, axis=1)
         opposite = jnp.sum(before * after, axis=1) < _OPPOSITE * jnp.sqrt(square(before) * square(after))
         turned = jnp.any(opposite)

@@ -98,8 +98,9 @@ class DiscOnPlane(AbstractDisc, AbstractConstraint):
     lost_heading: ClassVar[str | None] = "the disc {name} lies flat on its plane, and has no contact point"
 
     def heading(self, space, poses):
-        m, square, _ = _uphill(space, self, poses[0])
-        return m / square
+        # As in `_uphill`, of unit vectors.
+        n = space.direction(poses[0], self.axis)
+        return self.normal - dot(self.normal, n) * n
 
     def residual(self, space, poses, t):
         _, square, length = _uphill(space, self, poses[0])
