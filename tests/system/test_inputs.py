@@ -252,7 +252,7 @@ def test_forces_take_the_rates_of_points_that_move():
         mb.Controller("control", control, {"rate": "rail.displacement_rate"}, "rail.displacement"),
         mb.Actuator("drive", "rail.displacement", gain=(0.0,) * 3, bias=(0.0, 0.0, -16.0)),
         mb.JointFriction("rub", "rail.displacement", force=32.0, transition_speed=1.0),
-        mb.JointStop("stop", "rail.displacement", lower=0.0, upper=0.5, stiffness=0.0, damping=64.0, smoothing=1e-9),
+        mb.JointStop("stop", "rail.displacement", lower=0.8, upper=2.0, stiffness=0.0, damping=64.0, smoothing=1e-9),
         mb.JointSpring("winch", "cord.length", stiffness=0.0, damping=128.0),
         planar.Damper("oil", "ground", "block", damping=256.0),
         mb.Motor("motor", "rail.displacement", mode="speed", command=0.0, gain=512.0, lag=1.0),
