@@ -36,21 +36,21 @@ _ERRORS = 10.0
 class DroppedRows(eqx.Module):
     """Numbers of the rows of ψ, by which the dropped ones are watched.
 
-    **Fields:** the `sizes` of the rows; for rows of Φ the part of the gradient that is `independent` of the kept rows,
-    relative to the size, None if it is unknown; the largest `violation` of dropped rows, in units of the allowed one;
+    **Fields:** the `sizes` of the rows; the largest part of the gradient of a row of Φ that is `independent` of the kept
+    rows, relative to the row's size, None if it is unknown; the largest `violation` of dropped rows, in units of the allowed one;
     `suspected`: the same if rows were not implied any more at a smaller independent part already.
     """
 
     sizes: Float[Array, "velocity_rows"]
-    independent: Float[Array, "position_rows"] | None
+    independent: Float[Array, ""] | None
     violation: Float[Array, ""]
     suspected: Float[Array, ""]
 
     @classmethod
     def at_start(cls, at: Instant) -> "DroppedRows":
-        zero, n = jnp.zeros((), at.q.dtype), at.system.position_rows
+        zero = jnp.zeros((), at.q.dtype)
         sizes = at.row_sizes() if at.system.velocity_rows else jnp.zeros(0, at.q.dtype)
-        return cls(sizes, jnp.full(n, zero) if drops_positions(at.system) else None, zero, zero)
+        return cls(sizes, zero if drops_positions(at.system) else None, zero, zero)
 
 
 def drops_rows(system: AbstractEquation) -> bool:
@@ -97,13 +97,20 @@ def _violated(system, t, y, rtol):
     return violation_without_chart(at, rtol) > 1
 
 
-def independent_parts(
-    jacobian: Float[Array, "m n"], factor: Factor, order: PivotOrder, scale: Float[Array, "n"]
-) -> Float[Array, "m"]:
-    """The size of each row on the null space of the kept rows, in scales of the independent columns."""
+def independent_part(
+    jacobian: Float[Array, "m n"],
+    sizes: Float[Array, "mv"],
+    factor: Factor,
+    order: PivotOrder,
+    scale: Float[Array, "n"],
+) -> Float[Array, ""]:
+    """The largest part of a row that is independent of the kept rows, relative to the row's size.
+
+    **Arguments:** the rows of Φ; the `sizes` of the rows of ψ; `factor`, `order` and `scale` of the columns.
+    """
     n, free = factor.null_space.shape
     size = scale.at[order.columns[n - free :]].get(mode="promise_in_bounds", wrap_negative_indices=False)
-    return jnp.abs(jacobian @ factor.null_space) @ size
+    return jnp.max(jnp.abs(jacobian @ factor.null_space) @ size / sizes[: jacobian.shape[0]])
 
 
 def watched(at: Instant, rows: DroppedRows, newton_tol: Any, rtol: Any) -> DroppedRows:
@@ -119,9 +126,8 @@ def watched(at: Instant, rows: DroppedRows, newton_tol: Any, rtol: Any) -> Dropp
     suspected = jnp.zeros_like(rows.violation)
     if rows.independent is not None:
         displaced = jnp.clip(_ERRORS * rtol * rows.independent, newton_tol, allowed)
-        tighter = positions / displaced
-        suspected = jnp.max(jnp.where(rows.independent > _SUSPECTED * eps**_IMPLIED, tighter, 0.0))
-        positions = jnp.where(rows.independent > eps**_IMPLIED, allowed * tighter, positions)
+        suspected = jnp.where(rows.independent > _SUSPECTED * eps**_IMPLIED, jnp.max(positions) / displaced, 0.0)
+        allowed = jnp.where(rows.independent > eps**_IMPLIED, displaced, allowed)
     violation = jnp.max(positions, initial=0.0) / allowed
     # If all dropped rows are position constraints, their velocities follow.
     if system.velocity_rank - system.position_rank < system.velocity_rows - system.position_rows:

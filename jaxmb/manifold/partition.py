@@ -52,7 +52,7 @@ from .implied import (
     contradiction_ahead,
     drops_accelerations,
     drops_positions,
-    independent_parts,
+    independent_part,
     tolerance_of_dropped,
     violation_of_accelerations,
     watched,
@@ -88,9 +88,8 @@ _ROW_GROWTH = 4.0
 # length, ends at a third of the distance, and the next step crosses. (Linkages that lie flat several times, 60 speeds:
 # without this bound nine end there at rtol 1e-10, and energies are off by up to 7e-4 at 1e-6; with this bound none ends
 # there, and energies are off by up to 2e-6.)
-_NEARER = (
-    8.0  # At a prediction, the gradient of a row may be independent of the others by this multiple of the tolerance.
-)
+_NEARER = 8.0
+# At a prediction, the gradient of a row may be independent of the others by this multiple of the tolerance.
 _UNRESOLVED = 100.0
 
 
@@ -99,8 +98,8 @@ class ConstrainedAcceleration(eqx.Module):
 
     **Fields:** `u`, `udot`; the `factor` of the velocities' Jacobian; the factor of `every` row of A, None if no row
     binds accelerations only; the `memory` of the system's laws; `failed`: whether the laws failed to determine the
-    accelerations; `independent`: the `independent_parts` of rows of Φ, None if the split's own matrix has them. The
-    factors have no derivatives.
+    accelerations; the `jacobian` of ψ if rows of Φ are watched by the factor here, else None. The factors have no
+    derivatives.
     """
 
     u: Velocities
@@ -109,7 +108,7 @@ class ConstrainedAcceleration(eqx.Module):
     every: Factor | None
     memory: Memory
     failed: Bool[Array, ""]
-    independent: Float[Array, "position_rows"] | None
+    jacobian: Float[Array, "velocity_rows nu"] | None
 
 
 # A nested program, so that it is traced once for all its uses.
@@ -138,12 +137,9 @@ def _acceleration(at, formulation, split):
         jacobian = DenseJacobian(at.jacobian, every, every.rows)
     laws = laws_of(system)
     udot, multipliers, failed = laws.solve(at, formulation, jacobian, at.gamma)
-    independent = None
-    if drops_positions(system) and not split.ages:
-        rows = before.jacobian[: system.position_rows]
-        independent = independent_parts(rows, factor, split.velocity, system.velocity_scale())
-    memory = laws.remembered(at, multipliers)
-    return ConstrainedAcceleration(at.u, udot, factor, every, memory, failed, independent)
+    watched = drops_positions(system) and not split.ages
+    rows = before.jacobian[: system.velocity_rows] if watched else None
+    return ConstrainedAcceleration(at.u, udot, factor, every, laws.remembered(at, multipliers), failed, rows)
 
 
 def _at_coordinates(split, factor, every, at):
@@ -472,9 +468,11 @@ class PartitionTerm(AbstractChartTerm):
         split = chart.split.at_evaluation(out.factor)
         quality = _velocity_quality(self.system, out.factor, split.velocity)
         chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=_both(out.memory, out.memory))
-        if out.independent is not None and self.rtol is not None:
+        if out.jacobian is not None and self.rtol is not None:
             # The state is off the constraints by an error of the prediction.
-            independent = out.independent / chart.redundant.sizes[: self.system.position_rows]
+            sizes, scale = chart.redundant.sizes, self.system.velocity_scale()
+            rows = out.jacobian[: self.system.position_rows]
+            independent = independent_part(rows, sizes, out.factor, split.velocity, scale)
             independent = jnp.maximum(independent - _UNRESOLVED * self.rtol, 0.0)
             chart = eqx.tree_at(lambda chart: chart.redundant.independent, chart, independent)
         near = SolvedState(ChartConstraints(out.factor, split, out.every, chart.outdated), out.udot, out.memory)
@@ -549,11 +547,7 @@ def _updated(at, chart, max_influence):
         def renew(chart):
             split, fresh, singular = _choose(at, jacobian)
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
-            chart = dataclasses.replace(chart, split=split, quality=fresh, fresh=fresh, counters=counters)
-            if chart.redundant is None or chart.redundant.independent is None:
-                return chart
-            # Other rows may be dropped: their gradients are compared again with the next factor.
-            return eqx.tree_at(lambda chart: chart.redundant.independent, chart, replace_fn=jnp.zeros_like)
+            return dataclasses.replace(chart, split=split, quality=fresh, fresh=fresh, counters=counters)
 
         return cond_of_lanes(worse(chart), renew, lambda chart: chart, chart)
 
@@ -569,8 +563,8 @@ def _updated(at, chart, max_influence):
         fresh, counters = chart.fresh.at[-1].set(chart.nearness), chart.counters.at[0].set(0)
         refreshed = dataclasses.replace(chart, split=split, quality=quality, fresh=fresh, counters=counters)
         if drops_positions(at.system):
-            of_rows = jacobian[: at.system.position_rows], factor, split.coordinate, at.system.coordinate_scale()
-            independent = independent_parts(*of_rows) / chart.redundant.sizes[: at.system.position_rows]
+            rows, scale = jacobian[: at.system.position_rows], at.system.coordinate_scale()
+            independent = independent_part(rows, chart.redundant.sizes, factor, split.coordinate, scale)
             refreshed = eqx.tree_at(lambda chart: chart.redundant.independent, refreshed, independent)
         return renewed(refreshed, jacobian)
 

@@ -12,6 +12,7 @@ from .._types import State
 from ..linalg.arrays import is_traced
 from ..linalg.failure import nan_where
 from ..linalg.jitted import jitted
+from ..manifold.implied import drops_accelerations
 from ..system import AbstractSystem, parameters, with_parameters
 from ..system.instant import Instant
 
@@ -19,8 +20,8 @@ from ..system.instant import Instant
 # power of eps, 3e-4 in single precision.
 _TOLERANCE = 1e-5
 _ROUNDING = 0.5
-# The independent part of a row that is not implied, as a power of eps.
-_IMPLIED = 3 / 8
+# The independent part of a row that is not implied, as a power of eps: 1e-7.
+_IMPLIED = 0.45
 
 
 def consistent(system: AbstractSystem, t: Any, state: State) -> State:
@@ -80,7 +81,7 @@ def contradiction(system: AbstractSystem, t: Any, state: State) -> str:
     jacobian = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), np.finfo(jacobian.dtype).tiny)
     residual = np.abs(np.append(positions, velocities[system.position_rows :]))
     what = "are violated"
-    if np.max(residual, initial=0.0) <= np.finfo(residual.dtype).eps ** 0.75 or not system.velocity_rows:
+    if drops_accelerations(system) and np.max(residual, initial=0.0) <= np.finfo(residual.dtype).eps ** 0.5:
         what, residual = "ask for other accelerations", _unmet_accelerations(at)
     names = listed(system, residual > 1e-3 * np.max(residual, initial=0.0), residual)
     text = (
