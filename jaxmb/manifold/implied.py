@@ -36,9 +36,9 @@ _ERRORS = 10.0
 class DroppedRows(eqx.Module):
     """Numbers of the rows of ψ, by which the dropped ones are watched.
 
-    **Fields:** the `sizes` of the rows; the largest part of the gradient of a row of Φ that is `independent` of the kept
-    rows, relative to the row's size, None if it is unknown; the largest `violation` of dropped rows, in units of the allowed one;
-    `suspected`: the same if rows were not implied any more at a smaller independent part already.
+    **Fields:** the `sizes` of the rows; the largest part of the gradient of a row of Φ that is `independent` of the
+    kept rows, relative to the row's size, None if it is unknown; the largest `violation` of dropped rows, in units of
+    the allowed one; `suspected`: the same if rows were not implied any more at a smaller independent part already.
     """
 
     sizes: Float[Array, "velocity_rows"]
