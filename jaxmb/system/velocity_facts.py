@@ -36,9 +36,9 @@ class VelocityFact:
 
 def is_linear(system: Any) -> bool:
     """Whether ψ is affine in u, by data flow."""
-    slope = lambda arrays, rest, t, q, u: jax.jacfwd(eqx.combine(arrays, rest).velocity_residual, 2)(t, q, u)
     arrays, rest, t, q, u = _likes(system)
-    return not depends(lambda *given: slope(given[0], rest, *given[1:]), (arrays, t, q, u), 3)
+    slope = lambda arrays, t, q, u: jax.jacfwd(eqx.combine(arrays, rest).velocity_residual, 2)(t, q, u)
+    return not depends(slope, (arrays, t, q, u), 3)
 
 
 def is_drift_free(system: Any) -> bool:
@@ -55,8 +55,7 @@ def _likes(system):
     """The system's arrays as shapes, and its other leaves; a time, coordinates and velocities."""
     arrays, rest = eqx.partition(system, lambda x: isinstance(x, ARRAYS))
     like = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype)
-    dtype = system.guess.q.dtype if hasattr(system, "guess") else jnp.result_type(float)
-    sizes = (), (system.nq,), (system.nu,)
+    sizes, dtype = ((), (system.nq,), (system.nu,)), jnp.result_type(float)
     return jax.tree.map(like, arrays), rest, *(jax.ShapeDtypeStruct(size, dtype) for size in sizes)
 
 
