@@ -102,7 +102,7 @@ class Twist(NamedTuple):
 
 def _travel_of_a_rotation(by_travel: Twist, by_steer: Twist) -> Float[Array, ""]:
     """The λ nearest to zero at which `by_steer − λ by_travel` is a rotation about an axis, without a shift along it:
-    `(ω_s − λ ω_t) · (v_s − λ v_t) = 0`. If there is none, λ of the least shift times turning.
+    `(ω_s − λ ω_t) · (v_s − λ v_t) = 0`. If there is none, a continuous extension.
     """
     (turning_t, velocity_t), (turning_s, velocity_s) = by_travel, by_steer
     squared = jnp.dot(turning_t, velocity_t)
