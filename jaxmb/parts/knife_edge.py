@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..linalg.arrays import is_traced
-from ..linalg.rotations import cross, dot, norm
+from ..linalg.rotations import cross, dot
 from . import fields
 from .base import AbstractVelocityConstraint
 from .shapes import Ground, along, sleeve
@@ -52,8 +52,10 @@ class KnifeEdge(AbstractVelocityConstraint):
         if space.dimension == 2:
             return part
         part = part.filled(normal=axes[2])
-        ahead = space.direction(poses[0], part.axis)
-        if not is_traced((part, poses)) and norm(cross(part.normal, ahead)) < _ALONG:
+        if is_traced((part, poses)):
+            return part
+        ahead = space.direction(np.asarray(poses[0]), np.asarray(part.axis))
+        if np.linalg.norm(np.cross(np.asarray(part.normal), ahead)) < _ALONG:
             raise ValueError(
                 f"{self.label}: the blade stands along the normal of its plane at the given pose, and binds nothing "
                 "there; give another axis, normal or pose."

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..linalg.arrays import is_traced
+from ..linalg.jitted import on_host
 from ..linalg.rotations import cross, norm
 from . import fields
 from .base import AbstractDynamicForce, AbstractPotentialForce
@@ -83,9 +84,8 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     def _check_upright(self, space, poses):
         if space.dimension == 2 or is_traced((self.terrain, self.axis, poses)):
             return
-        # One program, not one for each operation.
-        axle, normal = space.direction(poses[0], self.axis), jax.jit(lambda: self._normal(space, poses[0]))()
-        if not norm(cross(axle, normal)) > _FLAT:
+        axle = space.direction(np.asarray(poses[0]), np.asarray(self.axis))
+        if not np.linalg.norm(np.cross(axle, _normal_below(self, space, poses[0]))) > _FLAT:
             raise ValueError(f"{self.label}: the wheel lies flat at the given pose; tilt it, or give another axis.")
 
     def may_vary(self, keys):
@@ -166,6 +166,11 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         rising = jnp.dot(self._velocity(space, pose, velocity, self.centre), normal)
         damping = -self.damping * step(depth / self.damping_depth) * rising
         return normal, spring, without_pull(spring, damping)
+
+
+@on_host
+def _normal_below(tyre, space, pose):
+    return tyre._normal(space, pose)
 
 
 class Tyre(AbstractTyre):

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._types import Coordinates, Scalar
+from ..linalg.jitted import on_host
 from ..system import AbstractSystem
 
 # Headings below this vanish, as a power of eps: 1e-6 in double precision.
@@ -25,11 +26,16 @@ def about_headings(system: AbstractSystem, are_lost: Any) -> str:
     return " and ".join(text for text, lost in zip(system.lost_headings, np.asarray(are_lost), strict=True) if lost)
 
 
+@on_host
+def _found(system, t, q):
+    return system.headings(t, q)
+
+
 def check_headings(system: AbstractSystem, t: Scalar, q: Coordinates, pose: str) -> None:
     """Raise a `ValueError` naming the parts whose headings vanish at a configuration, which messages call `pose`."""
     if not system.lost_headings:
         return
-    headings = np.asarray(system.headings(t, q))
+    headings = _found(system, np.asarray(t, q.dtype), q)
     lost = np.linalg.norm(headings, axis=1) <= float(np.finfo(headings.dtype).eps) ** _ZERO
     if np.any(lost):
         raise ValueError(f"At {pose} {about_headings(system, lost)}. Tilt the body, or give another axis or plane.")

@@ -64,6 +64,20 @@ def test_wheels_and_blades_that_lie_flat_are_refused():
         mb.Scene([wheel], joints=[blade]).compile()
 
 
+def test_poses_are_checked_within_a_trace_too():
+    """A scene of numbers that is compiled and assembled while JAX traces something else."""
+
+    def seen(x, tilt):
+        blade = spatial.KnifeEdge("blade", "coin", axis=(1.0, 0.0, 0.0))
+        coin = disc(tilt=tilt)
+        scene = mb.Scene([coin], joints=[spatial.RollingDisc("rolling", "coin", radius=RADIUS), blade])
+        return x * mb.assemble(scene.compile()).q[2]
+
+    assert abs(jax.jit(lambda x: seen(x, 1.0))(1.0) - RADIUS * np.sin(1.0)) < 1e-9
+    with pytest.raises(ValueError, match="'rolling' lies flat"):
+        jax.jit(lambda x: seen(x, 0.0))(1.0)
+
+
 @pytest.mark.slow
 def test_assembly_of_a_disc_that_lies_flat_is_refused():
     system = scene(disc(tilt=1.2)).compile()
