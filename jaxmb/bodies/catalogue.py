@@ -43,6 +43,11 @@ class SceneCatalogue(Catalogue):
         out |= joint_measures(self.joint_coordinates()) | frame_measures(system.frames, system.layout)
         return out | _drive_measures(system)
 
+    @property
+    def lost_headings(self):
+        told = ((g.group.part.lost_heading, name) for g in self.system.with_headings for name in g.group.names)
+        return tuple(text.format(name=repr(name)) for text, name in told)
+
     def cautions(self, motion, reach):
         turned = [] if reach is None else beyond_half_turns(self.system, np.asarray(reach))
         return lifted_ropes(self.system, motion) + turned

@@ -336,20 +336,17 @@ class RigidBodySystem(AbstractSystem):
         return GapsSeen(gaps, rates, widths, jnp.max(paces))
 
     @property
-    def _with_headings(self):
+    def with_headings(self) -> tuple[AbstractGroup, ...]:
+        """The groups of parts with headings."""
         groups = (*self.constraints.groups, *self.forces.groups)
-        return [g for g in groups if isinstance(g.group.part, AbstractLink) and g.group.part.lost_heading is not None]
-
-    @property
-    def lost_headings(self):
         return tuple(
-            g.group.part.lost_heading.format(name=repr(name)) for g in self._with_headings for name in g.group.names
+            g for g in groups if isinstance(g.group.part, AbstractLink) and g.group.part.lost_heading is not None
         )
 
     @eqx.filter_jit
     def headings(self, t, q):
         poses = self.bodies.plain_poses(q)
-        return jnp.concatenate([g.headings(t, poses) for g in self._with_headings])
+        return jnp.concatenate([g.headings(t, poses) for g in self.with_headings])
 
     @eqx.filter_jit
     def friction_reactions(self, t, q, u, multipliers):

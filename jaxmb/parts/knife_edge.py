@@ -1,6 +1,6 @@
 """A blade that does not slip sideways."""
 
-from typing import ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -54,7 +54,8 @@ class KnifeEdge(AbstractVelocityConstraint):
         part = part.filled(normal=axes[2])
         if is_traced((part, poses)):
             return part
-        ahead = space.direction(np.asarray(poses[0]), np.asarray(part.axis))
+        pose, axis = (cast(Any, np.asarray(x)) for x in (poses[0], part.axis))
+        ahead = space.direction(pose, axis)
         if np.linalg.norm(np.cross(np.asarray(part.normal), ahead)) < _ALONG:
             raise ValueError(
                 f"{self.label}: the blade stands along the normal of its plane at the given pose, and binds nothing "

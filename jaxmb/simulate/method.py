@@ -73,7 +73,7 @@ class Method(NamedTuple):
 
     def headings(self, system: AbstractSystem) -> Any:
         """The headings of parts as a function of time and state; None without any, and with steps of fixed length."""
-        if not (system.lost_headings and adapts(self.controller)):
+        if not (system.catalogue.lost_headings and adapts(self.controller)):
             return None
         return eqx.Partial(_headings_at, system)
 

@@ -166,7 +166,7 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
         return f"{how_far(outcome, span)} {about_friction(system, outcome.coupling)}"
     if result == RESULTS.contacts_undetermined:
         return about_contacts(system, outcome)
-    if system.lost_headings and (lost := about_headings(system, are_short(system, outcome.t, outcome.y.q))):
+    if system.catalogue.lost_headings and (lost := about_headings(system, are_short(system, outcome.t, outcome.y.q))):
         return (
             f"{how_far(outcome, span)} There {lost}, so the motion beyond is not determined. With `throw=False` the "
             "motion up to there is kept."

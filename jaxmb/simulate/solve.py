@@ -284,7 +284,7 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     """
     system = problem.system.prepared()
     result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck, problem.method.rtol)
-    if system.lost_headings:
+    if system.catalogue.lost_headings:
         result = RESULTS.where(stuck & jnp.any(are_short(system, t, y.q)), RESULTS.singular_configuration, result)
     if not system.friction_rows.size:
         return result, None

@@ -23,7 +23,9 @@ def are_short(system: AbstractSystem, t: Scalar, q: Coordinates) -> Bool[Array, 
 
 def about_headings(system: AbstractSystem, are_lost: Any) -> str:
     """What is told of the parts whose headings are lost; empty without any."""
-    return " and ".join(text for text, lost in zip(system.lost_headings, np.asarray(are_lost), strict=True) if lost)
+    return " and ".join(
+        text for text, lost in zip(system.catalogue.lost_headings, np.asarray(are_lost), strict=True) if lost
+    )
 
 
 @on_host
@@ -33,7 +35,7 @@ def _found(system, t, q):
 
 def check_headings(system: AbstractSystem, t: Scalar, q: Coordinates, pose: str) -> None:
     """Raise a `ValueError` naming the parts whose headings vanish at a configuration, which messages call `pose`."""
-    if not system.lost_headings:
+    if not system.catalogue.lost_headings:
         return
     headings = _found(system, np.asarray(t, q.dtype), q)
     lost = np.linalg.norm(headings, axis=1) <= float(np.finfo(headings.dtype).eps) ** _ZERO

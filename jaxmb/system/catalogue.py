@@ -47,6 +47,11 @@ class Catalogue:
             out[f"{name}.force"] = Measure((self.system.nu,), _force_along, self._rows_of(name), of_forces=True)
         return out
 
+    @property
+    def lost_headings(self) -> tuple[str, ...]:
+        """For each of the system's `headings` what it means that it vanishes, for messages."""
+        return ()
+
     def cautions(self, motion: Any, reach: Any) -> list[str]:
         """Sentences about a concrete motion in which a part is used beyond its model.
 

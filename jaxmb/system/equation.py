@@ -266,11 +266,6 @@ class AbstractEquation(eqx.Module):
 
     # Headings
 
-    @property
-    def lost_headings(self) -> tuple[str, ...]:
-        """For each of the `headings` what it means that it vanishes, for messages."""
-        return ()
-
     def headings(self, t: Scalar, q: Coordinates) -> Float[Array, "headings d"]:
         """Vectors whose directions the equations need; a motion ends where one of them vanishes."""
         del t
