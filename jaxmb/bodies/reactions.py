@@ -172,14 +172,15 @@ def undetermined(system: Any, ts: Any, ys: State) -> tuple[str, ...]:
     contacts, and friction that sticks, that other parts imply in a saved state of a concrete motion.
     """
     names = {name for row in system.implied for name in (row.name, *row.by)}
+    if is_traced((system, ts, ys)):
+        return tuple(sorted(names))
     contacts = system.contacts
-    if contacts and not is_traced((system, ts, ys)):
-        modes = np.asarray(jax.vmap(lambda q: contacts.modes(q).kinds)(ys.q))
-        alone = np.repeat([IMPLIED, IMPLIED_STICK], [contacts.n, contacts.m])
-        _, first = np.unique(modes, axis=0, return_index=True)
-        for k in first[np.any(modes[first] == alone, axis=1)]:
-            at = Instant(system, ts[k], ys.q[k], ys.u[k])
-            names |= _sharing(at, modes[k] == alone)
+    modes = np.asarray(jax.vmap(lambda q: contacts.modes(q).kinds)(ys.q))
+    implied = modes == np.repeat([IMPLIED, IMPLIED_STICK], [contacts.n, contacts.m])
+    # One state for each choice of laws.
+    states = {tuple(modes[k]): k for k in np.flatnonzero(np.any(implied, axis=1))}
+    for k in states.values():
+        names |= _sharing(Instant(system, ts[k], ys.q[k], ys.u[k]), implied[k])
     return tuple(sorted(names))
 
 

@@ -123,12 +123,12 @@ def watched(at: Instant, rows: DroppedRows, newton_tol: Any, rtol: Any) -> Dropp
         return dataclasses.replace(rows, violation=jnp.zeros_like(rows.violation))
     positions, velocities = at.violations(rows.sizes)
     allowed = _ALLOWED * jnp.maximum(newton_tol, eps**0.5)
-    suspected = jnp.zeros_like(rows.violation)
+    suspected, bound = jnp.zeros_like(rows.violation), allowed
     if rows.independent is not None:
         displaced = jnp.clip(_ERRORS * rtol * rows.independent, newton_tol, allowed)
         suspected = jnp.where(rows.independent > _SUSPECTED * eps**_IMPLIED, jnp.max(positions) / displaced, 0.0)
-        allowed = jnp.where(rows.independent > eps**_IMPLIED, displaced, allowed)
-    violation = jnp.max(positions, initial=0.0) / allowed
+        bound = jnp.where(rows.independent > eps**_IMPLIED, displaced, allowed)
+    violation = jnp.max(positions, initial=0.0) / bound
     # If all dropped rows are position constraints, their velocities follow.
     if system.velocity_rank - system.position_rank < system.velocity_rows - system.position_rows:
         violation = jnp.maximum(violation, jnp.max(velocities) / allowed)
