@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float, PyTree
 from .controller import AbstractControllerAround, states_inside
 
 # The fields of `Turning` that change with accepted steps only.
-_COUNTED = ("times", "angles", "rates", "jumps", "reach")
+_COUNTED = ("times", "angles", "rates", "reach")
 
 
 class Counted(NamedTuple):
@@ -30,15 +31,14 @@ class Turning(eqx.Module):
     """The state of a `TurningController`.
 
     **Fields:** `inner`: the state of the controller inside; the `times` of the ends of the last accepted step, with
-    the counted `angles` and their `rates` there, shape (2, k); whether a jump follows it (`jumps`); the `reach` of the
-    angles so far: at the start, and the least and the largest at the ends of steps.
+    the counted `angles` and their `rates` there, shape (2, k), before the first step the given angles; the `reach` of
+    the angles so far: at the start, and the least and the largest at the ends of steps.
     """
 
     inner: Any
     times: Float[Array, "2"]
     angles: Float[Array, "2 k"]
     rates: Float[Array, "2 k"]
-    jumps: Any
     reach: Float[Array, "3 k"]
 
     def at(self, t: Any) -> Float[Array, "k"]:
@@ -69,28 +69,23 @@ class TurningController(AbstractControllerAround):
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        angles, rates = self._seen(t0, y0)
-        angles = nearest_turn(angles, self.given)
         twice = lambda x: jnp.stack([x, x])
-        start = jnp.stack([angles, angles, angles])
-        return end, Turning(inner, twice(t0), twice(angles), twice(rates), jnp.array(False), start)
+        reach = jnp.stack([self.given, jnp.full_like(self.given, jnp.inf), jnp.full_like(self.given, -jnp.inf)])
+        return end, Turning(inner, twice(t0), twice(self.given), twice(jnp.zeros_like(self.given)), reach)
 
-    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         last: Turning = controller_state
-        out = self.controller.adapt_step_size(t0, t1, y0, y1, args, y_error, error_order, last.inner)
+        out = self.controller.adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, error_order, last.inner)
         keep, start, end, made_jump, inner, result = out
-        angles, rates = self._seen(t1, y1)
-        # The rates before a jump say nothing of the step after it.
-        leaving = jnp.where(last.jumps, rates, last.rates[1])
-        angles = nearest_turn(angles, last.angles[1] + (t1 - t0) * (leaving + rates) / 2)
-        new = Turning(
-            inner,
-            jnp.stack([t0, t1]),
-            jnp.stack([last.angles[1], angles]),
-            jnp.stack([leaving, rates]),
-            jnp.asarray(made_jump),
-            jnp.stack([last.reach[0], jnp.minimum(last.reach[1], angles), jnp.maximum(last.reach[2], angles)]),
-        )
+        # Both ends together are one copy of the angles in the program.
+        times = jnp.stack([t0, t1])
+        angles, rates = jax.vmap(self._seen)(times, jax.tree.map(lambda *ends: jnp.stack(ends), y0, y1_candidate))
+        before = nearest_turn(angles[0], last.angles[1])
+        after = nearest_turn(angles[1], before + (t1 - t0) * (rates[0] + rates[1]) / 2)
+        least, largest = jnp.minimum(before, after), jnp.maximum(before, after)
+        at_start = jnp.where(last.reach[1] > last.reach[2], before, last.reach[0])
+        reach = jnp.stack([at_start, jnp.minimum(last.reach[1], least), jnp.maximum(last.reach[2], largest)])
+        new = Turning(inner, times, jnp.stack([before, after]), rates, reach)
         kept = lambda new, old: jnp.where(keep, new, old)
         new = Turning(inner, *(kept(getattr(new, x), getattr(last, x)) for x in _COUNTED))
         return keep, start, end, made_jump, new, result
