@@ -267,7 +267,7 @@ class AbstractGroup(eqx.Module):
         if parts <= _MOST_TURNING:
             return in_time.ravel()
         weights = np.random.default_rng(0).uniform(1.0, 2.0, parts).astype(in_time.dtype)
-        return weights @ in_time
+        return jnp.asarray(weights) @ in_time
 
     @property
     def ends_at_turns(self) -> bool:
@@ -414,7 +414,7 @@ class ConstraintGroup(AbstractConstraintGroup):
 
     @property
     def ends_at_turns(self):
-        # Programs of servos are followed by accelerations.
+        # A servo follows its program by accelerations, so that error control sees all but its pulses.
         return super().ends_at_turns and self.is_position
 
     def _kernel_in_time(self, name, now):
@@ -637,7 +637,9 @@ class NonIdealGroup(AbstractGroup):
 
     def _kernel_in_time(self, name, now):
         # Any reactions show the time in a law.
-        return self.wrenches(now, jnp.ones((len(self.group.names), len(self.group.bodies[0]), now.velocities.shape[1])))
+        return self.wrenches(
+            now, jnp.ones((*self.group.body_index.shape, now.velocities.shape[1]), now.velocities.dtype)
+        )
 
     def wrenches(self, now: Kinematics, reactions: Array) -> Float[Array, "parts k v"]:
         """Wrenches of the laws on the bodies of their joints, from the joints' `reactions`."""

@@ -445,14 +445,9 @@ class RigidBodySystem(AbstractSystem):
     @property
     def _in_time(self) -> list[Callable[[Any], AbstractGroup]]:
         """Accessors of the groups with functions of time."""
-        paths = (
-            *(f"constraints.{kind}" for kind in ("position", "velocity", "servos", "nonideal")),
-            "forces.groups",
-        )
-        numbered = [(path, k, g) for path in paths for k, g in enumerate(attrgetter(path)(self))]
-        return [
-            lambda system, path=path, k=k: attrgetter(path)(system)[k] for path, k, g in numbered if g.group.of_time
-        ]
+        sets = *(f"constraints.{kind}" for kind in ("position", "velocity", "servos", "nonideal")), "forces.groups"
+        places = [(path, k) for path in sets for k, g in enumerate(attrgetter(path)(self)) if g.group.of_time]
+        return [lambda system, path=path, k=k: attrgetter(path)(system)[k] for path, k in places]
 
 
 def _of_rows(values: Array, count: int) -> Array:

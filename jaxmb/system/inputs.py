@@ -127,18 +127,17 @@ def _turning_times(kinds, system, state, t0, t1):
     for several, traced, signal in kinds:
         each = jax.vmap if several else lambda function: function
         if signal.given_at_samples:
-            times = jnp.ravel(each(lambda signal, traced=traced: _times_at_knots(signal, traced, ts))(signal))
-            of_knots.append(times)
-            values = [each(lambda signal: _at(signal, ts))(signal)]
-            values = [jnp.moveaxis(x.reshape(-1, *x.shape[-2:]), 1, 0).reshape(ts.size, -1) for x in values]
+            times, sampled = each(lambda signal, traced=traced: _at_knots(signal, traced, ts))(signal)
+            of_knots.append(jnp.ravel(times))
+            values = [jnp.moveaxis(sampled.reshape(-1, ts.size, sampled.shape[-1]), 1, 0).reshape(ts.size, -1)]
         else:
             values = [_at(_changed(signal, number) if number else signal, ts) for number in _numbers_of(signal)]
             turns = turns | turned(values[0])
         columns.extend(values)
     if system is not None:
-        turning, each = _looks(system, state, ts)
+        turning, in_looks = _looks(system, state, ts)
         turns = turns | turned(turning)
-        columns.append(each)
+        columns.append(in_looks)
     times = jnp.concatenate([ts[:1], ts[-1:], *of_knots])
     shown = turns.at[jnp.searchsorted(ts, times - 0.5 * (ts[1] - ts[0]))].set(True, mode="drop")
     pulses = pulses_of_samples(ts, jnp.concatenate(columns, axis=1), shown) & ~shown
@@ -148,16 +147,17 @@ def _turning_times(kinds, system, state, t0, t1):
 
 def _at(function, ts):
     """The values of a function at some times, one row for each time."""
-    return lax.map(lambda t: jnp.ravel(function(t)), ts, batch_size=min(_AT_ONCE, ts.size))
+    return jax.vmap(lambda t: jnp.ravel(function(t)))(ts)
 
 
-def _times_at_knots(series, traced, ts):
-    """Times at which a series turns or has the peak of a pulse; other times are infinite."""
+def _at_knots(series, traced, ts):
+    """Times at which a series turns or has the peak of a pulse, other times are infinite; its values at times `ts`."""
     knots, (first, last) = series.samples(ts[0], ts[-1]), (ts[0], ts[-1])
-    values = _at(series, jnp.clip(knots, first, last))
-    ended = pulses_at_knots(knots, lambda times: _at(series, times), (first, last), turned(values))
-    ended = ended | on_straight_lines(knots, values) if traced else ended
-    return jnp.where(ended & (knots > first) & (knots < last), knots, jnp.inf)
+    values = _at(series, jnp.concatenate([jnp.clip(knots, first, last), ts]))
+    known, sampled = values[: knots.size], values[knots.size :]
+    ended = pulses_at_knots(knots, known, (ts, sampled), lambda times: _at(series, times), turned(known))
+    ended = ended | on_straight_lines(knots, known) if traced else ended
+    return jnp.where(ended & (knots > first) & (knots < last), knots, jnp.inf), sampled
 
 
 def _looks(system, state, ts):

@@ -101,32 +101,35 @@ def pulses_of_samples(
 
 
 def pulses_at_knots(
-    ts: Float[Array, "n"], function: Callable[[Any], Array], span: tuple[Any, Any], ended: Bool[Array, "n"]
+    ts: Float[Array, "n"],
+    values: Float[Array, "n columns"],
+    sampled: tuple[Float[Array, "m"], Float[Array, "m columns"]],
+    function: Callable[[Any], Array],
+    ended: Bool[Array, "n"],
 ) -> Bool[Array, "n"]:
     """At which of its knots a series is at the peak of a pulse; or where steps are `ended` anyway.
 
-    **Arguments:** `function`: the values, of columns, at some times; `span`: the first and the last time of a run.
+    **Arguments:** `sampled`: times from the first to the last one of a run, and the values then; `function`: the values
+    at some times.
     """
-    n, (first, last) = ts.shape[0], span
+    n, first, last = ts.shape[0], sampled[0][0], sampled[0][-1]
     # Wider pulses of long series are seen in samples.
     widest = min(max(n // 3, 1), max(8, n // 128))
     reaches = 2 ** np.arange(int(np.log2(widest)) + 1)
-    known = function(jnp.clip(ts, first, last))
-    before, after = 2 * function(jnp.stack([first, last]))[:, None, None]
+    before, after = 2 * sampled[1][0][None, None], 2 * sampled[1][-1][None, None]
     sides = _both_sides(_BESIDE)
-    rows = jnp.asarray(_rows(sides), known.dtype)
+    rows = jnp.asarray(_rows(sides), values.dtype)
 
     def beside(reach):
         knots = jnp.clip(jnp.arange(n) + reach, 0, n - 1)
         width = jnp.abs(ts[knots] - ts)
         at = ts[None] + width[None] * jnp.asarray(sides, ts.dtype)[:, None]
         inside = jnp.clip(jnp.where(at < first, 2 * first - at, jnp.where(at > last, 2 * last - at, at)), first, last)
-        values = function(inside.reshape(-1)).reshape(*at.shape, -1)
+        around = function(inside.reshape(-1)).reshape(*at.shape, -1)
         early, late = (at < first)[..., None], (at > last)[..., None]
-        values = jnp.where(early, before - values, jnp.where(late, after - values, values))
-        return _Beside(width, values, rows)
+        return _Beside(width, jnp.where(early, before - around, jnp.where(late, after - around, around)), rows)
 
-    return _pulses(ts, known, beside, jnp.asarray(np.concatenate([reaches, -reaches])), ended, _AT_KNOTS)
+    return _pulses(ts, values, beside, jnp.asarray(np.concatenate([reaches, -reaches])), ended, _AT_KNOTS)
 
 
 def on_straight_lines(ts: Float[Array, "n"], values: Float[Array, "n columns"]) -> Bool[Array, "n"]:

@@ -10,7 +10,7 @@ import pytest
 from compiling import jit_quickly
 
 import jaxmb as mb
-from jaxmb import planar
+from jaxmb import planar, terrain
 from jaxmb.system.inputs import turning_times
 
 SOLVERS = {"Adams": mb.solvers.Adams(), "Dopri8": diffrax.Dopri8(), "Hermite": mb.solvers.Hermite()}
@@ -255,3 +255,110 @@ def test_what_does_not_come_and_go_needs_no_stops():
     assert (
         turning_times(mb.with_inputs(TORQUE, {"motor.torque": mb.Series(TS, np.sin(TS), "held")}), at, 0.0, END) is None
     )
+
+
+def bell(t, at, xp=jnp):
+    return xp.exp(-(((t - at) / 0.3) ** 2))
+
+
+CART = planar.Body("cart", mass=1.0, inertia=0.1)
+RAIL = planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0))
+PUSHED = mb.Scene([CART], joints=[RAIL], forces=[mb.JointForce("push", "rail.displacement", force=0.0)]).compile()
+BRAKED = mb.Scene(
+    [CART],
+    joints=[RAIL],
+    forces=[
+        mb.Force(
+            "brake",
+            "cart",
+            lambda x, v, t, p: (
+                jnp.zeros((1, 3)).at[0, 0].set(p["size"] * bell(t, p["at"]) - p["c"] * bell(t, 50.0) * v[0, 0])
+            ),
+            parameters={"size": 0.0, "at": 20.0, "c": 0.0},
+        )
+    ],
+).compile()
+IMPULSE = 0.3 * np.sqrt(np.pi)
+
+
+@pytest.mark.slow
+def test_derivatives_by_strengths_of_zero():
+    """Of the speed at the end, by the size of a pulse and by the damping of a later one, which its speed excites."""
+
+    def speed(strengths):
+        system = mb.with_parameters(BRAKED, {"brake.size": strengths[0], "brake.c": strengths[1]})
+        return mb.simulate(system, mb.assemble(BRAKED), t1=100.0, rtol=1e-9).ys.u[-1, 0]
+
+    closed = lambda size, c: size * IMPULSE * np.exp(-c * IMPULSE)
+    starts = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 2.0], [-3.0, 0.5]])
+    expected = np.array([[IMPULSE * np.exp(-c * IMPULSE), -IMPULSE * closed(s, c)] for s, c in np.asarray(starts)])
+    value, forward, reverse = jit_quickly(jax.vmap(lambda x: (speed(x), jax.jacfwd(speed)(x), jax.jacrev(speed)(x))))(
+        starts
+    )
+    np.testing.assert_allclose(value, [closed(*start) for start in np.asarray(starts)], atol=1e-7)
+    np.testing.assert_allclose(forward, expected, atol=1e-6)
+    np.testing.assert_allclose(reverse, forward, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_by_the_values_of_a_series_of_zeros():
+    """The start of an optimisation of a control: each value moves the sled by the area of its hat."""
+    ts = np.array([0.0, 30.0, 30.4, 31.0, 60.0, 60.5, 61.0, 100.0])
+
+    def speed(values):
+        inputs = {"push.force": mb.Series(ts, values)}
+        return mb.simulate(PUSHED, mb.assemble(PUSHED), t1=100.0, inputs=inputs).ys.u[-1, 0]
+
+    areas = 0.5 * np.diff(np.pad(ts, 1, "edge"))
+    slopes = jit_quickly(jax.grad(speed))(jnp.zeros(ts.size))
+    np.testing.assert_allclose(slopes, areas[:-1] + areas[1:], rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
+def test_small_pulses_beside_large_ones(solver):
+    """One program for both directions of time and for a member of a batch without any."""
+
+    def speed(sizes, slope, end):
+        force = lambda t: slope * t + sizes[0] * bell(jnp.abs(t), 20.0) + sizes[1] * bell(jnp.abs(t), 60.0)
+        motion = mb.simulate(
+            PUSHED, mb.assemble(PUSHED), t1=end, inputs={"push.force": force}, rtol=1e-8, solver=SOLVERS[solver]
+        )
+        return motion.ys.u[-1, 0]
+
+    sizes = jnp.array([[10.0, 0.2], [0.0, 0.0], [1.0, 1e-3], [0.0, -50.0]])
+    slopes = jnp.array([0.0, 0.0, 0.0, 100.0])
+    of_each = jit_quickly(jax.vmap(speed, (0, 0, None)))
+    for end in (100.0, -100.0):
+        expected = np.asarray(slopes) * end**2 / 2 + np.sign(end) * IMPULSE * np.sum(np.asarray(sizes), axis=1)
+        np.testing.assert_allclose(of_each(sizes, slopes, end), expected, atol=1e-5, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_small_stroke_strikes_after_a_large_one_away():
+    """The ground moves away by one metre, and later up to a ball at rest, which leaves with twice its speed."""
+    gap, height = 0.03, 0.04
+    ball = planar.PointMass("ball", mass=1.0, position=(0.0, gap))
+    paddle = mb.RigidContact("paddle", "ball", terrain=terrain.Flat(), restitution=1.0)
+    system = mb.Scene([ball], joints=[paddle]).compile()
+    level = lambda t: -bell(t, 20.0) + height * bell(t, 60.0)
+    motion = mb.simulate(system, mb.assemble(system), t1=100.0, inputs={"paddle.terrain.level": level})
+    time = 60.0 - 0.3 * np.sqrt(np.log(height / gap))
+    np.testing.assert_allclose(motion["ball"].velocity[-1, 1], 2 * gap * 2 * (60.0 - time) / 0.09, rtol=1e-6)
+    assert len(motion.events) == 1
+    np.testing.assert_allclose(motion.events.times[0], time, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_one_pulse_among_many_parts():
+    """One of forty free bodies is pushed for a moment, the others by forces that grow."""
+    law = lambda x, v, t, p: jnp.array([p["slope"] * t + p["size"] * bell(t, 50.0), 0.0, 0.0])
+    names = [f"b{k}" for k in range(40)]
+    numbers = lambda k: {"slope": 0.01 * float(k > 0), "size": float(k == 0)}
+    system = mb.Scene(
+        [planar.Body(name, mass=1.0, inertia=1.0) for name in names],
+        forces=[mb.Force(f"f{k}", name, law, parameters=numbers(k)) for k, name in enumerate(names)],
+    ).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=100.0, rtol=1e-9)
+    np.testing.assert_allclose(motion["b0"].velocity[-1, 0], IMPULSE, rtol=1e-6)
+    np.testing.assert_allclose(motion["b7"].velocity[-1, 0], 50.0, rtol=1e-6)
