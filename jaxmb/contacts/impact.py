@@ -77,8 +77,9 @@ def impact(
 
     The first gap that closes is zero after a small time τ. The state moves on by τ, changes, and moves back by τ with
     the new equations. So the state after the event is right to second order in τ, and its derivative includes the
-    dependence of the event's time on the state. `late`, `impulses` and the `energy` have derivatives as well, `rest`
-    has none. There is no second derivative.
+    dependence of the event's time on the state. Groups of contacts that do not act on each other have derivatives of
+    times of their own. `late`, `impulses` and the `energy` have derivatives as well, `rest` has none. There is no
+    second derivative.
 
     **Arguments:** `system`: with the internal states of `y`; `dated`: whether `late` has its derivative even if the
     state after the event does not depend on it, as when a contact opens; `given`: the event, if it is known.
