@@ -126,7 +126,7 @@ class AccelerationConstraint(AbstractCoordinateConstraint):
     ```
 
     If the rows are the derivative of a relation between positions or velocities, the motion may drift off this
-    relation.
+    relation. A row that others imply at the guess is watched along the motion, which fails where they begin to differ.
 
     **Arguments:** `matrix`: shape (rows, nq); `right`: shape (rows,).
     """

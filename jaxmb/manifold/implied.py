@@ -27,7 +27,7 @@ _ALLOWED = 8.0
 # power decides when a system is compiled.
 _IMPLIED = 3 / 8
 # A run that fails at this part of it fails for this reason: the gradients are compared every few steps only.
-_SUSPECTED = 0.1
+_SUSPECTED = 0.01
 # Such a row, and a row between accelerations, may be violated by the effect of this multiple of the tolerance of
 # integration.
 _ERRORS = 10.0

@@ -21,6 +21,9 @@ class Servo(AbstractLink):
     The reaction of the servo is the exact control force, the smallest one in the metric of M⁻¹. The servo has the name
     of its program; the numbers of the program and the gains are parameters under that name.
 
+    A servo that others imply at the given pose is watched along the motion: where its program begins to differ from
+    theirs, the run fails and names them.
+
     `motion["turn"].drive_force` is the control force along the quantity of a `Driver` [N, of an angle N m]: force ×
     rate is the power that the servo puts into the machine. For another program it is the force along each residual.
 
