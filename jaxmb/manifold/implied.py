@@ -24,12 +24,11 @@ from .orthogonal_projection import project_normalized
 # Redundant rows may be violated by this multiple of Newton's tolerance, or of the pivots that count as zero.
 _ALLOWED = 8.0
 # A row whose gradient is independent of the kept rows by this power of eps, 1e-6, is not implied any more. The same
-# power decides when a system is compiled.
-_IMPLIED = 3 / 8
-# A run that fails at this part of it fails for this reason: the gradients are compared every few steps only.
-_SUSPECTED = 0.01
-# Such a row, and a row between accelerations, may be violated by the effect of this multiple of the tolerance of
-# integration.
+# power decides when a system is compiled. A run that fails at the fraction `_SUSPECTED` of it fails for this reason,
+# since gradients are compared every few steps only.
+_IMPLIED, _SUSPECTED = 3 / 8, 0.01
+# A row that is not implied any more, and a row between accelerations, may be violated by the effect of this multiple of
+# the tolerance of integration.
 _ERRORS = 10.0
 
 

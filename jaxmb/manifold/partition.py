@@ -137,8 +137,8 @@ def _acceleration(at, formulation, split):
         jacobian = DenseJacobian(at.jacobian, every, every.rows)
     laws = laws_of(system)
     udot, multipliers, failed = laws.solve(at, formulation, jacobian, at.gamma)
-    watched = drops_positions(system) and not split.ages
-    rows = before.jacobian[: system.velocity_rows] if watched else None
+    by_factor = drops_positions(system) and not split.ages
+    rows = before.jacobian[: system.velocity_rows] if by_factor else None
     return ConstrainedAcceleration(at.u, udot, factor, every, laws.remembered(at, multipliers), failed, rows)
 
 
