@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._types import Scalar, VectorLike
-from .arrays import add_up, as_array, namespace
+from .arrays import add_up, as_array, is_traced, namespace
 from .bilinear import BilinearMap
 from .blocks import matrix_products
 
@@ -190,11 +190,11 @@ def from_axis_angle(axis: VectorLike, angle: Scalar) -> Float[Array, "4"]:
     **Raises:** `ValueError` for the zero vector; under a trace the result is NaN.
     """
     dtype = jnp.result_type(float)
-    axis, half = as_array(axis, dtype), as_array(angle, dtype) / 2
-    xp = namespace(axis, half)
-    if xp is np and not np.any(axis):
+    way, half = as_array(axis, dtype), as_array(angle, dtype) / 2
+    xp = namespace(way, half)
+    if not is_traced(way) and not np.any(way):
         raise ValueError("from_axis_angle: the axis is the zero vector, which has no direction.")
-    return jax.device_put(xp.concatenate([xp.cos(half)[None], xp.sin(half) * normalize(axis)]))
+    return jax.device_put(xp.concatenate([xp.cos(half)[None], xp.sin(half) * normalize(way)]))
 
 
 def from_matrix(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:

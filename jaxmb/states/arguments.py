@@ -76,7 +76,8 @@ def counted_angles(system: AbstractSystem, guess: State, values: Mapping[str, An
     if guess.angles is None and all(within(values[name]) for name in places):
         return None
     dtype = guess.q.dtype
-    angles = np.zeros(len(system.wrapped_angle_names()), dtype) if guess.angles is None else guess.angles
+    none = np.zeros(len(system.wrapped_angle_names()), dtype)
+    angles: Any = none if guess.angles is None else guess.angles
     for name, k in places.items():
         angles = replaced(angles, np.array([k]), jnp.asarray(values[name], dtype)[None])
     return angles

@@ -146,7 +146,7 @@ def test_derivatives(wheel):
         ]
 
     loss = lambda force: -(angle(force) ** 2)
-    reverse = jax.jit(jax.grad(loss))(2.0)
+    reverse = float(jax.jit(jax.grad(loss))(2.0))
     assert reverse == pytest.approx(-16.0, rel=1e-7)
     assert jax.jit(lambda x: jax.jvp(loss, (x,), (1.0,)))(2.0)[1] == pytest.approx(reverse, rel=1e-10)
     np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(loss)))(jnp.array([1.0, 3.0])), [-8.0, -24.0], rtol=1e-7)
