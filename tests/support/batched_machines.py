@@ -47,7 +47,7 @@ def _by_powers(poses, velocities, t, p):
     """A law of x + x²/2 + x³/3, whose powers are loops of different numbers of turns."""
     x = poses[0, 0]
     power = lambda n: lax.while_loop(lambda c: c[0] < n, lambda c: (c[0] + 1, c[1] * x), (0, 1.0))[1]
-    terms = jax.vmap(power)(jnp.arange(1, 4)) / jnp.arange(1, 4)
+    terms = jax.vmap(power)(jnp.arange(1, 4)) / jnp.arange(1.0, 4.0)
     return jnp.stack([-jnp.sum(terms), jnp.zeros(()), jnp.zeros(())])[None]
 
 

@@ -408,7 +408,7 @@ def counted(draw):
         tuple(draw.one(draw.some(), [draw.constant(3), draw.real()])),
     )
     turns = draw.one(2, draw.integer(largest=3))
-    return lax.fori_loop(0, turns, lambda k, carry: body(carry, k - 1.3), start)
+    return lax.fori_loop(0, turns, lambda k, carry: body(carry, jnp.sin(k.astype(float))), start)
 
 
 def going(draw):
