@@ -184,7 +184,8 @@ def _held(module: eqx.Module) -> dict[str, tuple[Any, bool]]:
 def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[int, ...] | None, list[Any]]]:
     """The name of each kernel of a part, the shape that it must return (None for any), and its arguments."""
     poses, velocities, t = _arguments(space, bodies)
-    if isinstance(part, AbstractLink) and part.lost_heading is not None:
+    lost_heading = part.lost_heading if isinstance(part, AbstractLink) else None
+    if lost_heading is not None:
         yield "heading", (space.dimension,), [poses]
     if isinstance(part, AbstractVelocityConstraint):
         yield "residual", (part.rows,), [poses, velocities, t]

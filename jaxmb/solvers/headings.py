@@ -4,23 +4,23 @@ Beyond such a state the equations are others, without anything in a vector field
 disc that falls flat jumps to the other side of its rim.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .controller import AbstractControllerAround
+from .gaps import AbstractWithoutJumps
 from .order import StepEstimate, refuse
 
 # Directions that turn by more than 148° in a step are opposite: steps resolve turns that are less fast.
 _OPPOSITE = -0.85
 
 
-class HeadingController(AbstractControllerAround):
+class HeadingController(AbstractWithoutJumps):
     """Wraps a controller so that no heading turns to its opposite in a step: such steps count as failed, so that they
     become shorter, up to the state at which the heading vanishes.
 
@@ -30,10 +30,14 @@ class HeadingController(AbstractControllerAround):
 
     controller: Any
     headings: Callable[[Any, Any], Float[Array, "k d"]]
-    sign: Any = 1
+    sign: Any
+
+    def __init__(self, controller: Any, headings: Callable[[Any, Any], Float[Array, "k d"]]):
+        self.controller, self.headings, self.sign = controller, headings, 1
 
     def wrap(self, direction):
-        return dataclasses.replace(self, controller=self.controller.wrap(direction), sign=direction)
+        inner = self.controller.wrap(direction)
+        return eqx.tree_at(lambda c: (c.controller, c.sign), self, (inner, direction))
 
     def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)

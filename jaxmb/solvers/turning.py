@@ -61,7 +61,10 @@ class TurningController(AbstractControllerAround):
     controller: Any
     angles: Callable[[Any, PyTree], tuple[Array, Array]]
     given: Float[Array, "k"]
-    direction: Any = 1.0
+    direction: Any
+
+    def __init__(self, controller: Any, angles: Callable[[Any, PyTree], tuple[Array, Array]], given: Any):
+        self.controller, self.angles, self.given, self.direction = controller, angles, given, 1.0
 
     def wrap(self, direction):
         inner = self.controller.wrap(direction)

@@ -90,7 +90,7 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
     # Concrete classes, since no attribute tells that a controller knows no jumps.
     if isinstance(controller, diffrax.ClipStepSizeController) and controller.jump_ts is None:
         controller = controller.controller
-    if isinstance(controller, AbstractWithoutJumps):
+    while isinstance(controller, AbstractWithoutJumps):
         controller = controller.controller
     jumps = not isinstance(controller, jumpless)
     if isinstance(solver, AbstractMultistep):

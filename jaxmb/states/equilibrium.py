@@ -27,7 +27,15 @@ from ..parts.names import names_arguments
 from ..system import AbstractSystem
 from ..system.instant import Instant
 from ..system.quantities import directions
-from .arguments import check_system, checked_guess, checked_time, holding, split_coordinates, split_internal_states
+from .arguments import (
+    check_system,
+    checked_guess,
+    checked_time,
+    counted_angles,
+    holding,
+    split_coordinates,
+    split_internal_states,
+)
 from .assembly import configuration
 from .balance import Balance, HostBalance, balance_on_host
 from .closest import tolerance
