@@ -76,7 +76,7 @@ def test_batches_with_all_ways_to_compile(way, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")
     options = [] if way is None else ["--compile", way]
     done = subprocess.run(
-        [sys.executable, batched_machines.__file__, "powers", "sliding", *options], capture_output=True, text=True
+        [sys.executable, batched_machines.__file__, "powers", *options], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout
 
