@@ -7,7 +7,7 @@ from compiling import jit_quickly
 from derivative_checks import central_differences, in_both_modes
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import planar, spatial, terrain
 from jaxmb.formulations import Multipliers, accelerations
 
 
@@ -155,7 +155,7 @@ def test_a_table_on_four_feet():
     """Three feet carry it, and the fourth follows; a table on three feet is determined."""
     table = spatial.Body("table", mass=4.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 0.0, 1.0))
     places = {"a": (1, 1), "b": (-1, 1), "c": (-1, -1), "d": (1, -1)}
-    foot = lambda name: mb.RigidContact(name, "table", point=(*places[name], -1.0), terrain=mb.terrain.Flat())
+    foot = lambda name: mb.RigidContact(name, "table", centre=(*places[name], -1.0), terrain=terrain.Flat())
     for names in ("abcd", "abc"):
         feet = [foot(name) for name in names]
         system = mb.Scene([table], joints=feet, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
