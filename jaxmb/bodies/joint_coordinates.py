@@ -124,7 +124,7 @@ def beyond_half_turns(system: Any, reach: np.ndarray) -> list[str]:
     places = {name: k for k, name in enumerate(system.wrapped_angle_names())}
     out = []
     for group in system.forces.groups:
-        part, joints = group.group.part, dict(group.group.inner).get(("joints", "0"))
+        part, joints = group.group.part, dict(group.group.inner).get(("joints", "0"), ())
         middles = part.middle_of_turn() if joints and isinstance(part, AbstractCoordinatePart) else None
         if middles is None or not part.is_periodic():
             continue

@@ -176,7 +176,8 @@ def undetermined(system: Any, ts: Any, ys: State) -> tuple[str, ...]:
         return tuple(sorted(names))
     contacts = system.contacts
     modes = np.asarray(jax.vmap(lambda q: contacts.modes(q).kinds)(ys.q))
-    implied = modes == np.repeat([IMPLIED, IMPLIED_STICK], [contacts.n, contacts.m])
+    alone = np.repeat([IMPLIED, IMPLIED_STICK], [contacts.n, contacts.m])
+    implied = modes == alone
     # One state for each choice of laws.
     states = {tuple(modes[k]): k for k in np.flatnonzero(np.any(implied, axis=1))}
     for k in states.values():

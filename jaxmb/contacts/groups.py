@@ -25,7 +25,7 @@ def groups_of(
 
     **Arguments:** laws that are `acting` in the event; those of them that `stays` closed, or stuck, throughout.
     """
-    if contacts.heads.size < 2:
+    if not contacts.in_groups:
         return None
     influence, acting = lax.stop_gradient((influence, acting))
     linked = contacts.linked

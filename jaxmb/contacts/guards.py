@@ -105,7 +105,8 @@ class ContactGuards(AbstractGuards):
         contacts, touch, t = system.contacts, self.touch * system.length, jnp.asarray(t, y.q.dtype)
         q = system.normalize(t, y.q)
         modes = contacts.modes(q)
-        opens = modes.open & (contacts.gaps(system, t, q) <= touch)
+        gaps = contacts.gaps(system, t, q)
+        opens = modes.open & (gaps <= touch)
         if not contacts.m:
             return opens
         rates = contacts.rates(system, t, q, y.u)[contacts.n :]

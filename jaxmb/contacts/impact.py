@@ -32,6 +32,7 @@ from ..linalg.pairs import of_pairs
 from ..linalg.pushed import dense, push
 from ..linalg.sums import with_entries
 from ..system.equation import AbstractEquation
+from ..system.instant import Instant
 from .forces import contact_forces, largest_force, reserves
 from .groups import HOLDS, least_in_group
 from .impacting import Event, find_event
@@ -122,11 +123,10 @@ def _impact_jvp(primals, tangents):
         dlate = dlate + _release(system, tolerance, event, (t, y), (dsystem, dt, dy))
     dz = None if y.z is None else dense(dy.z, y.z)
     change = _together if event.group is None else _apart
-    (dq, du, dz), *of_event = change(system, t, y, event, dlate, (dsystem, dt, dq, du, dz))
-    dq = jnp.where(np.isin(np.arange(system.nq), contacts.places), 0.0, dq)
-    late, impulses, energy = of_event
+    dafter, late, impulses, energy = change(system, t, y, event, dlate, (dsystem, dt, dq, du, dz))
+    dq = jnp.where(np.isin(np.arange(system.nq), contacts.places), 0.0, dafter.q)
     devent = jax.tree.map(lambda _: None, event)._replace(late=late, impulses=impulses, energy=energy)
-    return (after, event), (State(dq, du, dz), devent)
+    return (after, event), (State(dq, dafter.u, dafter.z), devent)
 
 
 def _together(system, t, y, event: Event, dlate, along):
@@ -140,7 +140,7 @@ def _together(system, t, y, event: Event, dlate, along):
     impulses, change, energy = _struck(Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du))
     if dz is not None:
         dz = dz + dlate * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
-    return (dq - dlate * rates[1], change - dlate * event.after, dz), dlate, impulses, energy
+    return State(dq - dlate * rates[1], change - dlate * event.after, dz), dlate, impulses, energy
 
 
 def _apart(system, t, y, event: Event, dlate, along):
@@ -155,11 +155,9 @@ def _apart(system, t, y, event: Event, dlate, along):
     rank = jnp.where(event.hits, 2, jnp.where(changes & (event.group != HOLDS), 1, 0))
     by_time = _by_times(phases, y, rank > 0)
     dlate = dlate[heads]
-    left, ahead, of_states, *of_impact = jax.tree.map(lambda x: dlate @ x, by_time)
-    dz = None if dz is None else dz + of_states
-    after_event = dq + left, change + ahead, dz
+    sums = jax.tree.map(lambda x, of_times: x + dlate @ of_times, (State(dq, change, dz), impulses, energy), by_time)
     # The time of the event is the time of its first group.
-    return after_event, dlate[jnp.argmax(rank[heads])], impulses + of_impact[0], energy + of_impact[1]
+    return sums[0], dlate[jnp.argmax(rank[heads])], *sums[1:]
 
 
 def _by_times(phases: Phases, y, acts):
@@ -171,10 +169,8 @@ def _by_times(phases: Phases, y, acts):
     heads, leads = jnp.asarray(system.contacts.heads), acts & (event.group == jnp.arange(acts.size))
     order, count = jnp.argsort(~leads[heads], stable=True), jnp.sum(leads)
     still = jax.tree.map(lambda _: None, system)
-    onwards = still, jnp.ones_like(t), system.rates(t, y.q, event.at)
-
-    def of_states(q, u):
-        return None if y.z is None else system.state_rates(t, q, u)
+    rates = Instant(system, t, y.q, event.at, y.z).motion(event.before)
+    onwards = still, jnp.ones_like(t), rates.q
 
     def advance(k, carry):
         (u, modes), rates, table = carry
@@ -183,14 +179,13 @@ def _by_times(phases: Phases, y, acts):
         impulses, change, energy = _struck(own)
         u, modes = u + (own.event.u - event.at), jnp.where(event.group == head, after, modes)
         q = system.contacts.with_modes(y.q, modes)
-        new = system.rates(t, q, u), contact_forces(system, t, q, u)[0], of_states(q, u)
-        left, ahead, of_z = jax.tree.map(lambda old, new: old - new, rates, new)
-        row = left, change - event.before + ahead, of_z, impulses, energy
+        new = Instant(system, t, q, u, y.z).motion(contact_forces(system, t, q, u)[0])
+        left = jax.tree.map(lambda old, new: old - new, rates, new)
+        row = State(left.q, change - event.before + left.u, left.z), impulses, energy
         return (u, modes), new, jax.tree.map(lambda table, x: table.at[order[k]].set(x), table, row)
 
     start = event.u - phases.alone(acts, event.impulses, event.held) @ phases.moves
-    rates = onwards[2], event.before, of_states(y.q, event.at)
-    row = *rates, event.impulses, event.energy
+    row = rates, event.impulses, event.energy
     table = jax.tree.map(lambda x: jnp.zeros((heads.size, *x.shape), x.dtype), row)
     # A loop over the groups that act, since it is mostly one.
     carry = (start, jnp.where(acts, before, after)), rates, table
@@ -239,8 +234,7 @@ def _release(system, tolerance, event, at, along):
     reserve_at_event, largest = reserve(system, t, y)
     k, releases = least_in_group(event.group, released, jnp.abs(reserve_at_event))
     least = lambda system, t, y: reserve(system, t, y)[0][k]
-    z = None if y.z is None else system.state_rates(t, y.q, y.u)
-    motion = State(system.rates(t, y.q, y.u), event.before, z)
+    motion = Instant(system, t, y.q, y.u, y.z).motion(event.before)
     value = push(least, (system, t, y), (dsystem, dt, dy))
     rate = eqx.filter_jvp(lambda t, y: least(system, t, y), (t, y), (jnp.ones_like(t), motion))[1]
     # A contact that an impact opens, or sets in motion, is not at its limit before. Balanced forces may leave no size

@@ -245,7 +245,7 @@ class Impacting:
     @property
     def in_groups(self) -> bool:
         """Whether there can be several groups."""
-        return self.contacts.heads.size > 1
+        return self.contacts.in_groups
 
     @property
     def phases(self) -> int:
@@ -535,12 +535,8 @@ class Impacting:
         if when.zeros is None:
             return None, when.first, when.hits
         after = contacts.as_modes(modes)
-        group = self.groups(
-            when.touching,
-            struck.resting & after.shut,
-            struck.ended & after.held,
-            self.modes.kinds[contacts.n :] != after.kinds[contacts.n :],
-        )
+        before, now = (numbers.kinds[contacts.n :] for numbers in (self.modes, after))
+        group = self.groups(when.touching, struck.resting & after.shut, struck.ended & after.held, before != now)
         until, about_to = when.zeros
         return group, *least_in_group(group, about_to & jnp.concatenate([when.touching, struck.ended]), until)
 

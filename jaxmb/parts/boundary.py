@@ -184,9 +184,6 @@ def _held(module: eqx.Module) -> dict[str, tuple[Any, bool]]:
 def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[int, ...] | None, list[Any]]]:
     """The name of each kernel of a part, the shape that it must return (None for any), and its arguments."""
     poses, velocities, t = _arguments(space, bodies)
-    lost_heading = part.lost_heading if isinstance(part, AbstractLink) else None
-    if lost_heading is not None:
-        yield "heading", (space.dimension,), [poses]
     if isinstance(part, AbstractVelocityConstraint):
         yield "residual", (part.rows,), [poses, velocities, t]
     elif hasattr(part, "residual"):
@@ -204,6 +201,8 @@ def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str
             yield "energy", (), [poses, t]
             if part.stores_by_speed:
                 yield "energy_in_motion", (), [poses, velocities, t]
+    if isinstance(part, AbstractLink) and part.lost_heading is not None:
+        yield "heading", (space.dimension,), [poses]
 
 
 def _check_gaps(part: AbstractForce, kernel: Callable[..., Any], given: list[Any]) -> None:

@@ -111,6 +111,11 @@ class ContactSet:
         """The first laws of those that are linked: contacts, and friction in joints."""
         return np.flatnonzero(np.argmax(self.linked, axis=1) == np.arange(self.n + self.m))
 
+    @property
+    def in_groups(self) -> bool:
+        """Whether there can be several groups of laws that act on each other."""
+        return self.heads.size > 1
+
     def at_rows(self, values: Float[Array, "acceleration_rows *k"]) -> Float[Array, "laws *k"]:
         """Values of the laws, from values of all rows of A."""
         return values[np.array(self.rows, int)]

@@ -92,14 +92,13 @@ def test_the_ground_does_not_hold_a_wheel_that_rebounds():
 
 
 @pytest.mark.slow
-def test_stops_and_draft_gears_never_pull():
+def test_stops_never_pull():
     bar = planar.Body("bar", mass=1.0, inertia=0.1)
     slide = planar.Prismatic("slide", "ground", "bar", point=(0.0, 0.0), axis=(1.0, 0.0))
     ends = {"lower": -1.0, "upper": 0.5, "stiffness": 1e4, "damping": 500.0}
     stops = [
         mb.JointStop("linear", "slide.displacement", **ends),
         mb.JointStop("progressive", "slide.displacement", **ends, exponent=1.5),
-        planar.DraftGear("gear", "ground", "bar", point_b=(5.0, 0.0), damping=1e7, free_length=5.0, slack=0.0),
     ]
     for stop in stops:
         system = mb.Scene([bar], joints=[slide], forces=[stop]).compile()

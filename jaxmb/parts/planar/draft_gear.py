@@ -9,7 +9,7 @@ from ...linalg.rotations import norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce, PathKind
 from ..kinks import clipped
-from ..smooth import quintic, sign, without_pull
+from ..smooth import quintic, sign
 from ..space import force_pair, separation, separation_rate
 
 
@@ -31,8 +31,7 @@ class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
     A loading gear follows the spring, an unloading one η times the spring: a cycle to the stroke δ dissipates
     `(1 − η)(½ k δ² + S₀ δ)`. The ramp r is x⁺ and the step p its derivative, except for |x| < `smoothing`/2, where
     polynomials give the ramp three continuous derivatives. Without slack, preload and friction the force is exactly
-    `k s`. Friction and damping always dissipate. While the gear unloads, damping is at most as large as the rest of the
-    force, so that a gear in draft never pushes, and one in buff never pulls.
+    `k s`. Friction and damping always dissipate; strong damping may exceed the spring of a gear that unloads fast.
 
     At zero length the direction is undefined and the force is taken as zero; `free_length` should exceed slack and
     stroke.
@@ -105,8 +104,7 @@ class DraftGear(AbstractPlanarPart, AbstractPointPair, AbstractPotentialForce):
         spring = self.preload * engaged + self.stiffness * ramp
         friction = 0.5 * (1 + self.unloading) + 0.5 * (1 - self.unloading) * sign(rate, self.transition_speed)
         _, stop, _ = self._engaged(stroke - self.travel)
-        force = spring * friction + self.stop_stiffness * stop
-        return force + without_pull(force, self.damping * engaged * rate)
+        return spring * friction + self.stop_stiffness * stop + self.damping * engaged * rate
 
     def _stored(self, stroke):
         _, ramp, area = self._engaged(stroke)
