@@ -43,6 +43,7 @@ def least(system, t, q, u):
     return np.linalg.pinv((A / sizes[:, None]).T, rcond=1e-10) @ force / sizes, force
 
 
+@pytest.mark.slow
 def test_shares_are_least_and_smooth(motion):
     multipliers = np.asarray(motion.multipliers)
     for k in (0, 37, 100):
@@ -137,6 +138,7 @@ def test_derivatives_of_shares():
     np.testing.assert_allclose(derivative, central_differences(tight, x), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_contacts_that_share_are_named():
     """Two equal stops; a third one is never reached."""
     body = planar.Body("body", mass=2.0, inertia=0.1, position=(0.5, 0.0))

@@ -23,8 +23,8 @@ def test_derivatives_by_the_points_of_a_table():
 
     def seen(points):
         x, y = points[: X.size], points[X.size :]
-        at = (-1.0, -0.2, 0.37, 1.05, 1.4)
-        return jnp.stack([function(x, y, s) for function in (local_spline.value, local_spline.integral) for s in at])
+        at, functions = jnp.array([-1.0, -0.2, 0.37, 1.05, 1.4]), (local_spline.value, local_spline.integral)
+        return jnp.concatenate([jax.vmap(function, (None, None, 0))(x, y, at) for function in functions])
 
     points, compiled = jnp.concatenate([X, Y]), jax.jit(seen)
     forward, reverse = jax.jit(jax.jacfwd(seen))(points), jax.jit(jax.jacrev(seen))(points)

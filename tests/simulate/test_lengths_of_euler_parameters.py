@@ -145,6 +145,7 @@ def test_required_forces():
     np.testing.assert_allclose(needs[1], needs[0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivative_by_the_raw_parameters(free):
     """Zero along the parameters themselves; forward mode, reverse mode and differences agree."""
     p, omega, along = 2.0 * np.asarray(spun([0.5, 0.5, -0.1, 0.7], [0, 0, 0], 0.0)[:4]), np.array([1.0, -2.0, 0.5]), 0.1

@@ -186,6 +186,7 @@ def test_identification_from_few_samples(wheel):
     assert fit.parameters["motor.force"] == pytest.approx(1.6, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_spring_that_is_turned_beyond_its_half_turn(wheel):
     """Its moment jumps there, of which the run warns; within the half turn about `middle` it does not."""
     middle = mb.JointSpring("coil", "hinge.angle", stiffness=1e-6, free=0.5, middle=2.0)
