@@ -31,8 +31,7 @@ def depends(function: Callable[..., Any], arguments: tuple[Any, ...], *which: in
     A dependence with a factor of zero counts as well.
     """
     program, reached = _traced(function, arguments, which)
-    for _ in _reached(program, reached):
-        pass
+    list(_reached(program, reached))
     return any(not isinstance(v, Literal) and v in reached for v in program.outvars)
 
 

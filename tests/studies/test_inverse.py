@@ -232,6 +232,7 @@ def torque_of(parameters, values):
 
 @pytest.mark.slow
 def test_derivatives_by_parameters_and_motion():
+    four_bar()  # compiled before JAX traces
     numbers = {"coupler.mass": jnp.asarray(3.0), "B.point_b": jnp.asarray([-1.5, 0.0])}
     values = jnp.asarray(crank(np.linspace(0.0, 1.0, 9)))
     along = {"coupler.mass": jnp.asarray(0.3), "B.point_b": jnp.asarray([0.2, -0.1])}
