@@ -272,7 +272,7 @@ class AbstractGroup(eqx.Module):
     @property
     def ends_at_turns(self) -> bool:
         """Whether steps end where a function of time turns, even if they would not pass over it."""
-        return getattr(self.group.part, "of_time", False)
+        return self.group.part.of_time
 
     def _kernel_in_time(self, name, now):
         if name == "gaps":

@@ -251,6 +251,9 @@ class AbstractActor(AbstractPart):
     moving: ClassVar[tuple[str, ...]] = ()
     # Whether the part may act on bodies and frames among its `sources`, other than joints and tendons.
     takes_bodies: ClassVar[bool] = False
+    # Whether `given_in_time` is its function of time, at whose turns steps end. Pulses are found without it as well, in
+    # all kernels that depend on time.
+    of_time: ClassVar[bool] = False
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         out = super().__new__(cls, *args, **kwargs)
@@ -311,9 +314,6 @@ class AbstractLink(AbstractActor):
 
     # Index from which bodies may repeat, as several places on one body; None if all must differ.
     several_from: ClassVar[int | None] = None
-    # Whether `given_in_time` is its function of time, at whose turns steps end. Pulses are found without it as well, in
-    # all kernels that depend on time.
-    of_time: ClassVar[bool] = False
     # The quantities of its coordinates; unknown without an entry.
     quantities: ClassVar[Quantities] = {}
     # Whether bodies touch each other, the ground or a road in it, as in a contact and a tyre.

@@ -166,6 +166,11 @@ class Series(AbstractSignal):
         values = np.asarray(self.values).reshape(len(self.ts), -1)
         return np.asarray(self.ts)[1:][np.any(np.diff(values, axis=0) != 0, axis=1)]
 
+    @property
+    def is_piecewise_linear(self) -> bool:
+        """Whether the values are on straight lines between the times of the series."""
+        return self.interpolation == "linear"
+
     def samples(self, t0, t1):
         return jnp.asarray(self.ts)
 

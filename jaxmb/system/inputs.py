@@ -18,7 +18,7 @@ from ..parts.names import unknown
 from ..parts.series import AbstractSignal, as_signal, of_one_kind, sample_times
 from ..solvers.evaluation import freeze
 from .parameters import parameters
-from .pulses import on_straight_lines, pulses_at_knots, pulses_of_samples, turned
+from .pulses import between_segments_on_one_line, on_straight_lines, pulses_at_knots, pulses_of_samples, turned
 from .system import AbstractSystem
 
 System = TypeVar("System", bound=AbstractSystem)
@@ -156,6 +156,8 @@ def _at_knots(series, traced, ts):
     values = _at(series, jnp.concatenate([jnp.clip(knots, first, last), ts]))
     known, sampled = values[: knots.size], values[knots.size :]
     ended = pulses_at_knots(knots, known, (ts, sampled), lambda times: _at(series, times), turned(known))
+    if series.is_piecewise_linear:
+        ended = ended | between_segments_on_one_line(knots, known, first, last)
     ended = ended | on_straight_lines(knots, known) if traced else ended
     return jnp.where(ended & (knots > first) & (knots < last), knots, jnp.inf), sampled
 

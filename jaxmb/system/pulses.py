@@ -13,6 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .._types import Scalar
+
 # The largest excursion of a function that may be missed between two steps, relative to its range.
 _HIDDEN = 0.1
 # A value is that of a pulse if it differs from the polynomial this many times more than the values beside the pulse.
@@ -25,6 +27,8 @@ _ROUNDING = 64
 _BESIDE = np.array([1.0, 1.27, 1.6, 1.9, 2.13, 2.61, 3.0])
 # Half widths of pulses, in samples of a function.
 _WIDTHS = np.array([2, 3, 4, 6, 9, 13, 20, 30, 45, 64])
+# The most segments of a piecewise linear function within a pulse between two segments on one line.
+_SEGMENTS = 8
 # Functions that are judged at the same time.
 _TOGETHER = 64
 
@@ -130,6 +134,36 @@ def pulses_at_knots(
         return _Beside(width, jnp.where(early, before - around, jnp.where(late, after - around, around)), rows)
 
     return _pulses(ts, values, beside, jnp.asarray(np.concatenate([reaches, -reaches])), ended, _AT_KNOTS)
+
+
+def between_segments_on_one_line(
+    ts: Float[Array, "n"], values: Float[Array, "n columns"], first: Scalar, last: Scalar
+) -> Bool[Array, "n"]:
+    """At which of its knots a piecewise linear function is at the peak of a pulse between two segments on one line.
+
+    A step that passes both segments shows nothing of the pulse. `first` and `last` are the ends of a run; beyond them
+    there are no segments, and `values` are those at the ends.
+    """
+    n, ts = ts.shape[0], jnp.clip(ts, first, last)
+    gaps = (ts[1:] - ts[:-1])[:, None]
+    slopes = (values[1:] - values[:-1]) / jnp.where(gaps > 0, gaps, 1.0)
+    beyond = ((ts <= first) | (ts >= last))[:, None]
+    left, within = jnp.arange(n), np.arange(1, _SEGMENTS)[:, None]
+
+    def look(peaks, segments):
+        right = jnp.minimum(left + segments, n - 1)
+        rise, width = values[right] - values[left], (ts[right] - ts[left])[:, None]
+        off_before = jnp.where(beyond[left], 0.0, jnp.abs(rise - width * slopes[jnp.maximum(left - 1, 0)]))
+        off_after = jnp.where(beyond[right], 0.0, jnp.abs(rise - width * slopes[jnp.minimum(right, n - 2)]))
+        slope = rise / jnp.where(width > 0, width, 1.0)
+        inner = jnp.minimum(left[None] + within, right[None])
+        lengths = (ts[inner] - ts[left][None])[..., None]
+        heights = jnp.abs(values[inner] - values[left][None] - lengths * slope[None])
+        stands_out = jnp.max(heights, axis=0) > _AT_KNOTS * (off_before + off_after) + _rounding(values)
+        highest = left[:, None] + 1 + jnp.argmax(heights, axis=0)
+        return peaks.at[jnp.where(stands_out, highest, n)].set(True, mode="drop"), None
+
+    return lax.scan(look, jnp.zeros(n, bool), jnp.arange(2, _SEGMENTS + 1))[0]
 
 
 def on_straight_lines(ts: Float[Array, "n"], values: Float[Array, "n columns"]) -> Bool[Array, "n"]:

@@ -9,7 +9,7 @@ from compiling import jit_quickly
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.system.inputs import turning_times
-from jaxmb.system.pulses import on_straight_lines, pulses_of_samples
+from jaxmb.system.pulses import between_segments_on_one_line, on_straight_lines, pulses_of_samples
 
 END, SAMPLES = 100.0, 513
 TS, SPACING = np.linspace(0.0, END, SAMPLES), END / (SAMPLES - 1)
@@ -81,6 +81,19 @@ def test_many_columns_hide_none():
     waves[7, 20] = np.nan
     found = jit_quickly(pulses_of_samples)(jnp.asarray(TS), jnp.asarray(waves), jnp.zeros(SAMPLES, bool))
     np.testing.assert_allclose(TS[np.asarray(found)], [40.0], atol=0.6 * SPACING)
+
+
+def test_a_small_pulse_on_the_flank_of_a_large_one():
+    """Of a piecewise linear series; values that are rough everywhere have none."""
+    ts = np.array([0.0, 20.0, 43.9, 44.6, 44.7, 44.8, 45.0, 45.1, 46.2, 79.0])
+    course = np.interp(ts, [0.0, 43.9, 45.1, 46.2, 79.0], [0.0, 0.0, -3.8, 0.0, 0.0])
+    course[5] -= 0.005
+    judge = jit_quickly(between_segments_on_one_line)
+    assert ts[np.asarray(judge(ts, course[:, None], ts[0], ts[-1]))].tolist() == [44.8, 45.1]
+    later = np.interp(np.maximum(ts, 44.9), ts, course)
+    assert ts[np.asarray(judge(ts, later[:, None], 44.9, ts[-1]))].tolist() == [45.1]
+    rough, times = np.random.default_rng(4).normal(size=(400, 1)), np.linspace(0.0, 1.0, 400)
+    assert np.sum(judge(times, rough, 0.0, 1.0)) <= 4
 
 
 def test_values_on_straight_lines():
