@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..linalg.graphs import connected
 from ..linalg.inertia import DiagonalInertia
 from ..linalg.jitted import on_host
 from ..linalg.rotations import unrotate
@@ -35,12 +34,7 @@ from ..system.instant import Instant
 from .independence import JointBlocks, JointRows
 from .joint_graph import elimination_order, joint_order
 from .rigid_bodies import Implied, RigidBodySystem
-
-# Thresholds of the smallest singular value of the equilibrated Jacobian of bodies without freedom. Below the first the
-# bodies do move; between the two they would move with slightly different dimensions. (Three rockers of 1 m with a pin
-# 1 mm out of place: 6e-5.)
-_MOVES = 1e-8
-_LOCKED = 5e-3
+from .rigidity import check_rigid
 
 
 def with_structure(system: RigidBodySystem) -> RigidBodySystem:
@@ -71,14 +65,15 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     check_gradients(system, _row_norms(system, at.blocks))
     row = np.arange(system.acceleration_rows)
     level = (row >= system.position_rows).astype(int) + (row >= system.velocity_rows)
-    absolute = joints.absolute_parts(_motions_as_one(system.layout, np.asarray(q)))
+    motions = _motions_as_one(system.layout, np.asarray(q))
+    absolute = joints.absolute_parts(motions)
     subsets = joints.subsets(level, absolute)
     dropped = tuple(sorted(r for subset in subsets for r in subset.dropped.tolist()))
     shares = [share for subset in subsets for share in subset.shares]
 
     order = joint_order(system, dropped, absolute)
     _check_contradictions(dataclasses.replace(system, elimination=order), q, shares)
-    _check_locked(system, joints, subsets)
+    check_rigid(system, joints, subsets, motions, absolute)
     implied = _implied(system, shares)
     _check_determined(system, implied)
     _check_nearby(dataclasses.replace(of_positions, elimination=order), q, joints, subsets)
@@ -225,56 +220,6 @@ def _check_contradictions(system, q, shares):
                 f"The {what} prescribed by {', '.join(sorted(names))} contradict each other (largest residual "
                 f"{largest:.3g}). Remove one of them, or make their motions agree."
             )
-
-
-def _check_locked(system, joints, subsets):
-    """Refuse bodies that are locked only by a small disagreement of redundant joints.
-
-    Three parallel rockers move, and one of their rows is implied. With one pin slightly out of place they assemble, if
-    at all, at a pose where they lock: there a row is nearly implied.
-    """
-    independent = np.zeros(system.acceleration_rows, bool)
-    for subset in subsets:
-        independent[subset.kept] = True
-    parts = joints.parts
-    for bodies, numbers in _connected(system, parts):
-        columns = system.layout.velocity_index[bodies].ravel()
-        columns = np.sort(columns[columns < system.nu])
-        # Open chains are skipped: they have no redundant joints, but long chains have small singular values too.
-        if len(numbers) == len(bodies) and all(len(parts[p].bodies) == 2 for p in numbers):
-            continue
-        # With fewer independent rows than columns the bodies move.
-        if sum(np.sum(independent[parts[p].numbers]) for p in numbers) < len(columns):
-            continue
-        scaled = joints.dense(numbers, columns) * joints.scale[columns]
-        scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), np.finfo(scaled.dtype).tiny)
-        left, sizes, _ = np.linalg.svd(scaled)
-        if _MOVES < sizes[-1] < _LOCKED:
-            share = np.abs(left[:, len(columns) - 1])
-            rows = [r for p in numbers for r in parts[p].numbers]
-            names = dict.fromkeys(system.rows[r][0] for r, x in zip(rows, share, strict=True) if x > 0.05 * share.max())
-            moving = ", ".join(system.body_names[k] for k in bodies if k < system.layout.bodies)
-            raise ValueError(
-                f"{moving} cannot move: {', '.join(names)} leave no degree of freedom, but with dimensions that "
-                f"differ only slightly from these they would (smallest singular value {sizes[-1]:.1e}). "
-                "Make the points and lengths of redundant joints agree, or remove one of them."
-            )
-
-
-def _connected(system, parts):
-    """Sets of bodies that position constraints connect, the ground left out, with their parts; none with a driver."""
-    ground = system.layout.ground
-    rheonomic = [moving for g in system.constraints.position for moving in [g.rheonomic] * len(g.group.bodies)]
-    moving = [[k for k in part.bodies if k != ground] for part in parts[: len(rheonomic)]]
-    first = connected(ground, filter(None, moving))
-    bodies, of_parts, driven = ([[] for _ in first] for _ in range(3))
-    for k in range(ground):
-        bodies[first[k]].append(k)
-    for p, moving_bodies in enumerate(moving):
-        if moving_bodies:
-            of_parts[first[moving_bodies[0]]].append(p)
-            driven[first[moving_bodies[0]]].append(rheonomic[p])
-    return [(b, p) for b, p, d in zip(bodies, of_parts, driven, strict=True) if d and not any(d)]
 
 
 def _bodies_of_joints(system):

@@ -35,7 +35,7 @@ _OPTIONAL = {
     "plot": ("matplotlib",),
     "view": ("viser",),
     "import": ("mujoco",),
-    "studies": ("cloudpickle", "scipy", "xarray", "zarr"),
+    "studies": ("cloudpickle", "xarray", "zarr"),
 }
 _STEPPED = ("four_bar", "andrews", "rod_chain", "tracked_vehicle")
 _RTOL, _REPEATS = 1e-8, 5

@@ -254,8 +254,10 @@ def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
     noise = 1e3 * jnp.finfo(along.dtype).eps * (largest(local.curvatures) + largest(local.sizes * local.multipliers))
     quiet = local.loose & (xp.abs(along) <= noise)
     size = xp.abs(local.curvatures)
+    # Without any stiffness the bound on steps decides the length.
+    stiff = xp.where(xp.max(size) > 0, xp.max(size), 1.0)
     # Directions without force count as stiff, so that rounding errors cause no motion along them.
-    size = xp.where(quiet, xp.max(size), xp.maximum(size, _NEGLIGIBLE * xp.max(size)))
+    size = xp.where(quiet, stiff, xp.maximum(size, _NEGLIGIBLE * stiff))
     size = size if downhill else xp.where(~quiet & (local.curvatures < 0), -size, size)
     stiffness = local.stiffness + (local.directions * (size - local.curvatures)[None, :]) @ local.directions.T
     return xp.linalg.solve(stiffness, local.directions @ xp.where(quiet, 0.0, along))
@@ -415,7 +417,8 @@ def _search(
         back = xp.dot(ahead.force, step) < -0.5 * xp.abs(xp.dot(local.force, step)) - other
         weaker = norm(ahead.force) < norm(local.force)
         better = ~back | weaker if downhill else (size <= close) | weaker
-        good = (k == 0) | (better & xp.all(xp.isfinite(ahead.force)))
+        # Forces after a step of rounding errors are rounding errors, and may push back.
+        good = (k == 0) | ((better | (size <= close**1.5)) & xp.all(xp.isfinite(ahead.force)))
         q, local = jax.tree.map(lambda new, old: xp.where(good, new, old), (trial, ahead), (q, local))
         radius = xp.where(good, xp.minimum(2 * radius, _LONGEST), 0.25 * radius)
         step = _step(local, downhill=downhill)

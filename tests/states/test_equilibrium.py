@@ -254,3 +254,39 @@ def test_legs_that_share_a_weight_do_not_pull():
     table = mb.Scene([top], joints=legs, forces=[mb.Gravity((0.0, 0.0, -G))]).compile()
     rests = mb.equilibrium(table, fix={f"leg{k}.mode": 1 for k in range(4)})
     np.testing.assert_allclose(rests.q[2], 0.5, atol=1e-9)
+
+
+def on_rope(slack=0.0, length=1.0):
+    """A mass of 1 kg below the end of a rope of 10 kN/m; a length of None is that of the given pose."""
+    bob = planar.PointMass("bob", mass=1.0, position=(0.0, slack - 1.0))
+    rope = mb.Rope("rope", [("ground", (0.0, 0.0)), ("bob", (0.0, 0.0))], length=length, stiffness=1e4)
+    return mb.Scene([bob], joints=[rope], forces=[mb.Gravity((0.0, -G))]).compile()
+
+
+@pytest.mark.parametrize(("slack", "length"), [(0.0, None), (1e-3, 1.0), (0.3, 1.0), (-1e-3, 1.0)])
+def test_a_load_on_an_elastic_rope_hangs_from_any_slack(slack, length):
+    state = mb.equilibrium(on_rope(slack, length))
+    np.testing.assert_allclose(state.q, [0.0, -1.0 - G / 1e4], rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_where_a_rope_just_tightens():
+    system = on_rope(1e-3)
+    height = lambda mass: mb.equilibrium(mb.with_parameters(system, {"bob.mass": mass})).q[1]
+    masses = jnp.array([0.5, 1.0, 2.0])
+    np.testing.assert_allclose(jax.jit(jax.vmap(height))(masses), -1.0 - masses * G / 1e4, rtol=0, atol=1e-12)
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(jax.jit(derivative(height))(1.0), -G / 1e4, rtol=1e-10)
+
+
+def test_equal_loads_on_a_rope_that_slides_over_a_pulley():
+    """They balance in a family of poses, which the search reaches up to rounding errors."""
+    loads = [
+        planar.PointMass(name, mass=1.0, position=at) for name, at in (("left", (-0.1, -1.0)), ("right", (0.1, -1.3)))
+    ]
+    over = mb.Pulley("ground", radius=0.1, turn="right", centre=(0.0, 0.0))
+    rope = mb.Rope("rope", [("left", (0.0, 0.0)), over, ("right", (0.0, 0.0))], stiffness=1e4)
+    system = mb.Scene(loads, joints=[rope], forces=[mb.Gravity((0.0, -G))]).compile()
+    state = mb.equilibrium(system)
+    stretch = G / 1e4
+    np.testing.assert_allclose(state.q, [-0.1, -1.0 - stretch / 2, 0.1, -1.3 - stretch / 2], rtol=0, atol=1e-12)
