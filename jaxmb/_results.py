@@ -40,7 +40,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "is kept."
     )
     assembly_failed = (
-        "The initial state is not finite or violates the constraints. Use `jaxmb.assemble` to make it consistent."
+        "The initial state is not finite or violates the constraints: `jaxmb.assemble` makes it consistent. If it is "
+        "from `assemble(..., throw=False)`, the mechanism cannot be assembled with these numbers, and "
+        "`jaxmb.assembly_gap` measures how far it is from that."
     )
     invalid_parameters = (
         "A parameter is not finite, or not in the range that its part asks for, or a direction is not a unit vector, "

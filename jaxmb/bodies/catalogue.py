@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..parts.base import AbstractLink
 from ..parts.coordinate_parts import AbstractCoordinatePart
 from ..parts.drivers import AbstractDriver
 from ..system.catalogue import Catalogue
@@ -83,6 +84,16 @@ class SceneCatalogue(Catalogue):
     def picture(self, ts, ys):
         acting = (*self.system.constraints.groups, *self.system.forces.groups)
         return picture(self.system, [g.group for g in acting], ts, ys)
+
+    def limits(self, t, q):
+        space, poses, out = self.system.layout.space, np.asarray(self.system.bodies.prepared_poses(q)), []
+        groups = (*self.system.constraints.groups, *self.system.forces.groups)
+        for group in (g.group for g in groups if isinstance(g.group.part, AbstractLink)):
+            for member, name in enumerate(group.names):
+                part = group.single(member, t).named(name)
+                reached = part.limit_reached(space, part.seen_poses(space, poses[group.body_index[member]]))
+                out += [f"{part.label} is at its limit: {reached}"] if reached else []
+        return tuple(dict.fromkeys(out))
 
     def not_finite(self, t, q, u):
         names = [

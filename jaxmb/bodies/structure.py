@@ -28,7 +28,7 @@ from ..states.redundancy import (
     dense_remains,
     smallest_step,
 )
-from ..states.refusals import violated_joints
+from ..states.refusals import violated_joints, without_a_joint
 from ..system.equation import Ranks
 from ..system.instant import Instant
 from .independence import JointBlocks, JointRows
@@ -60,6 +60,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
             "The scene cannot be compiled: the mechanism cannot be assembled from the given poses, residuals [m, rad] "
             f"remain in {listed}. The assembly starts at the position and the {turn} of each body: give poses that are "
             "nearer to an assembled mechanism. Else check lengths, points and axes: joints may contradict each other."
+            f"{without_a_joint(system, np.zeros((), q.dtype), system.guess.q)}"
         )
     joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, system.known_scales()[1])
     check_gradients(system, _row_norms(system, at.blocks))

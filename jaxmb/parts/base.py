@@ -332,6 +332,11 @@ class AbstractLink(AbstractActor):
         """
         raise NotImplementedError(f"{self.kind} says lost_heading, and needs a method heading.")
 
+    def limit_reached(self, space: AbstractSpace, poses: Poses) -> str:
+        """Hook: the limit of the part's equations at which some concrete poses are, for messages; empty if at none."""
+        del space, poses
+        return ""
+
     def is_length(self, coordinate: str) -> bool | None:
         """Whether a coordinate is a length, otherwise an angle; None if it is not known."""
         return None if coordinate not in self.quantities else self.quantities[coordinate] == "length"

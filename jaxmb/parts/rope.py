@@ -44,6 +44,8 @@ _PARALLEL = 1e-6
 _FARTHEST = 0.9 * np.pi
 # Angles beyond this are of a rope off its pulley [rad]; other negative ones are of more than half a turn.
 _FARTHEST_OFF = 0.8 * np.pi
+# Where a motion ends with a straight part shorter than this share of the radius, it ends because of it.
+_AT_CIRCLE = 0.01
 # Lengths that differ by no more than this share are equal.
 _ROUNDING = 1e-9
 # Of a point none.
@@ -329,6 +331,30 @@ class AbstractRope(AbstractLink):
         out = [wraps, *((held[h] if first else -held[h])[None] for _, first, h in ends)]
         order = np.argsort([*self.passed_places, *(k for k, _, _ in ends)])
         return unchecked_take(jnp.concatenate(out), order)
+
+    # Limits
+
+    def limit_reached(self, space, poses):
+        lengths, along = map(np.asarray, self._straight(space, poses))
+        radii = np.zeros(len(self.senses))
+        radii[self._pulleys] = [] if self.radii is None else self.radii
+        largest = np.maximum(radii[:-1], radii[1:])
+        # A rope that has lifted off its pulley lacks a part.
+        gone = np.isin(np.arange(len(lengths)), np.flatnonzero(self.lifts)) & (lengths == 0)
+        for k in np.flatnonzero((largest > 0) & ~gone & ~(lengths > _AT_CIRCLE * largest)):
+            if self.senses[k] and self.senses[k + 1]:
+                return f"the pulleys path[{k}] and path[{k + 1}] touch each other, where it has no tangent"
+            point, pulley = (k, k + 1) if self.senses[k + 1] else (k + 1, k)
+            return f"the point path[{point}] is at the circle of the pulley path[{pulley}], where it has no tangent"
+        if not self.size or self.counts:
+            return ""
+        away = np.abs(shortest(jnp.asarray(self._angles(space, poses, along) - self.bearings)))
+        if not np.any(away > _FARTHEST * (1 - _AT_CIRCLE)):
+            return ""
+        return (
+            f"its angle on a pulley, or the direction of a straight part at one that holds it, has changed by "
+            f"{_FARTHEST / np.pi:g} half turns since the given poses; with count_turns=True there is no limit"
+        )
 
     # Pictures
 

@@ -15,7 +15,7 @@ from ..linalg.arrays import is_traced
 from ..linalg.recent import Recent
 from ..manifold.impulse import find_jumps
 from ..solvers import AbstractMultistep, Adams
-from ..states.consistency import contradiction
+from ..states.consistency import contradiction, not_finite
 from ..states.headings import about_headings, are_short
 from ..states.refusals import LostRank, lost_rank, violated_joints
 from .span import Span
@@ -171,13 +171,22 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
             f"{how_far(outcome, span)} There {lost}, so the motion beyond is not determined. With `throw=False` the "
             "motion up to there is kept."
         )
+    reached = system.catalogue.limits(outcome.t, outcome.y.q)
+    if reached:
+        kept = "With `throw=False` the motion up to there is kept."
+        return f"{how_far(outcome, span)} There {' and '.join(reached)}. {kept}"
     if result == RESULTS.max_steps_reached:
         return about_steps(outcome, span, stats, is_stiff_at_end(probe, stats, solver))
     if not np.all(np.isfinite(np.concatenate(jax.tree.leaves(outcome.y)))):
-        return RESULTS[result] + about_zero_attitudes(system, outcome.y.q)
+        return RESULTS[result] + about_entries(system, outcome.y)
     if result == RESULTS.inconsistent_constraints:
         return contradiction(system, outcome.t, outcome.y)
     return f"{how_far(outcome, span)} {reason_of_failure(system, result, span, outcome)}"
+
+
+def about_entries(system, y) -> str:
+    """The entries of a state that are not finite. Euler parameters of length zero are told apart."""
+    return about_zero_attitudes(system, y.q) or f" Not finite: {not_finite(system, q=y.q, u=y.u, z=y.z)}."
 
 
 def about_zero_attitudes(system, q) -> str:

@@ -18,6 +18,7 @@ from ..linalg.arrays import as_array, is_traced, replaced
 from ..parts.names import UnknownNameError, unknown
 from ..system import AbstractSystem
 from ..system.quantities import rates_of
+from .consistency import not_finite
 
 
 def check_system(function: str, system: Any) -> None:
@@ -54,6 +55,11 @@ def checked_guess(function: str, system: AbstractSystem, guess: Any) -> State:
     check_kind(f"{function}: guess", guess, State, "a State(q, u)", "assemble returns one")
     if guess.z is not None and system.nz == 0:
         raise ValueError(f"{function}: guess.z: the system has no internal states.")
+    vectors = {"q": (guess.q, system.nq), "u": (guess.u, system.nu)}
+    known = {key: x for key, (x, size) in vectors.items() if not is_traced(x) and np.shape(x) == (size,)}
+    wrong = not_finite(system, **{key: x for key, x in known.items() if np.asarray(x).dtype.kind == "f"})
+    if wrong:
+        raise ValueError(f"{function}: the guess is not finite: {wrong}.")
     # A guess without internal states takes the internal states of the system's guess.
     z: Any = system.guess.z
     if guess.z is not None:

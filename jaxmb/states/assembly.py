@@ -35,6 +35,7 @@ from .arguments import (
     split_rates,
 )
 from .closest import closest_configuration, closest_velocities
+from .consistency import not_finite
 from .headings import check_headings
 from .refusals import cannot_assemble, cannot_move
 
@@ -98,7 +99,7 @@ def assemble(
     rates, rates_of_joints = split_rates(system, rates)
     u, fixed_rates = prescribe("rate", rates_of(system.rate_names()) if rates else {}, rates, guess.u)
     if not is_traced(u):
-        _check_finite(u, "rates")
+        _check_finite(system, "rates", u=u)
     raises = throw is not False
     q, _, ok = configuration(holding(system, of_joints, {}, t), guess.q, fix, t, raises)
     if rates_of_joints:
@@ -164,7 +165,7 @@ def configuration(
     q, fixed = prescribe("coordinate", system.coordinate_names() if fix else {}, {} if fix is None else fix, guess)
     if not is_traced(q):
         _check_modes(system, q, fixed)
-        _check_finite(q, "coordinates")
+        _check_finite(system, "coordinates", q=q)
     # The row of an open contact determines its mode.
     fixed[list(system.contacts.contact_places)] = False
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
@@ -219,6 +220,7 @@ def _is_met(system, t, q):
     return jnp.max(jnp.abs(system.coordinate_residual(t, q)), initial=0.0) <= _ROUNDING * jnp.finfo(q.dtype).eps * size
 
 
-def _check_finite(vector, what):
-    if not np.all(np.isfinite(vector)):
-        raise ValueError(f"The guess or the fixed {what} are not finite: {np.asarray(vector)}.")
+def _check_finite(system, what, **vector):
+    wrong = not_finite(system, **vector)
+    if wrong:
+        raise ValueError(f"The guess or the fixed {what} are not finite: {wrong}.")

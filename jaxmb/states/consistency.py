@@ -20,6 +20,8 @@ from ..system.instant import Instant
 # power of eps, 3e-4 in single precision.
 _TOLERANCE = 1e-5
 _ROUNDING = 0.5
+# The largest number of names in a message.
+_NAMED = 8
 # The independent part of a row that is not implied, as a power of eps: 1e-7.
 _IMPLIED = 0.45
 
@@ -121,6 +123,21 @@ def _violated(system, t, y) -> Any:
     positions, velocities = at.violations(at.row_sizes())
     depths = -system.contacts.gaps(system, t, at.q) / system.length
     return (positions > tol) | near.half_turned(at.q), velocities > tol, depths > tol
+
+
+def not_finite(system: AbstractSystem, **vectors: Any) -> str:
+    """The first entries of vectors `q`, `u` and `z` of a state that are not finite, by name with their values."""
+    names = {"q": system.coordinate_names(), "u": system.rate_names(), "z": system.state_names()}
+    out = []
+    for key, vector in vectors.items():
+        values = np.zeros(0) if vector is None else np.asarray(vector)
+        wrong = set(np.flatnonzero(~np.isfinite(values)).tolist())
+        # The names of numbers come before those of vectors that contain them.
+        for name, index in sorted(names[key].items(), key=lambda item: len(item[1])):
+            if wrong & set(index):
+                wrong -= set(index)
+                out.append(f"{name} ({', '.join(f'{values[k]:g}' for k in index)})")
+    return ", ".join(out[:_NAMED]) + (f" and {len(out) - _NAMED} more" if len(out) > _NAMED else "")
 
 
 def listed(system: AbstractSystem, violated: Any, residual: Any) -> str:

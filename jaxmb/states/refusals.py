@@ -1,5 +1,6 @@
 """Why a mechanism cannot be assembled or moved as prescribed, in words, and where its constraints lose rank."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,6 +25,9 @@ _BESIDE, _ITERATIONS = 0.03, 8
 _LOST, _LOST_IN_SEARCH = 1e-3, 1e-2
 # The smallest share of a joint that counts in a loss of rank, relative to the largest share.
 _SHARE = 0.05
+# The largest number of joints that are left out one after the other; the number of steps of each search for the others,
+# and the longest step; and the share of a displacement that is much less.
+_MOST_JOINTS, _SEARCHED, _LONGEST, _NEARER = 30, 60, 0.3, 0.1
 # The largest number of rows of a matrix that is decomposed for a message.
 _MOST_ROWS = 2000
 
@@ -35,6 +39,85 @@ def violated_joints(system: AbstractSystem, t: Scalar, q: Coordinates, least: fl
     """
     residual = np.nan_to_num(np.abs(np.asarray(system.position_residual(t, q))), nan=np.inf)
     return listed(system, residual >= least * float(system.length), residual)
+
+
+def without_a_joint(system: AbstractSystem, t: Scalar, q: Coordinates) -> str:
+    """Which joint, left out, lets the rest of a mechanism close, and how far it then is from closing, as sentences;
+    empty if no single joint does. In a loop the closest configuration spreads a gap over all joints.
+
+    **Arguments:** `q`: the poses from which the search starts.
+    """
+    rows = system.rows[: system.position_rows]
+    names = list(dict.fromkeys(name for name, _ in rows))
+    if not 2 <= len(names) <= _MOST_JOINTS:
+        return ""
+    q = np.asarray(q)
+    of_joint = {name: np.array([k for k, (other, _) in enumerate(rows) if other == name]) for name in names}
+    scale, host = np.asarray(system.coordinate_scale()), system.on_host(t)
+    if host is None:
+        at = lambda q: tuple(map(np.asarray, _linearised(system, t, q)))
+    else:
+        at = lambda q: (host.coordinate_residual(q), host.coordinate_jacobian(q) * scale)
+    closing = _Closing(at, scale, _ZERO * float(system.length))
+    found = {}
+    for name in names:
+        closed = closing.without(q, of_joint[name])
+        if closed is not None:
+            found[name] = float(np.max(np.abs((closed - q) / scale))), closing.least_gap(closed, of_joint[name])
+    if not found:
+        return ""
+    nearest = min(found, key=lambda name: found[name][0])
+    gap = lambda name: f"{found[name][1]:.3g} [m, rad]"
+    if all(found[nearest][0] < _NEARER * moved for name, (moved, _) in found.items() if name != nearest):
+        return f" Without {nearest} the other joints close, and it then misses by about {gap(nearest)}: check it first."
+    listing = ", ".join(found)
+    return f" Without any one of {listing} the others close; the lengths between them miss by about {gap(nearest)}."
+
+
+class _Closing(NamedTuple):
+    """The search for configurations in which constraints hold.
+
+    **Fields:** `at(q)`: residuals, and their Jacobian in scaled coordinates; the `scale` of the coordinates; residuals
+    up to `zero` vanish.
+    """
+
+    at: Callable[[Any], tuple[Any, Any]]
+    scale: Float[np.ndarray, "nq"]
+    zero: float
+
+    def without(self, q: Any, rows: Int[np.ndarray, "k"]) -> Any:
+        """The configuration near another in which all but these rows hold; None if the search finds none."""
+        for _ in range(_SEARCHED):
+            residual, jacobian = (np.delete(x, rows, axis=0) for x in self.at(q))
+            if np.max(np.abs(residual), initial=0.0) < self.zero:
+                return q
+            if not np.all(np.isfinite(jacobian)):
+                break
+            q = self._moved(q, np.linalg.lstsq(jacobian, -residual, rcond=_DEPENDENT)[0])
+        return None
+
+    def _moved(self, q, step):
+        return q + self.scale * step * min(1.0, _LONGEST / max(np.max(np.abs(step)), 1e-300))
+
+    def least_gap(self, q: Any, rows: Int[np.ndarray, "k"]) -> float:
+        """The smallest norm of the residuals of these rows while the others hold, from a configuration where these do:
+        by the method of Gauss and Newton along the motions that they allow.
+        """
+        least = np.inf
+        for _ in range(_SEARCHED):
+            residual, jacobian = self.at(q)
+            size = float(np.linalg.norm(residual[rows]))
+            if size >= least * (1 - _ZERO):
+                break
+            least = size
+            others = np.delete(jacobian, rows, axis=0)
+            allowed = np.eye(q.size) - np.linalg.pinv(others, rcond=_DEPENDENT) @ others
+            step = allowed @ np.linalg.lstsq(jacobian[rows] @ allowed, -residual[rows], rcond=_DEPENDENT)[0]
+            back = self.without(self._moved(q, step), rows)
+            if back is None:
+                break
+            q = back
+        return least
 
 
 class _Held(NamedTuple):
@@ -135,7 +218,8 @@ def cannot_assemble(system: AbstractSystem, t: Scalar, q: Coordinates, fixed: In
                 "coordinate."
             )
     if violated:
-        return f"{text}: {remain}. Check lengths, points and axes, or give a better guess."
+        alone = "" if held.names else without_a_joint(system, t, system.guess.q)
+        return f"{text}: {remain}. Check lengths, points and axes, or give a better guess.{alone}"
     return (
         f"{text}: the configuration that is closest to the guess is singular, or not the only one. Give another guess "
         "of the positions."

@@ -17,6 +17,7 @@ from .._printed import Printed
 from ..linalg.arrays import add_up, is_traced
 from ..linalg.jitted import jitted
 from ..linalg.rotations import cross, norm
+from ..parts.base import AbstractTendon
 from ..parts.coordinate_parts import AbstractCoordinatePart
 from ..parts.names import unknown
 from ..system import with_parameters
@@ -157,7 +158,8 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
 
     A load acts at the point of its part on the body, or of the joint on whose coordinate its part acts; without such a
     point, as in a contact, at the mass centre. With `required_forces`, the needed forces of actuators are loads by
-    their names in `by`; of a parameter, `"engine.torque"`, the load has the name of the part.
+    their names in `by`; of a parameter, `"engine.torque"`, the load has the name of the part. A cylinder or rope is one
+    load, with the forces of drivers, stops and friction along its length.
 
     The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Redundant joints
     have the shares of least norm. Of closed contacts, as many take the force as are independent. `undetermined` names
@@ -178,7 +180,8 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     if motion.ts.ndim != 1:
         raise ValueError("loads takes a single motion; jax.vmap(lambda motion: …)(motions) takes each of a batch.")
     number, (motion, machine, drives, given) = system.body_names.index(body), _actuated(motion)
-    parts, acting = _parts_on(system, number), _drives_on(machine, drives, number)
+    parts = _parts_on(system, number)
+    acting = _drives_on(machine, drives, number, list(parts))
     points, forces, moments, centre = _along(
         (system, machine),
         (tuple(map(tuple, parts.values())), drives, acting),
@@ -189,7 +192,7 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     )
     own = {} if system.forces.gravity is None else {system.forces.gravity_name: "gravity"}
     kinds = {name: _kind(system, name, entries[0]) for name, entries in parts.items()}
-    kinds |= {drives[k].name: "force" for k, *_ in acting} | own | {"inertia": "inertia"}
+    kinds |= {drives[k].name: "force" for k, *_, row in acting if row is None} | own | {"inertia": "inertia"}
     shared = system.catalogue.undetermined(motion.ts, motion.ys)
     undetermined = tuple(name for name in parts if name in shared)
     values = motion.ts, points, forces, moments, centre
@@ -225,24 +228,41 @@ def _parts_on(system, number: int) -> dict[str, list[_Entry]]:
                 for place, other in enumerate(bodies):
                     if other == number:
                         out.setdefault(name, []).append(_Entry(of, g, k, place))
+    for groups in _sets(system).values():
+        for group in groups:
+            for k, name in enumerate(group.group.names):
+                tendon = _tendon(group, k)
+                if tendon != name and tendon in out and name in out:
+                    out[tendon] += out.pop(name)
     return out
 
 
-def _drives_on(machine, drives, number: int) -> tuple[tuple[int, Any, int], ...]:
-    """The actuators besides parameters that act on a body: their numbers, the groups of their parts, or of the joints
-    on whose coordinates they act, and the numbers of the parts there.
+def _tendon(group, member: int) -> str | None:
+    """The name of the tendon that the part is, or on whose length it acts; None for other parts."""
+    part = group.group.part
+    if isinstance(part, AbstractTendon):
+        return group.group.names[member]
+    if isinstance(part, AbstractCoordinatePart) and isinstance(part.joint, AbstractTendon):
+        return dict(group.group.inner)["joints", "0"][member]
+    return None
+
+
+def _drives_on(machine, drives, number: int, names: list[str]) -> tuple[tuple[int, Any, int, int | None], ...]:
+    """The actuators besides parameters that act on a body: their numbers; the groups of their parts, or of the joints
+    on whose coordinates they act; the numbers of the parts there; and the row of `names` that contains them, or None.
     """
     out = []
     for k, drive in enumerate(drives):
         match drive.of:
             case "velocity":
                 if np.isin(machine.layout.velocity_index[number], drive.where).any():
-                    out.append((k, None, 0))
+                    out.append((k, None, 0, None))
             case "joint" | "part":
                 at = drive.where
                 group = machine.measured[at.group] if drive.of == "joint" else at.group(machine)
                 if number in group.group.bodies[int(at.member)]:
-                    out.append((k, group, int(at.member)))
+                    tendon = _tendon(group, int(at.member))
+                    out.append((k, group, int(at.member), names.index(tendon) if tendon in names else None))
     return tuple(out)
 
 
@@ -273,9 +293,14 @@ def _along(systems, parts, number, ts, ys, solved):
         here = (with_parameters(system, sought) if sought else system).at(y)
         now = here.kinematics(t, y.q, y.u)
         wrenches = _wrenches(here, parts, now, multipliers)
-        wrenches += [_of_drive(machine, drives[k], number, Instant.of(here, t, y), given[k]) for k, *_ in acting]
         points = [_point(here, entries, now.t) for entries in parts]
-        points += [_point_of(group, member, number, now.t) for _, group, member in acting]
+        for k, group, member, row in acting:
+            of_drive = _of_drive(machine, drives[k], number, Instant.of(here, t, y), given[k])
+            if row is None:
+                wrenches.append(of_drive)
+                points.append(_point_of(group, member, number, now.t))
+            else:
+                wrenches[row] += of_drive
         own = _of_body(here, number, now, udot)
         turns = [_in_body_axes(space, now.poses[number], wrench) for wrench in (*wrenches, *own)]
         forces, moments = (jnp.stack(x) for x in zip(*turns, strict=True))

@@ -128,6 +128,11 @@ class Catalogue:
         kind = type(self.system).__name__
         raise ValueError(f"A picture shows bodies, and a {kind} has none; viz.plot_motion shows its coordinates.")
 
+    def limits(self, t: Scalar, q: Coordinates) -> tuple[str, ...]:
+        """The parts that are at a limit of their equations, for messages."""
+        del t, q
+        return ()
+
     def not_finite(self, t: Scalar, q: Coordinates, u: Velocities) -> tuple[str, ...]:
         """Names of forces, residuals and rates of internal states that are not finite at a state, for messages."""
         system, t = self.system, jnp.asarray(t, q.dtype)

@@ -1,5 +1,6 @@
 """Ropes over pulleys: tangents, tensions and motions against closed forms and equations of motion by hand."""
 
+import re
 import warnings
 
 import diffrax
@@ -670,3 +671,62 @@ def test_turns_about_a_drum_with_a_moving_end(manifold):
     options = {"t1": 4.0, "saveat": np.linspace(0.0, 4.0, 9), "inputs": {"rope.points": circle}, "manifold": manifold}
     length = mb.simulate(system, mb.assemble(system), **options)["rope"].length
     np.testing.assert_allclose(length[-1] - length[0], 0.4, atol=1e-8)
+
+
+# Limits
+
+
+def hoist(left=(-0.15, -1.0), **rope):
+    """A load of 1 kg, beside the tangent, that 2 kg on the other end of the rope pull up to the pulley."""
+    over = mb.Pulley("ground", radius=0.1, turn="right", centre=(0.0, 0.0))
+    loads = [planar.PointMass("left", mass=1.0, position=left), planar.PointMass("right", mass=2.0, position=(0.1, -1))]
+    path = [("left", (0.0, 0.0)), over, ("right", (0.0, 0.0))]
+    return mb.Scene(loads, joints=[mb.Rope("rope", path, **rope)], forces=[GRAVITY]).compile()
+
+
+LIMITS = {
+    "far": ((-0.1, -0.5), ""),
+    "near": ((-0.1, -0.1), ""),
+    "at the circle": (
+        (-0.1 * np.cos(0.3) - 1e-7, -0.1 * np.sin(0.3)),
+        r"path\[0\] is at the circle of the pulley path",
+    ),
+    "in the circle": ((-0.05, 0.0), r"the point path\[0\] is at the circle of the pulley path\[1\]"),
+    "turned too far": ((0.0, 0.3), r"changed by 0\.9 half turns since the given poses; with count_turns=True"),
+}
+
+
+@pytest.mark.parametrize("rope", [{}, {"stiffness": 1e4}, {"slack": True}], ids=["taut", "elastic", "slack"])
+def test_the_limits_of_a_path_are_told(rope):
+    system = hoist(**rope)
+    for place, text in LIMITS.values():
+        found = system.catalogue.limits(0.0, system.guess.q.at[:2].set(jnp.array(place)))
+        assert len(found) == bool(text)
+        assert not text or re.search("^Rope 'rope' is at its limit: .*" + text, found[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rope", "solver"),
+    [
+        ({}, "auto"),
+        ({"stiffness": 1e4}, "auto"),
+        ({"slack": True}, "auto"),
+        ({"count_turns": True}, "auto"),
+        ({}, mb.solvers.Hermite()),
+        ({}, diffrax.Tsit5()),
+    ],
+)
+def test_a_load_that_reaches_its_pulley_ends_the_motion(rope, solver):
+    system = hoist(**rope)
+    state = mb.assemble(system)
+    motion = mb.simulate(system, state, t1=2.0, solver=solver, throw=False)
+    assert motion.result != mb.RESULTS.successful and motion.stats["num_steps"] < 1000
+    # The load rises by a metre at about a third of g, and then is at the circle.
+    end = motion.ts[-1]
+    assert 0.7 < end < 0.8 and abs(np.hypot(*motion.ys.q[-1][:2]) - 0.1) < 1e-3
+    message = rf"came to t = {float(end):.4g}.* There Rope 'rope' is at its limit: the point path\[0\] is at the circle"
+    with pytest.raises(RuntimeError, match=message.replace("0.", r"0\.")):
+        mb.simulate(system, state, t1=2.0, solver=solver)
+    ends = mb.simulate(system, state, t1=float(end) - 0.01, solver=solver)
+    np.testing.assert_allclose(ends.energy, ends.energy[0], rtol=1e-4)

@@ -9,6 +9,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar
+from jaxmb.states.consistency import not_finite
 
 CRANK, ROD = 0.3, 0.8
 REACH = CRANK + ROD
@@ -150,3 +151,91 @@ def test_times_too_coarse_for_any_step_are_named(bar):
     for options in ({}, {"manifold": mb.manifold.Projection()}):
         with pytest.raises(RuntimeError, match=where):
             mb.simulate(bar, mb.assemble(bar), t0=1.7e9, t1=1.7e9 + 2, **options)
+
+
+# Which joint
+
+
+AT = {"ground": (0.0, 0.0), "c": (0.0, 0.5), "k": (1.0, 1.0), "r": (2.0, 0.5), "d": (2.5, 1.0), "s": (3.0, 0.5)}
+PINS = {"A": "ground c", "B": "c k", "C": "k r", "D": "ground r", "E": "r d", "F": "d s", "G": "ground s"}
+PLACES = {"A": (0, 0), "B": (0, 1), "C": (2, 1), "D": (2, 0), "E": (2, 1), "F": (3, 1), "G": (3, 0)}
+
+
+def two_loops(name, off):
+    """Two four-bars side by side that share a rocker; the second point of the pin `name` is off."""
+    bodies = [
+        planar.Body(body, mass=1.0, inertia=0.1, position=place) for body, place in AT.items() if body != "ground"
+    ]
+    pins = []
+    for pin, (a, b) in ((pin, pair.split()) for pin, pair in PINS.items()):
+        point_a, point_b = (np.subtract(PLACES[pin], AT[body]) for body in (a, b))
+        point_b = point_b + (off if pin == name else (0.0, 0.0))
+        pins.append(planar.Revolute(pin, a, b, point_a=point_a, point_b=point_b))
+    return mb.Scene(bodies, joints=pins)
+
+
+@pytest.mark.slow(but=("F",))
+@pytest.mark.parametrize(
+    ("name", "off"), [("F", (4.0, 1.0)), ("B", (5.0, 3.0)), ("G", (0.0, -7.0))], ids=["F", "B", "G"]
+)
+def test_a_point_far_off_is_of_the_joint_that_is_named(name, off):
+    with pytest.raises(ValueError, match=f"Without {name} the other joints close, and it then misses by about"):
+        two_loops(name, off).compile()
+
+
+def four_bar(crank, coupler, rocker, base):
+    """The given poses are on no circle of the pins."""
+    lengths = {"crank": crank, "coupler": coupler, "rocker": rocker}
+    places = {"crank": (0.0, 0.5), "coupler": (1.0, 1.0), "rocker": (2.0, 0.5)}
+    turns = {"crank": np.pi / 2, "coupler": 0.0, "rocker": -np.pi / 2}
+    bodies = [planar.Body(n, mass=1.0, inertia=0.1, position=places[n], angle=turns[n]) for n in places]
+    ends = ["ground", *lengths, "ground"]
+    points = [((0.0, 0.0), (base, 0.0)), *(((x / 2, 0.0), (-x / 2, 0.0)) for x in lengths.values())]
+    starts = [points[0][0], *(p[0] for p in points[1:])]
+    ends_at = [*(p[1] for p in points[1:]), points[0][1]]
+    pins = [
+        planar.Revolute(f"p{k}", ends[k], ends[k + 1], point_a=starts[k], point_b=ends_at[k])
+        for k in range(len(ends) - 1)
+    ]
+    return mb.Scene(bodies, joints=pins)
+
+
+@pytest.mark.slow(but=("short",))
+@pytest.mark.parametrize("lengths", [(0.3, 0.5, 0.3, 2.0), (0.2, 3.0, 0.2, 1.0)], ids=["short", "long"])
+def test_what_lengths_of_a_loop_cannot_reach(lengths):
+    """The longest side less the sum of the others."""
+    with pytest.raises(ValueError, match=r"Without any one of p0, p1, p2, p3 the others close.*miss by about") as error:
+        four_bar(*lengths).compile()
+    miss = float(re.search(r"miss by about ([\d.e-]+)", str(error.value))[1])
+    assert miss == pytest.approx(2 * max(lengths) - sum(lengths), rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_joint_that_parameters_move_far_off_is_named():
+    system = two_loops("F", (0.0, 0.0)).compile()
+    changed = mb.with_parameters(system, {"F.point_b": jnp.array([4.0, 1.5])})
+    with pytest.raises(ValueError, match="Without F the other joints close"):
+        mb.assemble(changed)
+
+
+def test_entries_of_a_state_that_are_not_finite_are_named():
+    bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    system = mb.Scene([bar], joints=[planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))]).compile()
+    q, u = system.guess.q, system.guess.u
+    wrong = mb.State(q.at[1].set(jnp.nan), u)
+    for function in (mb.assemble, mb.equilibrium):
+        with pytest.raises(ValueError, match=rf"{function.__name__}: the guess is not finite: bar\.y \(nan\)"):
+            function(system, wrong)
+    with pytest.raises(ValueError, match=r"the guess is not finite: bar\.angle_rate \(inf\)"):
+        mb.assemble(system, mb.State(q, u.at[2].set(jnp.inf)))
+    with pytest.raises(ValueError, match=r"fixed coordinates are not finite: bar\.angle \(nan\)"):
+        mb.assemble(system, fix={"bar.angle": np.nan})
+    assert not_finite(system, q=np.full(3, np.nan), u=np.zeros(3)) == "bar.x (nan), bar.y (nan), bar.angle (nan)"
+
+
+@pytest.mark.slow
+def test_a_motion_from_a_state_that_is_not_finite_names_the_entry():
+    system = two_loops("F", (0.0, 0.0)).compile()
+    wrong = mb.State(system.guess.q.at[2].set(jnp.nan), system.guess.u)
+    with pytest.raises(RuntimeError, match=r"assembly_gap.* Not finite: c\.angle \(nan\)\."):
+        mb.simulate(system, wrong, t1=0.1)

@@ -85,7 +85,8 @@ class Optimum(Printed):
         could not be computed.
     - `constraints`: for every component of a constrained output, its bounds, values, whether it is active, and its
         multiplier.
-    - `iterations`: the log of the local optimisation that gave the result; `trials`: the number of its trials with
+    - `iterations`: the log of the local optimisation that gave the result, in which a row "accepted" is the best so far,
+        and a row "tried" is not; `trials`: the number of its trials with
         derivatives; `failed`: the number of rejected trials.
     - `attempts`: all local optimisations, the best first, if there were several.
     - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. A maximum,
@@ -130,9 +131,12 @@ class Optimum(Printed):
             rows += [
                 (str(k), *numbers(attempt.before, attempt.after), f"{attempt.violation:.1e}") for k, attempt in each
             ]
-        rows += [(), ("iteration", "objective", "violation", "step", "trials", "failed")]
+        rows += [(), ("iteration", "objective", "violation", "step", "trials", "failed", "")]
         log = [
-            (str(i.number), f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}", str(i.trials), str(i.failed))
+            (
+                *(str(i.number), f"{i.objective:.8g}", f"{i.violation:.1e}", f"{i.step:.1e}"),
+                *(str(i.trials), str(i.failed), "accepted" if i.accepted else "tried"),
+            )
             for i in self.iterations
         ]
         rows += [*log[:_FIRST], ("…",), *log[-_LAST:]] if len(log) > _FIRST + _LAST else log

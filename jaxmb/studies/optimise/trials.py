@@ -26,8 +26,8 @@ _ROUNDED = 1e-7
 @dataclasses.dataclass(frozen=True)
 class Iteration:
     """One line of the log: the number of the iteration, the objective, the largest violation of a constraint relative
-    to its size, the largest change of a parameter relative to its scale, and the numbers of trials and of failed trials
-    so far.
+    to its size, the largest change of a parameter relative to its scale, the numbers of trials and of failed trials so
+    far, and whether it was `accepted` as the best so far: otherwise it was only tried, on the way of the method.
     """
 
     number: int
@@ -36,6 +36,7 @@ class Iteration:
     step: float
     trials: int
     failed: int
+    accepted: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +109,8 @@ class Trials:
         if trial.good:
             step = float(np.max(np.abs(trial.z - self._noted), initial=0.0))
             values = float(trial.rows[0]), self.violation(trial), step
-            self.log.append(Iteration(len(self.log), *values, self.count, self.failed))
+            accepted = self.merit(trial) <= self.merit(self.best)
+            self.log.append(Iteration(len(self.log), *values, self.count, self.failed, accepted))
             self._noted = trial.z
 
 
