@@ -4,6 +4,8 @@ A `Motor` regulates a force, a speed or a position, and its force lags behind th
 which may lag, and a force that is affine in the coordinate and its rate.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
@@ -113,6 +115,7 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
     default none; `lag` [s] > 0, default none; `activation`, its initial value, default zero.
     """
 
+    ranges: ClassVar[Mapping[str, str]] = MappingProxyType({"control": "control_range"})
     control: fields.Number = fields.parameter(default=0.0)
     gear: fields.Number = fields.parameter(unit="1", default=1.0)
     gain: fields.Number = fields.parameter(shape=(3,), default=(1.0, 0.0, 0.0))

@@ -12,6 +12,7 @@ import abc
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import equinox as eqx
@@ -249,6 +250,8 @@ class AbstractActor(AbstractPart):
     # points, axes and the numbers of joints.
     takes_drift: ClassVar[bool] = True
     moving: ClassVar[tuple[str, ...]] = ()
+    # The fields, by the names of parameters, with the two limits to which each parameter is clipped.
+    ranges: ClassVar[Mapping[str, str]] = MappingProxyType({})
     # Whether the part may act on bodies and frames among its `sources`, other than joints and tendons.
     takes_bodies: ClassVar[bool] = False
     # Whether `given_in_time` is its function of time, at whose turns steps end. Pulses are found without it as well, in

@@ -1,6 +1,6 @@
 """Why a mechanism cannot be assembled or moved as prescribed, in words, and where its constraints lose rank."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,19 +51,19 @@ def without_a_joint(system: AbstractSystem, t: Scalar, q: Coordinates) -> str:
     names = list(dict.fromkeys(name for name, _ in rows))
     if not 2 <= len(names) <= _MOST_JOINTS:
         return ""
-    q = np.asarray(q)
+    start: Any = np.asarray(q)
     of_joint = {name: np.array([k for k, (other, _) in enumerate(rows) if other == name]) for name in names}
     scale, host = np.asarray(system.coordinate_scale()), system.on_host(t)
     if host is None:
-        at = lambda q: tuple(map(np.asarray, _linearised(system, t, q)))
+        at = lambda q: (np.asarray(x) for x in _linearised(system, t, q))
     else:
         at = lambda q: (host.coordinate_residual(q), host.coordinate_jacobian(q) * scale)
     closing = _Closing(at, scale, _ZERO * float(system.length))
     found = {}
     for name in names:
-        closed = closing.without(q, of_joint[name])
+        closed = closing.without(start, of_joint[name])
         if closed is not None:
-            found[name] = float(np.max(np.abs((closed - q) / scale))), closing.least_gap(closed, of_joint[name])
+            found[name] = float(np.max(np.abs((closed - start) / scale))), closing.least_gap(closed, of_joint[name])
     if not found:
         return ""
     nearest = min(found, key=lambda name: found[name][0])
@@ -81,7 +81,7 @@ class _Closing(NamedTuple):
     up to `zero` vanish.
     """
 
-    at: Callable[[Any], tuple[Any, Any]]
+    at: Callable[[Any], Iterable[Any]]
     scale: Float[np.ndarray, "nq"]
     zero: float
 

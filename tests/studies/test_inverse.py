@@ -499,3 +499,24 @@ def test_a_motion_that_the_machine_cannot_make():
     traced = jax.jit(lambda y: mb.required_forces(system, motion_of(system, [0.0, 1.0], *y), by=["motor"])["motor"])
     assert np.all(np.isnan(traced((bent.ys.q, bent.ys.u))))
     assert np.all(np.isfinite(mb.required_forces(system, bent, by=["motor"], tolerance=0.1)["motor"]))
+
+
+@pytest.mark.parametrize(("limits", "size"), [((0.0, 1.0), 2.0), ((0.0, 1.0), -2.0), ((0.2, 0.3), 2.0), (None, 2.0)])
+def test_a_control_beyond_its_range_is_found_with_a_warning(limits, size):
+    """An arm of 1 kg turns by ½ size t²; its moment of inertia about the pin is 0.35 kg m², the gain 0.35 N m."""
+    arm = planar.Body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "arm", point=(0.0, 0.0))
+    servo = mb.Actuator("servo", "pin.angle", gain=(0.35, 0.0, 0.0), control_range=limits)
+    system = mb.Scene([arm], joints=[pin], forces=[servo]).compile()
+    turn = {"pin.angle": lambda t: 0.5 * size * t**2}
+    find = lambda: mb.required_forces(system, turn, ts=[0.0, 0.5, 1.0], by=["servo.control"])
+    if limits is None:
+        found = find()
+    else:
+        low, high = limits
+        text = (
+            rf"servo\.control needs {size:g} to {size:g}, beyond its range from {low:g} to {high:g}, most of all at t"
+        )
+        with pytest.warns(UserWarning, match=text):
+            found = find()
+    np.testing.assert_allclose(found["servo.control"], size, rtol=1e-9)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -184,6 +185,24 @@ def released(system: Any, drives: Iterable[Drive]) -> Any:
 
     groups = tuple(map(constant, system.forces.groups))
     return dataclasses.replace(system, forces=dataclasses.replace(system.forces, groups=groups))
+
+
+def without_limits(system: Any, drives: Iterable[Drive]) -> tuple[Any, dict[str, Float[Array, "2"]]]:
+    """The system without the ranges to which sought parameters are clipped, and the ranges by the actuators' names."""
+    sought = {drive.where: drive.name for drive in drives if drive.of == "parameter"}
+    ranges, groups = {}, []
+    for group in system.forces.groups:
+        for parameter, field in group.group.part.ranges.items():
+            where = lambda group, field=field: getattr(group.group.part, field)
+            for k, part in enumerate(group.group.names):
+                name = sought.get(f"{part}.{parameter}")
+                if name is not None and where(group) is not None:
+                    ranges[name] = where(group)[k]
+                    group = eqx.tree_at(where, group, where(group).at[k].set(jnp.array([-jnp.inf, jnp.inf])))
+        groups.append(group)
+    if not ranges:
+        return system, ranges
+    return dataclasses.replace(system, forces=dataclasses.replace(system.forces, groups=tuple(groups))), ranges
 
 
 def _kept(group, names) -> tuple[Any, ...]:

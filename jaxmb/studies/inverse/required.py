@@ -1,5 +1,6 @@
 """Inverse dynamics: the forces of actuators that make a machine follow a motion."""
 
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -21,7 +22,10 @@ from ...system.quantities import Reaction, Solved
 from ...trajectory import Trajectory
 from .balance import Drives, Found, balanced, searched
 from .course import Course, free_names, planned, recorded
-from .drives import drives_of, released, without_drives
+from .drives import drives_of, released, without_drives, without_limits
+
+# Beyond a range by this share of it is a rounding error.
+_ROUNDING = 1e-9
 
 
 class RequiredForces(eqx.Module):
@@ -115,7 +119,7 @@ def required_forces(
         ignored. A force on a coordinate, such as a `Motor` or `JointForce`, is replaced by the sought force. On a
         coordinate of a joint, a body or a `LagrangianSystem`, `"pin.angle"`, `"hull.x"`, `"theta"`, a force is added. A
         parameter that forces are proportional to, `"engine.torque"` of a `Torque`, `"push.force"` or `"servo.control"`,
-        has the sought value, also in place of an input.
+        has the sought value, also in place of an input, and beyond a `control_range` with a warning.
     - `ts` [s]: ascending times, default the times of the first `Series`; not with a `Trajectory`.
     - `weights` > 0, by all names of `by`: the solution has the least sum of `weight × force²`.
     - `guess`: a state near the first position of a motion by coordinates, default that of the system; positions that
@@ -135,7 +139,7 @@ def required_forces(
     """
     check_system("required_forces", system)
     drives = drives_of(system, by)
-    system = released(system, drives)
+    system, ranges = without_limits(released(system, drives), drives)
     rest = without_drives(system, drives)
     spread = _spread(drives, weights, rest.guess.q.dtype)
     # A concrete class: a trajectory has states, and other motions have coordinates.
@@ -151,8 +155,25 @@ def required_forces(
     ends = np.cumsum([drive.size for drive in drives])
     of_each = lambda x: zip(drives, jnp.split(x, ends[:-1], axis=1), strict=True)
     forces = {drive.name: force.reshape(-1, *drive.shape) for drive, force in of_each(values)}
+    _warn_of_excess(path.ts, forces, ranges)
     power = {drive.name: jnp.sum(parts, axis=1) for drive, parts in of_each(powers)}
     return RequiredForces(path.ts, forces, power, path.ys, path.accelerations, multipliers, rest, system)
+
+
+def _warn_of_excess(ts, forces, ranges) -> None:
+    """Warn about sought parameters beyond the ranges to which their parts clip them."""
+    if is_traced((ts, forces, ranges)):
+        return
+    for name, (low, high) in ranges.items():
+        values = np.asarray(forces[name])
+        excess = np.maximum(float(low) - values, values - float(high))
+        if np.any(excess > _ROUNDING * (high - low)):
+            k = int(np.nanargmax(excess))
+            warnings.warn(
+                f"required_forces: {name} needs {np.nanmin(values):.4g} to {np.nanmax(values):.4g}, beyond its range "
+                f"from {low:g} to {high:g}, most of all at t = {float(ts[k]):g}.",
+                stacklevel=4,
+            )
 
 
 def _start(system, guess) -> State:

@@ -103,7 +103,9 @@ def floquet(
     ```
 
     The motion and its derivatives with respect to all independent perturbations of its start are integrated over one
-    period, on the constraints.
+    period, on the constraints. With contacts and friction they pass through impacts and changes between slip and stick,
+    whose times and jumps move with the perturbations. Where a perturbation adds or removes an event, as at a contact
+    that only touches, there is no derivative.
 
     **Arguments:**
 

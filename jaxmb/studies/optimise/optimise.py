@@ -85,9 +85,9 @@ class Optimum(Printed):
         could not be computed.
     - `constraints`: for every component of a constrained output, its bounds, values, whether it is active, and its
         multiplier.
-    - `iterations`: the log of the local optimisation that gave the result, in which a row "accepted" is the best so far,
-        and a row "tried" is not; `trials`: the number of its trials with
-        derivatives; `failed`: the number of rejected trials.
+    - `iterations`: the log of the local optimisation that gave the result. A row that is the best so far is "accepted",
+        another one is only "tried".
+    - `trials`: the number of its trials with derivatives; `failed`: the number of failed trials.
     - `attempts`: all local optimisations, the best first, if there were several.
     - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. A maximum,
         a saddle, a step of the objective, and an edge beyond which trials fail or the objective leaps up are not

@@ -124,3 +124,15 @@ def test_periods_and_names_that_cannot_be():
         mb.floquet(system, state, 1.0, ignorable=["thet"])
     with pytest.raises(ValueError, match="There are 1 independent coordinates"):
         mb.floquet(system, state, 1.0, coordinates=["theta", "thet"])
+
+
+@pytest.mark.slow
+def test_multipliers_of_a_motion_with_impacts():
+    """A slide between elastic stops: a perturbation of the speed moves its place in proportion to the time."""
+    slide = planar.Body("slide", mass=1.0, inertia=0.1, position=(0.2, 0.0))
+    rail = planar.Prismatic("rail", "ground", "slide", point=(0.0, 0.0), axis=(1.0, 0.0))
+    stop = mb.Stop("stop", "rail.displacement", lower=-0.2, upper=0.2, restitution=1.0)
+    system = mb.Scene([slide], joints=[rail, stop]).compile()
+    state = mb.assemble(system, fix={"slide.x": 0.1}, rates={"slide.x": 1.0})
+    found = mb.floquet(system, state, 0.8)
+    np.testing.assert_allclose(found.monodromy, [[1.0, 0.8], [0.0, 1.0]], atol=1e-8)

@@ -505,3 +505,17 @@ def test_a_number_that_the_function_reads_may_change():
     np.testing.assert_allclose(best(), 1.0, atol=1e-6)
     numbers["k"] = 3.0
     np.testing.assert_allclose(best(), 3.0, atol=1e-6)
+
+
+def test_rows_of_the_log_are_accepted_or_tried():
+    """Rosenbrock's valley from a start beyond its bend, where a method with momentum goes up."""
+    valley = lambda p: {"f": (1.0 - p["x"]) ** 2 + 100.0 * (p["y"] - p["x"] ** 2) ** 2}
+    best = mb.optimise(valley, {"x": -1.2, "y": 1.0}, objective="f", method=optax.adam(0.3), max_iterations=8)
+    least = np.inf
+    for row in best.iterations:
+        assert row.accepted == (row.objective <= least)
+        least = min(least, row.objective)
+    assert {row.accepted for row in best.iterations} == {True, False}
+    rows = [line.split() for line in str(best).splitlines()]
+    marks = {row[0]: row[-1] for row in rows if row and row[-1] in ("accepted", "tried")}
+    assert all(marks[str(i.number)] == ("accepted" if i.accepted else "tried") for i in best.iterations)
