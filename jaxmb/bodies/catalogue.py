@@ -88,7 +88,7 @@ class SceneCatalogue(Catalogue):
     def limits(self, t, q):
         space, poses, out = self.system.layout.space, np.asarray(self.system.bodies.prepared_poses(q)), []
         groups = (*self.system.constraints.groups, *self.system.forces.groups)
-        for group in (g.group for g in groups if isinstance(g.group.part, AbstractLink)):
+        for group in (g.group for g in groups if isinstance(g.group.part, AbstractLink) and g.group.part.has_limits):
             for member, name in enumerate(group.names):
                 part = group.single(member, t).named(name)
                 reached = part.limit_reached(space, part.seen_poses(space, poses[group.body_index[member]]))

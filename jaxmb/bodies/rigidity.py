@@ -66,7 +66,7 @@ def check_rigid(
         kept = subset.kept[subset.kept < system.position_rows]
         numbers = tuple(p for p in subset.parts if joints.parts[p].first < system.position_rows)
         # A joint alone holds its bodies at all dimensions; with fewer independent rows than columns the bodies move.
-        if len(numbers) < 2 or kept.size < subset.columns.size:
+        if len(numbers) < 2 or not 0 < subset.columns.size <= kept.size:
             continue
         if any(drivers[joints.parts[p].first] for p in numbers):
             continue

@@ -335,8 +335,13 @@ class AbstractLink(AbstractActor):
         """
         raise NotImplementedError(f"{self.kind} says lost_heading, and needs a method heading.")
 
+    # Whether `limit_reached` knows limits.
+    has_limits: ClassVar[bool] = False
+
     def limit_reached(self, space: AbstractSpace, poses: Poses) -> str:
-        """Hook: the limit of the part's equations at which some concrete poses are, for messages; empty if at none."""
+        """Hook, of a class with `has_limits`: the limit of its equations at which concrete poses are, for messages;
+        empty if at none.
+        """
         del space, poses
         return ""
 

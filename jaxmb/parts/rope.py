@@ -117,6 +117,7 @@ class AbstractRope(AbstractLink):
     marks: fields.Number = fields.parameter(shape=(None,), unit="rad", optional=True)
     quantities: ClassVar[Quantities] = {"length": "length", "wrap": "angle"}
     path_kind: ClassVar[PathKind] = "belt"
+    has_limits: ClassVar[bool] = True
 
     @property
     def kind(self):

@@ -171,13 +171,14 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
             f"{how_far(outcome, span)} There {lost}, so the motion beyond is not determined. With `throw=False` the "
             "motion up to there is kept."
         )
-    reached = system.catalogue.limits(outcome.t, outcome.y.q)
+    is_finite = bool(np.all(np.isfinite(np.concatenate(jax.tree.leaves(outcome.y)))))
+    reached = system.catalogue.limits(outcome.t, outcome.y.q) if is_finite else ()
     if reached:
         kept = "With `throw=False` the motion up to there is kept."
         return f"{how_far(outcome, span)} There {' and '.join(reached)}. {kept}"
     if result == RESULTS.max_steps_reached:
         return about_steps(outcome, span, stats, is_stiff_at_end(probe, stats, solver))
-    if not np.all(np.isfinite(np.concatenate(jax.tree.leaves(outcome.y)))):
+    if not is_finite:
         return RESULTS[result] + about_entries(system, outcome.y)
     if result == RESULTS.inconsistent_constraints:
         return contradiction(system, outcome.t, outcome.y)

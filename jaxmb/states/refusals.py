@@ -63,15 +63,15 @@ def without_a_joint(system: AbstractSystem, t: Scalar, q: Coordinates) -> str:
     for name in names:
         closed = closing.without(start, of_joint[name])
         if closed is not None:
-            found[name] = float(np.max(np.abs((closed - start) / scale))), closing.least_gap(closed, of_joint[name])
+            found[name] = float(np.max(np.abs((closed - start) / scale))), closed
     if not found:
         return ""
     nearest = min(found, key=lambda name: found[name][0])
-    gap = lambda name: f"{found[name][1]:.3g} [m, rad]"
-    if all(found[nearest][0] < _NEARER * moved for name, (moved, _) in found.items() if name != nearest):
-        return f" Without {nearest} the other joints close, and it then misses by about {gap(nearest)}: check it first."
-    listing = ", ".join(found)
-    return f" Without any one of {listing} the others close; the lengths between them miss by about {gap(nearest)}."
+    least, closed = found[nearest]
+    gap = f"by about {closing.least_gap(closed, of_joint[nearest]):.3g} [m, rad]"
+    if all(least < _NEARER * moved for name, (moved, _) in found.items() if name != nearest):
+        return f" Without {nearest} the other joints close, and it then misses {gap}: check it first."
+    return f" Without any one of {', '.join(found)} the others close; the lengths between them miss {gap}."
 
 
 class _Closing(NamedTuple):
