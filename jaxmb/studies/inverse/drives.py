@@ -190,6 +190,8 @@ def released(system: Any, drives: Iterable[Drive]) -> Any:
 def without_limits(system: Any, drives: Iterable[Drive]) -> tuple[Any, dict[str, Float[Array, "2"]]]:
     """The system without the ranges to which sought parameters are clipped, and the ranges by the actuators' names."""
     sought = {drive.where: drive.name for drive in drives if drive.of == "parameter"}
+    if not sought or not system.body_names:
+        return system, {}
     ranges, groups = {}, []
     for group in system.forces.groups:
         for parameter, field in group.group.part.ranges.items():
