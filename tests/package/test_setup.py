@@ -4,6 +4,7 @@ import ast
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import filelock
 import jax
@@ -325,3 +326,9 @@ print(repr(jax.config.jax_compilation_cache_dir))
     folder, said = process(code, JAXMB_CACHE=str(tmp_path / "taken"))
     assert folder is None and said.startswith("jaxmb: compiled programs are not kept: ") and said.count("\n") == 1
     assert process(code, JAXMB_CACHE="off") == (None, "")
+
+
+def test_the_readme_names_each_way_to_compile():
+    text = (Path(mb.__file__).parents[1] / "README.md").read_text()
+    ways = [way for way in _setup._OPTIONS if way is not None]
+    assert len(ways) == 3 and all(f'`"{way}"`' in text for way in ways)
