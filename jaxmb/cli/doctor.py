@@ -17,6 +17,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from .. import mechanisms
 from .._faulty_versions import fault_of
@@ -129,6 +130,7 @@ def _facts() -> Iterable[tuple[str, str]]:
     faults = [fault for name in (*_NEEDED, *sum(_OPTIONAL.values(), ())) if (fault := fault_of(name))]
     if faults:
         yield "wrong numbers", "; ".join(faults)
+    yield "shifted arrays", _shifts()
     devices = Counter((device.platform, device.device_kind) for device in jax.devices())
     yield "devices", ", ".join(f"{count} {name} ({kind})" for (name, kind), count in devices.items())
     yield "double precision", "on in commands; in Python by jaxmb.setup()"
@@ -140,6 +142,27 @@ def _version(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+def _shifts() -> str:
+    """What XLA makes of an array that is shifted in place and then gets a new axis."""
+    idiom = "b.at[1:].set(b[:-1]) with a new axis"
+    if shifts_rightly():
+        return f"{idiom} is right here"
+    return f"{idiom} is wrong here, a fault of XLA: write jnp.concatenate([b[:1], b[:-1]])"
+
+
+def shifts_rightly() -> bool:
+    """Whether XLA shifts an array in place rightly if the result gets a new axis, alone and under `vmap`."""
+
+    def shifted(x):
+        b = x + 1
+        return b.at[1:].set(b[:-1])[None]
+
+    one, several = np.arange(8.0), np.arange(64.0).reshape(8, 8)
+    right = lambda x: np.concatenate([x[..., :1], x[..., :-1]], axis=-1) + 1
+    results = (jax.jit(shifted)(one)[0], right(one)), (jax.jit(jax.vmap(shifted))(several)[:, 0], right(several))
+    return all(np.array_equal(found, expected) for found, expected in results)
 
 
 def _processor() -> str:

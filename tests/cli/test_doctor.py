@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 import jaxmb as mb
@@ -34,6 +35,17 @@ def test_quick(capsys):
     assert platform.machine() in facts["machine"] and re.search(r"\d+ cores?\b", facts["machine"])
     assert re.match(r"\d+ \w+ \(.+\)", facts["devices"])
     assert list(facts)[-2:] == ["double precision", "kept programs"]
+
+
+def test_whether_arrays_are_shifted_rightly(capsys, monkeypatch):
+    """As this machine does, and in words for either case."""
+    moved = jax.jit(lambda x: (x + 1).at[1:].set((x + 1)[:-1])[None])(np.arange(8.0))[0]
+    right = np.array_equal(moved, [1.0, *np.arange(1.0, 8.0)])
+    wrong = "is wrong here, a fault of XLA: write jnp.concatenate([b[:1], b[:-1]])"
+    assert doctor.shifts_rightly() == right
+    assert said(capsys)[0]["shifted arrays"].endswith("is right here" if right else wrong)
+    monkeypatch.setattr(doctor, "shifts_rightly", lambda: not right)
+    assert said(capsys)[0]["shifted arrays"].endswith(wrong if right else "is right here")
 
 
 def test_lines_are_short_but_for_paths(capsys, monkeypatch, tmp_path):

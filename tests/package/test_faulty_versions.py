@@ -1,14 +1,17 @@
 """Versions of other packages that compute wrong numbers: what is said of them."""
 
+import ast
 import importlib.metadata
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxmb as mb
 from jaxmb._faulty_versions import FAULTS, fault_of, warn_of_jaxlib
 from jaxmb.cli import main
 
@@ -62,3 +65,41 @@ def test_products_of_many_rows_on_this_machine():
     rows = jnp.stack([jnp.arange(16_385.0) % 7, jnp.zeros(16_385), jnp.ones(16_385)], axis=1)
     norms = jax.jit(jax.vmap(lambda row: jnp.sum((jnp.eye(3) @ row) ** 2)))(rows)
     np.testing.assert_allclose(norms, np.sum(np.asarray(rows) ** 2, axis=1), rtol=1e-6)
+
+
+def shifts(code):
+    """The lines where an array is updated in a slice by a slice of its own, as in `b.at[1:].set(b[:-1])`."""
+
+    def slices(node):
+        return any(isinstance(part, ast.Slice) for part in ast.walk(node))
+
+    for node in ast.walk(ast.parse(code)):
+        match node:
+            case ast.Call(
+                func=ast.Attribute(value=ast.Subscript(value=ast.Attribute(value=base, attr="at"), slice=place)),
+                args=[value, *_],
+            ) if slices(place):
+                parts = [part for part in ast.walk(value) if isinstance(part, ast.Subscript) and slices(part.slice)]
+                if any(ast.dump(part.value) == ast.dump(base) for part in parts):
+                    yield node.lineno
+
+
+def test_no_array_is_shifted_in_place():
+    """XLA computes it wrongly before a new axis; `concatenate` does it rightly. Only the doctor tries it."""
+    root = Path(mb.__file__).parent
+    found = {path.relative_to(root).as_posix() for path in root.rglob("*.py") if any(shifts(path.read_text()))}
+    assert found == {"cli/doctor.py"}
+
+
+@pytest.mark.parametrize(
+    "code, count",
+    [
+        ("b.at[1:].set(b[:-1])", 1),
+        ("f(y.q.at[:, 2:].add(2 * y.q[:, :-2] + 1)[None])", 1),
+        ("a.b.at[k].set(a.b[:-1])", 0),
+        ("b.at[1:].set(a[:-1])", 0),
+        ("b.at[1:].set(-b[0])", 0),
+    ],
+)
+def test_a_shift_in_place_is_found(code, count):
+    assert len(list(shifts(code))) == count
