@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -26,6 +27,9 @@ _TOUCH = 1e-6
 _ENOUGH, _LOOKED = 200, 512
 # A message names at most this many joints of a singular configuration.
 _NAMED = 8
+# Residuals contradict each other by more than this part of them.
+_CONTRADICTED = 1e-6
+_IN_TIME = "If positions depend on t, the others contain the derivatives by t."
 # Beyond the end of a motion, residuals above this part of the displacement count.
 _UNMET = 0.1
 
@@ -176,6 +180,8 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
     if reached:
         kept = "With `throw=False` the motion up to there is kept."
         return f"{how_far(outcome, span)} There {' and '.join(reached)}. {kept}"
+    if not system.body_names and (wrong := about_residuals(system, outcome.t, outcome.y)):
+        return f"{how_far(outcome, span)} {wrong}"
     if result == RESULTS.max_steps_reached:
         return about_steps(outcome, span, stats, is_stiff_at_end(probe, stats, solver))
     if not is_finite:
@@ -188,6 +194,39 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
 def about_entries(system, y) -> str:
     """The entries of a state that are not finite. Euler parameters of length zero are told apart."""
     return about_zero_attitudes(system, y.q) or f" Not finite: {not_finite(system, q=y.q, u=y.u, z=y.z)}."
+
+
+def about_residuals(system, t, y: State) -> str:
+    """How residuals that a class of the user's gives contradict each other, or what it declares; else empty."""
+    if not system.velocity_rows or not np.all(np.isfinite(y.q)):
+        return ""
+    scale, t = system.velocity_scale(), jnp.asarray(t, y.q.dtype)
+    # At any velocities and accelerations.
+    u, udot = (scale * jnp.cos(k + jnp.arange(y.u.size, dtype=y.q.dtype)) for k in (1.0, 2.0))
+    along = jnp.ones_like(t), system.rates(t, y.q, u)
+    at = lambda u: system.velocity_residual(t, y.q, u)
+    velocity, still = at(u), at(0 * u)
+    pairs = {
+        "velocity_residual is not the derivative of position_residual by time": (
+            velocity[: system.position_rows],
+            jax.jvp(system.position_residual, (t, y.q), along)[1],
+        ),
+        "acceleration_residual is not the derivative of velocity_residual by time": (
+            system.acceleration_residual(t, y.q, u, udot)[: system.velocity_rows],
+            jax.jvp(system.velocity_residual, (t, y.q, u), (*along, udot))[1],
+        ),
+    }
+    if system.drift_free:
+        pairs["velocity_residual does not vanish at rest, although drift_free = True"] = velocity, velocity - still
+    if system.linear:
+        pairs["velocity_residual is not linear, although linear = True"] = at(2 * u) - velocity, velocity - still
+    for text, (value, expected) in pairs.items():
+        size = float(jnp.max(jnp.abs(expected), initial=0.0))
+        off = ~(np.abs(np.asarray(value - expected)) <= _CONTRADICTED * size)
+        if np.any(off):
+            names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in np.flatnonzero(off)))
+            return f"The residuals of {names} contradict each other: {text}. {_IN_TIME}"
+    return ""
 
 
 def about_zero_attitudes(system, q) -> str:
@@ -268,7 +307,10 @@ def reason_of_failure(system, result, span: Span, outcome: Outcome) -> str:
     if lost is not None:
         return about_lost_rank(lost)
     coarse = about_coarse_times(system, span, t, y)
-    return f"{coarse} Or: {RESULTS[result]}" if coarse else RESULTS[result] + about_unmet(system, outcome, ahead, rates)
+    if coarse:
+        return f"{coarse} Or: {RESULTS[result]}"
+    unmet = about_unmet(system, outcome, ahead, rates)
+    return " ".join((RESULTS[result] + unmet, *system.catalogue.jumps_of_rows(t, y.q)))
 
 
 def about_lost_rank(lost: LostRank) -> str:
