@@ -520,3 +520,32 @@ def test_a_control_beyond_its_range_is_found_with_a_warning(limits, size):
         with pytest.warns(UserWarning, match=text):
             found = find()
     np.testing.assert_allclose(found["servo.control"], size, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_singular_position_is_said_to_be_singular():
+    """The lines of three legs of a plate meet in its centre, about which it turns; a crank is at its dead centre."""
+    angles = np.array([0.3, 2.2, 4.4])
+    legs = [
+        mb.Tendon(f"leg {k}", [("ground", (2 * np.cos(a), 2 * np.sin(a))), ("plate", (np.cos(a), np.sin(a)))])
+        for k, a in enumerate(angles)
+    ]
+    plate = mb.Scene([planar.Body("plate", mass=1.0, inertia=1.0)], joints=legs).compile()
+    names = ["plate.x", "plate.y", "plate.angle"]
+    still = lambda angle: dict(zip(names, (lambda t: 0 * t, lambda t: 0 * t, lambda t: angle + 0 * t), strict=True))
+    by = [f"{leg.name}.length" for leg in legs]
+    with pytest.raises(ValueError, match=r"t = 0 the position is singular: .* can move while leg 0\.length, leg 1"):
+        mb.required_forces(plate, still(0.0), by=by, ts=[0.0])
+    forces = mb.required_forces(plate, still(0.2), by=by, ts=[0.0])
+    np.testing.assert_allclose(forces["leg 0.length"], 0.0, atol=1e-12)
+
+    crank = planar.Body("crank", mass=1.0, inertia=0.1)
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(2.0, 0.0))
+    joints = [
+        planar.Revolute("bearing", "ground", "crank", point=(0.0, 0.0)),
+        planar.Revolute("pin", "crank", "rod", point=(1.0, 0.0)),
+        planar.PinInSlot("slot", "ground", "rod", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(1.0, 0.0)),
+    ]
+    machine = mb.Scene([crank, rod], joints=joints).compile()
+    with pytest.raises(ValueError, match=r"the position is singular: .* can move while slot\.displacement stand still"):
+        mb.required_forces(machine, {"bearing.angle": lambda t: 0 * t}, by=["slot.displacement"], ts=[0.0])

@@ -1,5 +1,6 @@
 """Inverse dynamics: the forces of actuators that make a machine follow a motion."""
 
+import dataclasses
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -15,6 +16,7 @@ from ...linalg.arrays import is_traced
 from ...linalg.failure import nan_where
 from ...parts.names import names_arguments, unknown
 from ...states.arguments import check_system, checked_guess
+from ...states.assembly import configuration
 from ...states.consistency import listed
 from ...system import AbstractSystem
 from ...system.description import counted
@@ -26,6 +28,9 @@ from .drives import drives_of, released, without_drives, without_limits
 
 # Beyond a range by this share of it is a rounding error.
 _ROUNDING = 1e-9
+
+# How near a position is at which actuators are tried, as a part of the scales of the coordinates.
+_NEAR = 1e-3
 
 
 class RequiredForces(eqx.Module):
@@ -134,8 +139,8 @@ def required_forces(
     actuator puts into the machine.
 
     **Raises:** `ValueError` naming freedoms without a force, coordinates that the constraints hold, actuators that
-    cannot produce the motion, joints that the motion violates, with residuals and time, contacts that it passes
-    through, and closed contacts of a `Trajectory`.
+    cannot produce the motion anywhere or at a singular position, joints that the motion violates, with residuals and
+    time, contacts that it passes through, and closed contacts of a `Trajectory`.
     """
     check_system("required_forces", system)
     drives = drives_of(system, by)
@@ -225,7 +230,7 @@ def _check_count(system, rest, drives: Drives, path: Course, weights):
 
 def _checked(values, found: Found, given, tolerance, throw):
     """The values, after a check that they are a solution."""
-    system, rest, drives, path = given
+    system, _, _, path = given
     bad = found.against(path, tolerance)
     if is_traced((given, bad)):
         if throw:
@@ -233,12 +238,13 @@ def _checked(values, found: Found, given, tolerance, throw):
             return eqx.error_if(values, jnp.any(bad), text)
         return nan_where(jnp.any(bad), values, (system, path))
     if throw is not False and np.any(bad):
-        raise ValueError(_refusal(rest, drives, path, found, int(np.argmax(bad)), tolerance))
+        raise ValueError(_refusal(given, found, int(np.argmax(bad)), tolerance))
     return [jnp.where(bad[:, None], jnp.nan, x) for x in values]
 
 
-def _refusal(rest, drives: Drives, path: Course, found: Found, k: int, tolerance: float) -> str:
-    """The reason why there is no solution at a time."""
+def _refusal(given, found: Found, k: int, tolerance: float) -> str:
+    """The reason why there is no solution at a time; `given` as in `_checked`."""
+    _, rest, drives, path = given
     here: Found = jax.tree.map(lambda x: np.asarray(x[k]), found)
     lead = f"required_forces: at t = {float(path.ts[k]):g}"
     off = np.abs(np.asarray(path.off[k]))
@@ -268,6 +274,11 @@ def _refusal(rest, drives: Drives, path: Course, found: Found, k: int, tolerance
     named = lambda mask: ", ".join(dict.fromkeys(name for name, bad in zip(labels, mask, strict=True) if bad))
     if not here.bound.all():
         free = free_names(rest, ~here.bound)
+        if _drive_nearby(given, k):
+            return (
+                f"{lead} the position is singular: {free} can move while {', '.join(dict.fromkeys(labels))} stand "
+                "still, which nearby cannot happen. Avoid the position, or add an actuator with weights=."
+            )
         reason = (
             f"the constraints hold {named(here.held)}" if here.held.any() else f"{named(~here.drives)} adds nothing"
         )
@@ -276,3 +287,14 @@ def _refusal(rest, drives: Drives, path: Course, found: Found, k: int, tolerance
         return f"{lead} friction does not determine the reactions of the joints."
     names = ", ".join(drive.name for drive in drives if drive.of == "parameter")
     return f"{lead} the forces are not proportional to {names}, such as beyond a limit. Name a coordinate instead."
+
+
+def _drive_nearby(given, k: int) -> bool:
+    """Whether the actuators produce all motions at a position near the position at a time."""
+    system, rest, drives, path = given
+    t, y = path.ts[k], jax.tree.map(lambda x: x[k], path.ys)
+    # In no particular direction.
+    moved = y.q + _NEAR * rest.coordinate_scale() * np.cos(1.0 + np.arange(y.q.size))
+    q, _, met = configuration(rest, rest.normalize(t, moved), {}, t, False)
+    there = searched(system, rest, drives, t, dataclasses.replace(y, q=q))
+    return bool(met) and bool(there.regular) and bool(np.all(there.bound))
