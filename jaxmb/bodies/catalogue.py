@@ -13,7 +13,7 @@ from ..parts.drivers import AbstractDriver
 from ..system.catalogue import Catalogue
 from ..system.quantities import Measure, entries_along, view_of_motion
 from ..system.structures import of_structure
-from .joint_coordinates import beyond_half_turns, joint_coordinates, joint_measures
+from .joint_coordinates import beyond_half_turns, joint_coordinates, joint_measures, jumping_couplings
 from .motion import body_measures, body_motion, frame_measures, scalar_measures
 from .picture import picture
 from .reactions import (
@@ -52,6 +52,9 @@ class SceneCatalogue(Catalogue):
     def cautions(self, motion, reach):
         turned = [] if reach is None else beyond_half_turns(self.system, np.asarray(reach))
         return lifted_ropes(self.system, motion) + turned
+
+    def jumps_of_rows(self, t, q):
+        return jumping_couplings(self.system, t, q)
 
     @of_structure
     def joint_coordinates(self):

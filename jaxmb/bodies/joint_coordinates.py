@@ -14,6 +14,7 @@ from jaxtyping import Array
 
 from .._compat import default_float
 from .._types import Scalar
+from ..parts.combinations import JointCoupling
 from ..parts.coordinate_parts import AbstractCoordinatePart, JointDriver
 from ..solvers.turning import nearest_turn
 from ..system.quantities import Measure, view_of_motion
@@ -138,6 +139,24 @@ def beyond_half_turns(system: Any, reach: np.ndarray) -> list[str]:
                     f"{name!r} jumps where {coordinate!r} is half a turn from {middle:.6g} rad, and the angle went "
                     f"from {least:.6g} to {largest:.6g}: let it act on 'winding.length' of a tendon that counts turns, "
                     f"jaxmb.FixedTendon('winding', ({coordinate!r},), coefficients=(1.0,))."
+                )
+    return out
+
+
+def jumping_couplings(system: Any, t: Scalar, q: Array) -> list[str]:
+    """A sentence for each coupling that jumps at concrete coordinates, since an angle is half a turn from its zero."""
+    poses, out = system.bodies.prepared_poses(q), []
+    for g in system.constraints.position:
+        if not isinstance(g.group.part, JointCoupling):
+            continue
+        for k, (name, x) in enumerate(zip(g.group.names, g.group.gather(poses), strict=True)):
+            part = g.group.single(k, t)
+            joints = [dict(g.group.inner)["joints", str(i + 1)][k] for i in range(len(part.within) - 1)]
+            for i in part.jumping(system.layout.space, x):
+                out.append(
+                    f"JointCoupling {name!r} jumps where '{joints[i]}.{part.within[i + 1]}' is half a turn from its "
+                    "zero, since it is known up to full turns and the ratio is not an integer: couple the length of "
+                    "a jaxmb.FixedTendon along it, which counts turns."
                 )
     return out
 

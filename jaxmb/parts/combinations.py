@@ -15,6 +15,8 @@ from . import fields
 from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
 from .coordinate_parts import AbstractOfCoordinates, shortest, turns
 
+# An angle [rad] this near to half a turn is there.
+_AT_HALF_TURN = 1e-2
 # Largest distance of coinciding points of a tendon, relative to its length.
 _APART = 1e-9
 
@@ -52,8 +54,20 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
     system = jaxmb.Scene([bar, link], joints=[pin, elbow, bend]).compile()
     ```
 
-    For angles known up to full turns, the row and `yᵢ − other_zero[i]` are wrapped to [−π, π]. Gears with integer
-    ratios then turn without end, other gears by half a turn to either side.
+    For angles known up to full turns, as of hinges in space, the row and `yᵢ − other_zero[i]` are wrapped to [−π, π].
+    Gears with integer ratios then turn without end. Other gears turn by half a turn to either side, where a run ends
+    with a message; along a tendon that counts turns they go on:
+
+    ```python
+    hinge = {"axis": (0.0, 0.0, 1.0), "point": (0.0, 0.0, 0.0)}
+    wheels = [spatial.Body(name, mass=1.0, inertia=(0.1, 0.1, 0.2)) for name in ("wheel", "pinion")]
+    axles = [spatial.Revolute(f"{wheel.name} axle", "ground", wheel.name, **hinge) for wheel in wheels]
+    turns = jaxmb.FixedTendon("turns", ("wheel axle.angle",), coefficients=(1.0,))
+    gear = jaxmb.JointCoupling("gear", "pinion axle.angle", "turns.length", coefficients=(0.0, 2.5))
+    gearbox = jaxmb.Scene(wheels, joints=[*axles, turns, gear]).compile()
+    ```
+
+    A gear with losses has a `DryFriction` by its name, `jaxmb.DryFriction("loss", "gear", coefficient=0.1)`.
 
     **Arguments:**
 
@@ -105,6 +119,19 @@ class JointCoupling(AbstractCombination, AbstractConstraint):
                 polynomial = polynomial * y + powers[k]
             out = out - polynomial
         return shortest(out[None]) if self.is_periodic(0) else out[None]
+
+    def jumping(self, space: Any, poses: Any) -> list[int]:
+        """The numbers of the angles among the y that are half a turn from their zeros, where the row jumps."""
+        _, *others = self.values(space, poses)
+        rows = np.asarray(self.coefficients).reshape(len(others), -1)
+        zeros, out = np.asarray(self.other_zero).reshape(-1), []
+        for i, (y, (_, *powers)) in enumerate(zip(others, rows, strict=True)):
+            ratio, *higher = (*powers, 0.0)
+            goes_on = self.is_periodic(0) and ratio == np.round(ratio) and not np.any(higher)
+            off = np.abs(np.asarray(shortest(y - zeros[i])))
+            if self.is_periodic(i + 1) and np.any(powers) and not goes_on and off > np.pi - _AT_HALF_TURN:
+                out.append(i)
+        return out
 
 
 class JointInertia(AbstractCombination, AbstractInertialConstraint):

@@ -61,6 +61,11 @@ class Catalogue:
         del motion, reach
         return []
 
+    def jumps_of_rows(self, t: Scalar, q: Coordinates) -> list[str]:
+        """Sentences about constraints that jump at a concrete position."""
+        del t, q
+        return []
+
     @of_structure
     def joint_coordinates(self) -> dict[str, Any]:
         """The coordinates of joints by name; each has a `shape`."""

@@ -196,3 +196,37 @@ def test_a_joint_without_a_coordinate_of_its_own():
     weld = planar.Fixed("weld", "ground", "body", point=(0.0, 0.0))
     with pytest.raises(ValueError, match="Fixed 'weld' has no coordinate"):
         mb.Scene([body], joints=[weld], forces=[mb.JointForce("f", "weld.angle", force=1.0)]).compile()
+
+
+def on_one_axis(names, *joints):
+    """Wheels that turn about the vertical axis, and further joints."""
+    wheels = [spatial.Body(name, mass=1.0, inertia=(0.1, 0.1, 0.2)) for name in names]
+    hinge = {"point": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0)}
+    axles = [spatial.Revolute(f"{name} axle", "ground", name, **hinge) for name in names]
+    return mb.Scene(wheels, joints=[*axles, *joints]).compile()
+
+
+def test_couplings_that_jump_at_half_a_turn_are_named():
+    couple = lambda name, *coefficients: mb.JointCoupling(
+        f"to {name}", f"{name} axle.angle", "a axle.angle", coefficients=coefficients
+    )
+    numbers = {"b": (0.0, 1.5), "c": (0.0, -2.0), "d": (0.1, 0.0, 0.3), "e": (0.2,)}
+    system = on_one_axis("abcde", *(couple(name, *given) for name, given in numbers.items()))
+
+    def said(angle):
+        q = np.array(system.guess.q)
+        q[system.coordinate_names()["a.orientation"]] = np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)
+        return [text.split(" jumps where ")[0] for text in system.catalogue.jumps_of_rows(0.0, jnp.asarray(q))]
+
+    assert said(np.pi - 1e-4) == said(1e-4 - np.pi) == ["JointCoupling 'to b'", "JointCoupling 'to d'"]
+    assert said(3.0) == []
+
+
+@pytest.mark.slow
+def test_a_gear_of_any_ratio_turns_without_end_along_a_tendon():
+    turns = mb.FixedTendon("turns", ("a axle.angle",), coefficients=(1.0,))
+    gear = mb.JointCoupling("gear", "b axle.angle", "turns.length", coefficients=(0.0, 2.5))
+    system = on_one_axis("ab", turns, gear)
+    motion = mb.simulate(system, mb.assemble(system, rates={"a axle.angle": 4.0}), t1=5.0, saveat=[2.0, 5.0])
+    np.testing.assert_allclose(motion["b axle"].angle, 10.0 * np.array([2.0, 5.0]), rtol=1e-7)
+    np.testing.assert_allclose(motion.quantity("turns.length"), 4.0 * np.array([2.0, 5.0]), rtol=1e-7)
