@@ -42,7 +42,8 @@ class Revolute(AbstractPlanarPart, AbstractJoint):
     system = jaxmb.Scene([bar], joints=[pin]).compile()
     ```
 
-    Its coordinate is `angle` [rad], `angle_b − angle_a`.
+    Its coordinate is `angle` [rad], `angle_b − angle_a`: the difference of the angles of the bodies, which need not be
+    zero at the given poses. The angle of a `spatial.Revolute` is.
     """
 
     rows: ClassVar[int] = 2
@@ -241,7 +242,8 @@ class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     system = jaxmb.Scene(wheels, joints=[*axles, mesh]).compile()
     ```
 
-    It has no coordinates; the joints of the axles have angles.
+    It has no coordinates; the joints of the axles have angles. A gear with losses is a `jaxmb.JointCoupling` of these
+    angles with a `jaxmb.DryFriction`.
 
     **Arguments:**
 

@@ -67,7 +67,8 @@ class Body(AbstractRigidBody):
 
     - `mass` [kg] > 0.
     - `inertia` [kg m²], shape (3, 3), about the mass centre in body axes, symmetric and positive definite (products of
-        inertia enter as `−∫ x y dm`); or shape (3,), its diagonal, in principal axes.
+        inertia enter as `−∫ x y dm`); or shape (3,), its diagonal, in principal axes. A gradient by the matrix is not
+        symmetric: only the sum of its entries [i, j] and [j, i] has a meaning, as the derivative by both together.
     - `centre` [m], shape (3,), the mass centre in the frame, default its origin. A changed `"name.centre"` moves the
         mass centre; the guess of the frame stays.
     """

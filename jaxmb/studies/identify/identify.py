@@ -94,7 +94,8 @@ def identify(
         every quantity is weighted by its range, and the noise is estimated from the residuals.
     - `bounds`: `(low, high)` by name, either of them None, kept by a change of variables. Parameters that parts declare
         to be positive, such as masses and moments of inertia, stay positive without bounds. Inertia matrices stay
-        positive definite, with principal moments that satisfy the triangle inequalities. The parameters of a
+        symmetric and positive definite, with principal moments that satisfy the triangle inequalities; they have six
+        unknowns, while `jax.grad` by a matrix is not symmetric (`jaxmb help derivatives`). The parameters of a
         `LagrangianSystem` have no such declaration. Unbounded parameters are scaled by their start.
     - `prior`: `(mean, deviation)` by name, of a normal distribution. A prior needs noise levels that are known or free.
     - `residual`: instead of `measured`, a function from the trajectory at `ts` to an array of residuals in units of
