@@ -40,7 +40,7 @@ from .parts.coordinate_parts import (
     JointFriction as JointFriction,
 )
 from .parts.tables import TableSpring as TableSpring, TableDamper as TableDamper, TableMotor as TableMotor
-from .parts.dry_friction import DryFriction as DryFriction
+from .parts.dry_friction import DryFriction as DryFriction, DryJointFriction as DryJointFriction
 from .parts.coordinate_parts import JointDriver as JointDriver
 from .parts.combinations import JointInertia as JointInertia, JointCoupling as JointCoupling
 

@@ -226,7 +226,7 @@ class Trajectory(eqx.Module):
         """
         if self.found_events is None:
             raise ValueError(
-                "There are no events, since the system has neither contacts such as jaxmb.Stop nor jaxmb.DryFriction."
+                "There are no events, since the system has neither contacts such as jaxmb.Stop nor dry friction."
             )
         # Not a field, so that a copy with other fields does not have it.
         attributes: Any = vars(self)

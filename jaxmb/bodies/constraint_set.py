@@ -162,10 +162,10 @@ class ConstraintSet(eqx.Module):
     def reactions(
         self, laws: Sequence[NonIdealGroup], now: Kinematics, multipliers: Float[Array, "rows"]
     ) -> list[Float[Array, "parts k v"]]:
-        """Reaction wrenches of the joints of non-ideal laws on the joints' bodies, one array for each law group; for
-        ropes their multipliers, shape (parts, rows).
+        """Reaction wrenches of the joints of non-ideal laws on the joints' bodies, one array for each law group. Laws
+        that need multipliers get those, shape (parts, rows); laws that need nothing get zeros.
         """
-        named, wrenches, bodies = {name for g in laws if not g.of_ropes for name in g.joints}, [], []
+        named, wrenches, bodies = {name for g in laws if g.needs == "wrenches" for name in g.joints}, [], []
         jacobian = None if self.elements is None else self.elements.jacobian(now.poses)
         first = 0
         for g, of_group in self.of_groups(multipliers):
@@ -183,7 +183,9 @@ class ConstraintSet(eqx.Module):
         reactions = jnp.concatenate([*wrenches, jnp.zeros(1, now.poses.dtype)])
 
         def of_law(g):
-            if g.of_ropes:
+            if g.needs == "nothing":
+                return jnp.zeros((*g.group.body_index.shape, now.velocities.shape[1]), now.velocities.dtype)
+            if g.needs == "multipliers":
                 return unchecked_take(multipliers, self._rows_of(g.joints))
             # A joint may be made of several constraints, all between the same bodies.
             of_joint = jnp.sum(unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints)), axis=1)

@@ -33,6 +33,7 @@ def contact_set(
         contact_of=tuple(contact_of),
         releases=tuple(g.group.part.static_coefficient is not None for g in frictions for _ in range(_count(g))),
         pairs=tuple(pairs),
+        constant=tuple(g.law.needs == "nothing" for g in frictions for _ in range(_count(g))),
         coupled=any(g.group.part.coupled for g in frictions),
     )
 

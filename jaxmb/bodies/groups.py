@@ -17,8 +17,9 @@ from .._captured import Captured
 from .._types import Scalar
 from ..linalg.blocks import vector_products
 from ..linalg.sums import unchecked_take
-from ..parts.base import AbstractLink, AbstractPart
+from ..parts.base import AbstractPart
 from ..parts.boundary import captured
+from ..parts.dry_friction import AbstractStickSlip
 from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal, of_each, of_one_kind
 from ..parts.servo import Servo
@@ -613,18 +614,21 @@ class NonIdealGroup(AbstractGroup):
     joints: tuple[str, ...] = eqx.field(static=True)
 
     @property
-    def of_ropes(self) -> bool:
-        """Whether the laws are friction of ropes, whose `reactions` are multipliers in place of wrenches."""
-        return isinstance(self.group.part, AbstractLink) and self.group.part.has_tension
+    def needs(self) -> str:
+        """What the laws need of their joints: reaction `"wrenches"`, `"multipliers"` in their place, or `"nothing"`."""
+        part = self.group.part
+        return part.needs if isinstance(part, AbstractStickSlip) else "wrenches"
 
     def tensions(self, now: Kinematics, reactions: Float[Array, "parts rows"]) -> Float[Array, "parts spans"]:
-        """Tensions of the spans of ropes, see `of_ropes`."""
+        """Tensions of the spans of ropes."""
         return self._of_reactions("tensions", now, reactions)
 
     def normal_forces(self, now: Kinematics, reactions: Array) -> Float[Array, "laws d"]:
         """Vectors as long as the normal forces of dry friction are large, for each row of the laws."""
         part, d = self.group.part, self._space.dimension
-        if not self.of_ropes:
+        if self.needs == "nothing":
+            return jnp.eye(1, d, dtype=now.poses.dtype).repeat(len(self.group.names), axis=0)
+        if self.needs == "wrenches":
             forces = reactions[:, part.last, :d]
             return forces if part.rows == 1 else jnp.repeat(forces, part.rows, axis=0)
         limits = self._of_reactions("limits", now, reactions).reshape(-1, 1)

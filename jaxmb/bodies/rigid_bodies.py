@@ -297,7 +297,7 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def friction_rows(self):
-        parts = {name for g in self.constraints.laws for name in g.joints}
+        parts = {name for g in self.constraints.laws if g.needs != "nothing" for name in g.joints}
         return np.array([k for k, (name, _) in enumerate(self.rows) if name in parts], int)
 
     @eqx.filter_jit

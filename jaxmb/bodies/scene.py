@@ -34,6 +34,7 @@ from ..parts.base import (
     rows_of,
 )
 from ..parts.boundary import captured, check_kernels
+from ..parts.combinations import JointCoupling
 from ..parts.dry_friction import AbstractDryFriction, AbstractStickSlip
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of, warn_of_angles
 from ..parts.forces import Gravity
@@ -329,11 +330,11 @@ def _check_kinds(scene: Scene):
         if not isinstance(body, AbstractBody):
             raise ValueError(f"bodies must hold Body or PointMass, got {_misplaced(body)}.")
     for part in scene.joints:
-        if not isinstance(part, AbstractLink) or isinstance(part, AbstractForce | AbstractDryFriction):
+        if not isinstance(part, AbstractLink) or isinstance(part, AbstractForce | AbstractStickSlip):
             raise ValueError(f"joints must hold constraints, got {_misplaced(part)}.")
     for part in scene.forces:
         # A concrete class: gravity acts on every body, so it shares no abstract class with force elements.
-        if not isinstance(part, AbstractForce | AbstractNonIdeal | AbstractDryFriction | Gravity):
+        if not isinstance(part, AbstractForce | AbstractNonIdeal | AbstractStickSlip | Gravity):
             raise ValueError(f"forces must hold force elements, friction, or Gravity, got {_misplaced(part)}.")
     if sum(not isinstance(part, AbstractActor) for part in scene.forces) > 1:
         raise ValueError("A scene has one Gravity; add the accelerations.")
@@ -355,7 +356,7 @@ def _misplaced(part) -> str:
         place = "bodies"
     elif isinstance(part, AbstractFrame):
         place = "frames"
-    elif isinstance(part, AbstractLink) and not isinstance(part, AbstractForce | AbstractDryFriction):
+    elif isinstance(part, AbstractLink) and not isinstance(part, AbstractForce | AbstractStickSlip):
         place = "joints"
     else:
         place = "forces"
@@ -380,7 +381,7 @@ def _check_names(scene: Scene):
     joints = dict.fromkeys(
         part.name
         for part in scene.joints
-        if isinstance(part, AbstractTendon) or (isinstance(part, kinds) and not part.sources)
+        if isinstance(part, AbstractTendon | JointCoupling) or (isinstance(part, kinds) and not part.sources)
     )
     # Unilateral constraints of coordinates, such as stops, have no point of contact.
     stops = {

@@ -16,6 +16,7 @@ _YIELD = 1e-10
 def largest_force(system, t, y, multipliers):
     """The size to which forces are compared."""
     largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, y.q, y.u)))
+    largest = system.contacts.with_limits(system, largest)
     return largest + jnp.finfo(largest.dtype).tiny
 
 

@@ -275,7 +275,8 @@ class Impacting:
             return udot, opening, None
         q, answers = self.contacts.stuck(q, self.moves.answers)
         reactions = lambda multipliers: system.friction_reactions(t, q, u, multipliers)
-        return udot, opening, jax.vmap(reactions)(jnp.concatenate([multipliers[None], answers]))
+        of_all = jax.vmap(reactions)(jnp.concatenate([multipliers[None], answers]))
+        return udot, opening, self.contacts.by_forces(of_all)
 
     # The time of the event
 
@@ -425,7 +426,7 @@ class Impacting:
         struck, curve = before.struck, before.problem.free + self.influence @ forces
         low, rest = self.low_bounces(before, curve[: self.contacts.n], k == 2 * self.turns - 1)
         # Without low bounces, and without forces that depend on others, a second round would give the same result.
-        rounds = before.rounds if self.contacts.in_joints.any() else jnp.where(jnp.any(low), 2, 1)
+        rounds = before.rounds if self.contacts.of_reactions else jnp.where(jnp.any(low), 2, 1)
         trial = next_trial(before.trial, *struck.gained, k // self.turns - rounds)
         return before._replace(
             problem=self.impulse_of(before.when, low, trial.share, before.problem.reactions),
@@ -458,7 +459,7 @@ class Impacting:
 
     def start(self) -> Round:
         """The state before the first round."""
-        n, m, in_joints = self.contacts.n, self.contacts.m, self.contacts.in_joints.any()
+        n, m, in_rounds = self.contacts.n, self.contacts.m, self.contacts.of_reactions
         none, one, yes = jnp.zeros(n + m, self.q.dtype), jnp.ones((), self.q.dtype), jnp.array(True)
         each, balance, zeros = one, None, None
         if self.in_groups:
@@ -474,7 +475,7 @@ class Impacting:
             answers=no,
             forces=none,
             solvable=yes,
-            rounds=jnp.array(_ROUNDS if in_joints else 1),
+            rounds=jnp.array(_ROUNDS if in_rounds else 1),
             trial=Trial(each, Bracket(0 * each, each, 0 * each, each, jnp.zeros(each.shape, int)), each < 0),
             compression=Phase(self.u, none > 0, none[n:], none) if self.phases == 2 else None,
             pushed=none if self.phases == 2 else None,

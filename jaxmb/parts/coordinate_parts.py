@@ -415,7 +415,9 @@ class JointFriction(AbstractScalarPart, AbstractForce):
     system = jaxmb.Scene([bar], joints=[pin], forces=[rub]).compile()
     ```
 
-    It does not depend on the reaction of the joint; `Friction` lists the ways in which a joint rubs.
+    It does not depend on the reaction of the joint, and at rest under a load it creeps. `DryJointFriction` sticks
+    exactly: it costs a coordinate, a row, and an event with a new start of the method at each transition. `Friction`
+    lists the ways in which a joint rubs.
 
     **Arguments:** `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0, below which friction is viscous.
     """

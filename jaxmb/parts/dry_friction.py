@@ -1,7 +1,7 @@
 """Dry friction that sticks exactly: Coulomb's law, with stick and slip as modes that change at exact times."""
 
 import abc
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -22,7 +22,8 @@ from .base import (
     Velocities,
     Wrenches,
 )
-from .coordinate_parts import AbstractOfJoints
+from .combinations import JointCoupling
+from .coordinate_parts import AbstractOfJoints, AbstractScalarPart
 from .modes import STICK, kind_of, slip_direction
 from .space import AbstractSpace, rate_of
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
@@ -42,6 +43,9 @@ class AbstractStickSlip(AbstractVelocityConstraint):
     # Those of slip and stick, as multiples of the normal forces; the latter may be None.
     coefficient: AbstractVar[Any]
     static_coefficient: AbstractVar[Any]
+    # What the law needs of its joint: reaction "wrenches", or the "multipliers" of its rows; "nothing" if the normal
+    # force is one, and the coefficients are forces.
+    needs: AbstractVar[Any]
 
     @property
     def coupled(self) -> bool:
@@ -55,7 +59,7 @@ class AbstractStickSlip(AbstractVelocityConstraint):
     @property
     @abc.abstractmethod
     def joint_name(self) -> str:
-        """The name of the part whose force is the normal force."""
+        """The name of the joint or contact that rubs, whose force is the normal force."""
 
     @property
     def limit(self) -> Array:
@@ -96,6 +100,10 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
     coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", constant=True)
     static_coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", optional=True, constant=True)
     directions: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
+
+    @property
+    def needs(self) -> Literal["wrenches", "multipliers"]:
+        return "wrenches"
 
     @property
     def rows(self) -> int:
@@ -190,6 +198,13 @@ class DryFriction(AbstractDryFriction):
     about the normal. The normal force is the contact's. In an impact, friction in contacts has an impulse of at most
     `coefficient` times the contact's, and exactly this if slip does not end; friction in joints has none.
 
+    In a gear, a `JointCoupling`, it acts along the first coordinate, and the normal force is the gear's force or moment
+    along it. With the coefficient c the efficiency of the gear is `1 − c` where power leaves it by this coordinate, and
+    `1 / (1 + c)` where power enters there.
+
+    In the thread of a `spatial.Screw` it acts about `"screw.angle"`, by the whole force of the joint; `Screw` has the
+    coefficient.
+
     With a `speed` the first body, or the terrain, is a belt: its surface moves at this speed along the directions of
     slip, and slip is measured against it.
 
@@ -202,12 +217,12 @@ class DryFriction(AbstractDryFriction):
     `Trajectory.reactions["rub"]` is its force on the last body, in stick and in slip.
 
     If no normal force exists, or several do (Painlevé's paradox), the run ends with a failure that names the friction.
-    `Friction` lists the ways in which a joint rubs.
+    `DryJointFriction` has a given size, without a normal force. `Friction` lists the ways in which a joint rubs.
 
     **Arguments:**
 
-    - `joint`: the name of the joint or contact, or `"joint.coordinate"`. The reaction must be determinate: no other
-      joint may imply any of its rows.
+    - `joint`: the name of the joint, contact or gear, or `"joint.coordinate"`. The reaction must be determinate: no
+      other joint may imply any of its rows.
     - `coefficient` μ ≥ 0 in slip; `static_coefficient` ≥ μ in stick, default μ.
     - `radius` [m] > 0 of the pin, for a coordinate that is an angle.
     - `speed` [m/s] of a belt, a number, or two numbers for two directions of slip; default none.
@@ -219,6 +234,12 @@ class DryFriction(AbstractDryFriction):
     within: tuple[str, ...] = eqx.field(static=True, default_factory=tuple, init=False)
     # The axis from which the tangents of a contact in space turn, see `AbstractRigidContact.tangents`; otherwise zero.
     pole: int = eqx.field(static=True, default_factory=int, init=False)
+    # Whether it rubs in a coupling of coordinates, along the first of them.
+    in_gear: bool = eqx.field(static=True, default_factory=bool, init=False)
+
+    @property
+    def needs(self):
+        return "multipliers" if self.in_gear else "wrenches"
 
     @property
     def homogeneous(self):
@@ -234,6 +255,10 @@ class DryFriction(AbstractDryFriction):
             )
         if isinstance(held, AbstractUnilateralConstraint):
             return part._of_contact(space, held, poses)
+        if isinstance(held, JointCoupling):
+            if self.radius is not None or "." in self.joint:
+                raise ValueError(f"{self.label}: friction in {held.label} is given by its name, without a radius.")
+            return part.with_fields(in_gear=True)
         within = part._slip_coordinates(space, held, poses)
         if all(self.source_is_length(0, name) for name in within) != (self.radius is None):
             needs = "slides and has no radius" if self.radius is not None else "turns: give the radius of its pin"
@@ -283,12 +308,26 @@ class DryFriction(AbstractDryFriction):
         in_contact = keys[0] == "joints" and isinstance(self.joints["0"], AbstractRigidContact)
         return not in_contact or "terrain" in keys
 
+    def seen_wrenches(self, space, poses, wrenches):
+        return wrenches if self.in_gear else super().seen_wrenches(space, poses, wrenches)
+
+    def normal_force(self, space, poses, reactions):
+        return norm(reactions) if self.in_gear else super().normal_force(space, poses, reactions)
+
+    def limits(self, space: AbstractSpace, poses: Poses, multipliers: Float[Array, "1"]) -> Float[Array, "1"]:
+        """The force along the coordinate of a coupling, from its multiplier."""
+        del space, poses
+        return multipliers
+
     def slip(self, space, poses, velocities):
         slip = self._relative_velocity(space, poses, velocities)
         return slip if self.speed is None else slip - self.speed.reshape(-1)
 
     def _relative_velocity(self, space, poses, velocities):
         held = self.joints["0"]
+        if self.in_gear:
+            first = lambda part, x: jnp.stack(part.joints["0"].values(space, x)[:1])
+            return rate_of(space, self, first, poses, velocities)[1]
         if isinstance(held, AbstractRigidContact):
             if self.drift is not None:
                 held = held.with_fields(drift=self.drift.joints["0"])
@@ -302,3 +341,75 @@ class DryFriction(AbstractDryFriction):
 
     def _length(self, name, value):
         return value if self.radius is None or self.joints["0"].is_length(name) else self.radius * value
+
+
+class DryJointFriction(AbstractScalarPart, AbstractStickSlip):
+    """Dry friction of constant size on a coordinate, which sticks exactly: a seal, a brake, a preloaded bearing.
+
+    ```python
+    bar = planar.Body("bar", mass=1.0, inertia=0.1, angular_velocity=2.0)
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    brake = jaxmb.DryJointFriction("brake", "pin.angle", force=0.5, static_force=0.6)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[brake]).compile()
+    ```
+
+    It is the law of `DryFriction`, without a normal force: in slip a generalized force of the size `force` acts against
+    the rate of the coordinate; in stick the coordinate is held by at most `static_force`. `simulate` finds the times of
+    transitions, which `Trajectory.events` lists. The coordinate `"brake.mode"` is 2 in stick and 1 or -1 in slip.
+
+    `Trajectory.reactions["brake"]` is its force and moment on the last body, in stick and in slip. In an impact it has
+    no impulse. `JointFriction` is the smooth law, without events, which creeps at rest: `Friction` compares them.
+
+    **Arguments:**
+
+    - `coordinate`: a number, of a joint or tendon, such as `"pin.angle"`, `"slide.displacement"` or `"cord.length"`.
+    - `force` ≥ 0 [N m, N] in slip; `static_force` ≥ `force` in stick, default `force`.
+    """
+
+    force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", constant=True)
+    static_force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", optional=True, constant=True)
+    rows: ClassVar[int] = 1
+    directions: ClassVar[int] = 1
+    needs: ClassVar[Literal["nothing"]] = "nothing"
+
+    @property
+    def coefficient(self):
+        return self.force
+
+    @property
+    def static_coefficient(self):
+        return self.static_force
+
+    @property
+    def joint_name(self):
+        return self.coordinate.partition(".")[0]
+
+    def validate(self):
+        if self.static_force is not None and not self.static_force >= self.force:
+            raise ValueError(
+                f"{self.label}: static_force must not be less than force, got {self.static_force} and {self.force}."
+            )
+
+    def numbers_agree(self):
+        return True if self.static_force is None else self.static_force >= self.force
+
+    def scalar_coordinates(self, space, parts):
+        return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
+
+    def complete(self, space, poses):
+        if isinstance(self.joint, AbstractUnilateralConstraint):
+            raise ValueError(
+                f"{self.label}: {self.joint.label} is not a joint; friction of bodies that touch is DryFriction."
+            )
+        return super().complete(space, poses)
+
+    def _slip(self, space, poses, velocities):
+        return self.measured_with_rate(space, poses, velocities)[1]
+
+    def wrenches(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Any, t: float
+    ) -> Wrenches:
+        """The wrench of slip on each of the joint's bodies."""
+        del reactions, t
+        slip, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
+        return pull(-self.force * slip_direction(self._modes(poses), slip))[0]

@@ -455,6 +455,7 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
     moving: ClassVar[tuple[str, ...]] = ("length", "points", "radii", "axes", "marks")
     has_tension: ClassVar[bool] = True
     directions: ClassVar[int] = 1
+    needs: ClassVar[Literal["multipliers"]] = "multipliers"
     static_coefficient: ClassVar[None] = None
 
     @property

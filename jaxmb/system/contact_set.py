@@ -45,8 +45,9 @@ class ContactSet:
 
     - For each law: its name in `names`; the index of its row of A in `rows`; the index of its mode in q in `places`.
     - For each contact: whether impacts follow Poisson's law, `by_poisson`, or Newton's.
-    - For each direction of friction: the index of its contact in `contact_of`, -1 in a joint; and in `releases`,
-        whether coefficients of slip and stick differ, so that accelerations jump as slip begins.
+    - For each direction of friction: the index of its contact in `contact_of`, -1 in a joint; in `releases`, whether
+        coefficients of slip and stick differ, so that accelerations jump as slip begins; and in `constant`, whether the
+        coefficients are forces, with a normal force of one.
     - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
     - `coupled`: whether the normal forces of friction in joints depend on friction itself, without other constraints.
     """
@@ -57,6 +58,7 @@ class ContactSet:
     by_poisson: tuple[bool, ...] = ()
     contact_of: tuple[int, ...] = ()
     releases: tuple[bool, ...] = ()
+    constant: tuple[bool, ...] = ()
     pairs: tuple[int, ...] = ()
     coupled: bool = False
 
@@ -90,6 +92,11 @@ class ContactSet:
     def in_joints(self) -> Bool[np.ndarray, "frictions"]:
         """Which directions of friction belong to joints, where the size of the reaction is the normal force."""
         return np.array(self.contact_of, int) < 0
+
+    @functools.cached_property
+    def of_reactions(self) -> bool:
+        """Whether some friction depends on the reaction of a joint."""
+        return bool(np.any(self.in_joints & ~np.array(self.constant, bool)))
 
     @functools.cached_property
     def in_pairs(self) -> Bool[np.ndarray, "frictions"]:
@@ -151,6 +158,20 @@ class ContactSet:
             return q, multipliers
         own = np.eye(multipliers.shape[1])[np.array(self.rows)]
         return self.bound(q), multipliers + jnp.asarray(own, multipliers.dtype)
+
+    # Friction of constant size, whose normal force is one
+
+    def by_forces(self, reactions: Float[Array, "more_laws m d"]) -> Float[Array, "more_laws m d"]:
+        """The reactions without forces along the laws, and by a unit force along each."""
+        if not any(self.constant):
+            return reactions
+        return reactions.at[1:, np.flatnonzero(self.constant)].set(0.0)
+
+    def with_limits(self, system: Any, size: Float[Array, ""]) -> Float[Array, ""]:
+        """The largest force, with limits of friction beside which no other force may act."""
+        if not any(self.constant):
+            return size
+        return size + jnp.max(system.contact_numbers.limit[np.flatnonzero(self.constant)])
 
     # Gaps and slips of the `system` with these contacts, as if all contacts were closed and all friction stuck
 

@@ -66,6 +66,16 @@ FRICTIONS = {
         ],
         mb.DryFriction("rub", "joint.angle_a", coefficient=0.3, radius=0.05),
     ),
+    "brake on a pin": (
+        [_body_2d("a"), _body_2d("b", x=1.2, spin=-0.4)],
+        [planar.Revolute("joint", "a", "b", point=(0.8, 0.8))],
+        mb.DryJointFriction("rub", "joint.angle", force=0.3, static_force=0.5),
+    ),
+    "seal of a sleeve": (
+        [_body_3d("a")],
+        [spatial.Cylindrical("joint", "ground", "a", point=(0.0, 0.1, 0.5), axis=(0.6, 0.0, 0.8))],
+        mb.DryJointFriction("rub", "joint.displacement", force=0.3),
+    ),
     "disc on a belt": (
         [_body_2d("a")],
         [mb.RigidContact("joint", "a", terrain=terrain.Bump(start=0.0, length=2.0, peak=0.2), radius=0.1)],

@@ -128,7 +128,7 @@ class Revolute(AbstractAxial):
     ```
 
     Its coordinate is `angle` [rad], the turn of `body_b` in `body_a` about the axis, from `x_a` to `x_b`: zero at the
-    given poses, unless these are given.
+    given poses, unless these are given. The angle of a `planar.Revolute` is the difference of the angles of its bodies.
     """
 
     rows: ClassVar[int] = 5
@@ -351,6 +351,12 @@ class Screw(AbstractSliding):
     With the angle θ, the displacement s and ψ = θ − 2π (s − offset)/pitch, the last row is `pitch/2π · 2 sin(ψ/2) = 0`
     with ψ in (−π, π]. It is periodic in θ and in s, like the screw, and holds for any number of turns; near zero its
     value is the axial error [m].
+
+    Friction in the thread is `jaxmb.DryFriction("thread", "screw.angle", coefficient=c, radius=r)`, and in a collar
+    under the same load a second one with its radius. With the coefficient μ of the thread, its mean radius r and
+    its slope `tan λ = pitch / (2π r)`, c is `μ (1 + tan²λ) / (1 ∓ μ tan λ)`, with the minus where the load is
+    raised; between both lies `μ (1 + tan²λ)`. For a trapezoidal thread with the angle α of its flanks, μ is divided
+    by `cos(α/2)`. The screw locks itself where c is at least tan λ.
 
     **Arguments:**
 
