@@ -29,7 +29,6 @@ _ENOUGH, _LOOKED = 200, 512
 _NAMED = 8
 # Residuals contradict each other by more than this part of them.
 _CONTRADICTED = 1e-6
-_IN_TIME = "If positions depend on t, the others contain the derivatives by t."
 # Beyond the end of a motion, residuals above this part of the displacement count.
 _UNMET = 0.1
 
@@ -180,7 +179,7 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
     if reached:
         kept = "With `throw=False` the motion up to there is kept."
         return f"{how_far(outcome, span)} There {' and '.join(reached)}. {kept}"
-    if not system.body_names and (wrong := about_residuals(system, outcome.t, outcome.y)):
+    if not system.body_names and (wrong := about_residuals(system.at(outcome.y), outcome.t, outcome.y)):
         return f"{how_far(outcome, span)} {wrong}"
     if result == RESULTS.max_steps_reached:
         return about_steps(outcome, span, stats, is_stiff_at_end(probe, stats, solver))
@@ -207,11 +206,11 @@ def about_residuals(system, t, y: State) -> str:
     at = lambda u: system.velocity_residual(t, y.q, u)
     velocity, still = at(u), at(0 * u)
     pairs = {
-        "velocity_residual is not the derivative of position_residual by time": (
+        "velocity_residual is not the derivative of position_residual by time, with its terms in t": (
             velocity[: system.position_rows],
             jax.jvp(system.position_residual, (t, y.q), along)[1],
         ),
-        "acceleration_residual is not the derivative of velocity_residual by time": (
+        "acceleration_residual is not the derivative of velocity_residual by time, with its terms in t": (
             system.acceleration_residual(t, y.q, u, udot)[: system.velocity_rows],
             jax.jvp(system.velocity_residual, (t, y.q, u), (*along, udot))[1],
         ),
@@ -221,11 +220,11 @@ def about_residuals(system, t, y: State) -> str:
     if system.linear:
         pairs["velocity_residual is not linear, although linear = True"] = at(2 * u) - velocity, velocity - still
     for text, (value, expected) in pairs.items():
-        size = float(jnp.max(jnp.abs(expected), initial=0.0))
+        size = float(jnp.max(jnp.abs(expected), initial=0.0) + jnp.max(jnp.abs(velocity)))
         off = ~(np.abs(np.asarray(value - expected)) <= _CONTRADICTED * size)
         if np.any(off):
             names = ", ".join(dict.fromkeys(repr(system.rows[k][0]) for k in np.flatnonzero(off)))
-            return f"The residuals of {names} contradict each other: {text}. {_IN_TIME}"
+            return f"The residuals of {names} contradict each other: {text}."
     return ""
 
 

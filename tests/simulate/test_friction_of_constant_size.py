@@ -132,7 +132,7 @@ def test_a_block_that_rubs_in_two_ways_stops(solver):
     (stop, *_) = motion.events
     np.testing.assert_allclose(stop.time, 3.0 / slow, rtol=1e-8)
     np.testing.assert_allclose(motion["block"].position[0, 0], 4.5 / slow, rtol=1e-8)
-    assert {event.kind for event in motion.events} == {"stick"}
+    np.testing.assert_allclose(motion["block"].velocity, 0.0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -28,7 +28,6 @@ from .drives import drives_of, released, without_drives, without_limits
 
 # Beyond a range by this share of it is a rounding error.
 _ROUNDING = 1e-9
-
 # How near a position is at which actuators are tried, as a part of the scales of the coordinates.
 _NEAR = 1e-3
 
