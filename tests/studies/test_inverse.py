@@ -544,7 +544,7 @@ def test_a_singular_position_is_said_to_be_singular():
     joints = [
         planar.Revolute("bearing", "ground", "crank", point=(0.0, 0.0)),
         planar.Revolute("pin", "crank", "rod", point=(1.0, 0.0)),
-        planar.PinInSlot("slot", "ground", "rod", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(1.0, 0.0)),
+        planar.PointOnLine("slot", "ground", "rod", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(1.0, 0.0)),
     ]
     machine = mb.Scene([crank, rod], joints=joints).compile()
     with pytest.raises(ValueError, match=r"the position is singular: .* can move while slot\.displacement stand still"):
