@@ -37,10 +37,9 @@ from .parts.coordinate_parts import (
     JointSpring as JointSpring,
     JointForce as JointForce,
     JointStop as JointStop,
-    JointFriction as JointFriction,
 )
 from .parts.tables import TableSpring as TableSpring, TableDamper as TableDamper, TableMotor as TableMotor
-from .parts.dry_friction import DryFriction as DryFriction, DryJointFriction as DryJointFriction
+from .parts.dry_friction import DryFriction as DryFriction, JointFriction as JointFriction
 from .parts.coordinate_parts import JointDriver as JointDriver
 from .parts.combinations import JointInertia as JointInertia, JointCoupling as JointCoupling
 

@@ -11,7 +11,8 @@ from ..linalg.rotations import from_matrix
 from ..parts.actuators import Actuator
 from ..parts.base import GROUND
 from ..parts.combinations import FixedTendon, JointCoupling, JointInertia, Tendon
-from ..parts.coordinate_parts import JointDriver, JointFriction, JointSpring, JointStop
+from ..parts.coordinate_parts import JointDriver, JointSpring, JointStop
+from ..parts.dry_friction import JointFriction
 from ..parts.forces import Damper, Gravity, PointForce, RotationalDamper
 from ..parts.shapes import AbstractShape
 from ..parts.spatial.bodies import Body

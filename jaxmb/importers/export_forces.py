@@ -10,7 +10,8 @@ from ..linalg.rotations import from_matrix
 from ..parts.actuators import Actuator
 from ..parts.base import AbstractInertialConstraint
 from ..parts.combinations import FixedTendon, JointInertia, Tendon
-from ..parts.coordinate_parts import JointFriction, JointSpring, JointStop
+from ..parts.coordinate_parts import JointSpring, JointStop
+from ..parts.dry_friction import JointFriction
 from ..parts.forces import RotationalDamper, SpringDamper
 from ..parts.spatial.kinematics import SPACE
 from .description import rotation_of

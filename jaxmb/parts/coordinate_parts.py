@@ -405,26 +405,3 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
         if self.exponent is None:
             return 0.5 * self.stiffness * jnp.sum(depths**2)
         return self.stiffness * jnp.sum(depths ** (self.exponent + 1)) / (self.exponent + 1)
-
-
-class JointFriction(AbstractScalarPart, AbstractForce):
-    """Dry friction of constant size on a coordinate: generalized force `−force tanh(rate / transition_speed)`.
-
-    ```python
-    rub = jaxmb.JointFriction("rub", "pin.angle", force=0.1)
-    system = jaxmb.Scene([bar], joints=[pin], forces=[rub]).compile()
-    ```
-
-    It does not depend on the reaction of the joint, and at rest under a load it creeps. `DryJointFriction` sticks
-    exactly: it costs a coordinate, a row, and an event with a new start of the method at each transition. `Friction`
-    lists the ways in which a joint rubs.
-
-    **Arguments:** `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0, below which friction is viscous.
-    """
-
-    force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative")
-    transition_speed: fields.Number = fields.parameter(unit=("rad/s", "m/s"), sign="positive", default=1e-2)
-
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: -self.force * jnp.tanh(v / self.transition_speed)
-        return self.force_along(space, poses, velocities, law)

@@ -56,7 +56,7 @@ class Cylinder(AbstractCylinder, AbstractTendon):
     ```
 
     It stands among the joints of a scene, and has the coordinate `length`. Other parts act on `"lift.length"`:
-    `JointStop` or `Stop` ends the stroke, `DryJointFriction` rubs as the seals do, `JointForce` or `Motor` pushes with
+    `JointStop` or `Stop` ends the stroke, `JointFriction` rubs as the seals do, `JointForce` or `Motor` pushes with
     a force. A `JointDriver` prescribes the length; `needed_pressure` is the pressure for its force:
 
     ```python

@@ -10,10 +10,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._compat import with_values
 from ..linalg.rotations import norm
 from ..linalg.sums import unchecked_take
 from . import fields
 from .base import (
+    AbstractForce,
     AbstractLink,
     AbstractPart,
     AbstractVelocityConstraint,
@@ -217,7 +219,8 @@ class DryFriction(AbstractDryFriction):
     `Trajectory.reactions["rub"]` is its force on the last body, in stick and in slip.
 
     If no normal force exists, or several do (Painlevé's paradox), the run ends with a failure that names the friction.
-    `DryJointFriction` has a given size, without a normal force. `Friction` lists the ways in which a joint rubs.
+    `JointFriction(…, exact=True)` has a given size, without a normal force. `Friction` lists the ways in which a joint
+    rubs.
 
     **Arguments:**
 
@@ -343,28 +346,73 @@ class DryFriction(AbstractDryFriction):
         return value if self.radius is None or self.joints["0"].is_length(name) else self.radius * value
 
 
-class DryJointFriction(AbstractScalarPart, AbstractStickSlip):
-    """Dry friction of constant size on a coordinate, which sticks exactly: a seal, a brake, a preloaded bearing.
+class JointFriction(AbstractScalarPart, AbstractForce):
+    """Dry friction of constant size on a coordinate: generalized force `−force tanh(rate / transition_speed)`, or with
+    exact stick.
 
     ```python
     bar = planar.Body("bar", mass=1.0, inertia=0.1, angular_velocity=2.0)
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
-    brake = jaxmb.DryJointFriction("brake", "pin.angle", force=0.5, static_force=0.6)
-    system = jaxmb.Scene([bar], joints=[pin], forces=[brake]).compile()
+    rub = jaxmb.JointFriction("rub", "pin.angle", force=0.1)
+    brake = jaxmb.JointFriction("brake", "pin.angle", force=0.5, static_force=0.6, exact=True)
+    system = jaxmb.Scene([bar], joints=[pin], forces=[rub, brake]).compile()
     ```
 
-    It is the law of `DryFriction`, without a normal force: in slip a generalized force of the size `force` acts against
-    the rate of the coordinate; in stick the coordinate is held by at most `static_force`. `simulate` finds the times of
-    transitions, which `Trajectory.events` lists. The coordinate `"brake.mode"` is 2 in stick and 1 or -1 in slip.
+    It does not depend on the reaction of the joint; `Friction` lists the ways in which a joint rubs. By default it is
+    smooth, and creeps at rest under a load.
 
-    `Trajectory.reactions["brake"]` is its force and moment on the last body, in stick and in slip. In an impact it has
-    no impulse. `JointFriction` is the smooth law, without events, which creeps at rest: `Friction` compares them.
+    If it is `exact`, it sticks: a seal, a brake, a preloaded bearing. It is then the law of `DryFriction` without a
+    normal force. In slip the generalized force acts against the rate of the coordinate; in stick the coordinate is held
+    by at most `static_force`. This costs a coordinate, a row, and an event with a new start of the method at each
+    transition. `Trajectory.events` lists them, the coordinate `"brake.mode"` is 2 in stick and 1 or -1 in slip, and
+    `Trajectory.reactions["brake"]` is the force and moment on the last body. In an impact it has no impulse.
 
     **Arguments:**
 
     - `coordinate`: a number, of a joint or tendon, such as `"pin.angle"`, `"slide.displacement"` or `"cord.length"`.
-    - `force` ≥ 0 [N m, N] in slip; `static_force` ≥ `force` in stick, default `force`.
+    - `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0, below which smooth friction is viscous, default 0.01.
+    - `exact`: whether it sticks; `static_force` ≥ `force` [N m, N] of exact friction in stick, default `force`.
     """
+
+    force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative")
+    transition_speed: fields.Number = fields.parameter(unit=("rad/s", "m/s"), sign="positive", optional=True)
+    static_force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", optional=True)
+    exact: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def validate(self):
+        if self.exact and self.transition_speed is not None:
+            raise ValueError(f"{self.label}: exact friction has no transition_speed; leave it out.")
+        if self.static_force is not None and not self.exact:
+            raise ValueError(f"{self.label}: static_force needs friction that sticks; give exact=True.")
+        if self.static_force is not None and not self.static_force >= self.force:
+            raise ValueError(
+                f"{self.label}: static_force must not be less than force, got {self.static_force} and {self.force}."
+            )
+
+    def scalar_coordinates(self, space, parts):
+        return (ScalarCoordinate(f"{self.name}.mode", moves=True),) if self.exact else ()
+
+    def with_numbers(self, given):
+        if self.exact and isinstance(self.joint, AbstractUnilateralConstraint):
+            raise ValueError(
+                f"{self.label}: {self.joint.label} is not a joint; friction of bodies that touch is DryFriction."
+            )
+        part = super().with_numbers(given)
+        return part if self.exact else part.filled(transition_speed=1e-2)
+
+    def components(self):
+        if not self.exact:
+            return (self,)
+        own = fields.values_of(self)
+        return (with_values(ExactFriction, {name: own[name] for name in fields.field_names(ExactFriction)}),)
+
+    def wrenches(self, space, poses, velocities, t):
+        law = lambda x, v: -self.force * jnp.tanh(v / self.transition_speed)
+        return self.force_along(space, poses, velocities, law)
+
+
+class ExactFriction(AbstractScalarPart, AbstractStickSlip):
+    """`JointFriction` that sticks."""
 
     force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", constant=True)
     static_force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", optional=True, constant=True)
@@ -384,24 +432,8 @@ class DryJointFriction(AbstractScalarPart, AbstractStickSlip):
     def joint_name(self):
         return self.coordinate.partition(".")[0]
 
-    def validate(self):
-        if self.static_force is not None and not self.static_force >= self.force:
-            raise ValueError(
-                f"{self.label}: static_force must not be less than force, got {self.static_force} and {self.force}."
-            )
-
     def numbers_agree(self):
         return True if self.static_force is None else self.static_force >= self.force
-
-    def scalar_coordinates(self, space, parts):
-        return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
-
-    def complete(self, space, poses):
-        if isinstance(self.joint, AbstractUnilateralConstraint):
-            raise ValueError(
-                f"{self.label}: {self.joint.label} is not a joint; friction of bodies that touch is DryFriction."
-            )
-        return super().complete(space, poses)
 
     def _slip(self, space, poses, velocities):
         return self.measured_with_rate(space, poses, velocities)[1]

@@ -17,7 +17,7 @@ class Friction(AbstractNonIdeal):
     |---|---|---|
     | `DryFriction`, in a joint or a rigid contact | `coefficient` times the reaction | sticks, with events |
     | `Pulley(friction=…)`, of a `Rope` on a pulley | by the equation of the capstan | sticks, with events |
-    | `DryJointFriction`, on a coordinate | a given `force` or moment | sticks, with events |
+    | `JointFriction(…, exact=True)`, on a coordinate | a given `force` or moment | sticks, with events |
     | `Friction`, in a joint | `coefficient` times the reaction | creeps, smooth |
     | `JointFriction`, on a coordinate | a given `force` or moment | creeps, smooth |
     | `JointSpring(stiffness=0.0)`, on a coordinate | `damping` times the rate | viscous |

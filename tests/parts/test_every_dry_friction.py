@@ -47,7 +47,7 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     rows = np.array(of.rows)[of.n :]
     moves = of.gradients(system, t, q, u)[-directions:] @ u
     friction = FRICTIONS[name][2]
-    constant = isinstance(friction, mb.DryJointFriction)
+    constant = isinstance(friction, mb.JointFriction)
     belt = None if constant else friction.speed
     np.testing.assert_allclose(moves, slip if belt is None else slip + belt, rtol=1e-11)
     touching = (

@@ -17,7 +17,7 @@ RAMP, END = 4.0, 2.0
 RAIL = planar.Prismatic("rail", "ground", "block", axis=(1.0, 0.0), point=(0.0, 0.0))
 BLOCK = planar.Body("block", mass=2.0, inertia=0.1)
 SLIDING = planar.Body("block", mass=2.0, inertia=0.1, velocity=(3.0, 0.0))
-RUB = mb.DryJointFriction("rub", "rail.displacement", force=2.0, static_force=3.0)
+RUB = mb.JointFriction("rub", "rail.displacement", force=2.0, static_force=3.0, exact=True)
 PULLED = mb.Scene([BLOCK], joints=[RAIL], forces=[RUB, mb.JointForce("pull", "rail.displacement", force=0.0)]).compile()
 
 
@@ -70,7 +70,7 @@ def test_a_hinge_in_space_stops_after_full_turns(on):
     wheel = spatial.Body("wheel", mass=1.0, inertia=(0.2, 0.3, inertia), angular_velocity=(0.0, 0.0, spin))
     hinge = spatial.Revolute("hinge", "ground", "wheel", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
     cord = mb.FixedTendon("cord", ("hinge.angle",), coefficients=(radius,))
-    brake = mb.DryJointFriction("brake", on, force=moment if on == "hinge.angle" else moment / radius)
+    brake = mb.JointFriction("brake", on, force=moment if on == "hinge.angle" else moment / radius, exact=True)
     system = mb.Scene([wheel], joints=[hinge, cord], forces=[brake]).compile()
     names = {"brake.force": brake.force, "wheel.inertia": jnp.diag(jnp.array([0.2, 0.3, inertia]))}
 
@@ -101,7 +101,7 @@ def test_a_pendulum_with_coulomb_friction_comes_to_rest_off_its_lowest_point():
     at = (length * np.sin(start), -length * np.cos(start))
     bar = planar.Body("bar", mass=mass, inertia=inertia - mass * length**2, position=at, angle=start)
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
-    rub = mb.DryJointFriction("rub", "pin.angle", force=force, static_force=static)
+    rub = mb.JointFriction("rub", "pin.angle", force=force, static_force=static, exact=True)
     system = mb.Scene([bar], joints=[pin], forces=[rub, mb.Gravity((0.0, -g))]).compile()
     motion = mb.simulate(system, mb.assemble(system), t1=12.0, saveat=[12.0], rtol=1e-10)
 
@@ -152,7 +152,7 @@ def test_a_block_rebounds_from_a_stop_and_sticks():
 
 @pytest.mark.slow
 def test_friction_of_size_zero_does_nothing():
-    none = mb.DryJointFriction("rub", "rail.displacement", force=0.0)
+    none = mb.JointFriction("rub", "rail.displacement", force=0.0, exact=True)
     system = mb.Scene([SLIDING], joints=[RAIL], forces=[none]).compile()
     motion = mb.simulate(system, mb.assemble(system), t1=3.0, saveat=[3.0])
     np.testing.assert_allclose(motion["block"].position[0, 0], 9.0, rtol=1e-10)
@@ -160,19 +160,31 @@ def test_friction_of_size_zero_does_nothing():
 
 
 def test_words_and_numbers():
-    assert "DryJointFriction  rub  of rail, where it sticks 1 row each" in str(PULLED.describe())
+    assert "ExactFriction  rub  of rail, where it sticks 1 row each" in str(PULLED.describe())
     assert {"rub.force", "rub.static_force"} <= set(mb.parameters(PULLED)) and not PULLED.friction_rows.size
     # Without a static force the force of slip holds in stick too.
-    alone = mb.Scene([BLOCK], joints=[RAIL], forces=[mb.DryJointFriction("rub", "rail.displacement", force=1.0)])
+    alone = mb.Scene(
+        [BLOCK], joints=[RAIL], forces=[mb.JointFriction("rub", "rail.displacement", force=1.0, exact=True)]
+    )
     assert mb.with_parameters(alone.compile(), {"rub.force": 0.5}).contact_numbers.limit == 0.5
-    with pytest.raises(
-        ValueError, match="joints must hold constraints, got DryJointFriction 'rub'; it belongs in force"
-    ):
+    with pytest.raises(ValueError, match="joints must hold constraints, got JointFriction 'rub'; it belongs in force"):
         mb.Scene([BLOCK], joints=[RAIL, RUB])
 
 
 BALL = spatial.Body("block", mass=1.0, inertia=(1.0, 1.0, 1.0))
 BAD = {
+    "a width of exact friction": (
+        BLOCK,
+        RAIL,
+        {"force": 1.0, "transition_speed": 0.1},
+        "exact friction has no transition_speed",
+    ),
+    "a static force of smooth friction": (
+        BLOCK,
+        RAIL,
+        {"force": 1.0, "static_force": 2.0, "exact": False},
+        "static_force needs friction that sticks; give exact=True",
+    ),
     "a negative force": (BLOCK, RAIL, {"force": -1.0}, "force must be non-negative, got -1.0"),
     "a limit below it": (
         BLOCK,
@@ -199,7 +211,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input(name):
     body, joint, options, message = BAD[name]
-    rub = mb.DryJointFriction("rub", **({"coordinate": "rail.displacement"} | options))
-    with pytest.raises(ValueError, match="DryJointFriction 'rub'") as caught:
+    rub = mb.JointFriction("rub", **({"coordinate": "rail.displacement", "exact": True} | options))
+    with pytest.raises(ValueError, match="JointFriction 'rub'") as caught:
         mb.Scene([body], joints=[joint], forces=[rub]).compile()
     assert message in str(caught.value)

@@ -69,12 +69,12 @@ FRICTIONS = {
     "brake on a pin": (
         [_body_2d("a"), _body_2d("b", x=1.2, spin=-0.4)],
         [planar.Revolute("joint", "a", "b", point=(0.8, 0.8))],
-        mb.DryJointFriction("rub", "joint.angle", force=0.3, static_force=0.5),
+        mb.JointFriction("rub", "joint.angle", force=0.3, static_force=0.5, exact=True),
     ),
     "seal of a sleeve": (
         [_body_3d("a")],
         [spatial.Cylindrical("joint", "ground", "a", point=(0.0, 0.1, 0.5), axis=(0.6, 0.0, 0.8))],
-        mb.DryJointFriction("rub", "joint.displacement", force=0.3),
+        mb.JointFriction("rub", "joint.displacement", force=0.3, exact=True),
     ),
     "disc on a belt": (
         [_body_2d("a")],
