@@ -18,6 +18,7 @@ from .states.assembly import assemble as assemble
 from .states.gap import assembly_gap as assembly_gap
 from .states.equilibrium import equilibrium as equilibrium
 from .simulate import simulate as simulate
+from .studies.evaluate import evaluate as evaluate
 from .studies.batch import batch as batch
 from .trajectory import Trajectory as Trajectory, load as load
 from .contacts.events import ContactEvents as ContactEvents, Event as Event

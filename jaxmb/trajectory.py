@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._arguments import package_for_tables
 from ._compat import changed, steps_of
@@ -26,10 +27,14 @@ from .formulations.shares import least_multipliers
 from .linalg.arrays import ARRAYS, is_traced
 from .linalg.jitted import jitted
 from .linalg.members import vmap_states
+from .manifold.default import default_manifold
 from .manifold.impulse import after_jumps, next_number
 from .manifold.orthogonal_projection import project_normalized
 from .parts.names import UnknownNameError, unknown
+from .solvers import Adams
+from .system import AbstractSystem
 from .system.instant import Instant
+from .system.picture import Picture, joined_pictures
 from .system.quantities import Reaction, Solved, with_shapes
 
 
@@ -50,6 +55,8 @@ class ConstraintViolation(NamedTuple):
         return f"ConstraintViolation: at most {position:.2g} of positions, {velocity:.2g} 1/s of velocities"
 
 
+# The default solver of a motion.
+_ADAMS = Adams()
 # The number of names that `print` of a motion shows.
 _SHOWN = 12
 
@@ -57,6 +64,10 @@ _SHOWN = 12
 def _listed(names: Sequence[str]) -> str:
     rest_of_names = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
     return f"{', '.join(names[:_SHOWN])}{rest_of_names}"
+
+
+# A later motion may begin this power of the precision from where the first ends, in units of coordinates.
+_MOVED = 0.375
 
 
 class _ByName(Mapping[str, Any]):
@@ -92,17 +103,49 @@ def _of_each_member(view: Callable[..., Any]) -> Callable[..., Any]:
     return of_all
 
 
+def _of_each_stage(view: Callable[..., Any]) -> Callable[..., Any]:
+    """A view of any motion, from a view of a run: the values in its stages, one after the other along time."""
+
+    @functools.wraps(view)
+    def of_all(trajectory, *arguments):
+        if not trajectory.stages:
+            return view(trajectory, *arguments)
+        return _along_time(trajectory, [view(stage, *arguments) for stage in trajectory.stages])
+
+    return of_all
+
+
+def _along_time(trajectory, values):
+    """Values of stages, one after the other along the axis of time."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x, trajectory.ts.ndim - 1), *values)
+
+
 def _view(view: Callable[["Trajectory"], Any]) -> Callable[["Trajectory"], Any]:
-    """A view of any batch of motions, from a view of one motion, compiled once for all runs of a system."""
+    """A view of any batch of motions, from a view of one run, compiled once for all runs of a system."""
     compiled = jitted(_of_each_member(view))
 
     @functools.wraps(view)
     def of_motion(trajectory):
+        states_of(trajectory)
         # The end of a run is not part of the program.
         unused = ("interpolation", "event_mask", "found_events", "closer")
         return compiled(changed(trajectory, stats={}, result=None, **dict.fromkeys(unused)))
 
-    return of_motion
+    return _of_each_stage(of_motion)
+
+
+def states_of(trajectory: "Trajectory") -> State:
+    """The saved states.
+
+    **Raises:** `ValueError` if the run saved something else, or nothing.
+    """
+    # A concrete class: a state consists of its fields.
+    if not isinstance(trajectory.ys, State):
+        saved = "nothing" if trajectory.ys is None else "the values of SaveAt(fn=…) in motion.ys"
+        raise ValueError(
+            f"This motion has no states, since it saved {saved}: let saveat be times, or a diffrax.SaveAt without fn."
+        )
+    return trajectory.ys
 
 
 class Trajectory(eqx.Module):
@@ -120,6 +163,7 @@ class Trajectory(eqx.Module):
     - `result`: how the motion ended.
     - `closer`: the same motion at tighter tolerances, after `error=True`.
     - `stats`: counts of the integration, by name.
+    - `stages`: the runs that were joined by `motion + later`, each with its own `system`; empty for a single run.
 
     **Counts:**
 
@@ -138,8 +182,12 @@ class Trajectory(eqx.Module):
     coordinate and `trajectory["theta_rate"]` its rate, shape (times,). `events` are the events of contacts and dry
     friction, as a table.
 
-    In a batch, which `jax.vmap` of a simulation returns, every field and every view has the batch's axes before the
-    axes given here.
+    **Batches:** `jax.vmap` of a simulation returns a batch. Every field and every view has the batch's axes before the
+    axes given here. `batch[3]` is a member, `batch[2:5]` a smaller batch, `len(batch)` the number of members, and a
+    loop over the batch gets them one by one.
+
+    **Stages:** `motion + later` joins two runs of one system in a motion for tables, pictures and views, such as runs
+    before and after a change of parameters. `simulate(system, motion.end, t0=1.0, t1=2.0)` begins where a motion ended.
     """
 
     system: Any
@@ -152,6 +200,7 @@ class Trajectory(eqx.Module):
     event_mask: Any
     found_events: FoundEvents | None = None
     closer: "Trajectory | None" = None
+    stages: tuple["Trajectory", ...] = ()
 
     def _is_known(self) -> bool:
         """Whether there are numbers to print."""
@@ -162,42 +211,84 @@ class Trajectory(eqx.Module):
         if not self._is_known():
             return super().__repr__()
         ts, steps, ended = (np.asarray(x) for x in (self.ts, self.stats["num_steps"], self.result._value))
-        finite, names = ts[np.isfinite(ts)], list(self)
+        finite, names = ts[np.isfinite(ts)], self._names()
         span = f"t = {finite.min():.6g} to {finite.max():.6g}" if finite.size else "no time"
         if ended.ndim:
             good = np.sum(ended == RESULTS.successful._value)
             text = f"Trajectories of {ended.size} runs of shape {ended.shape}, {good} successful: {span}"
         else:
             text = f"Trajectory: {finite.size} saved from {span} in {steps} steps; {RESULTS[self.result]}"
-        forces = self._force_names()
+        forces = self.force_names()
         force_line = f"\nForces, in motion.forces: {_listed(forces)}" if forces else ""
         return f"{text}\nNames: {_listed(names)}{force_line}"
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: Any) -> Any:
+        if not isinstance(name, str):
+            return self._members(name)
         if name in self.system.catalogue.motion_names():
-            return self.system.catalogue.motion(name, self.ys)
+            return self.system.catalogue.motion(name, states_of(self))
         if name in self:
+            states_of(self)
             return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
-        if name in self._force_names():
+        if name in self.force_names():
             raise UnknownNameError(f"{name!r} is a force: motion.forces[{name!r}] is what it exerts.")
-        raise unknown("body, joint or frame" if self.system.body_names else "coordinate", name, self)
+        raise unknown("body, joint or frame" if self.system.body_names else "coordinate", name, self._names())
 
     def __getattr__(self, name: str) -> Any:
         # JAX and notebooks look for private names; fields are missing while an object is made.
         if not name.startswith("_") and "system" in vars(self):
-            for view, names in (("motion", self), ("motion.forces", self._force_names())):
+            for view, names in (("motion", self._names()), ("motion.forces", self.force_names())):
                 if name in names:
                     raise AttributeError(f"A motion has its parts by their names: {view}[{name!r}].")
         # Python's own error, or the error raised by the property of this name.
         return super().__getattribute__(name)
 
-    def _force_names(self) -> tuple[str, ...]:
+    def force_names(self) -> tuple[str, ...]:
+        """The names in `forces`."""
         return self.system.catalogue.force_names() if self.system.body_names else ()
 
-    def __iter__(self) -> Iterator[str]:
+    def _names(self) -> tuple[str, ...]:
         """The names that `trajectory[name]` takes."""
         parts = (quantity.split(".")[0] for quantity in self.system.quantities())
-        return iter(dict.fromkeys((*self.system.catalogue.motion_names(), *parts)))
+        return tuple(dict.fromkeys((*self.system.catalogue.motion_names(), *parts)))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names()
+
+    @property
+    def _batch(self) -> tuple[int, ...]:
+        """The lengths of the batch's axes."""
+        return np.shape(self.result._value if self.ts is None else self.ts[..., 0])
+
+    def __iter__(self) -> Iterator[Any]:
+        """The names that `trajectory[name]` takes; of a batch, its members."""
+        return (self._members(k) for k in range(self._batch[0])) if self._batch else iter(self._names())
+
+    def __len__(self) -> int:
+        return self._batch[0] if self._batch else len(self._names())
+
+    def _members(self, index) -> "Trajectory":
+        """The members of a batch at an index of its axes, as of an array."""
+        if not self._batch:
+            raise IndexError(
+                f"This is a single motion, which has parts by their names, such as motion[{self._names()[0]!r}]; only "
+                f"a batch has members. Got {index!r}; states at saved times are in motion.ys, the last is motion.end."
+            )
+        if not is_traced(index):
+            # JAX takes the nearest index in place of one outside of an array.
+            np.broadcast_to(False, self._batch)[index]
+        return jax.tree.map(lambda x: _entries(x, index) if isinstance(x, ARRAYS) else x, self)
+
+    def __add__(self, later: "Trajectory") -> "Trajectory":
+        """The motion of both, where the later begins where this one ends: for tables, pictures and views by name.
+
+        Where they meet, the values of the later count. `stats` are sums, and views of each stage are computed with its
+        own system. `at` finds states in the stage of each time, and there is no `error` estimate.
+
+        **Raises:** `ValueError` if the later is not saved where this one ends, begins in another configuration, or has
+        other parts. Under `jit`, where this is unknown, its states are NaN then.
+        """
+        return joined(self, later) if isinstance(later, Trajectory) else NotImplemented
 
     def get(self, name: str, default: Any = None) -> Any:
         """`trajectory[name]`, or the default if there is no such name."""
@@ -231,11 +322,15 @@ class Trajectory(eqx.Module):
         # Not a field, so that a copy with other fields does not have it.
         attributes: Any = vars(self)
         if "_events" not in attributes:
-            events = contact_events(self.system, self.formulation, self.found_events)
+            events = self._events_of_run()
             if is_traced(events):
                 return events
             attributes["_events"] = events
         return attributes["_events"]
+
+    @_of_each_stage
+    def _events_of_run(self):
+        return contact_events(self.system, self.formulation, self.found_events)
 
     @property
     def error(self) -> "GlobalError":
@@ -249,7 +344,9 @@ class Trajectory(eqx.Module):
             )
         return GlobalError(self, self.closer)
 
+    @_of_each_stage
     def _measured(self, names):
+        states_of(self)
         quantities = self.system.quantities()
         chosen = {name: quantities[name] for name in names}
         solved = Solved(*self._solved) if any(quantity.of_forces for quantity in chosen.values()) else None
@@ -263,14 +360,41 @@ class Trajectory(eqx.Module):
         -numpy.inf)` before it. The state is NaN outside of the run, and where Newton's method finds no state on the
         constraints, as within steps that are too long.
         """
-        if self.interpolation is None:
+        if any(run.interpolation is None for run in self.stages or (self,)):
             raise ValueError("at(t) needs simulate(..., saveat=diffrax.SaveAt(dense=True)).")
         return self._at(t)
+
+    @property
+    def end(self) -> State:
+        """The state at the last saved time, from which a further run begins; where a run ended early, the last state
+        that it reached.
+
+        ```python
+        later = jaxmb.simulate(system, motion.end, t0=1.0, t1=2.0)
+        ```
+        """
+        states, numbers = states_of(self), jnp if is_traced(self.ts) else np
+        reached = numbers.isfinite(numbers.asarray(self.ts))
+        if numbers is np and reached[..., -1].all():
+            return _saved(self, -1)[1]
+        last = numbers.maximum(numbers.sum(reached, axis=-1) - 1, 0)[..., None, None]
+        return jax.tree.map(lambda x: jnp.squeeze(jnp.take_along_axis(x, last, -2), -2), states)
 
     @_of_each_member
     def _at(self, t):
         t = jnp.asarray(t, self.system.guess.q.dtype)
-        out = _between(self.system, self.interpolation, t.reshape(-1))
+        runs, flat = self.stages or (self,), t.reshape(-1)
+        # The axis of time points forward along the motion.
+        sign = jnp.sign(self.ts[-1] - self.ts[0]) if self.stages else 1
+        starts = [sign * run.ts[0] for run in runs[1:]]
+        out = None
+        for run, start, next_start in zip(runs, [None, *starts], [*starts, None], strict=True):
+            # Derivatives would be NaN if a stage were asked beyond its ends.
+            inside = flat if next_start is None else sign * jnp.minimum(sign * flat, next_start)
+            inside = inside if start is None else sign * jnp.maximum(sign * inside, start)
+            states = _between(run.system, run.interpolation, inside)
+            begun = True if start is None else (sign * flat >= start)[:, None]
+            out = states if out is None else jax.tree.map(functools.partial(jnp.where, begun), states, out)
         return jax.tree.map(lambda y: y.reshape(t.shape + y.shape[1:]), out)
 
     @property
@@ -303,9 +427,10 @@ class Trajectory(eqx.Module):
         return jax.vmap(lambda y: self.system.angular_momentum(y.q, y.u))(self.ys)
 
     @property
+    @_of_each_stage
     def rates(self) -> Float[Array, "times nq"]:
         """q̇ of every coordinate."""
-        return self.system.catalogue.rates_along(self.ts, self.ys)
+        return self.system.catalogue.rates_along(self.ts, states_of(self))
 
     @property
     def accelerations(self) -> Float[Array, "times nu"]:
@@ -346,9 +471,13 @@ class Trajectory(eqx.Module):
         """
         if self.ts.ndim != 1:
             raise ValueError("undetermined_reactions is of a single motion, not of a batch.")
+        states_of(self)
+        if self.stages:
+            return tuple(sorted({name for stage in self.stages for name in stage.undetermined_reactions}))
         motion = self.trimmed()
         return self.system.catalogue.undetermined(motion.ts, motion.ys)
 
+    @_of_each_stage
     def _reaction(self, name):
         return self.system.catalogue.reaction(name, self.ts, self.ys, self.multipliers)
 
@@ -357,6 +486,7 @@ class Trajectory(eqx.Module):
         """Generalized forces `Aᵀ λ` of the constraints by name, shape (times, nu)."""
         return _ByName("joint", self.system.catalogue.constraint_names(), self._constraint_force)
 
+    @_of_each_stage
     def _constraint_force(self, name):
         return self.system.catalogue.constraint_force(name, self.ts, self.ys, self.multipliers)
 
@@ -370,9 +500,10 @@ class Trajectory(eqx.Module):
         """
         return _ByName("force", self.system.catalogue.force_names(), self._wrenches)
 
+    @_of_each_stage
     def _wrenches(self, name):
         multipliers = None if self.system.ideal else self.multipliers
-        return self.system.catalogue.applied_wrenches(name, self.ts, self.ys, multipliers)
+        return self.system.catalogue.applied_wrenches(name, self.ts, states_of(self), multipliers)
 
     @property
     @_view
@@ -394,18 +525,14 @@ class Trajectory(eqx.Module):
         if isinstance(self.ts, Tracer) or self.ts is None or self.ts.ndim != 1:
             return self
         finite = np.isfinite(np.asarray(self.ts))
-        if finite.all():
-            return self
-        # By NumPy, since JAX would compile a program for each number of times; but not for traced arrays.
-        kept = lambda x: x[finite] if isinstance(x, Tracer) else jnp.asarray(np.asarray(x)[finite])
-        ts, ys = jax.tree.map(kept, (self.ts, self.ys))
-        return changed(self, ts=ts, ys=ys)
+        return self if finite.all() else at_rows(self, np.flatnonzero(finite))
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Arrays by name: `t`, `q`, `u`, `energy`, `"crank.angle"`, …, and `stats.…`."""
-        out = {"t": np.asarray(self.ts), "q": np.asarray(self.ys.q), "u": np.asarray(self.ys.u)}
-        if self.ys.z is not None:
-            out["z"] = np.asarray(self.ys.z)
+        states = states_of(self)
+        out = {"t": np.asarray(self.ts), "q": np.asarray(states.q), "u": np.asarray(states.u)}
+        if states.z is not None:
+            out["z"] = np.asarray(states.z)
         free = [name for name, quantity in self.system.quantities().items() if not quantity.of_forces]
         out |= {name: np.asarray(value) for name, value in self._measured(free).items()}
         out["energy"] = np.asarray(self.energy)
@@ -418,20 +545,31 @@ class Trajectory(eqx.Module):
         """An `xarray.Dataset` with the dimension `t` [s] and a variable for each quantity.
 
         Vectors have the dimension `axis` as well, with the coordinates x, y and z; Euler parameters have the dimension
-        `euler_parameter`. `read_measurements` reads such a Dataset.
+        `euler_parameter`. `read_measurements` reads such a Dataset of a single motion.
+
+        A batch has the dimension `member` before them, or `member_0`, `member_1`, … If its members are saved at
+        different times, the dimension of time is `save`, and `t` is a coordinate along members and saves.
 
         **Arguments:** `names` of quantities, as `quantity` takes them, and `"energy"`; default the energy and all
         quantities but forces and accelerations.
 
-        **Raises:** `ImportError` without xarray, which `jaxmb[studies]` installs; `ValueError` for a batch.
+        **Raises:** `ImportError` without xarray, which `jaxmb[studies]` installs.
         """
         xarray, values = package_for_tables("xarray", "jaxmb[studies]"), self._table(names)
-        components = _components(values)
+        ts, batch = np.asarray(self.ts), len(self._batch)
+        members = ("member",) if batch == 1 else tuple(f"member_{k}" for k in range(batch))
+        times = ts.reshape(-1, ts.shape[-1])
+        # Members that ended early have infinite times there.
+        longest = times[np.argmax(np.sum(np.isfinite(times), axis=1))]
+        shared = bool(np.all(~np.isfinite(times) | (times == longest)))
+        along = (*members, "t" if shared else "save")
+        components = _components(values, batch + 1)
         variables = {
-            name: (("t",) if value.ndim == 1 else ("t", components[value.shape[1]][0]), value)
+            name: ((*along, *(components[size][0] for size in value.shape[batch + 1 :])), value)
             for name, value in values.items()
         }
-        out = xarray.Dataset(variables, {"t": np.asarray(self.ts), **dict(components.values())})
+        t = ("t", longest) if shared else (along, ts)
+        out = xarray.Dataset(variables, {"t": t, **dict(components.values())})
         out["t"].attrs["units"] = "s"
         return out
 
@@ -443,8 +581,13 @@ class Trajectory(eqx.Module):
 
         **Raises:** `ImportError` without pandas; `ValueError` for a batch.
         """
+        if self._batch:
+            raise ValueError(
+                f"A table shows a single motion, and this is a batch of shape {self._batch}; choose a member, such as "
+                "batch[0], or take batch.to_xarray()."
+            )
         pandas, values = package_for_tables("pandas", "pandas"), self._table(names)
-        components, columns = _components(values), {"t": np.asarray(self.ts)}
+        components, columns = _components(values, 1), {"t": np.asarray(self.ts)}
         for name, value in values.items():
             if value.ndim == 1:
                 columns[name] = value
@@ -454,12 +597,7 @@ class Trajectory(eqx.Module):
         return pandas.DataFrame(columns)
 
     def _table(self, names: Sequence[str] | None) -> dict[str, np.ndarray]:
-        """Quantities by name, shape (times,) or (times, components)."""
-        if self.ts.ndim != 1:
-            raise ValueError(
-                f"A table shows a single motion, and this is a batch of shape {self.ts.shape[:-1]}; choose a member, "
-                "such as jax.tree.map(lambda leaf: leaf[0], trajectory)."
-            )
+        """Quantities by name, shape (times,) or (times, components), after the batch's axes."""
         quantities = self.system.quantities()
         if names is None:
             names = ["energy", *(name for name, quantity in quantities.items() if not quantity.of_forces)]
@@ -482,6 +620,136 @@ class Trajectory(eqx.Module):
                 f"Trajectory.save writes .npz, got {str(path)!r}; to_pandas() and to_xarray() are for other files."
             )
         np.savez_compressed(path, allow_pickle=False, **self.to_dict())  # pyright: ignore[reportArgumentType]
+
+
+def still(system: AbstractSystem, state: State, t: Any = 0.0) -> Trajectory:
+    """One state as a motion that is saved at one time, for its views."""
+    ts, ys = jax.tree.map(lambda y: _entries(y, None), (jnp.asarray(t, state.q.dtype), state))
+    formulation = default_manifold(system, _ADAMS, None).default_formulation(system)
+    return Trajectory(system, formulation, ts, ys, {}, RESULTS.successful, None, None)
+
+
+def at_rows(trajectory: Trajectory, rows: Int[np.ndarray, "n"]) -> Trajectory:
+    """A single motion at some of its saved times, in the order of time or against it."""
+    ts, ys = jax.tree.map(lambda x: _entries(x, rows), (trajectory.ts, trajectory.ys))
+    ends = np.cumsum([0, *(stage.ts.size for stage in trajectory.stages)])
+    of_stages = [rows[(rows >= first) & (rows < last)] - first for first, last in itertools.pairwise(ends)]
+    stages = [at_rows(stage, own) for stage, own in zip(trajectory.stages, of_stages, strict=True)]
+    backward = rows.size > 1 and rows[0] > rows[-1]
+    return changed(trajectory, ts=ts, ys=ys, stages=tuple(reversed(stages) if backward else stages))
+
+
+def picture_of(trajectory: Trajectory) -> Picture:
+    """The bodies and parts of a single motion, for a picture."""
+    pictures = [run.system.catalogue.picture(run.ts, states_of(run)) for run in trajectory.stages or (trajectory,)]
+    return pictures[0] if len(pictures) == 1 else joined_pictures(pictures)
+
+
+def joined(first: Trajectory, later: Trajectory) -> Trajectory:
+    """The motion of two runs, as `first + later`."""
+    first, later = (motion.trimmed() for motion in (first, later))
+    _check_parts(first, later)
+    apart = _apart(first.system, _saved(first, -1), _saved(later, 0))
+    if is_traced(apart):
+        # Under `jit` nothing can be raised.
+        meets = functools.reduce(jnp.logical_and, [jnp.all(x <= 1, axis=-1) for x in apart])[..., None, None]
+        later = changed(later, ys=jax.tree.map(lambda y: jnp.where(meets, y, jnp.nan), later.ys))
+    else:
+        _check_meeting(first, later, *(np.asarray(x) for x in apart))
+    *before, last = first.stages or (first,)
+    # At the time of a change, the values after it are saved.
+    before_end = lambda y: _entries(y, (..., slice(None, -1), slice(None)))
+    last = changed(last, ts=_entries(last.ts, (..., slice(None, -1))), ys=jax.tree.map(before_end, last.ys))
+    runs = tuple(changed(run, closer=None) for run in (*before, last, *(later.stages or (later,))))
+    ts, ys = jax.tree.map(lambda *x: jnp.concatenate(x, first.ts.ndim - 1), *((run.ts, run.ys) for run in runs))
+    return changed(
+        later,
+        ts=ts,
+        ys=ys,
+        stats=_sums(first.stats, later.stats),
+        result=_first_failure(first.result, later.result),
+        closer=None,
+        interpolation=None,
+        stages=runs,
+    )
+
+
+def _entries(x, index):
+    """Entries of an array; of a concrete one by NumPy, since JAX would compile a program for each index and shape."""
+    return x[index] if is_traced((x, index)) else jnp.asarray(np.asarray(x)[index])
+
+
+def _saved(motion, k):
+    """A saved time, and the state at it."""
+    entry = lambda y: _entries(y, (..., k, slice(None)))
+    return _entries(motion.ts, (..., k)), jax.tree.map(entry, states_of(motion))
+
+
+def _first_failure(first, later):
+    """The later result, unless the first run failed."""
+    if np.ndim(first._value):
+        return eqx.filter_vmap(_first_failure)(first, later)
+    return RESULTS.where((first == RESULTS.successful) | (first == RESULTS.event_occurred), later, first)
+
+
+def _sums(first, later):
+    """The sums of the counts that both runs have."""
+    both = {name: (jnp.asarray(first[name]), jnp.asarray(later[name])) for name in first if later.get(name) is not None}
+    counts = lambda x, y: x.shape == y.shape and jnp.issubdtype(x.dtype, jnp.integer)
+    return {name: x + y for name, (x, y) in both.items() if counts(x, y)}
+
+
+def _apart(system, end, start):
+    """How far a later motion begins from where the first ends, in time, coordinates and turns; at most 1 if they meet.
+
+    A return to the constraints may have moved coordinates a little.
+    """
+    if end[0].ndim:
+        return eqx.filter_vmap(_apart)(system, end, start)
+    (t0, y0), (t1, y1) = end, start
+    listed = np.unique([k for index in system.coordinate_names().values() for k in index])
+    eps, largest = float(jnp.finfo(t0.dtype).eps), jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    late = jnp.where(t0 == t1, 0.0, jnp.abs(t1 - t0) / (8 * eps * largest))
+    moved = (jnp.abs(y1.q - y0.q) / (eps**_MOVED * system.coordinate_scale()))[listed]
+    turned = jnp.zeros(0, t0.dtype) if y0.angles is None else jnp.abs(y1.angles - y0.angles) / np.pi
+    return late[None], moved, turned
+
+
+def _check_parts(first, later):
+    """Raise a `ValueError` for motions of systems with other parts, and of other batches."""
+    names = lambda motion: (*motion.system.quantities(), *(f"{name}[{k}]" for name, k in motion.system.rows))
+    if names(first) != names(later):
+        others = sorted({*names(first)} ^ {*names(later)}) or ["the same parts in another order"]
+        raise ValueError(f"Motions of one system can be joined, and one of these has {_listed(others)}.")
+    forms = [jax.tree.map(lambda y: y.shape[:-2], states_of(motion)) for motion in (first, later)]
+    if forms[0] != forms[1]:
+        raise ValueError(f"These motions save other numbers or are batches of other shapes: {forms[0]} and {forms[1]}.")
+
+
+def _check_meeting(first, later, *apart):
+    """Raise a `ValueError` if a later motion does not begin where the first ends; arguments as from `_apart`."""
+    late, moved, turned = (~(x <= 1) for x in apart)
+    if late.ndim > 1:
+        for k in range(late.shape[0]):
+            _check_meeting(first[k], later[k], *(x[k] for x in apart))
+        return
+    (t0, y0), (t1, y1) = _saved(first, -1), _saved(later, 0)
+    if np.any(late):
+        raise ValueError(
+            f"The first motion is saved until t = {float(t0):.6g}, and the later from t = {float(t1):.6g} on: save "
+            "both at the time where they meet, as by saveat=numpy.linspace(t0, t1, 101)."
+        )
+    names = first.system.coordinate_names()
+    if np.any(moved):
+        k = np.unique([k for index in names.values() for k in index])[np.argmax(moved)]
+        name = min((name for name, index in names.items() if k in index), key=lambda name: len(names[name]))
+        raise ValueError(
+            f"The later motion begins elsewhere: {name!r} is {float(y0.q[k]):.6g} where the first ends, and "
+            f"{float(y1.q[k]):.6g} where the later begins; start it from motion.end."
+        )
+    if np.any(turned):
+        name = first.system.wrapped_angle_names()[np.argmax(turned)]
+        raise ValueError(f"The later motion counts the turns of {name!r} anew; start it from motion.end.")
 
 
 class PartMotion:
@@ -548,9 +816,9 @@ class GlobalError(NamedTuple):
         return _distance(observed(self.motion), observed(self.closer))
 
 
-def _components(values: Mapping[str, np.ndarray]) -> dict[int, tuple[str, list[Any]]]:
-    """For each number of components of a quantity, the name of the dimension and the labels along it."""
-    sizes = sorted({value.shape[1] for value in values.values() if value.ndim > 1})
+def _components(values: Mapping[str, np.ndarray], axis: int) -> dict[int, tuple[str, list[Any]]]:
+    """For each number of components of a quantity along an axis, the name of the dimension and the labels along it."""
+    sizes = sorted({value.shape[axis] for value in values.values() if value.ndim > axis})
     # The number of components of vectors is the dimension of space.
     names = {4: "euler_parameter", 3 if 3 in sizes else 2: "axis"}
     labels = lambda size: list("xyz"[:size]) if names.get(size) == "axis" else list(range(size))

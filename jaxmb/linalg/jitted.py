@@ -17,7 +17,7 @@ _Result = TypeVar("_Result")
 
 _NO_TRACE = current_trace()
 # Programs that are called a few times then compile in half the time.
-_FOR_FEW_CALLS = {"xla_backend_optimization_level": 0}
+FOR_FEW_CALLS = {"xla_backend_optimization_level": 0}
 
 
 def jitted(
@@ -55,7 +55,7 @@ def jitted(
 
 def on_host(function: Callable[_Arguments, Any]) -> Callable[_Arguments, Any]:
     """`jitted` for concrete numbers and a few calls, with a result in NumPy, even while JAX traces something else."""
-    program = jitted(function, _FOR_FEW_CALLS)
+    program = jitted(function, FOR_FEW_CALLS)
 
     @functools.wraps(function)
     def called(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:

@@ -12,6 +12,7 @@ import functools
 import importlib
 import inspect
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -304,9 +305,40 @@ def _documented(classes: Iterable[type]) -> dict[str, Any]:
     return documented
 
 
+@functools.cache
+def results() -> dict[str, Entry]:
+    """Entries of the classes without a public name that public names return or explain, such as `Reaction`, by their
+    names.
+    """
+    out = {}
+    for entry in entries().values():
+        for each in (entry, *members(entry)) if entry.kind == "class" else (entry,):
+            for name in _classes_named(each):
+                thing = _class_of(name, each.thing)
+                if name not in _by_short_name() and thing is not None:
+                    out[name] = Entry(f"{thing.__module__.removeprefix(f'{PACKAGE}.')}.{name}", thing)
+    return out
+
+
+def _classes_named(entry: Entry) -> list[str]:
+    """The capitalised words of an annotation of the result, and of the code in a docstring."""
+    thing, made = entry.thing, signature(entry)
+    returns = thing.fget.__annotations__.get("return", "") if isinstance(thing, property) else ""
+    returns = made.return_annotation if made else returns
+    return [*re.findall(r"`([A-Z]\w+)`", entry.text), *re.findall(r"\b[A-Z]\w+", str(returns))]
+
+
+def _class_of(name: str, user: Any) -> type | None:
+    """The documented class of this package that a name means in the module of its user, or else in any module."""
+    using = sys.modules.get(getattr(inspect.unwrap(getattr(user, "fget", user)), "__module__", ""))
+    modules = [using] if name in vars(using or object) else [m for k, m in sys.modules.items() if k.startswith(PACKAGE)]
+    things = [vars(module).get(name) for module in modules]
+    return next((x for x in things if inspect.isclass(x) and x.__module__.startswith(PACKAGE) and x.__doc__), None)
+
+
 def find(name: str) -> Entry:
-    """The entry of a public name, with or without `jaxmb.` or `mb.`. The module may be left out if no other module has
-    the name, as in `four_bar`.
+    """The entry of a public name, with or without `jaxmb.` or `mb.`, or of a class that public names return. The module
+    may be left out if no other module has the name, as in `four_bar`.
 
     **Raises:** `UnknownNameError` with the nearest names; `ValueError` for a name of several modules.
     """
@@ -342,7 +374,7 @@ def _found(name: str) -> Entry | None:
     if len(same) > 1:
         listed = " and ".join(repr(entry.name) for entry in same)
         raise ValueError(f"{name!r} is the name of {listed}; give one of these.")
-    return same[0] if same else None
+    return same[0] if same else results().get(name)
 
 
 @functools.cache
@@ -356,7 +388,8 @@ def _by_short_name() -> dict[str, list[Entry]]:
 def _shortest_names() -> list[str]:
     """The shortest names by which entries are found."""
     by_short = _by_short_name()
-    return [entry.short if len(by_short[entry.short]) == 1 else entry.name for entry in entries().values()]
+    public = [entry.short if len(by_short[entry.short]) == 1 else entry.name for entry in entries().values()]
+    return [*public, *results()]
 
 
 def _every_member(entry: Entry) -> tuple[Entry, ...]:

@@ -205,6 +205,10 @@ def _actuated(motion: Any) -> tuple[Any, Any, tuple[Drive, ...], tuple[Any, ...]
 
     Only inverse dynamics has actuators apart from the system.
     """
+    if motion.stages:
+        raise ValueError(
+            "loads takes a single run; motion.stages are the runs of a joined motion, each with its system."
+        )
     return motion.trimmed(), motion.system, (), ()
 
 

@@ -1,5 +1,6 @@
 """The contents of a picture of a motion: bodies, parts, shapes and paths."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,3 +47,15 @@ class Picture(NamedTuple):
     paths: dict[str, Line]
     centres: dict[str, Float[np.ndarray, "3"]]
     inertias: dict[str, tuple[float, Float[np.ndarray, "3 3"]]]
+
+
+def joined_pictures(pictures: Sequence[Picture]) -> Picture:
+    """The picture of a motion of several stages: poses and paths follow each other, all else is of the last stage."""
+    follow = lambda values: {name: np.concatenate([own[name] for own in values]) for name in values[0]}
+    points = follow([{name: line.points for name, line in own.paths.items()} for own in pictures])
+    last = pictures[-1]
+    return last._replace(
+        positions=follow([own.positions for own in pictures]),
+        orientations=follow([own.orientations for own in pictures]),
+        paths={name: line._replace(points=points[name]) for name, line in last.paths.items()},
+    )

@@ -27,7 +27,8 @@ def of_structure(function: Callable[[Any], dict[str, Any]]) -> Callable[[Any], d
 
     @functools.wraps(function)
     def called(of: Any) -> dict[str, Any]:
-        (leaves, structure), batch = jax.tree.flatten(of.system), of.system.length.ndim
+        # The scales of a user's system may be plain numbers, which have no axes.
+        (leaves, structure), batch = jax.tree.flatten(of.system), of.system.guess.q.ndim - 1
         shapes = (jax.ShapeDtypeStruct(x.shape[batch:], x.dtype) if isinstance(x, ARRAYS) else x for x in leaves)
         return dict(computed(type(of), structure, tuple(shapes)))
 

@@ -8,7 +8,7 @@ from .._arguments import whole_number
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
 from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, picture_of
 from .figure import new_figure
 from .meshes import heights
 from .one_motion import check_finite, one_motion
@@ -52,7 +52,7 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
         )
     trajectory = one_motion(trajectory, "plot_mechanism", 1)
     check_finite(trajectory)
-    picture = trajectory.system.catalogue.picture(trajectory.ts, trajectory.ys)
+    picture = picture_of(trajectory)
     shapes = solids(picture, {}, None)
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))

@@ -5,7 +5,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -14,7 +13,7 @@ from ..parts.names import unknown
 from ..parts.shapes import DARK, AbstractShape, Color, along
 from ..system import AbstractSystem
 from ..system.picture import Picture
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, at_rows, picture_of
 from . import stage
 from .meshes import Triangles, unit_mesh
 from .one_motion import check_finite, one_motion
@@ -184,7 +183,7 @@ def motion(
     tint: Color | None,
 ) -> Motion:
     """A motion with its shapes; arguments as in `solids`."""
-    shown = trajectory.system.catalogue.picture(trajectory.ts, trajectory.ys)
+    shown = picture_of(trajectory)
     return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
 
 
@@ -215,8 +214,7 @@ def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
     near = np.clip(np.searchsorted(ts, wanted), 1, ts.size - 1)
     near = near - (wanted - ts[near - 1] < ts[near] - wanted)
     rows = order if ts.size <= frames else order[np.unique(near)]
-    ys = jax.tree.map(lambda y: np.asarray(y)[rows], trajectory.ys)
-    selection = dataclasses.replace(trajectory, ts=jax.numpy.asarray(trajectory.ts)[rows], ys=jax.device_put(ys))
+    selection = at_rows(trajectory, rows)
     check_finite(selection)
     return selection
 

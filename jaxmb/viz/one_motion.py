@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from .._results import RESULTS
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, states_of
 
 
 def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
@@ -12,14 +12,14 @@ def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
 
     **Arguments:** `name` of the picture, for messages; `least`: the number of times that it needs.
 
-    **Raises:** `ValueError` for a batch, and for a motion that was saved at fewer times.
+    **Raises:** `ValueError` for a batch, for a motion without states, and for one that was saved at fewer times.
     """
-    if trajectory.ts is None or trajectory.ts.ndim != 1:
-        shape = () if trajectory.ts is None else trajectory.ts.shape[:-1]
+    states_of(trajectory)
+    if trajectory.ts.ndim != 1:
+        shape = trajectory.ts.shape[:-1]
         raise ValueError(
             f"{name} shows single motions, but this is a batch of shape {shape}; choose members of it, such as "
-            "jax.tree.map(lambda leaf: leaf[0], trajectory), and show them one by one; viz.show takes a list or a "
-            "dictionary of them."
+            "batch[0], and show them one by one; viz.show takes a list or a dictionary of them."
         )
     trimmed = trajectory.trimmed()
     if trimmed.ts.shape[0] < least:

@@ -1,12 +1,13 @@
 """Public names: each has one entry with a docstring, and is found by what users call it."""
 
+import importlib
 import inspect
 
 import pytest
 
 import jaxmb as mb
 from jaxmb.reference import find, listed, shown, subjects, topics
-from jaxmb.reference.entries import entries, public_modules, public_names, signature
+from jaxmb.reference.entries import entries, public_modules, public_names, results, signature
 
 MODULES = {"": mb, **public_modules()}
 
@@ -86,6 +87,32 @@ def test_names_are_found(given, name):
 def test_unknown_names(given, message):
     with pytest.raises(ValueError, match=message):
         find(given)
+
+
+@pytest.mark.parametrize(
+    ("given", "name", "text"),
+    [
+        ("PartMotion", "trajectory.PartMotion", "The measurable quantities of a joint or a frame along a motion"),
+        ("jaxmb.Reaction", "system.quantities.Reaction", "The force that a joint exerts on its last body"),
+        ("BodyMotion", "system.quantities.BodyMotion", "Motion of one body"),
+        ("GlobalError", "trajectory.GlobalError", "The estimated global error"),
+        ("HeldOut", "studies.identify.prediction.HeldOut", "The quality of prediction"),
+        ("Mode", "studies.linear.linearisation.Mode", ""),
+    ],
+)
+def test_classes_that_public_names_return_have_help(given, name, text):
+    entry = find(given)
+    assert entry.name == name and text in shown(entry)
+    module, _, short = f"jaxmb.{name}".rpartition(".")
+    assert getattr(importlib.import_module(module), short) is entry.thing
+
+
+def test_every_class_in_the_annotation_of_a_public_result_is_found():
+    assert {"Quantity", "ConstraintViolation", "Prediction", "Chart"} <= results().keys()
+    for name, entry in results().items():
+        assert find(name) is entry and entry.kind == "class" and not entry.short.startswith("_")
+    with pytest.raises(mb.UnknownNameError, match="did you mean 'Reaction'"):
+        find("Reactoin")
 
 
 def test_signatures_are_those_of_the_source():

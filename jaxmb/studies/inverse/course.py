@@ -28,7 +28,7 @@ from ...states.assembly import configuration
 from ...states.closest import tolerance
 from ...system import AbstractSystem
 from ...system.quantities import directions
-from ...trajectory import Trajectory
+from ...trajectory import Trajectory, states_of
 from ..identify.measurements import have_times
 
 # The number of corrections of velocities for constraints that are not linear in them.
@@ -52,7 +52,7 @@ class Course(NamedTuple):
 
 def recorded(system: AbstractSystem, motion: Trajectory) -> Course:
     """The motion of a trajectory, with the internal states of the `system`."""
-    if motion.ts.ndim != 1:
+    if states_of(motion).q.ndim != 2:
         raise ValueError(
             "required_forces takes a single motion; jax.vmap(lambda motion: …)(motions) takes each member of a batch."
         )
