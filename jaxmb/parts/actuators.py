@@ -10,14 +10,16 @@ from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from . import fields
 from .base import AbstractDynamicForce
-from .coordinate_parts import AbstractCoordinatePart, AbstractScalarPart
+from .coordinate_parts import AbstractCoordinateForce, AbstractScalarPart
+from .curves import over_arrays
 from .kinks import clipped
 
 
-class Motor(AbstractCoordinatePart, AbstractDynamicForce):
+class Motor(AbstractCoordinateForce, AbstractDynamicForce):
     """A motor on a joint's coordinate that follows a command with lag and within a limit.
 
     ```python
@@ -72,12 +74,17 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
         part = self.filled(gain=0.0)
         return part.with_fields(force=fields.as_parameter(np.broadcast_to(self.force, given.shape)))
 
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: self.force.reshape(-1)
-        return self.force_along(space, poses, velocities, law)
+    def law(self, x, v):
+        return self.force.reshape(-1)
 
-    def state_rates(self, space, poses, velocities, t):
-        x, v = self.measured_with_rate(space, poses, velocities)
+    def curve(self, value: ArrayLike = 0.0, rate: ArrayLike = 0.0) -> Float[Array, "..."]:
+        """The demanded force [N m, N], which the force of the motor follows, at values [rad, m] and rates [rad/s, m/s]
+        of a coordinate that is a number: arrays that broadcast.
+        """
+        return over_arrays(self.label, _demanded, self, value=value, rate=rate)
+
+    def demand(self, x: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
+        """The demanded force at the coordinate and its rate, raveled."""
         if self.mode == "force":
             demand = self.command.reshape(-1)
         elif self.mode == "speed":
@@ -86,6 +93,10 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
             demand = -self.gain * self.shortest_difference(x, self.command) - self.damping * v
         if self.limit is not None:
             demand = self.limit * jnp.tanh(demand / self.limit)
+        return demand
+
+    def state_rates(self, space, poses, velocities, t):
+        demand = self.demand(*self.measured_with_rate(space, poses, velocities))
         return {"force": (demand.reshape(self.force.shape) - self.force) / self.lag}
 
     def state_sizes(self):
@@ -94,7 +105,11 @@ class Motor(AbstractCoordinatePart, AbstractDynamicForce):
         return {"force": jnp.where(size > 0, size, 1.0)}
 
 
-class Actuator(AbstractScalarPart, AbstractDynamicForce):
+def _demanded(motor, value, rate):
+    return motor.demand(value[None], rate[None])[0]
+
+
+class Actuator(AbstractCoordinateForce, AbstractScalarPart, AbstractDynamicForce):
     """An actuator with a control: a motor, or a position or velocity servo, with a gear.
 
     ```python
@@ -151,12 +166,13 @@ class Actuator(AbstractScalarPart, AbstractDynamicForce):
         reads_angle = (self.gain[..., 1] != 0) | (self.bias[..., 1] != 0)
         return jnp.where(reads_angle, self.middle, jnp.nan)
 
-    def wrenches(self, space, poses, velocities, t):
-        def law(x, v):
-            x = self.near(x, self.middle)
-            return self.gear * self.force(self.gear * x[0], self.gear * v[0])[None]
+    def law(self, x, v):
+        x = self.near(x, self.middle)
+        return self.gear * self.force(self.gear * x[0], self.gear * v[0])[None]
 
-        return self.force_along(space, poses, velocities, law)
+    def _in_itself(self):
+        # The activation follows the control, which takes its place.
+        return self.with_fields(lag=None, activation=None)
 
     def state_rates(self, space, poses, velocities, t):
         return {} if self.lag is None else {"activation": (self._clipped_control() - self.activation) / self.lag}

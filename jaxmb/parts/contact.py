@@ -18,17 +18,18 @@ penetration depth, so contact adds no constraint and no event.
 
 import abc
 import itertools
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractLaw, AbstractPotentialForce
 from .boundary import check_returns
+from .curves import over_arrays
 from .forces import over_ground
 from .shapes import Ground
 from .smooth import dry_friction, ramp, step, without_pull
@@ -262,14 +263,40 @@ class AbstractContact(AbstractPotentialForce):
         """Depth of the lowest point of a body, smoothed."""
         return ramp(radius - self.distance(centre), self.smoothing)
 
+    def _pressed(self, depth, load, spring, rising):
+        """The share of the damping, the force of damping, and the load of friction; from the smoothed depth, the `load`
+        of the normal law there, the force of the spring and the velocity along the normal.
+        """
+        engaged = self.onset(depth / self.damping_depth)
+        return engaged, *self.pressing(spring, -self.damping * engaged * rising, load)
+
+    def forces(
+        self, *, depth: ArrayLike, rate: ArrayLike = 0.0, slip: ArrayLike = 0.0, travel: ArrayLike = 0.0
+    ) -> "ContactForces":
+        """The forces of even ground on a body, without a machine: the laws of a motion.
+
+        ```python
+        laws = {"normal": jaxmb.contact.Linear(1e5), "friction": jaxmb.contact.Coulomb(0.8, transition_speed=0.01)}
+        ground = planar.Contact("ground contact", "wheel", terrain=jaxmb.terrain.Flat(), radius=0.3, **laws)
+        forces = ground.forces(depth=np.linspace(0.0, 0.02, 101), slip=0.1)
+        forces.normal, forces.friction
+        ```
+
+        **Arguments:** numbers or arrays that broadcast. `depth` [m] of the body's lowest point below the ground,
+        negative above it, and its `rate` [m/s]; along a line in the ground the `slip` velocity [m/s] of the lowest
+        point and the velocity `travel` of its centre, which only `Janosi` asks for.
+
+        **Returns:** `ContactForces`.
+        """
+        return over_arrays(self.label, _on_even_ground, self, depth=depth, rate=rate, slip=slip, travel=travel)
+
     def _wrench(self, space, pose, velocity, point, radius):
         centre = space.point(pose, point)
         travel = over_ground(self, centre, space.point_velocity(pose, velocity, point))
         depth, gradient = jax.value_and_grad(self._depth)(centre, radius)
         load, normal = self.normal.force(depth), self.outward(centre)
-        engaged, spring = self.onset(depth / self.damping_depth), -load * gradient
-        damping = -self.damping * engaged * jnp.dot(travel, normal)
-        damping, load = self.pressing(jnp.dot(spring, normal), damping, load)
+        spring = -load * gradient
+        engaged, damping, load = self._pressed(depth, load, jnp.dot(spring, normal), jnp.dot(travel, normal))
         # A normal force has the same wrench at the centre as at the lowest point.
         wrench = space.point_force(pose, point, spring + damping * normal)
         if self.friction is None:
@@ -279,6 +306,27 @@ class AbstractContact(AbstractPotentialForce):
         slip = along(over_ground(self, centre, space.point_velocity(pose, velocity, lowest)))
         friction = self.friction.force(load, engaged, slip, along(travel))
         return wrench + space.point_force(pose, lowest, friction)
+
+
+class ContactForces(NamedTuple):
+    """Forces of the ground on a body.
+
+    **Fields:** `normal` [N], of spring and damping, away from the ground; `friction` [N] along the line of the slip,
+    zero without friction.
+    """
+
+    normal: Float[Array, "..."]
+    friction: Float[Array, "..."]
+
+
+def _on_even_ground(contact, depth, rate, slip, travel):
+    smoothed, slope = jax.value_and_grad(ramp)(depth, contact.smoothing)
+    load = contact.normal.force(smoothed)
+    spring = load * slope
+    engaged, damping, load = contact._pressed(smoothed, load, spring, -rate)
+    if contact.friction is None:
+        return ContactForces(spring + damping, jnp.zeros_like(spring))
+    return ContactForces(spring + damping, contact.friction.force(load, engaged, slip[None], travel[None])[0])
 
 
 class Contact(AbstractContact):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from . import fields
 from .base import (
@@ -22,6 +22,7 @@ from .base import (
     KnownParts,
     Wrenches,
 )
+from .curves import check_given, over_arrays
 from .drivers import AbstractDriver
 from .forces import generalized_force
 from .names import unknown
@@ -129,7 +130,8 @@ class AbstractOfCoordinates(AbstractOfJoints):
 
     def is_periodic(self, k: int = 0) -> bool:
         """Whether a coordinate is an angle known up to full turns."""
-        return self.within[k] in self.joints[str(k)].periodic
+        # A part outside of a scene does not know its joint.
+        return bool(self.joints) and self.within[k] in self.joints[str(k)].periodic
 
 
 class AbstractCoordinatePart(AbstractOfCoordinates):
@@ -181,7 +183,7 @@ class AbstractCoordinatePart(AbstractOfCoordinates):
     def shortest_difference(self, value: Float[Array, "n"], target: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """`value − target`, wrapped to [−π, π] for any angle."""
         out = value - target.reshape(-1)
-        return shortest(out) if self.within[0] in self.joint.angles else out
+        return shortest(out) if self.joints and self.within[0] in self.joint.angles else out
 
     def near(self, value: Float[Array, "n"], middle: Float[Array, "*shape"]) -> Float[Array, "n"]:
         """The value; an angle known up to full turns is wrapped to within half a turn of `middle`."""
@@ -207,6 +209,42 @@ class AbstractCoordinatePart(AbstractOfCoordinates):
             )
 
 
+class AbstractCoordinateForce(AbstractCoordinatePart):
+    """A part that exerts a force along a coordinate, which its value and its rate determine."""
+
+    @abc.abstractmethod
+    def law(self, x: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
+        """The generalized force along the coordinate, from its value and its rate, raveled."""
+
+    def wrenches(self, space, poses, velocities, t):
+        return self.force_along(space, poses, velocities, self.law)
+
+    def curve(self, value: ArrayLike = 0.0, rate: ArrayLike = 0.0) -> Float[Array, "..."]:
+        """The generalized force [N m, N] along the coordinate, positive where it increases the coordinate: the law of a
+        motion, without a machine.
+
+        ```python
+        spring = jaxmb.JointSpring("spring", "pin.angle", stiffness=20.0, damping=0.5, free=0.0)
+        forces = spring.curve(np.linspace(-1.0, 1.0, 101), rate=0.3)
+        ```
+
+        **Arguments:** `value` [rad, m] and `rate` [rad/s, m/s] of the coordinate, numbers or arrays that broadcast. An
+        angle counts as it is, without the turns that a joint in space takes off. The control of an actuator with a lag
+        acts at once.
+
+        **Raises:** `ValueError` for other arguments, and for a number that the part gets from a scene only.
+        """
+        return over_arrays(self.label, _force_at, self._in_itself(), value=value, rate=rate)
+
+    def _in_itself(self):
+        """The part with all numbers that the law needs."""
+        return self
+
+
+def _force_at(part, value, rate):
+    return part.law(value[None], rate[None])[0]
+
+
 def shortest(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The angle [rad] wrapped to [−π, π]."""
     return angle - turns(angle)
@@ -217,7 +255,7 @@ def turns(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return 2 * np.pi * lax.stop_gradient(jnp.round(angle / (2 * np.pi)))
 
 
-class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
+class JointSpring(AbstractCoordinateForce, AbstractPotentialForce):
     """A linear spring and damper on a coordinate: generalized force `−stiffness (value − free) − damping rate`.
 
     ```python
@@ -253,15 +291,17 @@ class JointSpring(AbstractCoordinatePart, AbstractPotentialForce):
     def middle_of_turn(self):
         return self.free if self.middle is None else self.middle
 
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: -self.stiffness * self._stretch(x) - self.damping * v
-        return self.force_along(space, poses, velocities, law)
+    def law(self, x, v):
+        return -self.stiffness * self._stretch(x) - self.damping * v
+
+    def _in_itself(self):
+        return check_given(self, "free")
 
     def energy(self, space, poses, t):
         return 0.5 * self.stiffness * jnp.sum(self._stretch(self.measured(space, poses)) ** 2)
 
 
-class JointForce(AbstractCoordinatePart, AbstractForce):
+class JointForce(AbstractCoordinateForce, AbstractForce):
     """A force along a coordinate, or a moment about it, with its reaction on the other body: a motor on a hinge.
 
     ```python
@@ -279,9 +319,8 @@ class JointForce(AbstractCoordinatePart, AbstractForce):
         self._check_shape("force", given)
         return self
 
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: self.force.reshape(-1)
-        return self.force_along(space, poses, velocities, law)
+    def law(self, x, v):
+        return self.force.reshape(-1)
 
 
 class JointDriver(AbstractCoordinatePart, AbstractDriver):
@@ -326,7 +365,7 @@ class AbstractScalarPart(AbstractCoordinatePart):
         return self
 
 
-class JointStop(AbstractScalarPart, AbstractPotentialForce):
+class JointStop(AbstractCoordinateForce, AbstractScalarPart, AbstractPotentialForce):
     """Compliant stops at the ends of a coordinate's range: a spring and a damper where it is outside.
 
     ```python
@@ -389,16 +428,13 @@ class JointStop(AbstractScalarPart, AbstractPotentialForce):
     def _depths(self, value):
         return ramp(-self._gaps(value), self.smoothing)
 
-    def wrenches(self, space, poses, velocities, t):
-        def law(x, v):
-            depth, pull = jax.vjp(self._depths, x)
-            push = self.stiffness * (depth if self.exponent is None else depth**self.exponent)
-            if self.damping is not None:
-                _, rate = jax.jvp(self._depths, (x,), (v,))
-                push += without_pull(push, self.damping * with_drift(self, rate, lambda part: part._depths(x)))
-            return -pull(push)[0]
-
-        return self.force_along(space, poses, velocities, law)
+    def law(self, x, v):
+        depth, pull = jax.vjp(self._depths, x)
+        push = self.stiffness * (depth if self.exponent is None else depth**self.exponent)
+        if self.damping is not None:
+            _, rate = jax.jvp(self._depths, (x,), (v,))
+            push += without_pull(push, self.damping * with_drift(self, rate, lambda part: part._depths(x)))
+        return -pull(push)[0]
 
     def energy(self, space, poses, t):
         depths = self._depths(self.measured(space, poses))

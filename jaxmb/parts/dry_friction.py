@@ -25,7 +25,7 @@ from .base import (
     Wrenches,
 )
 from .combinations import JointCoupling
-from .coordinate_parts import AbstractOfJoints, AbstractScalarPart
+from .coordinate_parts import AbstractCoordinateForce, AbstractOfJoints, AbstractScalarPart
 from .modes import STICK, kind_of, slip_direction
 from .space import AbstractSpace, rate_of
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
@@ -346,7 +346,7 @@ class DryFriction(AbstractDryFriction):
         return value if self.radius is None or self.joints["0"].is_length(name) else self.radius * value
 
 
-class JointFriction(AbstractScalarPart, AbstractForce):
+class JointFriction(AbstractCoordinateForce, AbstractScalarPart, AbstractForce):
     """Dry friction of constant size on a coordinate: generalized force `−force tanh(rate / transition_speed)`, or with
     exact stick.
 
@@ -397,8 +397,7 @@ class JointFriction(AbstractScalarPart, AbstractForce):
             raise ValueError(
                 f"{self.label}: {self.joint.label} is not a joint; friction of bodies that touch is DryFriction."
             )
-        part = super().with_numbers(given)
-        return part if self.exact else part.filled(transition_speed=1e-2)
+        return super().with_numbers(given)._in_itself()
 
     def components(self):
         if not self.exact:
@@ -406,9 +405,11 @@ class JointFriction(AbstractScalarPart, AbstractForce):
         own = fields.values_of(self)
         return (with_values(ExactFriction, {name: own[name] for name in fields.field_names(ExactFriction)}),)
 
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: -self.force * jnp.tanh(v / self.transition_speed)
-        return self.force_along(space, poses, velocities, law)
+    def law(self, x, v):
+        return -self.force * (jnp.sign(v) if self.exact else jnp.tanh(v / self.transition_speed))
+
+    def _in_itself(self):
+        return self if self.exact else self.filled(transition_speed=1e-2)
 
 
 class ExactFriction(AbstractScalarPart, AbstractStickSlip):

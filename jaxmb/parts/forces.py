@@ -5,11 +5,12 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..linalg.rotations import norm
 from . import fields
 from .base import AbstractForce, AbstractPair, AbstractPart, AbstractPointPair, AbstractPotentialForce, PathKind
+from .curves import check_given, over_arrays
 from .space import force_pair, moment_pair, rate_of, separation, separation_rate, with_drift
 
 
@@ -74,6 +75,12 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
     def complete(self, space, poses):
         return self if self.free_length is not None else self.filled(free_length=norm(separation(space, self, poses)))
 
+    def curve(self, length: ArrayLike, rate: ArrayLike = 0.0) -> Float[Array, "..."]:
+        """The tension [N] at lengths [m] > 0 and rates [m/s], arrays that broadcast: the law of a motion, without a
+        machine.
+        """
+        return over_arrays(self.label, _tension, check_given(self, "free_length"), length=length, rate=rate)
+
     def wrenches(self, space, poses, velocities, t):
         d, rate = separation(space, self, poses), separation_rate(space, self, poses, velocities)
         square = jnp.dot(d, d)
@@ -87,6 +94,10 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
         d = separation(space, self, poses)
         # ½ k (l − l0)², written so that its derivative at l = 0 is finite.
         return 0.5 * self.stiffness * (jnp.dot(d, d) - 2 * self.free_length * norm(d) + self.free_length**2)
+
+
+def _tension(spring, length, rate):
+    return spring.stiffness * (length - spring.free_length) + spring.damping * rate
 
 
 class Damper(AbstractPointPair, AbstractForce):

@@ -221,7 +221,19 @@ class MagicFormulaTyre(AbstractTyre):
 
     def _forces(self, wheel: _Rolling) -> magic_formula.Forces:
         """Forces and moments at the contact's centre, along its axes."""
-        x, y = self.deflection / wheel.point.relaxation_lengths()
+        slips = self.deflection / wheel.point.relaxation_lengths()
+        return self._at_slips(wheel.point, slips, wheel.speed, norm(wheel.slip), wheel.rolling / wheel.speed)
+
+    def _steady(self, load, slip_ratio, slip_angle, camber, speed):
+        point = magic_formula.Point(self.version, self.coefficients, load, self.mirror * camber, self.pressure)
+        slips = jnp.stack([slip_ratio, -jnp.tan(slip_angle)])
+        return self._at_slips(point, slips, speed, speed * norm(slips), 1.0)
+
+    def _usual_speed(self, speed):
+        return self.coefficients["LONGVL"] if speed is None else speed
+
+    def _at_slips(self, point, slips, speed, slip_speed, travel) -> magic_formula.Forces:
+        x, y = slips
         alpha = -self.mirror * jnp.arctan(y)
-        forces = wheel.point.forces(x, alpha, wheel.speed, norm(wheel.slip), wheel.rolling / wheel.speed)
+        forces = point.forces(x, alpha, speed, slip_speed, travel)
         return forces._replace(fy=self.mirror * forces.fy, mx=self.mirror * forces.mx, mz=self.mirror * forces.mz)

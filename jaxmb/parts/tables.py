@@ -8,11 +8,11 @@ import jax.numpy as jnp
 
 from . import fields, local_spline
 from .base import AbstractDynamicForce, AbstractForce, AbstractPotentialForce
-from .coordinate_parts import AbstractScalarPart
+from .coordinate_parts import AbstractCoordinateForce, AbstractScalarPart
 from .kinks import clipped
 
 
-class TableSpring(AbstractScalarPart, AbstractPotentialForce):
+class TableSpring(AbstractCoordinateForce, AbstractScalarPart, AbstractPotentialForce):
     """A spring on a coordinate by a table: generalized force `−f(value)`, with the curve f through given points.
 
     ```python
@@ -46,15 +46,14 @@ class TableSpring(AbstractScalarPart, AbstractPotentialForce):
     def _in_table(self, value):
         return self.near(value, self.middle_of_turn())[0]
 
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: -local_spline.value(self.values, self.forces, self._in_table(x))[None]
-        return self.force_along(space, poses, velocities, law)
+    def law(self, x, v):
+        return -local_spline.value(self.values, self.forces, self._in_table(x))[None]
 
     def energy(self, space, poses, t):
         return local_spline.integral(self.values, self.forces, self._in_table(self.measured(space, poses)))
 
 
-class TableDamper(AbstractScalarPart, AbstractForce):
+class TableDamper(AbstractCoordinateForce, AbstractScalarPart, AbstractForce):
     """A damper on a coordinate by a table: generalized force `−f(rate)`, with the curve f through given points.
 
     ```python
@@ -78,12 +77,11 @@ class TableDamper(AbstractScalarPart, AbstractForce):
     def numbers_agree(self):
         return jnp.all(jnp.diff(self.rates) > 0)
 
-    def wrenches(self, space, poses, velocities, t):
-        law = lambda x, v: -local_spline.value(self.rates, self.forces, v[0])[None]
-        return self.force_along(space, poses, velocities, law)
+    def law(self, x, v):
+        return -local_spline.value(self.rates, self.forces, v[0])[None]
 
 
-class TableMotor(AbstractScalarPart, AbstractDynamicForce):
+class TableMotor(AbstractCoordinateForce, AbstractScalarPart, AbstractDynamicForce):
     """A motor by its torque curve: torque over speed at full control, as a table.
 
     ```python
@@ -124,15 +122,14 @@ class TableMotor(AbstractScalarPart, AbstractDynamicForce):
         part = super().with_numbers(given)
         return part if self.lag is None else part.filled(activation=0.0)
 
-    def wrenches(self, space, poses, velocities, t):
-        control = self._control() if self.lag is None else self.activation
+    def law(self, x, v):
+        control, speed = self._control() if self.lag is None else self.activation, self.gear * v[0]
+        forwards = jnp.where(control < 0, -speed, speed)
+        return (self.gear * control * local_spline.value(self.speeds, self.torques, forwards))[None]
 
-        def law(x, v):
-            speed = self.gear * v[0]
-            forwards = jnp.where(control < 0, -speed, speed)
-            return (self.gear * control * local_spline.value(self.speeds, self.torques, forwards))[None]
-
-        return self.force_along(space, poses, velocities, law)
+    def _in_itself(self):
+        # The activation follows the control, which takes its place.
+        return self.with_fields(lag=None, activation=None)
 
     def state_rates(self, space, poses, velocities, t):
         return {} if self.lag is None else {"activation": (self._control() - self.activation) / self.lag}

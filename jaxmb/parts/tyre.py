@@ -4,11 +4,13 @@ Source: H. B. Pacejka, "Tyre and Vehicle Dynamics", 3rd ed., Butterworth-Heinema
 transient models).
 """
 
+import abc
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
 from ..linalg.arrays import is_traced
 from ..linalg.jitted import on_host
@@ -17,7 +19,9 @@ from . import fields
 from .base import AbstractDynamicForce, AbstractPotentialForce
 from .boundary import check_returns
 from .contact import AbstractNormalLaw
+from .curves import over_arrays
 from .forces import over_ground
+from .magic_formula import Forces
 from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step, without_pull
 from .terrain import AbstractTerrain, distance, outward, pace_over
@@ -108,6 +112,49 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         axle = np.eye(3)[2] if space.dimension == 2 else self.axis
         tyre = wheel(self.radius, axis=axle, position=space.in_space(self.centre))
         return (None, Ground(height=self.terrain.height)), *((0, shape) for shape in tyre)
+
+    def forces(
+        self,
+        *,
+        load: ArrayLike,
+        slip_ratio: ArrayLike = 0.0,
+        slip_angle: ArrayLike = 0.0,
+        camber: ArrayLike = 0.0,
+        speed: ArrayLike | None = None,
+    ) -> Forces:
+        """The forces and moments of steady rolling, without a machine: the law of a motion.
+
+        ```python
+        ground = {"terrain": jaxmb.terrain.Flat(), "normal": jaxmb.contact.Linear(2e5)}
+        tyre = planar.Tyre(
+            "tyre", "wheel", radius=0.3, coefficient=0.9, slip_stiffness=15.0, relaxation_length=0.2, **ground
+        )
+        forces = tyre.forces(load=4e3, slip_angle=np.linspace(-0.2, 0.2, 101))
+        forces.fx, forces.fy
+        ```
+
+        **Arguments:** numbers or arrays that broadcast.
+
+        - `load` [N] ≥ 0, the force along the normal.
+        - `slip_ratio`: of the slip velocity, of the tread against the ground, to the rolling speed; positive for
+            driving.
+        - `slip_angle` [rad], positive for a wheel that moves to the left, less than a right angle.
+        - `camber` [rad], positive if the wheel's top leans to the right. `Tyre` does not depend on it.
+        - `speed` [m/s] > 0 of rolling, on which `Tyre` does not depend; default LONGVL, the speed of the tyre's data.
+
+        **Returns:** `Forces` on the wheel at the contact: `fx` forwards, `fy` to the left [N]; about these directions
+        and the normal `mx`, `my` and `mz` [N m].
+        """
+        given = {"load": load, "slip_ratio": slip_ratio, "slip_angle": slip_angle, "camber": camber}
+        return over_arrays(self.label, type(self)._steady, self, **given, speed=self._usual_speed(speed))
+
+    @abc.abstractmethod
+    def _steady(self, load, slip_ratio, slip_angle, camber, speed) -> Forces:
+        """The forces of steady rolling."""
+
+    def _usual_speed(self, speed):
+        """The speed of rolling, with its default."""
+        return 1.0 if speed is None else speed
 
     def _upwards(self, space, pose, normal_W):
         """World unit vector from the point of the rim that is lowest over the ground to the wheel's centre."""
@@ -215,10 +262,18 @@ class Tyre(AbstractTyre):
         wrench = space.pull_back(pose, -load * gradient)
         normal, spring, damping = self._normal_forces(space, pose, velocity, depth, load)
         along, point, *_ = self._contact(space, pose, velocity, normal, self.radius)
-        sliding = self.slip_stiffness * self.deflection / (self.relaxation_length * self.coefficient)
-        # The law of dry friction, with the deflection in the place of slip.
-        friction = dry_friction(self.coefficient * (spring + damping), -sliding, 1.0)
+        friction = self._friction(spring + damping, self.deflection, self.relaxation_length)
         return (wrench + space.point_force(pose, point, friction @ along + damping * normal))[None]
+
+    def _friction(self, load, deflection, relaxation_length):
+        sliding = self.slip_stiffness * deflection / (relaxation_length * self.coefficient)
+        # The law of dry friction, with the deflection in the place of slip.
+        return dry_friction(self.coefficient * load, -sliding, 1.0)
+
+    def _steady(self, load, slip_ratio, slip_angle, camber, speed):
+        fx, fy = self._friction(load, jnp.stack([slip_ratio, -jnp.tan(slip_angle)]), 1.0)
+        none = jnp.zeros_like(fx)
+        return Forces(fx, fy, none, none, none)
 
     def energy(self, space, poses, t):
         return self.normal.energy(self._depth(space, poses[0]))

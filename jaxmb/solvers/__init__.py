@@ -5,16 +5,18 @@ method of your own derives from `AbstractMultistep`, with a field for its tolera
 diffrax gives it, at predicted and at corrected states:
 
 ```python
+from jax.flatten_util import ravel_pytree
 from jaxmb import solvers
 
 tolerances: solvers.Tolerances = solvers.tolerances_of("Heun")
 adjoint = solvers.MeshAdjoint(most=1024)  # Keeps the numbers of so many steps for derivatives.
 
 def heun(term, t, h, y, args, chart):
-    now = solvers.evaluate(term, t, solvers.ravel(y), y, chart, args)
+    flat, unravel = ravel_pytree(y)  # Methods compute with the components of a state in one vector.
+    now = solvers.evaluate(term, t, flat, y, chart, args)
     predicted = solvers.evaluate(term, t + h, now.y + h * now.f, y, chart, args)
     end = solvers.project_near(term, t + h, now.y + h * (now.f + predicted.f) / 2, y, predicted, args)
-    y1 = solvers.unravel_like(y, end.y)
+    y1 = unravel(end.y)
     return y1, jnp.max(jnp.abs(end.y - predicted.y)), solvers.next_chart(term, t + h, y1, end.chart, args)
 
 def next_step(error):  # For a method of fixed order, whose error is of second order in the step.
@@ -30,13 +32,7 @@ from .._moved import tell_of_moved as _tell_of_moved
 from . import stability as stability
 from .adams import Adams as Adams
 from .controller import MultistepController as MultistepController
-from .evaluation import (
-    evaluate as evaluate,
-    next_chart as next_chart,
-    project_near as project_near,
-    ravel as ravel,
-    unravel_like as unravel_like,
-)
+from .evaluation import evaluate as evaluate, next_chart as next_chart, project_near as project_near
 from .hermite import Hermite as Hermite
 from .mesh import MeshAdjoint as MeshAdjoint
 from .multistep import (
@@ -48,4 +44,8 @@ from .multistep import (
 from .order import choose_order as choose_order
 from .tolerances import Tolerances as Tolerances
 
-_tell_of_moved(__name__)
+_tell_of_moved(
+    __name__,
+    ravel="the first result of jax.flatten_util.ravel_pytree",
+    unravel_like="the second result of jax.flatten_util.ravel_pytree",
+)

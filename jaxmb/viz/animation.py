@@ -9,15 +9,19 @@ from typing import Any
 import numpy as np
 
 from .._arguments import whole_number
+from .._types import State
 from ..parts.names import names_arguments
 from ..parts.shapes import AbstractShape
+from ..system import AbstractSystem
 from ..trajectory import Trajectory
 from . import scenery
 from .motion_nodes import Motion, check_shapes, chosen, motion
+from .one_motion import as_motion
 from .solids import COLORS
 from .stage import SceneNode, page
 
-Motions = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
+Shown = Trajectory | State
+Motions = Shown | Sequence[Shown] | Mapping[str, Shown]
 Shapes = Mapping[str, AbstractShape | Sequence[AbstractShape]]
 
 # Shortest and longest motion [s] that is shown in real time.
@@ -62,6 +66,7 @@ def show(
     speed: float | None = None,
     overlay: bool = False,
     height: int = 480,
+    system: AbstractSystem | None = None,
 ) -> MovingPicture:
     """Make a moving picture of one or several motions, for a notebook or saved as a page.
 
@@ -91,6 +96,7 @@ def show(
         minute. The slider shows the playing time, the picture the time of the motion.
     - `overlay`: show several motions in one place, each in a colour, instead of side by side.
     - `height` [pixels], in a notebook.
+    - `system`: of states, which are shown in place of motions: `show(state, system=system)`.
 
     **Returns:** a `MovingPicture`, of about 0.8 MB and more for long motions of many bodies.
 
@@ -103,11 +109,13 @@ def show(
             raise ValueError(f"{name} must be a positive number, got {value!r}.")
     points, reactions, forces = (_listed(names) for names in (points, reactions, forces))
     shapes = shapes or {}
-    for single in _named(trajectory).values():
+    named, least = _named(trajectory), 1 if system is not None else 2
+    named = {name: as_motion(single, system) for name, single in named.items()}
+    for single in named.values():
         check_shapes(single.system, shapes)
     motions = [
-        motion(name, chosen(single, frames), shapes, COLORS[k % len(COLORS)] if overlay else None)
-        for k, (name, single) in enumerate(_named(trajectory).items())
+        motion(name, chosen(single, frames, least), shapes, COLORS[k % len(COLORS)] if overlay else None)
+        for k, (name, single) in enumerate(named.items())
     ]
     forces_of = [_arrows(single, reactions, forces) for single in motions]
     view = scenery.View.of(motions, overlay)
@@ -116,7 +124,8 @@ def show(
     square = scenery.round_number(4 * strength * view.cell / view.size) if strength > 0 else 0.0
     scale = view.cell / square if square else 0.0
     first, last = min(single.times[0] for single in motions), max(single.times[-1] for single in motions)
-    speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST))
+    # A state has no duration.
+    speed = speed or float((last - first) / np.clip(last - first, _SHORTEST, _LONGEST)) or 1.0
     played: list[tuple[np.ndarray, Sequence[SceneNode]]] = []
     for single, offset, arrows in zip(motions, view.offsets, forces_of, strict=True):
         drawn = {"points": points, "arrows": arrows, "scale": scale, "thickness": 0.0035 * view.size}
@@ -147,7 +156,7 @@ def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((names,) if isinstance(names, str) else names))
 
 
-def _named(trajectory: Motions) -> dict[str, Trajectory]:
+def _named(trajectory: Motions) -> dict[str, Shown]:
     if isinstance(trajectory, Mapping):
         motions = {str(name): single for name, single in trajectory.items()}
     elif isinstance(trajectory, Sequence):
@@ -157,8 +166,8 @@ def _named(trajectory: Motions) -> dict[str, Trajectory]:
     if not motions:
         raise ValueError("There is no motion to show.")
     for single in motions.values():
-        if not (hasattr(single, "system") and hasattr(single, "ts")):
-            raise ValueError(f"show takes motions returned by simulate, got {type(single).__name__}.")
+        if not (isinstance(single, State) or (hasattr(single, "system") and hasattr(single, "ts"))):
+            raise ValueError(f"show takes motions returned by simulate, or states, got {type(single).__name__}.")
     return motions
 
 

@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._arguments import whole_number
+from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
 from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
+from ..system import AbstractSystem
 from ..trajectory import Trajectory, picture_of
 from .figure import new_figure
 from .meshes import heights
-from .one_motion import check_finite, one_motion
+from .one_motion import as_motion, check_finite, one_motion
 from .silhouettes import area, edges, stroke
 from .solids import COLORS, solids
 
@@ -25,18 +27,23 @@ _TIMES = 6
 _EDGE: Color = (40, 40, 40)
 
 
-def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
-    """Draw the bodies at evenly spaced saved times, fainter at earlier times, with the paths of their mass centres.
+def plot_mechanism(
+    trajectory: Trajectory | State, frames: int = 5, *, system: AbstractSystem | None = None
+) -> "Figure":
+    """Draw the bodies at evenly spaced saved times, fainter at earlier times, with the paths of their mass centres; or
+    at one state.
 
     ```python
     jaxmb.viz.plot_mechanism(motion, frames=4).savefig("poses.png")
+    jaxmb.viz.plot_mechanism(state, system=system)
     ```
 
     Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars (in space lines) from the
     mass centre to the points where parts act. Springs, rods and tracks are drawn between their points, and in the plane
     the terrain. Up to 8 bodies have paths and a legend.
 
-    **Arguments:** `trajectory`: a motion of a planar or spatial scene; `frames`: the number of poses, at least 1.
+    **Arguments:** `trajectory`: a motion of a planar or spatial scene, or a `State`, with its `system`; `frames`: the
+    number of poses, at least 1.
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
     left out.
@@ -44,7 +51,7 @@ def plot_mechanism(trajectory: Trajectory, frames: int = 5) -> "Figure":
     **Raises:** `ValueError` for `frames < 1`, a batch, states that are not finite, and a system without bodies;
     `ImportError` without matplotlib.
     """
-    frames = whole_number("frames", frames)
+    frames, trajectory = whole_number("frames", frames), as_motion(trajectory, system)
     if not trajectory.system.body_names:
         raise ValueError(
             f"plot_mechanism draws bodies, and a {type(trajectory.system).__name__} has none; plot_motion shows its "

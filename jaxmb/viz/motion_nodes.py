@@ -200,15 +200,15 @@ def check_shapes(system: AbstractSystem, given: Mapping[str, AbstractShape | Seq
             raise ValueError(f"The shapes of {body!r} must be one or several from jaxmb.shapes, got {body_shapes!r}.")
 
 
-def chosen(trajectory: Trajectory, frames: int) -> Trajectory:
+def chosen(trajectory: Trajectory, frames: int, least: int = 2) -> Trajectory:
     """The motion at up to `frames` of its saved times, in ascending order.
 
-    **Raises:** `ValueError` for a batch, for a motion saved at fewer than two times, and for states that are not
+    **Raises:** `ValueError` for a batch, for a motion saved at fewer than `least` times, and for states that are not
     finite.
     """
-    trajectory = one_motion(trajectory, "A moving picture")
+    trajectory = one_motion(trajectory, "A moving picture", least)
     ts, order = np.unique(np.asarray(trajectory.ts), return_index=True)
-    if ts.size < 2:
+    if ts.size < least:
         raise ValueError("A picture needs a motion saved at two times or more; give simulate saveat=…")
     wanted = np.linspace(ts[0], ts[-1], min(frames, ts.size))
     near = np.clip(np.searchsorted(ts, wanted), 1, ts.size - 1)

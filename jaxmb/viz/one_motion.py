@@ -1,10 +1,28 @@
-"""The single motion that a picture shows, without times that a run did not reach."""
+"""The single motion or state that a picture shows, without times that a run did not reach."""
 
 import jax
 import numpy as np
 
 from .._results import RESULTS
-from ..trajectory import Trajectory, states_of
+from .._types import State
+from ..simulate.arguments import checked_state
+from ..system import AbstractSystem
+from ..trajectory import Trajectory, states_of, still
+
+
+def as_motion(shown: Trajectory | State, system: AbstractSystem | None) -> Trajectory:
+    """A motion, or a state of a `system` as a motion with one time.
+
+    **Raises:** `ValueError` for a state without its system, and for a motion with a system.
+    """
+    # A concrete class: a state consists of its fields.
+    if not isinstance(shown, State):
+        if system is not None:
+            raise ValueError("system belongs to a State that is shown; a motion has its own system.")
+        return shown
+    if system is None:
+        raise ValueError("A picture of a State needs its system: give system=system.")
+    return still(system, checked_state(system, shown))
 
 
 def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:

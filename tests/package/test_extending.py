@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 
 import jaxmb as mb
@@ -130,15 +131,16 @@ class TwoStep(solvers.AbstractMultistep):
 
     def initial_state(self, terms, t0, t1, y0, args, chart, before):
         chart = solvers.next_chart(terms, t0, y0, chart, args)
-        first = solvers.evaluate(terms, t0, solvers.ravel(y0), y0, chart, args)
+        start, _ = ravel_pytree(y0)
+        first = solvers.evaluate(terms, t0, start, y0, chart, args)
 
         def numbers(terms, flat):
             near = solvers.evaluate(terms, t0, flat, y0, chart, args)
             there = solvers.project_near(terms, t0, flat, y0, near, args)
             return there.y, jnp.stack([there.f, there.f])
 
-        sizes = self.first_sizes(solvers.ravel(y0), first.f, before)
-        tangents = self.first_tangents(numbers, terms, solvers.ravel(y0), before)
+        sizes = self.first_sizes(start, first.f, before)
+        tangents = self.first_tangents(numbers, terms, start, before)
         # As if the derivative had been the same one step ago.
         ts, rates = jnp.stack([t0, 2 * t0 - t1]), jnp.stack([first.f, first.f])
         return TwoStepState(ts, rates, first.chart, sizes, tangents)
@@ -153,7 +155,7 @@ class TwoStep(solvers.AbstractMultistep):
         return TwoStepAttempt(predicted, second.y, rates, first.failed | second.failed, second.chart)
 
     def advance(self, terms, t1, y0, args, state):
-        before = solvers.ravel(y0)
+        before, unravel = ravel_pytree(y0)
         step, along = self.attempted(terms, t1, before, y0, args, state)
         tangents, scales = self.tangents_after(state.tangents, along)
         tolerated = self.tolerances.of_step(before, step.after, t1 - state.ts[0], state.sizes)
@@ -172,7 +174,7 @@ class TwoStep(solvers.AbstractMultistep):
             target=0.5,
             work=jnp.array([2, 0]),
         )
-        y1 = solvers.unravel_like(y0, step.after)
+        y1 = unravel(step.after)
         chart, sizes = solvers.next_chart(terms, t1, y1, step.chart, args), self.grown_sizes(state.sizes, step.after)
         new = TwoStepState(jnp.stack([t1, state.ts[0]]), step.rates, chart, sizes, tangents)
         return y1, estimate, {"y0": y0, "y1": y1}, new, step.failed

@@ -108,7 +108,7 @@ def test_classes_that_public_names_return_have_help(given, name, text):
 
 
 def test_every_class_in_the_annotation_of_a_public_result_is_found():
-    assert {"Quantity", "ConstraintViolation", "Prediction", "Chart"} <= results().keys()
+    assert {"Quantity", "ConstraintViolation", "Prediction", "Reaction"} <= results().keys()
     for name, entry in results().items():
         assert find(name) is entry and entry.kind == "class" and not entry.short.startswith("_")
     with pytest.raises(mb.UnknownNameError, match="did you mean 'Reaction'"):

@@ -57,7 +57,7 @@ def test_what_is_no_table_is_refused(monkeypatch):
         motion.to_pandas(["bar.angel"])
     batch = motion_of(motion.system, np.tile(TS, (2, 1)), np.zeros((2, 5, 3)), np.zeros((2, 5, 3)))
     with pytest.raises(ValueError, match=r"a batch of shape \(2,\); choose a member"):
-        batch.to_xarray()
+        batch.to_pandas()
     dataset = motion.to_xarray()
     with pytest.raises(ValueError, match=r"Unknown coordinate of time 'time'.*'t'"):
         mb.read_measurements(dataset, time="time")

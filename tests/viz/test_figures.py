@@ -14,6 +14,7 @@ from jaxmb.linalg.rotations import rotate
 from jaxmb.parts import contact
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
+from jaxmb.trajectory import at_rows
 from jaxmb.viz.motion_nodes import chosen
 
 TS = np.linspace(0.0, 1.0, 5)
@@ -80,9 +81,26 @@ def test_times_that_a_run_did_not_reach_are_left_out(piston):
 def test_a_batch_is_refused_with_the_way_to_its_members(piston):
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), piston)
     for picture in (viz.plot_motion, viz.plot_mechanism, lambda motion: chosen(motion, 10)):
-        with pytest.raises(ValueError, match=r"batch of shape \(2,\); choose members of it, such as jax.tree.map"):
+        with pytest.raises(ValueError, match=r"batch of shape \(2,\); choose members of it, such as batch\[0\]"):
             picture(batch)
-        picture(jax.tree.map(lambda leaf: leaf[1], batch))
+        picture(batch[1])
+
+
+def test_a_state_is_drawn_as_a_motion_with_one_time(piston):
+    state = piston.end
+    last = at_rows(piston, np.array([4]))
+    for own, other in zip(
+        viz.plot_mechanism(state, system=piston.system).axes, viz.plot_mechanism(last).axes, strict=True
+    ):
+        assert [line.get_label() for line in own.lines] == [line.get_label() for line in other.lines]
+        for line, same in zip(own.lines, other.lines, strict=True):
+            np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
+    with pytest.raises(ValueError, match="needs its system: give system=system"):
+        viz.plot_mechanism(state)
+    with pytest.raises(ValueError, match="a motion has its own system"):
+        viz.plot_mechanism(piston, system=piston.system)
+    with pytest.raises(ValueError, match=r"got state\.q of shape"):
+        viz.plot_mechanism(mb.State(state.q[:1], state.u), system=piston.system)
 
 
 def test_states_that_are_not_finite_are_named(piston):

@@ -19,6 +19,8 @@ from jaxmb import planar, shapes, spatial, terrain, viz
 from jaxmb.cli.folders import check_picture, show_motion
 from jaxmb.linalg import rotations as rot
 from jaxmb.parts import contact
+from jaxmb.viz.motion_nodes import chosen
+from jaxmb.viz.one_motion import as_motion
 from jaxmb.viz.solids import solids
 
 G, MASS, INERTIA, ARM = 9.81, 2.0, 0.3, 0.6
@@ -145,6 +147,15 @@ def test_fewer_frames_are_saved_ones(pendulum):
     """The saved times nearest to evenly spaced ones, with the first and the last."""
     times, _ = Page(viz.show(pendulum[0], frames=3).html).values("/clock", "text")
     assert np.allclose(times, [0.0, 1.5, 4.0])
+
+
+def test_states_are_shown_at_one_time(pendulum):
+    motion, _, angle, _ = pendulum
+    states = [jax.tree.map(lambda y, k=k: y[k], motion.ys) for k in (0, 1)]
+    picture = viz.show(states, system=motion.system, points="tip", overlay=True)
+    assert picture.frames == 1 and Page(picture.html).values("/clock", "text")[0] == [0.0]
+    single = viz.motion_nodes.motion("", chosen(as_motion(states[1], motion.system), 4, 1), {}, None)
+    np.testing.assert_allclose(single.point("bar")[0, :2], ARM * np.array([np.cos(angle[1]), np.sin(angle[1])]))
 
 
 def test_speed(pendulum):
@@ -299,8 +310,10 @@ def test_motions_that_cannot_be_shown(pendulum):
     spoilt = dataclasses.replace(trajectory, ys=jax.tree.map(lambda y: y.at[3].set(jnp.nan), trajectory.ys))
     with pytest.raises(ValueError, match=r"at 1\.5 s is not finite"):
         viz.show(spoilt)
-    with pytest.raises(ValueError, match="returned by simulate, got State"):
-        viz.show([trajectory.ys])
+    with pytest.raises(ValueError, match="returned by simulate, or states, got int"):
+        viz.show([3])
+    with pytest.raises(ValueError, match="needs its system: give system=system"):
+        viz.show([trajectory.end])
     with pytest.raises(ValueError, match="no motion"):
         viz.show([])
     wrong = ({"frames": 1}, {"frames": 2.5}, {"speed": 0.0}, {"speed": np.nan}, {"speed": "fast"}, {"height": -1})

@@ -1,7 +1,10 @@
 """A torsional spring between planar bodies."""
 
+from jaxtyping import Array, ArrayLike, Float
+
 from .. import fields
 from ..base import AbstractPair, AbstractPlanarPart, AbstractPotentialForce
+from ..curves import check_given, over_arrays
 from ..space import moment_pair
 from .joints import relative_angle
 
@@ -28,8 +31,18 @@ class TorsionalSpringDamper(AbstractPlanarPart, AbstractPair, AbstractPotentialF
         return self.filled(free_angle=relative_angle(poses))
 
     def wrenches(self, space, poses, velocities, t):
-        angle, rate = relative_angle(poses) - self.free_angle, velocities[1, 2] - velocities[0, 2]
-        return moment_pair(space, poses, (-self.stiffness * angle - self.damping * rate)[None])
+        moment = _moment(self, relative_angle(poses), velocities[1, 2] - velocities[0, 2])
+        return moment_pair(space, poses, moment[None])
+
+    def curve(self, angle: ArrayLike, rate: ArrayLike = 0.0) -> Float[Array, "..."]:
+        """The moment [N m] on B at angles `angle_b − angle_a` [rad] and rates [rad/s], arrays that broadcast: the law
+        of a motion, without a machine.
+        """
+        return over_arrays(self.label, _moment, check_given(self, "free_angle"), angle=angle, rate=rate)
 
     def energy(self, space, poses, t):
         return 0.5 * self.stiffness * (relative_angle(poses) - self.free_angle) ** 2
+
+
+def _moment(spring, angle, rate):
+    return -spring.stiffness * (angle - spring.free_angle) - spring.damping * rate
