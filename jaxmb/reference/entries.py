@@ -322,9 +322,9 @@ def results() -> dict[str, Entry]:
 
 def _classes_named(entry: Entry) -> list[str]:
     """The capitalised words of an annotation of the result, and of the code in a docstring."""
-    thing, made = entry.thing, signature(entry)
-    returns = thing.fget.__annotations__.get("return", "") if isinstance(thing, property) else ""
-    returns = made.return_annotation if made else returns
+    function = inspect.unwrap(getattr(entry.thing, "fget", entry.thing))
+    # A class has the annotations of its fields.
+    returns = "" if inspect.isclass(function) else getattr(function, "__annotations__", {}).get("return", "")
     return [*re.findall(r"`([A-Z]\w+)`", entry.text), *re.findall(r"\b[A-Z]\w+", str(returns))]
 
 

@@ -1,0 +1,187 @@
+"""Laws of parts without a machine: as written by hand, as in a motion, with derivatives, and wrong arguments."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import contact, planar, spatial, terrain
+from jaxmb.parts import magic_formula
+
+ANGLE, RATE, FLAT = 0.4, 1.3, terrain.Flat()
+ON_ANGLE = {
+    "spring": mb.JointSpring("spring", "pin.angle", stiffness=20.0, damping=0.5, free=0.1),
+    "force": mb.JointForce("force", "pin.angle", force=3.0),
+    "stop": mb.JointStop("stop", "pin.angle", lower=-0.5, upper=0.3, stiffness=100.0, exponent=1.5, damping=2.0),
+    "friction": mb.JointFriction("friction", "pin.angle", force=0.7, transition_speed=0.5),
+    "table spring": mb.TableSpring("table spring", "pin.angle", values=(-1.0, 0.0, 0.3, 1.0), forces=(-9.0, 0, 1, 8)),
+    "table damper": mb.TableDamper("table damper", "pin.angle", rates=(-1.0, 0.0, 1.0, 3.0), forces=(-2.0, 0, 1, 5)),
+    "table motor": mb.TableMotor(
+        "table motor", "pin.angle", speeds=(0.0, 10.0, 30.0), torques=(0.8, 0.7, 0.1), control=-0.6, gear=8.0
+    ),
+    "actuator": mb.Actuator("actuator", "pin.angle", control=0.9, gain=(5, 1, 0), bias=(0, -4, -2), gear=1.5),
+}
+GROUND = {"normal": contact.Hertz(1e6), "damping": 300.0, "radius": 0.3, "smoothing": 1e-4, "terrain": FLAT}
+GRIP = {"coefficient": 0.9, "slip_stiffness": 15.0, "relaxation_length": 0.2}
+
+
+def tyre(**changes):
+    return planar.Tyre("tyre", "wheel", **(GROUND | GRIP | changes))
+
+
+# By hand
+
+
+def test_curves_by_hand():
+    spring, springs = ON_ANGLE["spring"], np.linspace(-1.0, 1.0, 5)
+    np.testing.assert_allclose(
+        spring.curve(springs, rate=[[0.0], [2.0]]), [-20 * (springs - 0.1), -20 * (springs - 0.1) - 1.0]
+    )
+    line = planar.SpringDamper("line", "ground", "bar", stiffness=30.0, damping=2.0, free_length=0.5)
+    np.testing.assert_allclose(line.curve([0.5, 0.7], rate=0.1), [0.2, 6.2])
+    motor = mb.Motor("motor", "pin.angle", mode="speed", command=10.0, gain=2.0, lag=0.05, limit=15.0)
+    np.testing.assert_allclose(motor.curve(rate=[0.0, 10.0]), [15 * np.tanh(20 / 15), 0.0])
+    assert ON_ANGLE["friction"].curve(rate=0.5) == pytest.approx(-0.7 * np.tanh(1.0))
+
+
+def test_steady_forces_of_a_tyre_by_hand():
+    load, ratio, angle = 4e3, np.array([0.0, 0.05, 0.3]), np.array([[0.0], [0.1], [-0.2]])
+    forces = tyre().forces(load=load, slip_ratio=ratio, slip_angle=angle)
+    slips = np.stack(np.broadcast_arrays(ratio, -np.tan(angle)))
+    size = np.maximum(np.linalg.norm(15 * slips / 0.9, axis=0), 1e-300)
+    known = 0.9 * load * np.tanh(size) * 15 * slips / 0.9 / size
+    np.testing.assert_allclose([forces.fx, forces.fy], known, rtol=1e-12, atol=1e-9)
+    assert forces.mz.shape == (3, 3) and not np.any(forces.mz)
+    # One direction, and another grip sideways.
+    sideways = tyre(slip_stiffness=(15.0, 10.0)).forces(load=load, slip_angle=1e-6)
+    assert sideways.fy == pytest.approx(-10.0 * load * 1e-6)
+
+
+def test_forces_of_a_contact_by_hand():
+    ground = planar.Contact("road", "wheel", friction=contact.Coulomb(0.8, transition_speed=0.1), **GROUND)
+    depth = np.array([-0.02, 0.0, 0.02])
+    forces = ground.forces(depth=depth, rate=0.05, slip=[[0.02], [-3.0]])
+    root = np.sqrt(depth**2 + 1e-8)
+    smooth = (depth + root) / 2
+    step = np.clip(smooth / 0.01, 0, 1)
+    step = step**3 * (10 + step * (6 * step - 15))
+    normal = 1e6 * smooth**1.5 * (1 + depth / root) / 2 + 300 * step * 0.05
+    np.testing.assert_allclose(forces.normal, np.stack([normal, normal]), rtol=1e-7)
+    load = 1e6 * smooth**1.5 * smooth**2 / (smooth**2 + 0.25e-8) + 300 * step * 0.05
+    np.testing.assert_allclose(forces.friction[1], 0.8 * load, rtol=2e-2)
+    # A body that leaves the ground is not pulled, and one without friction slips.
+    assert ground.forces(depth=0.02, rate=-1e3).normal == 0
+    smooth_ground = planar.Contact("road", "wheel", **GROUND)
+    assert smooth_ground.forces(depth=0.02, slip=1.0).friction == 0
+
+
+def test_wrong_arguments():
+    for call, message in (
+        (lambda: mb.JointSpring("spring", "pin.angle", stiffness=1.0).curve(0.0), "JointSpring 'spring': give free"),
+        (lambda: ON_ANGLE["spring"].curve("much"), "JointSpring 'spring': value must be an array of real numbers"),
+        (lambda: ON_ANGLE["spring"].curve([0.0, 1.0], [1.0, 2.0, 3.0]), r"value \(2,\), rate \(3,\)"),
+        (lambda: tyre().forces(load=np.nan), "Tyre 'tyre': load must not be NaN"),
+        (lambda: planar.SpringDamper("line", "a", "b", stiffness=1.0).curve(1.0), "give free_length"),
+        (lambda: planar.TorsionalSpringDamper("coil", "a", "b", stiffness=1.0).curve(1.0), "give free_angle"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+# As in a motion
+
+
+def test_the_law_of_a_spring_is_that_of_a_motion():
+    curve_is_that_of_a_motion("spring")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ON_ANGLE)
+def test_laws_along_a_coordinate_are_those_of_a_motion(name):
+    curve_is_that_of_a_motion(name)
+
+
+def curve_is_that_of_a_motion(name):
+    part = ON_ANGLE[name]
+    bar = planar.Body("bar", mass=1.0, inertia=0.1)
+    system = mb.Scene([bar], joints=[planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))], forces=[part]).compile()
+    state = mb.State(jnp.array([0.0, 0.0, ANGLE]), jnp.array([0.0, 0.0, RATE]))
+    wrench = mb.evaluate(system, state, name)[-1]
+    assert float(part.curve(ANGLE, RATE)) == pytest.approx(float(wrench[2]), rel=1e-13)
+
+
+@pytest.mark.slow
+def test_forces_of_a_contact_are_those_of_a_motion():
+    for friction in (
+        contact.Coulomb(0.8, transition_speed=0.1),
+        contact.Janosi(
+            cohesion=1e3, friction_angle=0.5, shear_modulus=0.02, length=0.2, area=0.02, transition_speed=0.1
+        ),
+    ):
+        ground = planar.Contact("road", "wheel", friction=friction, **GROUND)
+        wheel = planar.Body("wheel", mass=10.0, inertia=0.5)
+        system = mb.Scene([wheel], forces=[ground]).compile()
+        for sinking, travel, spin in ((0.1, 2.0, -9.0), (-5.0, 2.0, -5.0)):
+            state = mb.State(jnp.array([0.0, 0.295, 0.0]), jnp.array([travel, -sinking, spin]))
+            wrench = mb.evaluate(system, state, "road")[0]
+            forces = ground.forces(depth=0.005, rate=sinking, slip=travel + 0.3 * spin, travel=travel)
+            np.testing.assert_allclose([forces.friction, forces.normal], wrench[:2], rtol=1e-10, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["brush", "magic formula", "magic formula, right"])
+def test_forces_of_a_tyre_are_those_of_a_motion(kind):
+    """A wheel that rolls steadily, with the deflection of steady slip."""
+    speed, ratio, angle = 15.0, 0.04, 0.07
+    if kind == "brush":
+        part = tyre(terrain=FLAT, transition_speed=1e-7, damping=0.0)
+        lengths = lambda load: 0.2 * jnp.ones(2)
+    else:
+        file = Path(__file__).parents[1] / "support" / "example_61.tir"
+        side = "right" if "right" in kind else None
+        part = spatial.MagicFormulaTyre("tyre", "wheel", file, terrain=FLAT, side=side, transition_speed=1e-7)
+        lengths = lambda load: magic_formula.Point(
+            "6.1", part.coefficients, load, 0.0, part.pressure
+        ).relaxation_lengths()
+    wheel = spatial.Body("wheel", mass=10.0, inertia=(0.5, 0.9, 0.5))
+    system = mb.Scene([wheel], forces=[part]).compile()
+    height = part.radius - 0.01
+    q = jnp.array([0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
+    u = jnp.array([speed, speed * np.tan(angle), 0.0, 0.0, speed * (1 + ratio) / height, 0.0])
+    load = float(mb.evaluate(system, mb.State(q, u, jnp.zeros(2)), "tyre")[0, 2])
+    deflection = lengths(load) * jnp.array([ratio, -np.tan(angle)])
+    wrench = mb.evaluate(system, mb.State(q, u, deflection), "tyre")[0]
+    forces = part.forces(load=load, slip_ratio=ratio, slip_angle=angle, speed=speed)
+    np.testing.assert_allclose([forces.fx, forces.fy], wrench[:2], rtol=1e-6)
+    if kind != "brush":
+        np.testing.assert_allclose(forces.mz, wrench[5], rtol=1e-6)
+
+
+# Derivatives
+
+
+@pytest.mark.slow
+def test_derivatives_of_curves():
+    def values(x):
+        stiff = mb.JointSpring("spring", "pin.angle", stiffness=x[0], damping=x[1], free=0.1)
+        grip = tyre(coefficient=x[2], normal=contact.Hertz(1e6)).forces(
+            load=4e3 * x[3], slip_ratio=0.1, slip_angle=x[4]
+        )
+        ground = planar.Contact(
+            "road", "wheel", friction=contact.Coulomb(x[2], transition_speed=0.1), **(GROUND | {"damping": x[5]})
+        )
+        pressed = ground.forces(depth=0.01 * x[4], rate=0.1, slip=0.1)
+        own = jnp.stack([stiff.curve(x[4], x[5] / 1e3), grip.fx / 1e3, grip.fy / 1e3, *(f / 1e3 for f in pressed)])
+        return own
+
+    x, h = jnp.array([20.0, 0.5, 0.9, 1.1, 0.2, 300.0]), 1e-6
+    forward, reverse = jax.jit(jax.jacfwd(values))(x), jax.jit(jax.jacrev(values))(x)
+    compiled = jax.jit(values)
+    differences = [(compiled(x + h * step) - compiled(x - h * step)) / (2 * h) for step in np.eye(6)]
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(forward, np.stack(differences, axis=1), rtol=1e-6, atol=1e-7)
+    together = jax.vmap(lambda angle: tyre().forces(load=4e3, slip_angle=angle).fy)(jnp.array([0.1, 0.2]))
+    np.testing.assert_allclose(together, tyre().forces(load=4e3, slip_angle=[0.1, 0.2]).fy, rtol=1e-14)
