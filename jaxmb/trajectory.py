@@ -57,6 +57,8 @@ class ConstraintViolation(NamedTuple):
 
 # The default solver of a motion.
 _ADAMS = Adams()
+# A later motion may begin this power of the precision from where the first ends, in units of coordinates.
+_MOVED = 0.375
 # The number of names that `print` of a motion shows.
 _SHOWN = 12
 
@@ -64,10 +66,6 @@ _SHOWN = 12
 def _listed(names: Sequence[str]) -> str:
     rest_of_names = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
     return f"{', '.join(names[:_SHOWN])}{rest_of_names}"
-
-
-# A later motion may begin this power of the precision from where the first ends, in units of coordinates.
-_MOVED = 0.375
 
 
 class _ByName(Mapping[str, Any]):
@@ -139,7 +137,6 @@ def states_of(trajectory: "Trajectory") -> State:
 
     **Raises:** `ValueError` if the run saved something else, or nothing.
     """
-    # A concrete class: a state consists of its fields.
     if not isinstance(trajectory.ys, State):
         saved = "nothing" if trajectory.ys is None else "the values of SaveAt(fn=…) in motion.ys"
         raise ValueError(
@@ -180,7 +177,7 @@ class Trajectory(eqx.Module):
     `trajectory["crank"]` is a `BodyMotion`, the motion of a body. `trajectory["hip"]` is a `PartMotion`, the motion of
     a joint, a frame or a part with internal states. In generalized coordinates `trajectory["theta"]` is a
     coordinate and `trajectory["theta_rate"]` its rate, shape (times,). `events` are the events of contacts and dry
-    friction, as a table.
+    friction, as a table. `evaluate` has the same quantities at one state.
 
     **Batches:** `jax.vmap` of a simulation returns a batch. Every field and every view has the batch's axes before the
     axes given here. `batch[3]` is a member, `batch[2:5]` a smaller batch, `len(batch)` the number of members, and a
@@ -218,7 +215,7 @@ class Trajectory(eqx.Module):
             text = f"Trajectories of {ended.size} runs of shape {ended.shape}, {good} successful: {span}"
         else:
             text = f"Trajectory: {finite.size} saved from {span} in {steps} steps; {RESULTS[self.result]}"
-        forces = self.force_names()
+        forces = self._force_names()
         force_line = f"\nForces, in motion.forces: {_listed(forces)}" if forces else ""
         return f"{text}\nNames: {_listed(names)}{force_line}"
 
@@ -230,21 +227,20 @@ class Trajectory(eqx.Module):
         if name in self:
             states_of(self)
             return self.quantity(name) if name in self.system.quantities() else PartMotion(self, name)
-        if name in self.force_names():
+        if name in self._force_names():
             raise UnknownNameError(f"{name!r} is a force: motion.forces[{name!r}] is what it exerts.")
         raise unknown("body, joint or frame" if self.system.body_names else "coordinate", name, self._names())
 
     def __getattr__(self, name: str) -> Any:
         # JAX and notebooks look for private names; fields are missing while an object is made.
         if not name.startswith("_") and "system" in vars(self):
-            for view, names in (("motion", self._names()), ("motion.forces", self.force_names())):
+            for view, names in (("motion", self._names()), ("motion.forces", self._force_names())):
                 if name in names:
                     raise AttributeError(f"A motion has its parts by their names: {view}[{name!r}].")
         # Python's own error, or the error raised by the property of this name.
         return super().__getattribute__(name)
 
-    def force_names(self) -> tuple[str, ...]:
-        """The names in `forces`."""
+    def _force_names(self) -> tuple[str, ...]:
         return self.system.catalogue.force_names() if self.system.body_names else ()
 
     def _names(self) -> tuple[str, ...]:
@@ -258,7 +254,7 @@ class Trajectory(eqx.Module):
     @property
     def _batch(self) -> tuple[int, ...]:
         """The lengths of the batch's axes."""
-        return np.shape(self.result._value if self.ts is None else self.ts[..., 0])
+        return np.shape(self.result._value) if self.ts is None else self.ts.shape[:-1]
 
     def __iter__(self) -> Iterator[Any]:
         """The names that `trajectory[name]` takes; of a batch, its members."""
@@ -331,7 +327,8 @@ class Trajectory(eqx.Module):
 
     @_of_each_stage
     def _events_of_run(self):
-        return contact_events(self.system, self.formulation, self.found_events)
+        record: Any = self.found_events
+        return contact_events(self.system, self.formulation, record)
 
     @property
     def error(self) -> "GlobalError":
@@ -627,7 +624,8 @@ def still(system: AbstractSystem, state: State, t: Any = 0.0) -> Trajectory:
     """One state as a motion that is saved at one time, for its views."""
     ts, ys = jax.tree.map(lambda y: _entries(y, None), (jnp.asarray(t, state.q.dtype), state))
     formulation = default_manifold(system, _ADAMS, None).default_formulation(system)
-    return Trajectory(system, formulation, ts, ys, {}, RESULTS.successful, None, None)
+    successful: Any = RESULTS.successful
+    return Trajectory(system, formulation, ts, ys, {}, successful, None, None)
 
 
 def at_rows(trajectory: Trajectory, rows: Int[np.ndarray, "n"]) -> Trajectory:

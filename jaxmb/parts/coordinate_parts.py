@@ -267,7 +267,8 @@ class JointSpring(AbstractCoordinateForce, AbstractPotentialForce):
     exerts no force, default the coordinate at the given poses. In space the spring of an angle takes the shortest way
     to `free`, up to half a turn. With `middle` [rad], the middle of its range, the angle is instead wrapped to within
     half a turn of `middle`. A run that goes beyond, where the force jumps, warns. On the length of a `FixedTendon`
-    along the angle, a spring winds up through any number of turns.
+    along the angle, a spring winds up through any number of turns. `spring.curve(0.1, rate=0.3)` is the force without a
+    machine.
     """
 
     stiffness: fields.Number = fields.parameter(unit=("N m/rad", "N/m"), sign="non-negative")

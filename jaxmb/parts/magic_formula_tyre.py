@@ -83,6 +83,7 @@ class MagicFormulaTyre(AbstractTyre):
     change of it the tyre takes or gives energy without a force.
 
     The coefficients, and all scaling factors, are parameters, `"tyre.PDY1"`; `"tyre.mirror"` is −1 for a mirrored tyre.
+    `tyre.forces(load=4e3, slip_angle=0.1, camber=0.02)` are the forces and moments without a machine.
 
     **Arguments:**
 

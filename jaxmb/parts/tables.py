@@ -25,7 +25,7 @@ class TableSpring(AbstractCoordinateForce, AbstractScalarPart, AbstractPotential
     The curve has two continuous derivatives. Where the points rise it never falls, and where they fall it never rises;
     next to a highest or a lowest point it may pass that point. Beyond the first and the last point it continues as a
     straight line, through this point and its neighbour. The energy is its integral from the first point. In space an
-    angle counts within half a turn of the middle of the table.
+    angle counts within half a turn of the middle of the table. `spring.curve(1.05)` is the force without a machine.
 
     **Arguments:** `values` [rad, m] of the coordinate, shape (n,), ascending, n ≥ 3; `forces` [N m, N], shape (n,),
     positive where the spring pulls towards smaller values.
@@ -93,7 +93,7 @@ class TableMotor(AbstractCoordinateForce, AbstractScalarPart, AbstractDynamicFor
     With the speed `gear ẋ` of the coordinate x, the generalized force is `gear control f(speed)`. A negative control
     drives backwards, with the torque at `f(−speed)`. The curve f is as in `TableSpring`, with straight lines beyond its
     ends: beyond the speed of no torque the motor brakes, the faster the more, as a direct-current motor does. A last
-    pair of points with one torque bounds it.
+    pair of points with one torque bounds it. `motor.curve(rate=speeds)` is the force without a machine.
 
     With a `lag` an internal state, the `activation`, takes the place of the control and follows it, `lag ·
     d(activation)/dt = control − activation`.

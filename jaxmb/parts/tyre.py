@@ -235,7 +235,7 @@ class Tyre(AbstractTyre):
     `−v_s/V`; the lateral slip is the tangent of the slip angle. With `s = c d/(σ μ)`, the force on the wheel at its
     lowest point is `μ N tanh(|s|) s/|s|`: `c N d/σ` for small slips, and friction for large ones. The load N is the
     force along the normal, of spring and damping. The wheel's inclination only moves the contact; there is no aligning
-    torque or rolling resistance.
+    torque or rolling resistance. `tyre.forces(load=4e3, slip_angle=0.1)` are the forces without a machine.
 
     **Arguments:**
 

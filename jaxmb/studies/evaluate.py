@@ -58,7 +58,8 @@ def evaluate(system: AbstractSystem, state: State, names: str | Sequence[str], *
     chosen = checked_names("quantity", (names,) if isinstance(names, str) else names)
     state = checked_state(system, state)
     motion = still(system, state, real_array("t", t, state.q.dtype))
-    measures, forces = system.catalogue.measures(), motion.force_names()
+    catalogue = system.catalogue
+    measures, forces = catalogue.measures(), catalogue.force_names() if system.body_names else ()
     for name in chosen:
         if name not in measures and name not in (*_ENERGIES, *forces):
             raise unknown("quantity", name, (*measures, *_ENERGIES, *forces))

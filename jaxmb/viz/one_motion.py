@@ -15,7 +15,6 @@ def as_motion(shown: Trajectory | State, system: AbstractSystem | None) -> Traje
 
     **Raises:** `ValueError` for a state without its system, and for a motion with a system.
     """
-    # A concrete class: a state consists of its fields.
     if not isinstance(shown, State):
         if system is not None:
             raise ValueError("system belongs to a State that is shown; a motion has its own system.")
@@ -32,6 +31,8 @@ def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
 
     **Raises:** `ValueError` for a batch, for a motion without states, and for one that was saved at fewer times.
     """
+    if isinstance(trajectory, State):
+        raise ValueError(f"{name} shows a motion, got a State, which plot_mechanism and show take.")
     states_of(trajectory)
     if trajectory.ts.ndim != 1:
         shape = trajectory.ts.shape[:-1]

@@ -97,6 +97,8 @@ def test_a_state_is_drawn_as_a_motion_with_one_time(piston):
             np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
     with pytest.raises(ValueError, match="needs its system: give system=system"):
         viz.plot_mechanism(state)
+    with pytest.raises(ValueError, match="plot_motion shows a motion, got a State"):
+        viz.plot_motion(state)
     with pytest.raises(ValueError, match="a motion has its own system"):
         viz.plot_mechanism(piston, system=piston.system)
     with pytest.raises(ValueError, match=r"got state\.q of shape"):
