@@ -107,7 +107,9 @@ def test_laws_along_a_coordinate_are_those_of_a_motion(name):
 def curve_is_that_of_a_motion(name):
     part = ON_ANGLE[name]
     bar = planar.Body("bar", mass=1.0, inertia=0.1)
-    system = mb.Scene([bar], joints=[planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))], forces=[part]).compile()
+    system = mb.Scene(
+        [bar], joints=[planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))], forces=[part]
+    ).compile()
     state = mb.State(jnp.array([0.0, 0.0, ANGLE]), jnp.array([0.0, 0.0, RATE]))
     wrench = mb.evaluate(system, state, name)[-1]
     assert float(part.curve(ANGLE, RATE)) == pytest.approx(float(wrench[2]), rel=1e-13)
