@@ -83,7 +83,7 @@ class Motor(AbstractCoordinateForce, AbstractDynamicForce):
         """
         return over_arrays(self.label, _demanded, self, value=value, rate=rate)
 
-    def demand(self, x: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
+    def _demand(self, x: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
         """The demanded force at the coordinate and its rate, raveled."""
         if self.mode == "force":
             demand = self.command.reshape(-1)
@@ -96,7 +96,7 @@ class Motor(AbstractCoordinateForce, AbstractDynamicForce):
         return demand
 
     def state_rates(self, space, poses, velocities, t):
-        demand = self.demand(*self.measured_with_rate(space, poses, velocities))
+        demand = self._demand(*self.measured_with_rate(space, poses, velocities))
         return {"force": (demand.reshape(self.force.shape) - self.force) / self.lag}
 
     def state_sizes(self):
@@ -106,7 +106,7 @@ class Motor(AbstractCoordinateForce, AbstractDynamicForce):
 
 
 def _demanded(motor, value, rate):
-    return motor.demand(value[None], rate[None])[0]
+    return motor._demand(value[None], rate[None])[0]
 
 
 class Actuator(AbstractCoordinateForce, AbstractScalarPart, AbstractDynamicForce):

@@ -136,7 +136,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         **Arguments:** numbers or arrays that broadcast.
 
         - `load` [N] ≥ 0, the force along the normal.
-        - `slip_ratio`: of the slip velocity, of the tread against the ground, to the rolling speed; positive for
+        - `slip_ratio`: the velocity of the tread against the ground, backwards, over the speed of rolling; positive for
             driving.
         - `slip_angle` [rad], positive for a wheel that moves to the left, less than a right angle.
         - `camber` [rad], positive if the wheel's top leans to the right. `Tyre` does not depend on it.
