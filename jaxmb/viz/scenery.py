@@ -140,7 +140,9 @@ def _ball(name, position, radius, color):
 
 def clock(times: Float[np.ndarray, "times"], notes: Sequence[str], marks: Sequence[str], view: View) -> stage.SceneNode:
     """A label with the time of the motion, the size of the grid, notes, and a mark at each time, which may be empty."""
-    digits = max(0, 2 - int(np.floor(np.log10(times[-1] - times[0]))))
+    # A state has no duration.
+    duration = times[-1] - times[0] or 1.0
+    digits = max(0, 2 - int(np.floor(np.log10(duration))))
     rest = "".join(f"  ·  {note}" for note in (f"grid {view.cell:g} m", *notes))
     marks = [f"  ·  {mark}" if mark else "" for mark in marks]
     texts = [f"t = {t:.{digits}f} s{rest}{mark}" for t, mark in zip(times, marks, strict=True)]

@@ -94,17 +94,9 @@ def test_wrong_arguments():
 # As in a motion
 
 
-def test_the_law_of_a_spring_is_that_of_a_motion():
-    curve_is_that_of_a_motion("spring")
-
-
-@pytest.mark.slow
+@pytest.mark.slow(but=("friction",))
 @pytest.mark.parametrize("name", ON_ANGLE)
 def test_laws_along_a_coordinate_are_those_of_a_motion(name):
-    curve_is_that_of_a_motion(name)
-
-
-def curve_is_that_of_a_motion(name):
     part = ON_ANGLE[name]
     bar = planar.Body("bar", mass=1.0, inertia=0.1)
     system = mb.Scene(

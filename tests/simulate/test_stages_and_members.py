@@ -54,6 +54,12 @@ def test_the_end_is_the_last_state_that_a_run_reached(stone):
         assert isinstance(run.end, mb.State) and run.end.z is None
         np.testing.assert_array_equal(run.end.q, motion.ys.q[k])
         np.testing.assert_array_equal(run.end.u, motion.ys.u[k])
+
+
+@pytest.mark.slow
+def test_the_end_of_a_batch_under_jit_and_its_derivatives(stone):
+    motion = thrown(stone, [0.0, 0.2, 0.4])
+    early = dataclasses.replace(motion, ts=jnp.array([0.0, 0.2, jnp.inf]))
     several = jax.tree.map(lambda *x: jnp.stack(x), motion, early)
     np.testing.assert_array_equal(several.end.q, motion.ys.q[jnp.array([2, 1])])
     np.testing.assert_array_equal(
@@ -124,6 +130,7 @@ def test_views_of_a_joined_motion_are_those_of_its_stages(stone, heavy, joined):
         mb.loads(third, "stone")
 
 
+@pytest.mark.slow
 def test_tables_of_joined_motions(joined):
     table = joined.to_xarray()
     np.testing.assert_array_equal(table.t, joined.ts)
@@ -182,7 +189,24 @@ def test_states_at_any_time_of_a_joined_motion(stone, heavy):
 # Members of a batch
 
 
-def test_members_of_a_batch(stone):
+def test_a_batch_has_members(stone):
+    states = [thrown(stone, FIRST, speed) for speed in (1.0, 2.0)]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    assert len(batch) == 2 and "stone" in batch
+    for own, alone in zip(batch, states, strict=True):
+        np.testing.assert_array_equal(own.ys.q, alone.ys.q)
+    np.testing.assert_array_equal(batch[-1].end.u, states[1].end.u)
+    for index, message in ((2, "index 2 is out of bounds"), ((0, 0), "too many indices")):
+        with pytest.raises(IndexError, match=message):
+            batch[index]
+    with pytest.raises(IndexError, match=r"single motion, which has parts by their names, such as motion\['stone'\]"):
+        batch[0][0]
+    table = batch.to_xarray("stone.angle")
+    assert table["stone.angle"].dims == ("member", "t") and np.array_equal(table.t, FIRST)
+
+
+@pytest.mark.slow
+def test_members_and_views_of_a_batch(stone):
     speeds = jnp.array([1.0, 2.0, 3.0])
     batch = jax.vmap(lambda speed: thrown(stone, FIRST, speed))(speeds)
     assert len(batch) == 3 and len([*batch]) == 3 and "stone" in batch
@@ -200,13 +224,9 @@ def test_members_of_a_batch(stone):
     np.testing.assert_array_equal(both[1].energy, both.energy[1])
     with pytest.raises(ValueError, match="begins elsewhere"):
         batch + jax.vmap(lambda speed: thrown(stone, LATER, speed))(speeds[::-1])
-    for index, message in ((3, "index 3 is out of bounds"), ((0, 0), "too many indices")):
-        with pytest.raises(IndexError, match=message):
-            batch[index]
-    with pytest.raises(IndexError, match=r"single motion, which has parts by their names, such as motion\['stone'\]"):
-        batch[0][0]
 
 
+@pytest.mark.slow
 def test_a_batch_as_xarray(stone):
     speeds = jnp.array([1.0, 2.0])
     batch = jax.vmap(lambda speed: thrown(stone, FIRST, speed))(speeds)
