@@ -284,8 +284,7 @@ class Trajectory(eqx.Module):
         **Raises:** `ValueError` if the later is not saved where this one ends, begins in another configuration, or has
         other parts. Under `jit`, where this is unknown, its states are NaN then.
         """
-        # A concrete class: Python asks the other operand if this is none.
-        return joined(self, later) if isinstance(later, Trajectory) else NotImplemented
+        return joined(self, later) if hasattr(later, "stages") else NotImplemented
 
     def get(self, name: str, default: Any = None) -> Any:
         """`trajectory[name]`, or the default if there is no such name."""
