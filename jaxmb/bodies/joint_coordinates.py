@@ -147,6 +147,7 @@ def jumping_couplings(system: Any, t: Scalar, q: Array) -> list[str]:
     """A sentence for each coupling that jumps at concrete coordinates, since an angle is half a turn from its zero."""
     poses, out = system.bodies.prepared_poses(q), []
     for g in system.constraints.position:
+        # A concrete class: no other constraint jumps with an angle.
         if not isinstance(g.group.part, JointCoupling):
             continue
         for k, (name, x) in enumerate(zip(g.group.names, g.group.gather(poses), strict=True)):

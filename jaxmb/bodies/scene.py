@@ -378,6 +378,7 @@ def _check_names(scene: Scene):
     body_names = dict.fromkeys([*(body.name for body in scene.bodies), GROUND, *(frame.name for frame in scene.frames)])
     # A servo's program is not a joint and has no friction.
     kinds = AbstractConstraint | AbstractVelocityConstraint | AbstractCompound
+    # A concrete class: among constraints of coordinates gears alone have losses.
     joints = dict.fromkeys(
         part.name
         for part in scene.joints

@@ -258,6 +258,7 @@ class DryFriction(AbstractDryFriction):
             )
         if isinstance(held, AbstractUnilateralConstraint):
             return part._of_contact(space, held, poses)
+        # A concrete class: no other joint without coordinates has a force along one of them.
         if isinstance(held, JointCoupling):
             if self.radius is not None or "." in self.joint:
                 raise ValueError(f"{self.label}: friction in {held.label} is given by its name, without a radius.")
