@@ -21,7 +21,7 @@ from ..manifold.manifold import normalize_state
 from ..solvers import AbstractMultistep
 from ..solvers.controller import intended_step
 from ..solvers.events import NO_STATE, events_found
-from ..solvers.turning import Counted, TurningController, turning_of
+from ..solvers.turning import Counted, turning_of, with_turning
 from ..states.consistency import is_consistent
 from ..states.headings import are_short
 from ..system import AbstractSystem
@@ -67,7 +67,7 @@ class Problem(NamedTuple):
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
         controller = self.stops.around(controller, contacts, gaps, method.headings(system))
         if self.angles is not None:
-            controller = TurningController(controller, WrappedAngles(system), self.angles)
+            controller = with_turning(controller, WrappedAngles(system), self.angles)
         return {
             "y0": y0,
             "t0": span.t0,

@@ -7,6 +7,7 @@ both ends of a step tell the turns of its end. Saved states take the angles with
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ class Counted(NamedTuple):
 
 
 class Turning(eqx.Module):
-    """The state of a `TurningController`.
+    """The state of an `AbstractTurningController`.
 
     **Fields:** `inner`: the state of the controller inside; the `times` of the ends of the last accepted step, with
     the counted `angles` and their `rates` there, shape (2, k), before the first step the given angles; the `reach` of
@@ -51,7 +52,7 @@ class Turning(eqx.Module):
         return before + x * (after - before) + x * (1.0 - x) * bend
 
 
-class TurningController(AbstractControllerAround):
+class AbstractTurningController(diffrax.AbstractStepSizeController):
     """Counts the full turns of angles along the accepted steps of the `controller` inside.
 
     **Fields:** `angles(t, y)`: angles up to full turns, and their rates, in the user's time; `given`: counted angles at
@@ -99,6 +100,20 @@ class TurningController(AbstractControllerAround):
         return angles, rates * direction
 
 
+class TurningController(AbstractTurningController, AbstractControllerAround):
+    """Around a controller with tolerances."""
+
+
+class FixedTurningController(AbstractTurningController):
+    """Around a controller without tolerances, such as `diffrax.ConstantStepSize`."""
+
+
+def with_turning(controller: Any, angles: Callable[[Any, PyTree], tuple[Array, Array]], given: Any) -> Any:
+    """A controller that counts turns around another one; see `AbstractTurningController`."""
+    adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    return (TurningController if adapts else FixedTurningController)(controller, angles, given)
+
+
 def nearest_turn(angles: Float[Array, "*k"], near: Float[Array, "*k"]) -> Float[Array, "*k"]:
     """The angles [rad] plus the full turns that bring them nearest to others; unchanged beside numbers that are not
     finite.
@@ -115,4 +130,4 @@ def turning_of(controller_state: Any) -> Turning | None:
 
 def without_turning(controller: Any) -> Any:
     """The controller inside, which alone decides on steps."""
-    return controller.controller if isinstance(controller, TurningController) else controller
+    return controller.controller if isinstance(controller, AbstractTurningController) else controller

@@ -61,6 +61,12 @@ def test_a_hinge_saved_at_the_end_only(wheel):
     assert on.to_dict()["hinge.angle"][-1] == pytest.approx(400.0, abs=1e-6)
 
 
+def test_a_hinge_by_steps_of_constant_length(wheel):
+    fixed = {"solver": diffrax.Tsit5(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.05}
+    motion = mb.simulate(wheel, mb.assemble(wheel), t1=2.0, **fixed)
+    assert motion["hinge"].angle[-1] == pytest.approx(16.0, abs=1e-6)
+
+
 def test_turns_of_a_state():
     """An angle that is given beyond half a turn; the screw's displacement tells its turns."""
     joints = [JOINTS["hinge"], JOINTS["screw"]]
