@@ -114,9 +114,11 @@ def _changed(old: CodeType, new: CodeType) -> Iterator[tuple[CodeType, CodeType]
     """The functions that differ between two sources of one module, outer ones before inner ones."""
     if old.co_flags & inspect.CO_OPTIMIZED and old != new:
         yield old, new
-    inner = [[const for const in code.co_consts if isinstance(const, CodeType)] for code in (old, new)]
-    for pair in zip(*inner, strict=True):
-        yield from _changed(*pair)
+    inner, others = ([const for const in code.co_consts if isinstance(const, CodeType)] for code in (old, new))
+    # A fault with one comprehension more changes the whole function only.
+    if len(inner) == len(others):
+        for pair in zip(inner, others, strict=True):
+            yield from _changed(*pair)
 
 
 def _is_written(code: CodeType) -> bool:

@@ -422,7 +422,7 @@ FAULTS = [
     Fault(
         "parts/spatial/joints.py",
         "[separation(space, self, poses), _parallel(space, self, poses)]",
-        "[offset_in_a(space, self, poses), 0.5 * _parallel(space, self, poses)]",
+        "[separation(space, self, poses), _parallel(space, self, poses[::-1])]",
     ),
     Fault("parts/spatial/joints.py", '"angle_b": -turn_about', '"angle_b": turn_about'),
     Fault(
@@ -441,8 +441,8 @@ FAULTS = [
     ),
     Fault(
         "parts/spatial/joints.py",
-        "return jnp.concatenate([_parallel(space, self, poses), height[None]])",
-        "return jnp.concatenate([_parallel(space, self, poses), height[None] ** 3])",
+        "height = dot(self.axis_a, offset_in_a(space, self, poses))",
+        "height = dot(self.axis_a, separation(space, self, poses))",
     ),
     Fault(
         "parts/spatial/kinematics.py",
@@ -727,6 +727,7 @@ FAULTS = [
     Fault(
         "linalg/jacobian.py", "towards - self.direction(self.multipliers(self.jacobian.product(towards)))", "towards"
     ),
+    Fault("linalg/members.py", "*x.shape[2:])[:count], results)", "*x.shape[2:])[-count:], results)"),
     Fault("linalg/newton.py", "size * jnp.maximum(shrinks, rate)), k + 1", "size * rate), k + 1"),
     Fault("linalg/orthogonal.py", "-out.range @ turn.T", "out.range @ turn.T"),
     Fault("linalg/roots.py", "return y, -0.5 * y * y * y * tangents[0]", "return y, -0.5 * y * y * tangents[0]"),
@@ -889,11 +890,7 @@ FAULTS = [
         "jnp.arctan2(self.side * upward[1], upward[2])",
     ),
     # Studies: fits, optimisation, sweeps
-    Fault(
-        "studies/batch.py",
-        "jax.tree.map(lambda x: x[0], x)\n            return",
-        "jax.tree.map(lambda x: x[-1], x)\n            return",
-    ),
+    Fault("studies/batch.py", "        if number != count:", "        if number < count:"),
     Fault("studies/identify/covariance.py", "surplus = count - int(", "surplus = count + int("),
     Fault("studies/identify/density.py", "problem.free.log_volume(z) - problem.objective(z)", "-problem.objective(z)"),
     Fault(
@@ -1048,7 +1045,7 @@ FAULTS = [
     ),
     # Reports, pictures, commands, mechanisms
     Fault("cli/doctor.py", "text if all(versions.values())", "text if any(versions.values())"),
-    Fault("cli/run.py", "factors = 1 + _CHANGE * np.eye(", "factors = 1 - 0 * _CHANGE * np.eye("),
+    Fault("cli/run.py", "np.linalg.norm(np.stack(others) - first, axis=1)", "np.linalg.norm(np.stack(others), axis=1)"),
     Fault(
         "mechanisms/_relative.py",
         "return jnp.concatenate([behind[:1], -behind[1:]])",
@@ -1056,7 +1053,9 @@ FAULTS = [
     ),
     Fault("mechanisms/flyball.py", '"alpha": jnp.arctan2(-along[:, 2]', '"alpha": jnp.arctan2(along[:, 2]'),
     Fault("mechanisms/four_bar.py", "(coupler**2 - rocker**2 + distance**2)", "(rocker**2 - coupler**2 + distance**2)"),
-    Fault("mechanisms/mechanism.py", "np.where(largest > 1e-12, largest, 1.0)", "np.where(largest > 1e-12, 1.0, 1.0)"),
+    Fault(
+        "mechanisms/mechanism.py", "np.where(largest > 1e-12, largest, 1.0)", "np.where(largest < 1e-12, largest, 1.0)"
+    ),
     Fault("report/evaluations.py", "(tableau.num_stages - tableau.fsal) + int(tableau.fsal)", "tableau.num_stages"),
     Fault("report/stress_test.py", '"small" if error < known_to else error', '"small" if error > known_to else error'),
     Fault("report/table.py", "cell.ljust(widths[k]) if k < words", "cell.ljust(widths[k]) if k <= words"),

@@ -103,7 +103,7 @@ class Records:
     """What each file of tests calls and how long it takes, kept in a folder."""
 
     def __init__(self, folder: Path):
-        self._folder = folder
+        self._folder, self._read = folder, dict[Path, Seen]()
         folder.mkdir(parents=True, exist_ok=True)
 
     def _path(self, file: str) -> Path:
@@ -111,12 +111,15 @@ class Records:
 
     def get(self, file: str) -> Seen | None:
         path = self._path(file)
-        return Seen(**json.loads(path.read_text())) if path.exists() else None
+        if path not in self._read and path.exists():
+            self._read[path] = Seen(**json.loads(path.read_text()))
+        return self._read.get(path)
 
     def keep(self, file: str, seen: Seen) -> None:
         for old in self._folder.glob(f"{file.replace('/', '.')}.*.json"):
             old.unlink()
         _write(self._path(file), asdict(seen))
+        self._read[self._path(file)] = seen
 
     def forget(self) -> None:
         for path in self._folder.glob("*.json"):
@@ -279,12 +282,13 @@ class Fork:
         """Never returns."""
         try:
             os.setpgid(0, 0)
-            log = os.open(cache / f"fork-{os.getpid()}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(log, 1)
-            os.dup2(log, 2)
+            log = cache / "seeded_faults" / f"{os.getpid()}.log"
+            opened = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+            os.dup2(opened, 1)
+            os.dup2(opened, 2)
             seen = execute(self.run, cache)
             Path(self._out.name).write_text(json.dumps(asdict(seen)))
-            os.unlink(cache / f"fork-{os.getpid()}.log")
+            log.unlink()
         except BaseException:
             traceback.print_exc()
         finally:
@@ -302,7 +306,7 @@ class Fork:
         text = Path(self._out.name).read_text()
         if text and not status:
             return Seen(**json.loads(text))
-        return Seen(died=f"status {status}" if status else "an error in the runner, see its log")
+        return Seen(died=f"status {status}" if status else "an error of the runner, in a log beside the records")
 
     def end(self) -> None:
         """Ends it and the processes that it started."""
