@@ -166,7 +166,7 @@ def search(fault: Fault, before: Outcome | None, records: Records, options: Any)
     """Asks for one run after another, and returns what came out."""
     place = fault.place()
     outcome, began = Outcome(*fault, module=_digest(PACKAGE / fault.file)), time.monotonic()
-    near = by_nearness(fault, place, records, tuple(options.tests))
+    near = by_nearness(fault, place, records, tuple(options.tests or ["tests/"]))
     known = set() if before is None else {test.split("::")[0] for test in before.noticed_by}
     files = sorted(near, key=lambda file: file not in known)
     if before is not None and before.module == outcome.module and not options.retry:
@@ -282,6 +282,7 @@ class Fork:
         """Never returns."""
         try:
             os.setpgid(0, 0)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
             log = cache / "seeded_faults" / f"{os.getpid()}.log"
             opened = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
             os.dup2(opened, 1)
@@ -391,7 +392,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--limit", type=float, default=LIMIT, help="most seconds of one file's tests")
     parser.add_argument("--slow", action="store_true", help="slow tests as well, if no short one notices")
     parser.add_argument("--all-files", action="store_true", help="every file that notices, not the first alone")
-    parser.add_argument("--tests", nargs="+", default=["tests"], help="files or folders of tests, all by default")
+    parser.add_argument("--tests", action="append", help="a file or folder of tests, all by default")
     parser.add_argument("--retry", action="store_true", help="faults again that were not noticed")
     parser.add_argument("--renew", action="store_true", help="find out again what each file calls")
     parser.add_argument("--cache", type=Path, default=ROOT / ".pytest_cache", help="pytest's cache folder")
@@ -400,12 +401,14 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     options = arguments()
+    # Whoever ends this process ends its forks.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     os.chdir(ROOT)
     prepare()
     records = Records(options.cache / "seeded_faults")
     if options.renew:
         records.forget()
-    keeps = options.tests == ["tests"]
+    keeps = not options.tests
     outcomes, began = read_table() if keeps else {}, time.monotonic()
     chosen = [f for f in FAULTS if not options.words or any(word in str(f) for word in options.words)]
 
