@@ -62,10 +62,7 @@ class AbstractTurningController(diffrax.AbstractStepSizeController):
     controller: Any
     angles: Callable[[Any, PyTree], tuple[Array, Array]]
     given: Float[Array, "k"]
-    direction: Any
-
-    def __init__(self, controller: Any, angles: Callable[[Any, PyTree], tuple[Array, Array]], given: Any):
-        self.controller, self.angles, self.given, self.direction = controller, angles, given, 1.0
+    direction: Any = 1.0
 
     def wrap(self, direction):
         inner = self.controller.wrap(direction)
@@ -110,8 +107,10 @@ class FixedTurningController(AbstractTurningController):
 
 def with_turning(controller: Any, angles: Callable[[Any, PyTree], tuple[Array, Array]], given: Any) -> Any:
     """A controller that counts turns around another one; see `AbstractTurningController`."""
-    adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    return (TurningController if adapts else FixedTurningController)(controller, angles, given)
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        # Its tolerances are properties.
+        return TurningController(controller, angles, given)  # pyright: ignore[reportCallIssue]
+    return FixedTurningController(controller, angles, given)
 
 
 def nearest_turn(angles: Float[Array, "*k"], near: Float[Array, "*k"]) -> Float[Array, "*k"]:

@@ -62,7 +62,7 @@ def test_a_hinge_saved_at_the_end_only(wheel):
 
 
 def test_a_hinge_by_steps_of_constant_length(wheel):
-    fixed = {"solver": diffrax.Tsit5(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.05}
+    fixed = {"solver": diffrax.Tsit5(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.02}
     motion = mb.simulate(wheel, mb.assemble(wheel), t1=2.0, **fixed)
     assert motion["hinge"].angle[-1] == pytest.approx(16.0, abs=1e-6)
 
