@@ -21,6 +21,7 @@ from ._compat import changed, steps_of
 from ._results import RESULTS
 from ._types import State
 from .contacts.events import ContactEvents, FoundEvents, contact_events
+from .contacts.shares import shared_multipliers
 from .formulations import AbstractFormulation
 from .formulations.laws import accelerations_at
 from .formulations.shares import least_multipliers
@@ -347,7 +348,8 @@ class Trajectory(eqx.Module):
         quantities = self.system.quantities()
         chosen = {name: quantities[name] for name in names}
         solved = Solved(*self._solved) if any(quantity.of_forces for quantity in chosen.values()) else None
-        return {name: quantity.value(self.ts, self.ys, solved) for name, quantity in chosen.items()}
+        states = lambda quantity: self.bearing if quantity.of_forces else self.ys
+        return {name: quantity.value(self.ts, states(quantity), solved) for name, quantity in chosen.items()}
 
     def at(self, t: ArrayLike) -> State:
         """The state at any time or times [s] of a run with `SaveAt(dense=True)`, on the constraints; in a batch, at the
@@ -445,9 +447,15 @@ class Trajectory(eqx.Module):
         def single(t, y):
             at = Instant.of(self.system, t, y)
             udot, multipliers = accelerations_at(at, self.formulation)
-            return udot, least_multipliers(at, multipliers)
+            return udot, shared_multipliers(at, least_multipliers(at, multipliers))
 
         return vmap_states(single, self.system.acceleration_rows * self.system.nu)(self.ts, self.ys)
+
+    @property
+    def bearing(self) -> State:
+        """The states to which the `multipliers` belong, in which implied contacts bear their shares of forces."""
+        ys = states_of(self)
+        return self.system.contacts.bearing(ys) if self.system.contacts.n > 1 else ys
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:
@@ -464,7 +472,7 @@ class Trajectory(eqx.Module):
         """Names of the joints and contacts whose shares of a force the equations leave open.
 
         Each row counts by its constraint force, with forces multiplied by the system's size. The shares of redundant
-        joints have the least sum of squares of these. Of closed contacts, as many take the force as are independent.
+        joints have the least sum of squares of these, and so have the shares of closed contacts, none of which pulls.
         """
         if self.ts.ndim != 1:
             raise ValueError("undetermined_reactions is of a single motion, not of a batch.")
@@ -476,7 +484,7 @@ class Trajectory(eqx.Module):
 
     @_of_each_stage
     def _reaction(self, name):
-        return self.system.catalogue.reaction(name, self.ts, self.ys, self.multipliers)
+        return self.system.catalogue.reaction(name, self.ts, self.bearing, self.multipliers)
 
     @property
     def constraint_forces(self) -> Mapping[str, Array]:
@@ -485,7 +493,7 @@ class Trajectory(eqx.Module):
 
     @_of_each_stage
     def _constraint_force(self, name):
-        return self.system.catalogue.constraint_force(name, self.ts, self.ys, self.multipliers)
+        return self.system.catalogue.constraint_force(name, self.ts, self.bearing, self.multipliers)
 
     @property
     def forces(self) -> Mapping[str, Array]:
@@ -500,7 +508,7 @@ class Trajectory(eqx.Module):
     @_of_each_stage
     def _wrenches(self, name):
         multipliers = None if self.system.ideal else self.multipliers
-        return self.system.catalogue.applied_wrenches(name, self.ts, states_of(self), multipliers)
+        return self.system.catalogue.applied_wrenches(name, self.ts, self.bearing, multipliers)
 
     @property
     @_view

@@ -8,9 +8,11 @@ from .groups import AbstractConstraintGroup, ConstraintGroup, VelocityConstraint
 
 
 def contact_set(
-    constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[VelocityConstraintGroup]
+    constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[VelocityConstraintGroup], shared: bool
 ) -> ContactSet:
-    """The contacts among the groups of position constraints, and the dry friction among the velocity constraints."""
+    """The contacts among the groups of position constraints, and the dry friction among the velocity constraints;
+    `shared`: see `ContactSet`.
+    """
     contacts = [g for g in constraints if isinstance(g.group.part, AbstractUnilateralConstraint)]
     frictions = [g for g in velocity_constraints if g.joints]
     if not contacts and not frictions:
@@ -35,6 +37,7 @@ def contact_set(
         pairs=tuple(pairs),
         constant=tuple(g.law.needs == "nothing" for g in frictions for _ in range(_count(g))),
         coupled=any(g.group.part.coupled for g in frictions),
+        shared=shared,
     )
 
 

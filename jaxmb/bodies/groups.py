@@ -140,6 +140,10 @@ class Group(eqx.Module):
         """The coordinates of one part, from the poses of its bodies."""
         return self.kernel("coordinates")(part, part.seen_poses(self.layout.space, poses))
 
+    def at(self, t: Scalar) -> Any:
+        """All parts at a time."""
+        return self.map(lambda at: at(t)) if self.inputs else self.part
+
     def single(self, member: int, t: Scalar) -> Any:
         """One part at a time."""
         return self._at(member, jax.tree.map(lambda leaf: leaf[member], self.part), t)

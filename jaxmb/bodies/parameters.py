@@ -223,8 +223,9 @@ def _inputs(
     for name in signals:
         if name not in varying:
             raise ValueError(
-                f"{name!r} must be constant: masses, moments of inertia, frames, gravity and the gains of servos "
-                "cannot be inputs."
+                f"{name!r} must be constant: masses, moments of inertia, frames, gravity, the gains of servos, "
+                "restitution, speeds of belts and friction of ropes cannot be inputs. For a change at a time, end the "
+                "run there, change the number by with_parameters, and simulate on from the end."
             )
     return new
 

@@ -78,7 +78,7 @@ class RigidBodySystem(AbstractSystem):
     contacts: ContactSet = eqx.field(static=True, init=False)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self):
-        self.contacts = contact_set(self.constraints.position, self.constraints.velocity)
+        self.contacts = contact_set(self.constraints.position, self.constraints.velocity, self.ranks.shared)
 
     # Sizes and names
 
@@ -310,10 +310,16 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def contact_numbers(self):
+        return self._contact_numbers(lambda group: group.part)
+
+    def contact_numbers_at(self, t):
+        return self._contact_numbers(lambda group: group.at(t))
+
+    def _contact_numbers(self, parts):
         contacts = [
-            g.group.part for g in self.constraints.position if isinstance(g.group.part, AbstractUnilateralConstraint)
+            parts(g.group) for g in self.constraints.position if isinstance(g.group.part, AbstractUnilateralConstraint)
         ]
-        frictions = [(g.group.part, g.rows) for g in self.constraints.frictions]
+        frictions = [(parts(g.group), g.rows) for g in self.constraints.frictions]
         joined = lambda values: jnp.concatenate([*values, jnp.zeros(0, self.length.dtype)])
         return ContactNumbers(
             restitution=joined(part.restitution for part in contacts),

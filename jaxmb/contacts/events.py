@@ -7,8 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._arguments import package_for_tables
 from .._printed import preformatted
@@ -18,8 +19,9 @@ from ..linalg.arrays import is_traced
 from ..linalg.jitted import jitted
 from ..parts.modes import CLOSED, FREE, OPEN, STICK
 from ..system import AbstractSystem
+from ..system.instant import Instant
 from .guards import ContactGuards
-from .tolerance import ContactTolerance
+from .tolerance import REST, ContactTolerance
 
 # Impulses of contacts that are this small relative to a simultaneous one count as zero.
 _ROUNDING = 1e-12
@@ -33,13 +35,30 @@ class FoundEvents(NamedTuple):
     """The recorded events of a run.
 
     **Fields:** their `number`; buffers with the `times` of the ends of steps at which they happen, and the raveled
-    `states` before them; `touch`: gaps that count as closed, in units of the system's size.
+    `states` before them; `touch`: gaps that count as closed, in units of the system's size; the time and the raveled
+    state at the `start` of the run, and its last time, `end`; None if they are not known.
     """
 
     number: Int[Array, ""]
     times: Float[Array, " events"]
     states: Float[Array, "events n"]
     touch: Float[Array, ""]
+    start: tuple[Float[Array, ""], Float[Array, "n"]] | None = None
+    end: Float[Array, ""] | None = None
+
+
+class AtStart(NamedTuple):
+    """Contacts and dry friction at the start of a run: the `time` [s], and the arrays of `ContactEvents` then.
+    `moves`: where dry friction slips, or is about to; it may also be at its limit at rest, with a mode of slip.
+    """
+
+    time: Float[Array, ""]
+    impulses: Float[Array, "parts"]
+    kinetic_energy_lost: Float[Array, ""]
+    before: Float[Array, "parts"]
+    after: Float[Array, "parts"]
+    rest: Float[Array, "parts"]
+    moves: Bool[Array, "parts"]
 
 
 class Event(NamedTuple):
@@ -55,7 +74,8 @@ class Event(NamedTuple):
     - `part`: the name of the part.
     - `kind`: of a contact `"impact"`, after which the gap opens again, `"close"`, `"open"`, `"rest"`: the end of
         infinitely many bounces, or `"impulse"`: it stays closed while others strike. Of friction `"stick"`, `"slip"`,
-        or `"impact"` for an impulse alone.
+        or `"impact"` for an impulse alone. In the table, and in `ContactEvents.at_start`, `"closed at start"`, `"stick
+        at start"` and `"slip at start"` hold from `t0` on; `"impact at start"` is an impulse then.
     - `impulse` [N s, N m s].
     - `kinetic_energy_lost` [J]: the kinetic energy that all bodies together lose at this time, the same for each part.
         It is negative if a driver, whose speed is given, does more work at the impact than the impact dissipates.
@@ -76,14 +96,16 @@ class ContactEvents(eqx.Module):
     ```python
     print(motion.events)  # A table, of a motion with contacts such as `RigidContact`.
     motion.events.times, motion.events.impulses, motion.events.kinetic_energy_lost
+    slips = [event.part for event in motion.events.at_start if event.kind == "slip at start"]
     ```
 
     Parts that change at the same time share an event. Its time has the derivative of the first of them; impulses and
     energies have those of their own times.
 
-    Impacts at `t0` and at announced `jumps` are part of the motion and are not listed. A state that is saved just at an
-    event may be the state before it or after it. Times, impulses and energies have first derivatives; `rest` counts as
-    a constant.
+    The table begins with contacts that are closed, and friction that sticks or slips, from `t0` on: `at_start`, with
+    arrays in `start`. The other arrays have the events on the way only, and so have `list` and `len`. Impacts at
+    announced `jumps` are part of the motion and are not listed. A state that is saved just at an event may be the state
+    before it or after it. Times, impulses and energies have first derivatives; `rest` counts as a constant.
 
     **Fields:**
 
@@ -98,6 +120,8 @@ class ContactEvents(eqx.Module):
         and other friction implies it, 0 if it does not act.
     - `rest` [s], shape (events, parts): the time from an event to the end of infinitely many bounces too low to be
         resolved, after which the contact is at rest; zero without such bounces.
+    - `start`: `t0` as `time`, and the other arrays at that time, without the axis of events.
+    - `end` [s]: the last time of the motion.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -108,6 +132,8 @@ class ContactEvents(eqx.Module):
     before: Float[Array, "events parts"]
     after: Float[Array, "events parts"]
     rest: Float[Array, "events parts"]
+    start: AtStart | None = None
+    end: Float[Array, ""] | None = None
 
     def __len__(self) -> int:
         return len(self._rows())
@@ -129,7 +155,7 @@ class ContactEvents(eqx.Module):
     def __str__(self) -> str:
         if isinstance(self.times, Tracer) or self.times.ndim != 1:
             return repr(self)
-        events = self._rows()
+        events = [*self.at_start, *self._rows()]
         # The energy that parts lose together is shown at the first of them.
         first = [k == 0 or event.time != events[k - 1].time for k, event in enumerate(events)]
         rows = [
@@ -143,21 +169,62 @@ class ContactEvents(eqx.Module):
         )
 
     def to_pandas(self) -> Any:
-        """A `pandas.DataFrame` with a row for each `Event`.
+        """A `pandas.DataFrame` with a row for each `Event` of the table.
 
         **Raises:** `ImportError` without pandas; `ValueError` for a batch.
         """
-        return package_for_tables("pandas", "pandas").DataFrame(self._rows(), columns=list(Event._fields))
+        rows = [*self.at_start, *self._rows()]
+        return package_for_tables("pandas", "pandas").DataFrame(rows, columns=list(Event._fields))
+
+    @property
+    def at_start(self) -> list[Event]:
+        """What holds from `t0` on: an `Event` for each contact that is closed, and for friction that sticks or slips.
+
+        **Raises:** `ValueError` for a batch, and under `jit`.
+        """
+        concrete = self._concrete()
+        return [] if concrete.start is None else list(concrete._from_start(concrete.start))
 
     def _rows(self) -> list[Event]:
+        concrete = self._concrete()
+        rows = [row for k in np.flatnonzero(np.isfinite(concrete.times)) for row in concrete._at(k)]
+        return sorted(rows, key=lambda event: event.time)
+
+    def _concrete(self):
         if isinstance(self.times, Tracer) or self.times.ndim != 1:
             raise ValueError(
                 "The events of one motion are a table; in a batch or under jit they are arrays: see the fields of "
                 "ContactEvents."
             )
-        concrete = jax.tree.map(np.asarray, self)
-        rows = [row for k in np.flatnonzero(np.isfinite(concrete.times)) for row in concrete._at(k)]
-        return sorted(rows, key=lambda event: event.time)
+        return jax.tree.map(np.asarray, self)
+
+    def _from_start(self, start: AtStart) -> Iterator[Event]:
+        """The parts that act from the start on, with concrete numbers."""
+        time, lost = float(start.time), float(start.kinetic_energy_lost)
+        for i, name in enumerate(self.names[: self.contacts]):
+            impulse = float(start.impulses[i])
+            if start.after[i] > OPEN or impulse > 0:
+                kind = "closed at start" if start.after[i] > OPEN else "impact at start"
+                yield Event(time, name, kind, impulse, lost)
+            yield from self._rest(time, name, start.rest[i], start.after[i])
+        for name, i, impulse in self._frictions(start.impulses):
+            after, slips = start.after[i], np.any(start.moves[i:][: self.names.count(name)])
+            if impulse != 0 or after != FREE:
+                kind = "impact" if after == FREE else "slip" if after < STICK and slips else "stick"
+                yield Event(time, name, f"{kind} at start", impulse, lost)
+
+    def _rest(self, time, name, rest, after) -> Iterator[Event]:
+        """The end of infinitely many bounces, if it is within the motion."""
+        if rest > 0 and after == CLOSED and (self.end is None or time + rest <= self.end):
+            yield Event(time + float(rest), name, "rest", 0.0, 0.0)
+
+    def _frictions(self, impulses) -> Iterator[tuple[str, int, float]]:
+        """Friction by name, with the index of its first row, and its impulse."""
+        for name in dict.fromkeys(self.names[self.contacts :]):
+            # Friction in two directions has two rows.
+            i = self.names.index(name)
+            of_both = impulses[i:][: self.names.count(name)]
+            yield name, i, float(np.linalg.norm(of_both) if of_both.size > 1 else of_both[0])
 
     def _at(self, k: int) -> Iterator[Event]:
         """The parts that take part in one event, with concrete numbers."""
@@ -171,12 +238,8 @@ class ContactEvents(eqx.Module):
             was_open, is_open = bool(were_open[i]), bool(are_open[i])
             if impulses[i] > (0.0 if was_open else least) or was_open != is_open:
                 yield Event(time, name, _KINDS[was_open, is_open], float(impulses[i]), lost)
-            if self.rest[k, i] > 0 and self.after[k, i] == CLOSED:
-                yield Event(time + float(self.rest[k, i]), name, "rest", 0.0, 0.0)
-        for name in dict.fromkeys(self.names[self.contacts :]):
-            # Friction in two directions has two rows.
-            i, of_both = self.names.index(name), impulses[self.names.index(name) :][: self.names.count(name)]
-            impulse = float(np.linalg.norm(of_both) if of_both.size > 1 else of_both[0])
+            yield from self._rest(time, name, self.rest[k, i], self.after[k, i])
+        for name, i, impulse in self._frictions(impulses):
             before, after = self.before[k, i], self.after[k, i]
             # Friction that sticks goes on sticking when other friction begins or ceases to imply it.
             changed = before != after and min(before, after) < STICK
@@ -187,33 +250,59 @@ class ContactEvents(eqx.Module):
 
 def contact_events(system: AbstractSystem, formulation: AbstractFormulation, record: FoundEvents) -> ContactEvents:
     """The events of a run, or of a batch of runs, from their records."""
-    evaluated = _evaluated if is_traced((system, formulation, record)) else _happened
-    contacts = system.contacts
-    return ContactEvents(contacts.names, contacts.n, *evaluated(system, formulation, record))
+    (most, axis), contacts, start = (record.times.shape[-1], record.times.ndim - 1), system.contacts, None
+    if record.start is None:
+        rows = _of_records(system, formulation, record)
+    else:
+        # The start is the first record, so that one program serves all.
+        with_start = lambda first, rest: jnp.concatenate([jnp.expand_dims(first, axis), rest], axis)
+        times, states = map(with_start, record.start, (record.times, record.states))
+        rows = _of_records(system, formulation, record._replace(number=record.number + 1, times=times, states=states))
+        parted = [(lax.index_in_dim(x, 0, axis, False), lax.slice_in_dim(x, 1, None, axis=axis)) for x in rows]
+        start, rows = AtStart(record.start[0], *(x for x, _ in parted[1:])), [x for _, x in parted]
+    return ContactEvents(contacts.names, contacts.n, *_in_order(rows[:-1], axis, most), start, record.end)
 
 
-def _happened(system, formulation, record):
-    """The same for concrete numbers: as many events as there are, in blocks that all use one program."""
+def _of_records(system, formulation, record):
+    """The numbers of recorded events, one row each: times, infinite for rows without an event, impulses, energies,
+    modes before and after, times to rest, and which friction moves.
+    """
+    if is_traced((system, formulation, record)):
+        return _evaluated(system, formulation, record)
     most, axis = record.times.shape[-1], record.times.ndim - 1
     number, times, states = (np.asarray(x) for x in (record.number, record.times, record.states))
     number, blocks = np.minimum(number, most), []
     # Concrete also while a function is traced, if the run is not its argument.
     with jax.ensure_compile_time_eval():
+        # In blocks that all use one program.
         for first in range(0, max(int(np.max(number, initial=0)), 1), _TOGETHER):
             places = np.minimum(np.arange(first, first + _TOGETHER), most - 1)
             block = record._replace(number=number - first, times=times[..., places], states=states[..., places, :])
             blocks.append(_evaluated(system, formulation, block))
-    rows = [np.concatenate(column, axis) for column in zip(*blocks, strict=True)]
+    return [np.concatenate(column, axis) for column in zip(*blocks, strict=True)]
+
+
+def _in_order(rows, axis, most):
+    """Rows in the order of time; concrete ones of a single run without those behind its last event.
+
+    **Arguments:** `most`: the number of rows of a batch.
+    """
+    if is_traced(rows):
+        order = jnp.argsort(jnp.isinf(rows[0]), axis=axis, stable=True)
+        return [jnp.take_along_axis(x, _along(order, x), axis) for x in rows]
     count = int(np.sum(np.isfinite(rows[0]))) if axis == 0 else most
     order = np.argsort(np.isinf(rows[0]), axis=axis, kind="stable")[..., :count]
 
     def placed(x, fill):
-        along = order.reshape(order.shape + (1,) * (x.ndim - order.ndim))
-        happened = np.take_along_axis(x, along, axis)
+        happened = np.take_along_axis(np.asarray(x), _along(order, x), axis)
         padding = [(0, count - happened.shape[axis] if k == axis else 0) for k in range(x.ndim)]
         return jax.device_put(np.pad(happened, padding, constant_values=fill))
 
     return placed(rows[0], np.inf), *(placed(x, 0.0) for x in rows[1:])
+
+
+def _along(order, x):
+    return order.reshape(order.shape + (1,) * (x.ndim - order.ndim))
 
 
 @jitted
@@ -232,14 +321,27 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, record:
         is_event = k < record.number
         flat = jnp.where(is_event, flat, first[0])
         y = State(flat[:nq], flat[nq : nq + nu], flat[nq + nu :] if system.nz else None)
-        out = guards.impact(jnp.where(is_event, t, first[1]), y, dated=True)
+        at = jnp.where(is_event, t, first[1])
+        event = guards.event(at, y)
+        out = guards.impact(at, y, dated=True, event=event)
         # Steps may also end where nothing changes.
         before, after = out.modes
-        is_event = is_event & (jnp.any(before != after) | jnp.any(out.impulses != 0))
+        changes = jnp.any(before != after) | jnp.any(out.impulses != 0)
+        is_event = is_event & (changes | ((k == 0) & (record.start is not None)))
         time = jnp.where(is_event, t + out.late, jnp.inf)
-        values = out.impulses, out.energy, before, after, out.rest
-        return time, *jax.tree.map(lambda x: jnp.where(is_event, x, 0.0), values)
+        values = out.impulses, out.energy, before, after, out.rest, _moves(guards, Instant.of(system, at, y), event)
+        return time, *jax.tree.map(lambda x: jnp.where(is_event, x, jnp.zeros_like(x)), values)
 
-    rows = jax.vmap(single)(jnp.arange(record.times.size), record.times, record.states)
-    order = jnp.argsort(jnp.isinf(rows[0]), stable=True)
-    return jax.tree.map(lambda x: x[order], rows)
+    return jax.vmap(single)(jnp.arange(record.times.size), record.times, record.states)
+
+
+def _moves(guards: ContactGuards, at: Instant, event: Any) -> Bool[Array, "parts"]:
+    """Where dry friction slips after an event, or begins to, beyond rounding errors."""
+    (system, t, q), contacts = (at.system, at.t, at.q), at.system.contacts
+    gradients = jnp.abs(contacts.gradients(system, t, q, event.u))
+    rates = jnp.abs(contacts.rates(system, t, q, event.u))
+    begins = jnp.abs(contacts.accelerations(system, t, q, event.u, event.after))
+    sizes = gradients @ jnp.abs(event.u), gradients @ jnp.abs(at.inertia.solve(at.force))
+    slowest = guards.tolerance.in_metres(system).slowest
+    moves = (rates > REST * sizes[0] + slowest) | (begins > REST * sizes[1] + slowest)
+    return lax.stop_gradient(moves & (np.arange(moves.size) >= contacts.n))

@@ -35,14 +35,14 @@ def reserves(system, t, q, u, multipliers):
         size = _YIELD * jnp.max(jnp.diag(gram)) + jnp.finfo(gram.dtype).tiny
         shared = solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ dry)
         dry = jnp.where(stick, shared, dry)
-    return jnp.concatenate([forces[:n], system.contact_numbers.limit * normal - sizes_of(contacts.pairs, dry)])
+    return jnp.concatenate([forces[:n], system.contact_numbers_at(t).limit * normal - sizes_of(contacts.pairs, dry)])
 
 
 def friction_coefficients(system, t, q, u):
     """Coefficients of friction and limits of stick, as multiples of the force along the gap of a contact. That force is
     the normal force if the gap grows by one metre a metre.
     """
-    contacts, numbers = system.contacts, system.contact_numbers
+    contacts, numbers = system.contacts, system.contact_numbers_at(t)
     if contacts.in_joints.all():
         return numbers.coefficient, numbers.limit
     unit = np.isin(np.arange(system.acceleration_rows), contacts.rows[: contacts.n]).astype(q.dtype)

@@ -72,7 +72,11 @@ class SlipSearch:
         of_pair = placed_pairs(dry.pairs, jnp.stack([touches, may], axis=1), among[n:])
         rigid = W
         if len(pairs) > 1:
-            W = W + _YIELD * jnp.max(jnp.diag(W)) * jnp.diag(np.isin(laws, both).astype(W.dtype))
+            # Normal forces are undetermined only where contacts imply each other.
+            normals = among & (laws < n)
+            shared = jnp.any(normals & ~independent_components(W, normals))
+            yields = np.isin(laws, both) | (normals & shared)
+            W = W + _YIELD * jnp.max(jnp.diag(W)) * jnp.diag(yields.astype(W.dtype))
         step = 1 / (W[both[:, 0], both[:, 0]] + W[both[:, 1], both[:, 1]])
         turns = np.zeros((len(pairs), 2, b.size, b.size), W.dtype)
         for turn, (i, j) in zip(turns, both, strict=True):
@@ -216,8 +220,10 @@ class SlipSearch:
 
 
 def with_implied(W: Float[Array, "n_m n_m"], answers: Answers) -> Answers:
-    """The answers with as many laws of stick as are independent of each other and of the contacts."""
+    """The answers with as many closed contacts as are independent of each other, and as many laws of stick as are
+    independent of each other and of the contacts.
+    """
     n, sticks = answers.closed.size, answers.sticks
-    closed = jnp.concatenate([answers.closed, jnp.zeros_like(sticks)])
+    closed = independent_components(W, jnp.concatenate([answers.closed, jnp.zeros_like(sticks)]))
     independent = independent_components(reduced(W, closed)[n:, n:], sticks)
-    return answers._replace(sticks=independent, implied=sticks & ~independent)
+    return answers._replace(closed=closed[:n], sticks=independent, implied=sticks & ~independent)

@@ -16,6 +16,7 @@ from ..system.equation import AbstractEquation
 from .forces import contact_forces, largest_force, reserves
 from .impact import Impact, impact
 from .impacting import Event, find_event
+from .shares import Shares
 from .tolerance import REST, ContactTolerance
 
 # Slip in two directions that begins has the direction of its modes up to this multiple of the slow velocity.
@@ -49,7 +50,11 @@ class ContactGuards(AbstractGuards):
         q = system.normalize(t, y.q)
         modes = contacts.modes(q)
         gap = contacts.gaps(system, t, q)
-        free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers.peaks), system.length)
+        free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers_at(t).peaks), system.length)
+        if contacts.shared:
+            # Contacts that others imply at one pose may part, or meet, at another.
+            apart = self.tolerance.in_metres(system).near - jnp.abs(gap)
+            free = jnp.where(modes.shut & ~modes.closed, apart, free)
         acts = self.forces(y)
         if contacts.m:
             rates = contacts.rates(system, t, q, y.u)[contacts.n :]
@@ -60,7 +65,11 @@ class ContactGuards(AbstractGuards):
             here = system.at(y)
             _, multipliers = contact_forces(here, t, q, y.u)
             largest = largest_force(here, t, dataclasses.replace(y, q=q), multipliers)
-            return reserves(here, t, q, y.u, multipliers) / largest
+            left = reserves(here, t, q, y.u, multipliers) / largest
+            if not contacts.shared:
+                return left
+            pushes = Shares.at(here, t, q, y.u).largest_least(left[: contacts.n])
+            return jnp.concatenate([pushes, left[contacts.n :]])
 
         reserves_of_active = cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free)
         return jnp.where(acts, reserves_of_active, free / system.length)
@@ -119,7 +128,7 @@ class ContactGuards(AbstractGuards):
         system, y = lax.stop_gradient((self.system, y))
         contacts, t = system.contacts, jnp.asarray(t, y.q.dtype)
         q = system.normalize(t, y.q)
-        slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers.peaks
+        slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers_at(t).peaks
         rates = contacts.rates(system, t, q, y.u)[: contacts.n] * slopes / system.length
         # The rates of bodies that move side by side are rounding errors, and close nothing.
         least = _RATE * jnp.finfo(rates.dtype).eps * jnp.max(jnp.abs(y.u) / system.velocity_scale())

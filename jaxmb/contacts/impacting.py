@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import add_up
-from ..linalg.complementarity import independent_components, solved_components
+from ..linalg.complementarity import independent_components, reduced, solved_components
+from ..linalg.elimination import solve
 from ..linalg.inertia import AbstractInertia
 from ..linalg.pairs import for_first, of_pairs
 from ..linalg.rotations import norm
@@ -32,6 +33,8 @@ from .tolerance import REST, ContactTolerance
 _ROUNDS = 4
 # Rebounds without gain of energy are found in this many trials, to this fraction of the summands of the energy.
 _TRIALS, _GAIN = 40, 1e-12
+# Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact.
+_UNDETERMINED = 1e-6
 
 
 class Event(NamedTuple):
@@ -262,8 +265,10 @@ class Impacting:
         return self.rates + self.moves.rows @ (u - self.u)
 
     def sizes_of_rates(self, *velocities):
-        """The sizes of the summands of the rates at some velocities."""
-        return jnp.abs(self.moves.rows) @ add_up(map(jnp.abs, velocities))
+        """The sizes of the summands of the rates at some velocities. Rates below their resolution are rounding errors:
+        of bodies at rest all summands are.
+        """
+        return jnp.abs(self.moves.rows) @ add_up(map(jnp.abs, velocities)) + self.tolerance.slowest / REST
 
     def accelerated(self, u):
         """Accelerations without contacts and friction, as `u̇` and along the laws' directions. Also the reactions of the
@@ -291,7 +296,11 @@ class Impacting:
         hits = about_to[first]
         late = jnp.where(hits, until[first], 0.0)
         closes = about_to[:n] & (np.arange(n) == first)
-        touching = self.modes.shut | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
+        shut = self.modes.shut
+        if self.contacts.shared:
+            # Contacts that others implied may have parted.
+            shut = shut & (self.modes.closed | (self.gap <= 0.5 * self.tolerance.near))
+        touching = shut | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
         at = self.u + late * before
         zeros = (until, about_to) if self.in_groups else None
         return When(late, first, hits, before, at, self.rates_at(at), touching, zeros)
@@ -451,8 +460,9 @@ class Impacting:
         low = when.touching & ~struck.resting & (curve < 0) & opens & (restitution < 1)
         low = jnp.where(is_first, low, before.low)
         # Each bounce takes `restitution` times as long as the previous bounce.
-        ratio = jnp.where(low & (bounce > 0), restitution, 0.0)
-        rest = jnp.where(low & (bounce > 0), 2 * rate / (falls * (1 - ratio)), 0.0)
+        bounces = low & (bounce > self.tolerance.slowest)
+        ratio = jnp.where(bounces, restitution, 0.0)
+        rest = jnp.where(bounces, 2 * rate / (falls * (1 - ratio)), 0.0)
         return low, jnp.where(is_first, rest, before.rest)
 
     # The rounds
@@ -525,7 +535,7 @@ class Impacting:
             modes=(self.modes.numbers, modes),
             rest=jnp.pad(settled.rest, (0, self.contacts.m)),
             energy=0.5 * (kinetic(when.u) - kinetic(after)),
-            solvable=settled.solvable,
+            solvable=settled.solvable & self.determined(settled, implied),
             share=struck.share,
             compression=self.compressed(settled.compression),
         )
@@ -560,6 +570,27 @@ class Impacting:
         begun = struck.ended & self.contacts.in_pairs
         of_friction = modes_of_friction(last.sticks, last.implied, last.slips, begun)
         return jnp.concatenate([of_contacts, of_friction]).astype(self.q.dtype), implied
+
+    def determined(self, settled: Round, implied):
+        """Whether slip is the same for all shares of the forces of contacts that imply each other."""
+        n, last = self.contacts.n, settled.answers
+        if not (self.contacts.shared and self.contacts.m):
+            return True
+        closed = jnp.concatenate([last.closed, jnp.zeros(self.contacts.m, bool)])
+        left, normals = reduced(self.influence, closed), self.influence[:n, :n]
+        # A unit force on each implied contact (column), with what the others have less.
+        less = jnp.where(last.closed[:, None] & last.closed[None, :], normals, jnp.eye(n, dtype=normals.dtype))
+        less = solve(less, jnp.where(last.closed[:, None] & implied[None, :], -normals, 0.0))
+        moved = less + jnp.diag(jnp.where(implied, 1.0, 0.0))
+        rate = settled.struck.rate[n:]
+        speed = self.laws.sizes(rate)
+        ended = settled.struck.ended
+        slips = jnp.where(ended, last.slips, rate / jnp.where(ended, 1.0, speed))
+        contact = np.array(self.contacts.contact_of)
+        pushes = jnp.where(self.contacts.in_joints[:, None], 0.0, moved[contact])
+        change = left[n:, n:] @ ((self.laws.coefficient * slips)[:, None] * pushes)
+        size = self.laws.coefficient * jnp.diag(self.influence)[n:]
+        return jnp.all(jnp.abs(change) <= _UNDETERMINED * jnp.max(size))
 
     def lost(self, settled: Round, implied):
         """Which laws hold the velocities after the event, and the impulses that remove the rates left by rounding

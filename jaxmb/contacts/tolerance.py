@@ -35,6 +35,11 @@ class ContactTolerance(eqx.Module):
         return _NEAR * self.touch
 
     @property
+    def slowest(self) -> Float[Array, ""]:
+        """The rate per second up to which gaps and slips do not change."""
+        return self.touch
+
+    @property
     def bounce(self) -> Float[Array, ""]:
         """The height of the bounces that are omitted."""
         return _BOUNCE * self.touch

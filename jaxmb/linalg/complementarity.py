@@ -16,6 +16,8 @@ PIVOT = 1e-9
 # Right-hand sides are displaced by this multiple of their largest entry, differently in each row: with equal right-hand
 # sides the method could cycle.
 _APART = 1e-10
+# The lower bound in the linear program of `largest_least`: its components are above -1.
+_BOUND = 2.0
 
 
 def positive_components(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"], Bool[Array, ""]]:
@@ -70,6 +72,49 @@ def lemke(W: Float[Array, "k k"], b: Float[Array, "k"]) -> tuple[Bool[Array, "k"
     _, basis, leaving, solvable, _ = lax.while_loop(proceed, advance, first)
     positive = jnp.any(basis[None, :] == np.arange(k, 2 * k)[:, None], axis=1)
     return positive, solvable & (leaving == 2 * k)
+
+
+def largest_least(
+    x: Float[Array, "k"], instead: Float[Array, "k k"], given: Bool[Array, "k"], free: Bool[Array, "k"]
+) -> Float[Array, ""]:
+    """The largest s for which some choice of the `free` components leaves all components at least s; at most 1.
+
+    By a linear program. Components are in units in which they are of the size of one, or smaller.
+
+    **Arguments:** `x`: the `given` components while the free ones are zero; `instead`: the change of each given
+    component (row) by a unit of each free one (column).
+    """
+    x, instead, given, free = lax.stop_gradient((x, instead, given, free))
+    k, one = x.size, jnp.ones(1, x.dtype)
+    # Unknown are what free components have above s, and s above a lower bound of it.
+    instead = jnp.where(given[:, None] & free[None, :], instead, 0.0)
+    less = jnp.where(given, 1 - jnp.sum(instead, axis=1), 0.0)
+    A = jnp.concatenate([-instead, less[:, None]], axis=1)
+    A = jnp.concatenate([A, jnp.pad(one, (k, 0))[None]])
+    most = jnp.concatenate([jnp.where(given, x + _BOUND * less, 1.0), (1 + _BOUND) * one])
+    prices = jnp.concatenate([jnp.where(free, 0.0, 1.0), -one])
+    none = jnp.zeros_like(A)
+    matrix = jnp.concatenate([jnp.concatenate([none, A.T], axis=1), jnp.concatenate([-A, none], axis=1)])
+    right = jnp.concatenate([prices, most])
+    positive, solvable = lemke(matrix, right)
+    least = solved_components(matrix, right, positive)[k] - _BOUND
+    return jnp.where(solvable, least, jnp.min(jnp.where(given, x, 1.0)))
+
+
+def least_norm(x: Float[Array, "k"], instead: Float[Array, "k k"], free: Bool[Array, "k"]) -> Float[Array, "k"]:
+    """The components ≥ 0 with the least sum of squares, over all choices of the `free` components; differentiable.
+
+    **Arguments:** `x` with all free components at zero; `instead`: see `largest_least`, zero for other pairs.
+    """
+    choices = jnp.where(free[None, :], instead + jnp.eye(x.size, dtype=x.dtype), 0.0)
+    gram = choices.T @ choices + jnp.diag(jnp.where(free, 0.0, 1.0))
+    along = choices @ solve(gram, choices.T)
+    least = x - along @ x
+    # Components that would be negative are raised to zero.
+    moves = lax.stop_gradient(jnp.diag(along)) > PIVOT
+    along = jnp.where(moves[:, None] & moves[None, :], along, jnp.eye(x.size, dtype=x.dtype))
+    raised, _ = positive_components(along, jnp.where(moves, least, 1.0))
+    return jnp.maximum(least + jnp.where(moves[:, None], along, 0.0) @ solved_components(along, least, raised), 0.0)
 
 
 def independent_components(W: Float[Array, "k k"], among: Bool[Array, "k"]) -> Bool[Array, "k"]:

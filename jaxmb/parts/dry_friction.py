@@ -65,8 +65,10 @@ class AbstractStickSlip(AbstractVelocityConstraint):
 
     @property
     def limit(self) -> Array:
-        """The coefficient of stick."""
-        return self.coefficient if self.static_coefficient is None else self.static_coefficient
+        """The coefficient of stick; not below the coefficient of slip, which may be an input."""
+        if self.static_coefficient is None:
+            return self.coefficient
+        return jnp.maximum(self.coefficient, self.static_coefficient)
 
     def residual(self, space, poses, velocities, t):
         del t
@@ -99,8 +101,8 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
     """
 
     joint: str = fields.name()
-    coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", constant=True)
-    static_coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", optional=True, constant=True)
+    coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative")
+    static_coefficient: fields.Number = fields.parameter(unit="1", sign="non-negative", optional=True)
     directions: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
 
     @property
@@ -212,7 +214,8 @@ class DryFriction(AbstractDryFriction):
 
     Several contacts in space that stick, such as the feet of a table, share undetermined forces. These are as small as
     possible, and where a contact reaches its limit others take more. If the normal forces are undetermined too, as with
-    four feet, the motion in slip may be undetermined as well, and the run may end with a failure. In the plane the run
+    four feet, their shares are as small as possible. In slip they may leave the motion undetermined, as of a table that
+    slides and spins: such a run ends with a failure that names contacts and friction. In the plane the run
     finds a possible distribution, in which a foot of a body at rest may be at its limit: its mode is slip, at velocity
     zero, and another foot bears the rest. The motion and the sum of the forces are determined.
 
@@ -226,7 +229,8 @@ class DryFriction(AbstractDryFriction):
 
     - `joint`: the name of the joint, contact or gear, or `"joint.coordinate"`. The reaction must be determinate: no
       other joint may imply any of its rows.
-    - `coefficient` μ ≥ 0 in slip; `static_coefficient` ≥ μ in stick, default μ.
+    - `coefficient` μ ≥ 0 in slip; `static_coefficient` ≥ μ in stick, default μ. Both may be inputs, as of a brake that
+        closes: `inputs={"rub.coefficient": Series(ts, values, "held")}`. Stick never has the smaller one.
     - `radius` [m] > 0 of the pin, for a coordinate that is an angle.
     - `speed` [m/s] of a belt, a number, or two numbers for two directions of slip; default none.
     """

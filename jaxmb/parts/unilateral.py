@@ -232,6 +232,7 @@ class RigidContact(AbstractRigidContact):
     ```
 
     The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is compliant.
+    The rim of a disc in space has no rigid contact with ground; `spatial.RollingDisc` rolls on a plane.
 
     **Arguments:**
 

@@ -92,7 +92,13 @@ def about_contacts(system, outcome: Outcome) -> str:
     touch = np.asarray(contacts.gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
     touch = np.append(touch, [True] * contacts.m)
     names = ", ".join(dict.fromkeys(repr(name) for name, at in zip(contacts.names, touch, strict=True) if at))
-    return f"{RESULTS[RESULTS.contacts_undetermined]} These are {names}, at t = {float(outcome.t):.6g}."
+    text = f"{RESULTS[RESULTS.contacts_undetermined]} These are {names}, at t = {float(outcome.t):.6g}."
+    if contacts.shared and contacts.m:
+        text += (
+            " Or, if they slip in different directions, the motion is undetermined: it depends on the shares of a load "
+            "that contacts which imply each other leave open. Three feet determine it, and so do compliant contacts."
+        )
+    return text
 
 
 def has_failed(result) -> Any:

@@ -136,11 +136,14 @@ class End(NamedTuple):
     events: Any
 
     @classmethod
-    def of(cls, solution: Any, stops: Stops) -> "End":
+    def of(cls, solution: Any, stops: Stops, start: tuple[Any, State]) -> "End":
+        """The end of a run with a `start`, its time and the state that was given."""
         t, y = solution.ts[1][-1], jax.tree.map(lambda y: y[-1], _parted(solution.ys[1])[0])
         contact_events, events = None, events_found(solution.controller_state)
         if events is not None:
-            contact_events = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch)
+            t0, given = start
+            first = t0, jnp.concatenate([given.q, given.u, *([] if given.z is None else [given.z])])
+            contact_events = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch, first, t)
             if stops.event is not None:
                 # The last step is cut off at the user's event, before the events at its end.
                 later = jnp.isfinite(contact_events.times) & (contact_events.times > t)
@@ -187,7 +190,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         ys = seen(first.fn, ts, ys, (problem.span.t0, start.y))
     elif angles is not None:
         ys = dataclasses.replace(ys, angles=angles)
-    end = End.of(solution, stops)
+    end = End.of(solution, stops, (problem.span.t0, start.given))
     result, stuck, ran_out, coupling = _verdict(problem, span, start, end, solution, lost, saves.outside)
     motion, failed = (ys, solution.interpolation), has_failed(result)
     if problem.traced:

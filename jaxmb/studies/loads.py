@@ -187,7 +187,7 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
         (tuple(map(tuple, parts.values())), drives, acting),
         number,
         motion.ts,
-        motion.ys,
+        motion.bearing,
         (motion.accelerations, motion.multipliers, given),
     )
     own = {} if system.forces.gravity is None else {system.forces.gravity_name: "gravity"}

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._types import Coordinates, Scalar, Velocities
+from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.pairs import of_pairs
 from ..linalg.sums import unchecked_take, with_entries
-from ..parts.modes import CLOSED, STICK, Modes
+from ..parts.modes import CLOSED, IMPLIED, STICK, Modes
 
 
 class ContactNumbers(NamedTuple):
@@ -50,6 +50,7 @@ class ContactSet:
         coefficients are forces, with a normal force of one.
     - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
     - `coupled`: whether the normal forces of friction in joints depend on friction itself, without other constraints.
+    - `shared`: whether contacts imply each other if all of them are closed, at the pose for which the system was made.
     """
 
     names: tuple[str, ...] = ()
@@ -61,6 +62,7 @@ class ContactSet:
     constant: tuple[bool, ...] = ()
     pairs: tuple[int, ...] = ()
     coupled: bool = False
+    shared: bool = False
 
     def __bool__(self) -> bool:
         return bool(self.names)
@@ -143,6 +145,14 @@ class ContactSet:
         """The coordinates with other modes, a number for each law or a common number."""
         places = np.array(self.places, int)
         return with_entries(q, places, jnp.broadcast_to(jnp.asarray(modes, q.dtype), places.shape))
+
+    def bearing(self, ys: State) -> State:
+        """States in which implied contacts bear forces as other closed contacts do."""
+        places = np.array(self.places[: self.n], int)
+        modes = ys.q[..., places]
+        return dataclasses.replace(
+            ys, q=ys.q.at[..., places].set(jnp.where(jnp.round(modes) == IMPLIED, CLOSED, modes))
+        )
 
     def bound(self, q: Coordinates) -> Float[Array, "nq"]:
         """The coordinates with all contacts closed and all friction sticking."""

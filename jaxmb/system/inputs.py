@@ -41,11 +41,11 @@ def with_inputs(system: System, inputs: Signals) -> System:
     start = jaxmb.assemble(shaken, fix={"bar.angle": 0.5})
     ```
 
-    Torques, forces, coefficients, lengths, points and the numbers of drivers and of user functions may be inputs.
-    Masses, moments of inertia, gravity, the gains of servos, and points of compliant contacts and of joints that rub
-    (`Friction`) may not. Rates of inputs enter the velocities and accelerations that constraints prescribe, the rates
-    of coordinates and points that forces depend on, and the velocities of a moving terrain. The values of a series can
-    be differentiated like parameters.
+    Torques, forces, coefficients, also of `DryFriction`, lengths, points and the numbers of drivers and of user
+    functions may be inputs. Masses, moments of inertia, gravity, the gains of servos, restitution, the friction of a
+    rope, and points of compliant contacts and of joints that rub (`Friction`) may not. Rates of inputs enter the
+    velocities and accelerations that constraints prescribe, the rates of coordinates and points that forces depend on,
+    and the velocities of a moving terrain. The values of a series can be differentiated like parameters.
 
     **Arguments:** `inputs`: a `Series`, or a function of time [s] that JAX can differentiate, by the parameter's name,
     `{"motor.torque": Series(ts, torques)}`. A function is captured with the values that it reads now.

@@ -4,8 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import linprog, nnls
 
-from jaxmb.linalg.complementarity import independent_components, positive_components, solved_components
+from jaxmb.linalg.complementarity import (
+    independent_components,
+    largest_least,
+    least_norm,
+    positive_components,
+    solved_components,
+)
 
 
 @jax.jit
@@ -65,3 +72,49 @@ def test_derivative_of_a_solution():
     W, b = jnp.array([[2.0, 1.0], [1.0, 3.0]]), jnp.array([-1.0, 2.0])
     jacobian = jax.jacfwd(lambda b: solve(W, b)[0])(b)
     np.testing.assert_allclose(jacobian, [[-0.5, 0.0], [0.0, 0.0]], atol=1e-15)
+
+
+def moves_of(instead, free):
+    """The changes of all components by a unit of each free one."""
+    return np.asarray(instead + jnp.diag(jnp.where(free, 1.0, 0.0)))[:, np.asarray(free)]
+
+
+def choices(random, k):
+    """Random components of which one to three are free, and how they change the others."""
+    free = np.isin(np.arange(k), random.choice(k, random.integers(1, 4), replace=False))
+    instead = np.where(~free[:, None] & free[None, :], random.normal(size=(k, k)), 0.0)
+    x = np.where(free, 0.0, random.uniform(-1.0, 1.0, k) if random.random() < 0.5 else random.integers(0, 2, k))
+    return jnp.asarray(x, float), jnp.asarray(instead), jnp.asarray(free)
+
+
+def test_the_largest_least_component_is_that_of_a_linear_program():
+    """Against SciPy's; half of the problems have components that are zero."""
+    random, found = np.random.default_rng(1), jax.jit(largest_least)
+    for _ in range(60):
+        x, instead, free = choices(random, 6)
+        moves = np.concatenate([moves_of(instead, free), -np.ones((6, 1))], axis=1)
+        n = moves.shape[1] - 1
+        bounds = [*n * [(None, None)], (None, 1.0)]
+        known = linprog(np.append(np.zeros(n), -1.0), -moves, np.asarray(x), bounds=bounds).x[-1]
+        np.testing.assert_allclose(found(x, instead, ~free, free), known, atol=1e-12)
+
+
+def test_the_least_norm_of_components_that_are_not_negative():
+    """No allowed change lowers the sum of squares. Four feet under an eccentric load, by hand: their shares are a
+    plane, until the foot opposite to the load has none.
+    """
+    random, found, least = np.random.default_rng(2), jax.jit(least_norm), jax.jit(largest_least)
+    for _ in range(60):
+        x, instead, free = choices(random, 6)
+        if least(x, instead, ~free, free) < 1e-3:
+            continue
+        y, moves = np.asarray(found(x, instead, free)), moves_of(instead, free)
+        np.testing.assert_allclose(y, x + moves @ y[np.asarray(free)], atol=1e-12)
+        # Forces from below hold the components that are zero, and only these.
+        zero = y < 1e-12
+        unbalanced = nnls(moves[zero].T, moves.T @ y)[1] if np.any(zero) else np.linalg.norm(moves.T @ y)
+        assert np.all(y >= 0) and unbalanced < 1e-10
+    # The force of the last foot moves to its neighbours, and comes from the opposite foot.
+    instead, last = jnp.zeros((4, 4)).at[:3, 3].set(jnp.array([1.0, -1.0, -1.0])), jnp.arange(4) == 3
+    for load, shares in (((0.0, 1.0, 1.0), (0.5, 0.5, 0.5, 0.5)), ((0.8, 0.1, 0.3), (0.8, 0.1, 0.3, 0.0))):
+        np.testing.assert_allclose(found(jnp.asarray([*load, 0.0]), instead, last), shares, atol=1e-15)

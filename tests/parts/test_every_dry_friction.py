@@ -224,6 +224,3 @@ def test_what_needs_smooth_forces_refuses_it():
         mb.equilibrium(system)
     with pytest.raises(ValueError, match="joints must hold constraints"):
         mb.Scene([BODY], joints=[SLIDE, mb.DryFriction("rub", "joint", coefficient=0.3)])
-    with pytest.raises(ValueError, match="coefficient' must be constant"):
-        series = mb.Series([0.0, 1.0], [0.1, 0.2])
-        mb.simulate(system, mb.assemble(system), t1=1.0, inputs={"rub.coefficient": series})

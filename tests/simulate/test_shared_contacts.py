@@ -1,0 +1,134 @@
+"""Four ropes and four feet of one body, whose shares of a force the equations leave open."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxmb as mb
+from jaxmb import spatial
+from jaxmb.contacts.dry_laws import Dry
+from jaxmb.contacts.friction import frictional
+
+G = 9.81
+CORNERS = np.array([(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2), (-0.3, -0.2)])
+INERTIA = np.diag([0.03, 0.04, 0.05])
+DOWN = mb.Gravity((0.0, 0.0, -G))
+
+
+@functools.cache
+def on_ropes():
+    """A box of 2 kg on four equal ropes of 1 m; its mass centre is 0.1 m below the plane of their ends."""
+    box = spatial.Body("box", mass=2.0, inertia=INERTIA, position=(0.0, 0.0, -1.1))
+    ropes = [
+        mb.Slack(f"rope {k}", "ground", "box", point_a=(*xy, 0.0), point_b=(*xy, 0.1), length=1.0)
+        for k, xy in enumerate(CORNERS)
+    ]
+    return mb.Scene([box], joints=ropes, forces=[DOWN]).compile()
+
+
+def test_four_ropes_are_known_to_share_and_three_are_not():
+    system = on_ropes()
+    assert system.contacts.shared
+    three = mb.Scene(
+        [spatial.Body("box", mass=2.0, inertia=INERTIA, position=(0.0, 0.0, -1.1))],
+        joints=[
+            mb.Slack(f"rope {k}", "ground", "box", point_a=(*xy, 0.0), point_b=(*xy, 0.1), length=1.0)
+            for k, xy in enumerate(CORNERS[:3])
+        ],
+        forces=[DOWN],
+    ).compile()
+    assert not three.contacts.shared
+
+
+@pytest.mark.slow
+def test_a_box_swings_on_four_ropes():
+    """As a pendulum, since it does not turn: against its equation. At rest each rope has a quarter of the weight."""
+    system = on_ropes()
+    for speed in (0.0, 1.0):
+        state = mb.assemble(system, rates={"box.velocity": (speed, 0.0, 0.0)})
+        ts = np.linspace(0.0, 1.0, 6)
+        motion = mb.simulate(system, state, t1=1.0, saveat=ts, rtol=1e-9, atol=1e-11)
+        known = solve_ivp(
+            lambda t, y: [y[1], -G * np.sin(y[0])], (0, 1), [0.0, speed], t_eval=ts, rtol=1e-11, atol=1e-12
+        )
+        angle, rate = known.y
+        where = np.stack([np.sin(angle), 0 * angle, -0.1 - np.cos(angle)], axis=1)
+        np.testing.assert_allclose(motion["box"].position, where, atol=1e-8)
+        assert len(motion.events) == 0
+        assert motion.undetermined_reactions == tuple(f"rope {k}" for k in range(4))
+        pulls = np.stack([motion.reactions[f"rope {k}"].force for k in range(4)])
+        along = np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+        total = 2.0 * (G * np.cos(angle) + rate**2)
+        np.testing.assert_allclose(np.sum(pulls, axis=0), total[:, None] * along, atol=1e-6)
+        sizes = np.einsum("kti,ti->kt", pulls, along)
+        assert np.all(sizes > 0)
+        # The shares of least norm are a plane over the corners.
+        np.testing.assert_allclose(sizes[0] - sizes[1] - sizes[2] + sizes[3], 0.0, atol=1e-6)
+
+
+def feet_problem(twist):
+    """The influence of the forces on four feet of a box on each other, accelerations without them, and the velocities
+    of the feet at a twist."""
+    points = np.concatenate([CORNERS, np.full((4, 1), -0.1)], axis=1)
+    row = lambda along, p: np.concatenate([along, np.cross(p, along)])
+    z, x, y = np.eye(3)[[2, 0, 1]]
+    rows = np.array([*(row(z, p) for p in points), *(row(d, p) for p in points for d in (x, y))])
+    inverse = np.diag(1 / np.array([2.0, 2.0, 2.0, *np.diag(INERTIA)]))
+    return rows @ inverse @ rows.T, rows @ np.array([0.0, 0.0, -G, 0.0, 0.0, 0.0]), rows @ twist
+
+
+@functools.cache
+def laws_of_feet():
+    contact_of, pairs = tuple(np.repeat(np.arange(4), 2).tolist()), (0, 2, 4, 6)
+
+    @jax.jit
+    def found(W, b, slips):
+        dry = Dry(contact_of, pairs, jnp.full(8, 0.3), slips, jnp.zeros(8))
+        return frictional(W, b, dry, jnp.ones(12, bool))
+
+    return found
+
+
+def test_four_feet_at_rest_stick():
+    """All of them, and none slips for rounding errors; as many laws have a force as are independent."""
+    W, b, _ = feet_problem(np.zeros(6))
+    answers = laws_of_feet()(jnp.asarray(W), jnp.asarray(b), jnp.zeros(8))
+    assert answers.solvable and np.sum(answers.closed) == 3
+    assert np.all(answers.sticks | answers.implied) and not np.any(answers.slips)
+    # A push within the limit of friction is held as well, and one beyond it is not.
+    for push, sticks in ((2.9, True), (3.0, False)):
+        answers = laws_of_feet()(jnp.asarray(W), jnp.asarray(b).at[4::2].add(push), jnp.zeros(8))
+        assert answers.solvable and np.all(answers.sticks | answers.implied) == sticks
+
+
+@functools.cache
+def on_feet():
+    box = spatial.Body("box", mass=2.0, inertia=INERTIA, position=(0.0, 0.0, 0.1))
+    feet = [
+        mb.RigidContact(f"foot {k}", "box", terrain=mb.terrain.Flat(), centre=(*xy, -0.1))
+        for k, xy in enumerate(CORNERS)
+    ]
+    rubs = [mb.DryFriction(f"rub {k}", f"foot {k}", coefficient=0.3) for k in range(4)]
+    return mb.Scene([box], joints=feet, forces=[DOWN, *rubs]).compile()
+
+
+@pytest.mark.slow
+def test_a_box_slides_on_four_feet():
+    """To its stop, and at rest; sliding and spinning at once, its motion is undetermined."""
+    system = on_feet()
+    state = mb.assemble(system)
+    at = lambda speed, spin: dataclasses.replace(state, u=state.u.at[0].set(speed).at[5].set(spin))
+    stays = mb.simulate(system, at(0.0, 0.0), t1=0.2)
+    assert len(stays.events) == 0
+    assert {event.kind for event in stays.events.at_start} == {"closed at start", "stick at start"}
+    slides = mb.simulate(system, at(0.5, 0.0), t1=0.2)
+    np.testing.assert_allclose(slides["box"].position[-1, 0], 0.5**2 / (2 * 0.3 * G), rtol=1e-8)
+    assert slides.undetermined_reactions == tuple(f"foot {k}" for k in range(4))
+    with pytest.raises(RuntimeError, match="motion is undetermined") as caught:
+        mb.simulate(system, at(0.5, 1.0), t1=0.2)
+    assert "'foot 0'" in str(caught.value) and "'rub 3'" in str(caught.value)
