@@ -1,6 +1,7 @@
 """Rigid bodies joined by constraints and forces: the compiled form of a scene."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -127,7 +128,10 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def rows(self):
-        return tuple((name, k) for g in self.constraints.groups for name in g.group.names for k in range(g.rows))
+        # Parts with several components have one sequence of rows.
+        names = [name for g in self.constraints.groups for name in g.group.names for _ in range(g.rows)]
+        counts = {name: itertools.count() for name in names}
+        return tuple((name, next(counts[name])) for name in names)
 
     # Bodies
 

@@ -252,15 +252,15 @@ def contact_events(system: AbstractSystem, formulation: AbstractFormulation, rec
     """The events of a run, or of a batch of runs, from their records."""
     (most, axis), contacts, start = (record.times.shape[-1], record.times.ndim - 1), system.contacts, None
     if record.start is None:
-        rows = _of_records(system, formulation, record)
+        *rows, _ = _of_records(system, formulation, record)
     else:
         # The start is the first record, so that one program serves all.
         with_start = lambda first, rest: jnp.concatenate([jnp.expand_dims(first, axis), rest], axis)
         times, states = map(with_start, record.start, (record.times, record.states))
         rows = _of_records(system, formulation, record._replace(number=record.number + 1, times=times, states=states))
         parted = [(lax.index_in_dim(x, 0, axis, False), lax.slice_in_dim(x, 1, None, axis=axis)) for x in rows]
-        start, rows = AtStart(record.start[0], *(x for x, _ in parted[1:])), [x for _, x in parted]
-    return ContactEvents(contacts.names, contacts.n, *_in_order(rows[:-1], axis, most), start, record.end)
+        start, rows = AtStart(record.start[0], *(x for x, _ in parted[1:])), [x for _, x in parted[:-1]]
+    return ContactEvents(contacts.names, contacts.n, *_in_order(rows, axis, most), start=start, end=record.end)
 
 
 def _of_records(system, formulation, record):
