@@ -93,12 +93,10 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
 
 
 def _are_shared(system, q):
-    """Whether closed contacts imply each other; see `ContactSet`. Large scenes count as shared without a look."""
+    """Whether closed contacts imply each other; see `ContactSet`. Large scenes are not looked at."""
     contacts, on_host = system.contacts, system.on_host(0.0)
-    if contacts.n < 2:
+    if contacts.n < 2 or on_host is None:
         return False
-    if on_host is None:
-        return True
     blocks = on_host.blocks(np.asarray(contacts.bound(q)))
     entries = np.concatenate([*(np.asarray(b).ravel() for b in blocks), np.zeros(1)])
     source = system.layout.jacobian_source(
