@@ -454,8 +454,7 @@ class Trajectory(eqx.Module):
     @property
     def bearing(self) -> State:
         """The states to which the `multipliers` belong, in which implied contacts bear their shares of forces."""
-        ys = states_of(self)
-        return self.system.contacts.bearing(ys) if self.system.contacts.n > 1 else ys
+        return self.system.contacts.bearing(states_of(self))
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:

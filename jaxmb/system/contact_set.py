@@ -148,6 +148,8 @@ class ContactSet:
 
     def bearing(self, ys: State) -> State:
         """States in which implied contacts bear forces as other closed contacts do."""
+        if self.n < 2:
+            return ys
         places = np.array(self.places[: self.n], int)
         modes = ys.q[..., places]
         return dataclasses.replace(

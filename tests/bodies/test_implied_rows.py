@@ -538,4 +538,3 @@ def test_each_row_of_a_part_has_a_number_of_its_own():
     system = mb.Scene([axle, *bodies], joints=[*joints, *rolls]).compile()
     assert len(set(system.rows)) == len(system.rows)
     assert [k for name, k in system.rows if name == "right rolls"] == [0, 1, 2]
-    assert [(row.name, row.row) for row in system.implied] == [("left rolls", 0)]
