@@ -574,7 +574,7 @@ class Impacting:
     def determined(self, settled: Round, implied):
         """Whether slip is the same for all shares of the forces of contacts that imply each other."""
         n, last = self.contacts.n, settled.answers
-        if not (self.contacts.shared and self.contacts.m):
+        if not self.contacts.may_leave_slip_open:
             return True
         closed = jnp.concatenate([last.closed, jnp.zeros(self.contacts.m, bool)])
         left, normals = reduced(self.influence, closed), self.influence[:n, :n]

@@ -93,7 +93,7 @@ def about_contacts(system, outcome: Outcome) -> str:
     touch = np.append(touch, [True] * contacts.m)
     names = ", ".join(dict.fromkeys(repr(name) for name, at in zip(contacts.names, touch, strict=True) if at))
     text = f"{RESULTS[RESULTS.contacts_undetermined]} These are {names}, at t = {float(outcome.t):.6g}."
-    if contacts.shared and contacts.m:
+    if contacts.may_leave_slip_open:
         text += (
             " Or, if they slip in different directions, the motion is undetermined: it depends on the shares of a load "
             "that contacts which imply each other leave open. Three feet determine it, and so do compliant contacts."

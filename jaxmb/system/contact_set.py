@@ -68,6 +68,11 @@ class ContactSet:
         return bool(self.names)
 
     @property
+    def may_leave_slip_open(self) -> bool:
+        """Whether shares of normal forces may change slip."""
+        return self.shared and self.m > 0
+
+    @property
     def n(self) -> int:
         """The number of contacts."""
         return len(self.by_poisson)
