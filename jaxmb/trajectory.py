@@ -21,7 +21,6 @@ from ._compat import changed, steps_of
 from ._results import RESULTS
 from ._types import State
 from .contacts.events import ContactEvents, FoundEvents, contact_events
-from .contacts.shares import shared_multipliers
 from .formulations import AbstractFormulation
 from .formulations.laws import accelerations_at
 from .formulations.shares import least_multipliers
@@ -447,14 +446,15 @@ class Trajectory(eqx.Module):
         def single(t, y):
             at = Instant.of(self.system, t, y)
             udot, multipliers = accelerations_at(at, self.formulation)
-            return udot, shared_multipliers(at, least_multipliers(at, multipliers))
+            return udot, self.system.contacts.sharing.multipliers(at, least_multipliers(at, multipliers))
 
         return vmap_states(single, self.system.acceleration_rows * self.system.nu)(self.ts, self.ys)
 
     @property
     def bearing(self) -> State:
         """The states to which the `multipliers` belong, in which implied contacts bear their shares of forces."""
-        return self.system.contacts.bearing(states_of(self))
+        contacts = self.system.contacts
+        return contacts.sharing.bearing(contacts, states_of(self))
 
     @property
     def reactions(self) -> Mapping[str, Reaction]:

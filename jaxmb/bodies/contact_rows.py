@@ -2,16 +2,18 @@
 
 from collections.abc import Sequence
 
+from ..contacts.shares import Sharing
 from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.contact_set import ContactSet
+from ..system.sharing import NoSharing
 from .groups import AbstractConstraintGroup, ConstraintGroup, VelocityConstraintGroup
 
 
 def contact_set(
-    constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[VelocityConstraintGroup], shared: bool
+    constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[VelocityConstraintGroup], shares: bool
 ) -> ContactSet:
     """The contacts among the groups of position constraints, and the dry friction among the velocity constraints;
-    `shared`: see `ContactSet`.
+    `shares`: whether contacts imply each other, see `ContactSet.sharing`.
     """
     contacts = [g for g in constraints if isinstance(g.group.part, AbstractUnilateralConstraint)]
     frictions = [g for g in velocity_constraints if g.joints]
@@ -37,7 +39,7 @@ def contact_set(
         pairs=tuple(pairs),
         constant=tuple(g.law.needs == "nothing" for g in frictions for _ in range(_count(g))),
         coupled=any(g.group.part.coupled for g in frictions),
-        shared=shared,
+        sharing=Sharing() if shares else NoSharing(),
     )
 
 

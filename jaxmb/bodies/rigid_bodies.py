@@ -62,7 +62,8 @@ class RigidBodySystem(AbstractSystem):
 
     **Fields:** the sets of `bodies`, `constraints` and `forces`; the groups of `frames`, and of `free_joints`, which
     have no rows; `guess`, the state given with the bodies; `length` [m], the scene's size; `ranks`; `implied` rows;
-    `elimination`, the joints' order of elimination, or None; `design` variables; the `contacts` and dry friction.
+    `elimination`, the joints' order of elimination, or None; `design` variables; whether contacts imply each other,
+    so that they have `shares` of forces; the `contacts` and dry friction.
     """
 
     bodies: BodySet
@@ -76,10 +77,11 @@ class RigidBodySystem(AbstractSystem):
     implied: tuple[Implied, ...] = eqx.field(static=True)
     elimination: JointOrder | None = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = ()
+    shares: bool = eqx.field(static=True, default=False)
     contacts: ContactSet = eqx.field(static=True, init=False)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self):
-        self.contacts = contact_set(self.constraints.position, self.constraints.velocity, self.ranks.shared)
+        self.contacts = contact_set(self.constraints.position, self.constraints.velocity, self.shares)
 
     # Sizes and names
 
@@ -312,18 +314,11 @@ class RigidBodySystem(AbstractSystem):
 
     # Contacts and dry friction
 
-    @property
-    def contact_numbers(self):
-        return self._contact_numbers(lambda group: group.part)
-
-    def contact_numbers_at(self, t):
-        return self._contact_numbers(lambda group: group.at(t))
-
-    def _contact_numbers(self, parts):
+    def contact_numbers(self, t):
         contacts = [
-            parts(g.group) for g in self.constraints.position if isinstance(g.group.part, AbstractUnilateralConstraint)
+            g.group.at(t) for g in self.constraints.position if isinstance(g.group.part, AbstractUnilateralConstraint)
         ]
-        frictions = [(parts(g.group), g.rows) for g in self.constraints.frictions]
+        frictions = [(g.group.at(t), g.rows) for g in self.constraints.frictions]
         joined = lambda values: jnp.concatenate([*values, jnp.zeros(0, self.length.dtype)])
         return ContactNumbers(
             restitution=joined(part.restitution for part in contacts),

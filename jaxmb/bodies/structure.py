@@ -86,7 +86,8 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     )
     return dataclasses.replace(
         system,
-        ranks=Ranks(position, position + invariants, velocity, acceleration, _are_shared(system, q)),
+        ranks=Ranks(position, position + invariants, velocity, acceleration),
+        shares=system.contacts.may_share and _are_shared(system, q),
         implied=implied,
         elimination=elimination_order(system, dropped, absolute),
     )
@@ -95,7 +96,7 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
 def _are_shared(system, q):
     """Whether closed contacts imply each other; see `ContactSet`. Large scenes are not looked at."""
     contacts, on_host = system.contacts, system.on_host(0.0)
-    if contacts.n < 2 or on_host is None:
+    if on_host is None:
         return False
     blocks = on_host.blocks(np.asarray(contacts.bound(q)))
     entries = np.concatenate([*(np.asarray(b).ravel() for b in blocks), np.zeros(1)])
@@ -104,10 +105,9 @@ def _are_shared(system, q):
     )
     rows = entries[source] * system.known_scales()[1]
     rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), np.finfo(rows.dtype).tiny)
-    of_contacts = np.array(contacts.rows[: contacts.n])
-    others = np.delete(rows, contacts.rows, axis=0)
+    normals, others = rows[np.array(contacts.rows[: contacts.n])], np.delete(rows, contacts.rows, axis=0)
     rank = lambda rows: int(np.linalg.matrix_rank(rows, tol=_INDEPENDENT)) if len(rows) else 0
-    return rank(np.concatenate([others, rows[of_contacts]])) < rank(others) + contacts.n
+    return rank(np.concatenate([others, normals])) < rank(others) + len(normals)
 
 
 def _parts(system):

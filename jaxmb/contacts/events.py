@@ -344,4 +344,4 @@ def _moves(guards: ContactGuards, at: Instant, event: Any) -> Bool[Array, "parts
     sizes = gradients @ jnp.abs(event.u), gradients @ jnp.abs(at.inertia.solve(at.force))
     slowest = guards.tolerance.in_metres(system).slowest
     moves = (rates > REST * sizes[0] + slowest) | (begins > REST * sizes[1] + slowest)
-    return lax.stop_gradient(moves & (np.arange(moves.size) >= contacts.n))
+    return lax.stop_gradient(jnp.pad(moves[contacts.n :], (contacts.n, 0)))

@@ -16,7 +16,7 @@ _YIELD = 1e-10
 def largest_force(system, t, y, multipliers):
     """The size to which forces are compared."""
     largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(system.force(t, y.q, y.u)))
-    largest = system.contacts.with_limits(system, largest)
+    largest = system.contacts.with_limits(system, t, largest)
     return largest + jnp.finfo(largest.dtype).tiny
 
 
@@ -35,14 +35,14 @@ def reserves(system, t, q, u, multipliers):
         size = _YIELD * jnp.max(jnp.diag(gram)) + jnp.finfo(gram.dtype).tiny
         shared = solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ dry)
         dry = jnp.where(stick, shared, dry)
-    return jnp.concatenate([forces[:n], system.contact_numbers_at(t).limit * normal - sizes_of(contacts.pairs, dry)])
+    return jnp.concatenate([forces[:n], system.contact_numbers(t).limit * normal - sizes_of(contacts.pairs, dry)])
 
 
 def friction_coefficients(system, t, q, u):
     """Coefficients of friction and limits of stick, as multiples of the force along the gap of a contact. That force is
     the normal force if the gap grows by one metre a metre.
     """
-    contacts, numbers = system.contacts, system.contact_numbers_at(t)
+    contacts, numbers = system.contacts, system.contact_numbers(t)
     if contacts.in_joints.all():
         return numbers.coefficient, numbers.limit
     unit = np.isin(np.arange(system.acceleration_rows), contacts.rows[: contacts.n]).astype(q.dtype)

@@ -13,10 +13,10 @@ from ..linalg.rotations import norm
 from ..parts.modes import BEGUN
 from ..solvers.manifold_term import AbstractGuards
 from ..system.equation import AbstractEquation
+from ..system.instant import Instant
 from .forces import contact_forces, largest_force, reserves
 from .impact import Impact, impact
 from .impacting import Event, find_event
-from .shares import Shares
 from .tolerance import REST, ContactTolerance
 
 # Slip in two directions that begins has the direction of its modes up to this multiple of the slow velocity.
@@ -50,11 +50,8 @@ class ContactGuards(AbstractGuards):
         q = system.normalize(t, y.q)
         modes = contacts.modes(q)
         gap = contacts.gaps(system, t, q)
-        free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers_at(t).peaks), system.length)
-        if contacts.shared:
-            # Contacts that others imply at one pose may part, or meet, at another.
-            apart = self.tolerance.in_metres(system).near - jnp.abs(gap)
-            free = jnp.where(modes.shut & ~modes.closed, apart, free)
+        free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers(t).peaks), system.length)
+        free = contacts.sharing.guarded(modes, gap, lambda: self.tolerance.in_metres(system).near, free)
         acts = self.forces(y)
         if contacts.m:
             rates = contacts.rates(system, t, q, y.u)[contacts.n :]
@@ -65,11 +62,7 @@ class ContactGuards(AbstractGuards):
             here = system.at(y)
             _, multipliers = contact_forces(here, t, q, y.u)
             largest = largest_force(here, t, dataclasses.replace(y, q=q), multipliers)
-            left = reserves(here, t, q, y.u, multipliers) / largest
-            if not contacts.shared:
-                return left
-            pushes = Shares.at(here, t, q, y.u).largest_least(left[: contacts.n])
-            return jnp.concatenate([pushes, left[contacts.n :]])
+            return contacts.sharing.reserves(Instant(here, t, q, y.u), multipliers, reserves) / largest
 
         reserves_of_active = cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free)
         return jnp.where(acts, reserves_of_active, free / system.length)
@@ -128,7 +121,7 @@ class ContactGuards(AbstractGuards):
         system, y = lax.stop_gradient((self.system, y))
         contacts, t = system.contacts, jnp.asarray(t, y.q.dtype)
         q = system.normalize(t, y.q)
-        slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers_at(t).peaks
+        slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers(t).peaks
         rates = contacts.rates(system, t, q, y.u)[: contacts.n] * slopes / system.length
         # The rates of bodies that move side by side are rounding errors, and close nothing.
         least = _RATE * jnp.finfo(rates.dtype).eps * jnp.max(jnp.abs(y.u) / system.velocity_scale())

@@ -222,14 +222,15 @@ def _release(system, tolerance, event, at, along):
     """The derivative of the time at which a force reaches its limit: zero for a contact that opens, the limit of
     sticking for friction that begins to slip; with groups for each law.
     """
-    (t, y), (dsystem, dt, dy) = at, along
-    before, after = map(system.contacts.as_modes, event.modes)
+    (t, y), (dsystem, dt, dy), contacts = at, along, system.contacts
+    before, after = map(contacts.as_modes, event.modes)
     released = jnp.concatenate([before.closed & after.open, before.sticks & ~after.sticks])
 
     def reserve(system, t, y):
         """The reserves of the forces below their limits, and their size of comparison."""
         _, multipliers = contact_forces(system, t, y.q, y.u)
-        return reserves(system, t, y.q, y.u, multipliers), largest_force(system, t, y, multipliers)
+        at = Instant(system, t, y.q, y.u)
+        return contacts.sharing.reserves(at, multipliers, reserves), largest_force(system, t, y, multipliers)
 
     reserve_at_event, largest = reserve(system, t, y)
     k, releases = least_in_group(event.group, released, jnp.abs(reserve_at_event))

@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import add_up
-from ..linalg.complementarity import independent_components, reduced, solved_components
-from ..linalg.elimination import solve
+from ..linalg.complementarity import independent_components, solved_components
 from ..linalg.inertia import AbstractInertia
 from ..linalg.pairs import for_first, of_pairs
 from ..linalg.rotations import norm
@@ -33,8 +32,6 @@ from .tolerance import REST, ContactTolerance
 _ROUNDS = 4
 # Rebounds without gain of energy are found in this many trials, to this fraction of the summands of the energy.
 _TRIALS, _GAIN = 40, 1e-12
-# Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact.
-_UNDETERMINED = 1e-6
 
 
 class Event(NamedTuple):
@@ -296,10 +293,7 @@ class Impacting:
         hits = about_to[first]
         late = jnp.where(hits, until[first], 0.0)
         closes = about_to[:n] & (np.arange(n) == first)
-        shut = self.modes.shut
-        if self.contacts.shared:
-            # Contacts that others implied may have parted.
-            shut = shut & (self.modes.closed | (self.gap <= 0.5 * self.tolerance.near))
+        shut = self.contacts.sharing.shut(self.modes, self.gap, self.tolerance.near)
         touching = shut | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
         at = self.u + late * before
         zeros = (until, about_to) if self.in_groups else None
@@ -342,7 +336,7 @@ class Impacting:
 
     def bounces(self, when: When):
         """The rates at which gaps would open by Newton's law."""
-        return self.system.contact_numbers.restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
+        return self.system.contact_numbers(self.t).restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
 
     def impulse_of(self, when: When, low, share, reactions) -> Problem:
         """The problem of the impulses. Contacts that are `low` do not bounce, others bounce with a share of the whole
@@ -363,7 +357,7 @@ class Impacting:
     def expand(self, k, before: Round, answers, impulses) -> Round:
         """The end of the compression, and the problem of the expansion: impulses beyond the least ones."""
         when = before.when
-        again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]
+        again = self.system.contact_numbers(self.t).restitution * impulses[: self.contacts.n]
         pushes = np.array(self.contacts.by_poisson, bool) & ~before.low
         again = jnp.where(pushes, of_contacts(before.trial.share, self.contacts.n) * again, 0.0)
         u = self.moved(k, when, impulses)
@@ -453,7 +447,7 @@ class Impacting:
 
         **Arguments:** `curve`: the second derivatives of the gaps.
         """
-        when, struck, restitution = before.when, before.struck, self.system.contact_numbers.restitution
+        when, struck, restitution = before.when, before.struck, self.system.contact_numbers(self.t).restitution
         rate, bounce = struck.rate[: self.contacts.n], self.bounces(when)
         falls = jnp.where(curve < 0, -curve, 1.0)
         opens = rate**2 <= 2 * falls * self.tolerance.bounce
@@ -535,7 +529,7 @@ class Impacting:
             modes=(self.modes.numbers, modes),
             rest=jnp.pad(settled.rest, (0, self.contacts.m)),
             energy=0.5 * (kinetic(when.u) - kinetic(after)),
-            solvable=settled.solvable & self.determined(settled, implied),
+            solvable=settled.solvable & self.contacts.sharing.determined(self.laws, settled, implied),
             share=struck.share,
             compression=self.compressed(settled.compression),
         )
@@ -570,27 +564,6 @@ class Impacting:
         begun = struck.ended & self.contacts.in_pairs
         of_friction = modes_of_friction(last.sticks, last.implied, last.slips, begun)
         return jnp.concatenate([of_contacts, of_friction]).astype(self.q.dtype), implied
-
-    def determined(self, settled: Round, implied):
-        """Whether slip is the same for all shares of the forces of contacts that imply each other."""
-        n, last = self.contacts.n, settled.answers
-        if not self.contacts.may_leave_slip_open:
-            return True
-        closed = jnp.concatenate([last.closed, jnp.zeros(self.contacts.m, bool)])
-        left, normals = reduced(self.influence, closed), self.influence[:n, :n]
-        # A unit force on each implied contact (column), with what the others have less.
-        less = jnp.where(last.closed[:, None] & last.closed[None, :], normals, jnp.eye(n, dtype=normals.dtype))
-        less = solve(less, jnp.where(last.closed[:, None] & implied[None, :], -normals, 0.0))
-        moved = less + jnp.diag(jnp.where(implied, 1.0, 0.0))
-        rate = settled.struck.rate[n:]
-        speed = self.laws.sizes(rate)
-        ended = settled.struck.ended
-        slips = jnp.where(ended, last.slips, rate / jnp.where(ended, 1.0, speed))
-        contact = np.array(self.contacts.contact_of)
-        pushes = jnp.where(self.contacts.in_joints[:, None], 0.0, moved[contact])
-        change = left[n:, n:] @ ((self.laws.coefficient * slips)[:, None] * pushes)
-        size = self.laws.coefficient * jnp.diag(self.influence)[n:]
-        return jnp.all(jnp.abs(change) <= _UNDETERMINED * jnp.max(size))
 
     def lost(self, settled: Round, implied):
         """Which laws hold the velocities after the event, and the impulses that remove the rates left by rounding

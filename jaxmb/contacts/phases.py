@@ -95,7 +95,7 @@ class Phases:
         event, contacts, at = self.event, self.contacts, self.at
         # Velocities and impulses also change with the share of the rebounds.
         rates = contacts.rates(*at, event.at)
-        bounce = _restitution(at[0]) * jnp.maximum(-rates[: contacts.n], 0.0)
+        bounce = _restitution(*at[:2]) * jnp.maximum(-rates[: contacts.n], 0.0)
         bounce = jnp.pad(jnp.where(self.rebound, bounce, 0.0), (0, contacts.m))
         impulses, change, by_share = (self.in_one if event.compression is None else self.in_two)(bounce)
 
@@ -125,14 +125,14 @@ class Phases:
 
     def in_two(self, bounce):
         """The same for an impact by Poisson's law."""
-        event, compression, (system, *_) = self.event, self.event.compression, self.at
+        event, compression, (system, t, _) = self.event, self.event.compression, self.at
         assert compression is not None
         n, m = self.contacts.n, self.contacts.m
         none = jnp.zeros(n, event.u.dtype)
         first, between, matrix = self.solved(event.at, self.du, compression, none)
         first_by_share = lambda dshare: solve(matrix, jnp.where(compression.held, dshare * bounce, 0.0))
         pushes = ~event.low & np.array(self.contacts.by_poisson, bool)
-        again = lambda system, impulses: jnp.where(pushes, self.share * _restitution(system) * impulses[:n], 0.0)
+        again = lambda system, impulses: jnp.where(pushes, self.share * _restitution(system, t) * impulses[:n], 0.0)
         normal = push(again, (system, compression.impulses), (self.tangents[0], first))
         last = Phase(event.u, event.held, event.slips, event.impulses - compression.impulses)
         second, change, last_matrix = self.solved(compression.u, between, last, normal)
@@ -140,7 +140,7 @@ class Phases:
         def by_share(dshare):
             first = first_by_share(dshare)
             normal = dshare * compression.impulses + event.share * first
-            normal = jnp.where(pushes, _restitution(system) * normal[:n], 0.0)
+            normal = jnp.where(pushes, _restitution(system, t) * normal[:n], 0.0)
             closing = dshare * bounce - self.rows @ (first @ self.moves)
             return first + solve(last_matrix, jnp.where(event.held, closing, jnp.pad(normal, (0, m))))
 
@@ -170,7 +170,7 @@ class Phases:
         def unmet(system, t, q, first, u):
             """The remaining rates, and the unbalanced momentum."""
             rates = Instant(system, t, q, phase.u).velocity_rows
-            bounce = _restitution(system) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
+            bounce = _restitution(system, t) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
             bounce = jnp.where(phase.held[:n] & self.rebound, self.share * bounce, 0.0)
             rates = rates.at[rows[:n]].add(-bounce)
             momentum = system.inertia(t, q, u).product(phase.u - u)
@@ -216,5 +216,5 @@ def _coefficients(event: Event, at, tangents):
     return coefficients(*at), push(coefficients, at, tangents)
 
 
-def _restitution(system):
-    return system.contact_numbers.restitution
+def _restitution(system, t):
+    return system.contact_numbers(t).restitution

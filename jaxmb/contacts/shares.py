@@ -5,6 +5,7 @@ them: along each such choice the equations of motion stay as they are. All conta
 leaves none of them pulling.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -13,13 +14,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Coordinates, Scalar, Velocities
-from ..linalg.complementarity import PIVOT, largest_least, least_norm
+from .._types import Coordinates, Scalar, State, Velocities
+from ..linalg.complementarity import PIVOT, largest_least, least_norm, reduced
 from ..linalg.elimination import solve
 from ..linalg.sums import with_entries
+from ..parts.modes import CLOSED, IMPLIED
 from ..system.equation import AbstractEquation
-from ..system.instant import Instant
+from ..system.sharing import NoSharing
 from .forces import directions
+
+# Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact.
+_UNDETERMINED = 1e-6
 
 
 class Shares(NamedTuple):
@@ -43,17 +48,18 @@ class Shares(NamedTuple):
         rows, projector = rows[: contacts.n], others.projector(system.inertia(t, q, u))
         none = jnp.zeros(system.acceleration_rows, q.dtype)
         influence = rows @ jax.vmap(lambda row: projector.solve(row, none)[0])(rows).T
-        matrix = jnp.where(closed[:, None] & closed[None, :], influence, jnp.eye(contacts.n, dtype=q.dtype))
-        instead = solve(matrix, jnp.where(closed[:, None] & implied[None, :], -influence, 0.0))
+        instead = _instead(influence, closed, implied)
         shares = lax.stop_gradient(jnp.any(jnp.abs(instead) > PIVOT, axis=1))
         return cls(implied, instead, implied | (closed & shares))
 
     def largest_least(self, forces: Float[Array, "n"]) -> Float[Array, "n"]:
-        """The forces of contacts, in units of the largest; of those that share, the largest least force that all of
-        them can have.
-        """
+        """The forces of contacts; of those that share, the largest least force that all of them can have."""
         given = self.sharing & ~self.implied
-        least = largest_least(jnp.where(given, forces, 0.0), self.instead, given, self.implied)
+        forces_given = jnp.where(given, forces, 0.0)
+        # In units in which the method has its bound.
+        size = lax.stop_gradient(jnp.max(jnp.abs(forces_given)))
+        size = jnp.where(size > 0, size, 1.0)
+        least = size * largest_least(forces_given / size, self.instead, given, self.implied)
         return jnp.where(given, least, forces)
 
     def least(self, forces: Float[Array, "n"]) -> Float[Array, "n"]:
@@ -62,11 +68,66 @@ class Shares(NamedTuple):
         return jnp.where(self.sharing, shared, forces)
 
 
-def shared_multipliers(at: Instant, multipliers: Float[Array, "m"]) -> Float[Array, "m"]:
-    """Multipliers in which implied contacts have their shares of the forces; see `ContactSet.bearing`."""
-    contacts = at.system.contacts
-    if contacts.n < 2:
-        return multipliers
-    forces = contacts.at_rows(multipliers)[: contacts.n]
-    shares = Shares.at(at.system, at.t, at.q, at.u)
-    return with_entries(multipliers, np.array(contacts.rows[: contacts.n]), shares.least(forces))
+@dataclasses.dataclass(frozen=True)
+class Sharing(NoSharing):
+    """Contacts that imply each other if all of them are closed."""
+
+    def shut(self, modes, gap, near):
+        # Contacts that others implied may have parted.
+        return modes.shut & (modes.closed | (gap <= 0.5 * near))
+
+    def guarded(self, modes, gap, near, values):
+        # Contacts that others imply at one pose may part, or meet, at another.
+        return jnp.where(modes.shut & ~modes.closed, near() - jnp.abs(gap), values)
+
+    def reserves(self, at, multipliers, reserves):
+        contacts = at.system.contacts
+        shares = Shares.at(at.system, at.t, at.q, at.u)
+        forces = contacts.at_rows(multipliers)[: contacts.n]
+        least = shares.largest_least(forces)
+        # Friction is at its limit where the normal forces have their least shares.
+        shared = with_entries(multipliers, np.array(contacts.rows[: contacts.n]), shares.least(forces))
+        bearing = self.bearing(contacts, State(at.q, at.u)).q
+        return jnp.concatenate([least, reserves(at.system, at.t, bearing, at.u, shared)[contacts.n :]])
+
+    def determined(self, laws, settled, implied):
+        contacts, last, struck = laws.contacts, settled.answers, settled.struck
+        n, m = contacts.n, contacts.m
+        if not m:
+            return True
+        left = reduced(laws.influence, jnp.concatenate([last.closed, jnp.zeros(m, bool)]))[n:, n:]
+        moved = _instead(laws.influence[:n, :n], last.closed, implied)
+        moved = moved + jnp.diag(jnp.where(implied, 1.0, 0.0))
+        rate, ended = struck.rate[n:], struck.ended
+        slips = jnp.where(ended, last.slips, rate / jnp.where(ended, 1.0, laws.sizes(rate)))
+        pushes = jnp.where(contacts.in_joints[:, None], 0.0, moved[np.array(contacts.contact_of)])
+        change = left @ ((laws.coefficient * slips)[:, None] * pushes)
+        size = laws.coefficient * jnp.diag(laws.influence)[n:]
+        return jnp.all(jnp.abs(change) <= _UNDETERMINED * jnp.max(size))
+
+    def multipliers(self, at, multipliers):
+        contacts = at.system.contacts
+        forces = contacts.at_rows(multipliers)[: contacts.n]
+        shares = Shares.at(at.system, at.t, at.q, at.u)
+        return with_entries(multipliers, np.array(contacts.rows[: contacts.n]), shares.least(forces))
+
+    def bearing(self, contacts, ys):
+        places = np.array(contacts.contact_places, int)
+        modes = ys.q[..., places]
+        borne = jnp.where(jnp.round(modes) == IMPLIED, CLOSED, modes)
+        return dataclasses.replace(ys, q=ys.q.at[..., places].set(borne))
+
+    def about(self, contacts):
+        if not contacts.m:
+            return ""
+        return (
+            " Or, if they slip in different directions, the motion is undetermined: it depends on the shares of a load "
+            "that contacts which imply each other leave open. Three feet determine it, and so do compliant contacts."
+        )
+
+
+def _instead(influence, closed, implied):
+    """The change of the force of each closed contact (row) by a unit force of each implied one (column)."""
+    both = closed[:, None] & closed[None, :]
+    matrix = jnp.where(both, influence, jnp.eye(closed.size, dtype=influence.dtype))
+    return solve(matrix, jnp.where(closed[:, None] & implied[None, :], -influence, 0.0))

@@ -79,12 +79,11 @@ def largest_least(
 ) -> Float[Array, ""]:
     """The largest s for which some choice of the `free` components leaves all components at least s; at most 1.
 
-    By a linear program. Components are in units in which they are of the size of one, or smaller.
+    By a linear program, and differentiable. Components are in units in which they are of the size of one, or smaller.
 
     **Arguments:** `x`: the `given` components while the free ones are zero; `instead`: the change of each given
     component (row) by a unit of each free one (column).
     """
-    x, instead, given, free = lax.stop_gradient((x, instead, given, free))
     k, one = x.size, jnp.ones(1, x.dtype)
     # Unknown are what free components have above s, and s above a lower bound of it.
     instead = jnp.where(given[:, None] & free[None, :], instead, 0.0)
@@ -96,7 +95,7 @@ def largest_least(
     none = jnp.zeros_like(A)
     matrix = jnp.concatenate([jnp.concatenate([none, A.T], axis=1), jnp.concatenate([-A, none], axis=1)])
     right = jnp.concatenate([prices, most])
-    positive, solvable = lemke(matrix, right)
+    positive, solvable = lemke(*lax.stop_gradient((matrix, right)))
     least = solved_components(matrix, right, positive)[k] - _BOUND
     return jnp.where(solvable, least, jnp.min(jnp.where(given, x, 1.0)))
 

@@ -420,8 +420,8 @@ class JointFriction(AbstractCoordinateForce, AbstractScalarPart, AbstractForce):
 class ExactFriction(AbstractScalarPart, AbstractStickSlip):
     """`JointFriction` that sticks."""
 
-    force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", constant=True)
-    static_force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", optional=True, constant=True)
+    force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative")
+    static_force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative", optional=True)
     rows: ClassVar[int] = 1
     directions: ClassVar[int] = 1
     needs: ClassVar[Literal["nothing"]] = "nothing"

@@ -92,13 +92,8 @@ def about_contacts(system, outcome: Outcome) -> str:
     touch = np.asarray(contacts.gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
     touch = np.append(touch, [True] * contacts.m)
     names = ", ".join(dict.fromkeys(repr(name) for name, at in zip(contacts.names, touch, strict=True) if at))
-    text = f"{RESULTS[RESULTS.contacts_undetermined]} These are {names}, at t = {float(outcome.t):.6g}."
-    if contacts.may_leave_slip_open:
-        text += (
-            " Or, if they slip in different directions, the motion is undetermined: it depends on the shares of a load "
-            "that contacts which imply each other leave open. Three feet determine it, and so do compliant contacts."
-        )
-    return text
+    at = f"These are {names}, at t = {float(outcome.t):.6g}."
+    return f"{RESULTS[RESULTS.contacts_undetermined]} {at}{contacts.sharing.about(contacts)}"
 
 
 def has_failed(result) -> Any:

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 
 from .._compat import with_values
 from .._results import RESULTS
@@ -142,7 +143,7 @@ class End(NamedTuple):
         contact_events, events = None, events_found(solution.controller_state)
         if events is not None:
             t0, given = start
-            first = t0, jnp.concatenate([given.q, given.u, *([] if given.z is None else [given.z])])
+            first = t0, ravel_pytree(dataclasses.replace(given, angles=None))[0]
             contact_events = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch, first, t)
             if stops.event is not None:
                 # The last step is cut off at the user's event, before the events at its end.

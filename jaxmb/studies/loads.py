@@ -162,7 +162,7 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     load, with the forces of drivers, stops and friction along its length.
 
     The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Redundant joints
-    have the shares of least norm. Of closed contacts, as many take the force as are independent. `undetermined` names
+    and closed contacts have the shares of least norm. `undetermined` names
     both; under a trace it names joints only. The loads are differentiable, so that a design can bound them.
 
     **Arguments:** the `motion` of bodies, from `simulate` or `required_forces`; the name of the `body`.
@@ -187,7 +187,7 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
         (tuple(map(tuple, parts.values())), drives, acting),
         number,
         motion.ts,
-        motion.bearing,
+        system.contacts.sharing.bearing(system.contacts, motion.ys),
         (motion.accelerations, motion.multipliers, given),
     )
     own = {} if system.forces.gravity is None else {system.forces.gravity_name: "gravity"}

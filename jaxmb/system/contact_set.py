@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._types import Coordinates, Scalar, State, Velocities
+from .._types import Coordinates, Scalar, Velocities
 from ..linalg.pairs import of_pairs
 from ..linalg.sums import unchecked_take, with_entries
-from ..parts.modes import CLOSED, IMPLIED, STICK, Modes
+from ..parts.modes import CLOSED, STICK, Modes
+from .sharing import NoSharing
 
 
 class ContactNumbers(NamedTuple):
@@ -50,7 +51,7 @@ class ContactSet:
         coefficients are forces, with a normal force of one.
     - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
     - `coupled`: whether the normal forces of friction in joints depend on friction itself, without other constraints.
-    - `shared`: whether contacts imply each other if all of them are closed, at the pose for which the system was made.
+    - `sharing`: whether contacts imply each other if all of them are closed, at the pose for which the system was made.
     """
 
     names: tuple[str, ...] = ()
@@ -62,15 +63,15 @@ class ContactSet:
     constant: tuple[bool, ...] = ()
     pairs: tuple[int, ...] = ()
     coupled: bool = False
-    shared: bool = False
+    sharing: NoSharing = dataclasses.field(default_factory=NoSharing)
 
     def __bool__(self) -> bool:
         return bool(self.names)
 
     @property
-    def may_leave_slip_open(self) -> bool:
-        """Whether shares of normal forces may change slip."""
-        return self.shared and self.m > 0
+    def may_share(self) -> bool:
+        """Whether there are contacts that could imply each other."""
+        return self.n > 1
 
     @property
     def n(self) -> int:
@@ -151,16 +152,6 @@ class ContactSet:
         places = np.array(self.places, int)
         return with_entries(q, places, jnp.broadcast_to(jnp.asarray(modes, q.dtype), places.shape))
 
-    def bearing(self, ys: State) -> State:
-        """States in which implied contacts bear forces as other closed contacts do."""
-        if self.n < 2:
-            return ys
-        places = np.array(self.places[: self.n], int)
-        modes = ys.q[..., places]
-        return dataclasses.replace(
-            ys, q=ys.q.at[..., places].set(jnp.where(jnp.round(modes) == IMPLIED, CLOSED, modes))
-        )
-
     def bound(self, q: Coordinates) -> Float[Array, "nq"]:
         """The coordinates with all contacts closed and all friction sticking."""
         return self.with_modes(q, np.repeat([CLOSED, STICK], [self.n, self.m]).astype(float))
@@ -184,11 +175,11 @@ class ContactSet:
             return reactions
         return reactions.at[1:, np.flatnonzero(self.constant)].set(0.0)
 
-    def with_limits(self, system: Any, size: Float[Array, ""]) -> Float[Array, ""]:
+    def with_limits(self, system: Any, t: Scalar, size: Float[Array, ""]) -> Float[Array, ""]:
         """The largest force, with limits of friction beside which no other force may act."""
         if not any(self.constant):
             return size
-        return size + jnp.max(system.contact_numbers.limit[np.flatnonzero(self.constant)])
+        return size + jnp.max(system.contact_numbers(t).limit[np.flatnonzero(self.constant)])
 
     # Gaps and slips of the `system` with these contacts, as if all contacts were closed and all friction stuck
 

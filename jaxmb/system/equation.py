@@ -34,15 +34,12 @@ else:
 
 
 class Ranks(eqx.Module):
-    """Numbers of independent rows of Φ along velocities, of `coordinate_residual`, of ψ and of A; and whether contacts
-    are `shared`, see `ContactSet`; static.
-    """
+    """Numbers of independent rows of Φ along velocities, of `coordinate_residual`, of ψ and of A; static."""
 
     position: int = eqx.field(static=True)
     coordinate: int = eqx.field(static=True)
     velocity: int = eqx.field(static=True)
     acceleration: int = eqx.field(static=True)
-    shared: bool = eqx.field(static=True, default=False)
 
 
 class AbstractEquation(eqx.Module):
@@ -276,15 +273,10 @@ class AbstractEquation(eqx.Module):
 
     # Unilateral constraints
 
-    @property
-    def contact_numbers(self) -> ContactNumbers:
-        """The numbers of `contacts`; they are parameters."""
-        return ContactNumbers(*[jnp.zeros(0)] * 4)
-
-    def contact_numbers_at(self, t: Scalar) -> ContactNumbers:
-        """The numbers of `contacts` at a time, for parameters that are inputs."""
+    def contact_numbers(self, t: Scalar) -> ContactNumbers:
+        """The numbers of `contacts` at a time; they are parameters, and some may be inputs."""
         del t
-        return self.contact_numbers
+        return ContactNumbers(*[jnp.zeros(0)] * 4)
 
     def friction_reactions(
         self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]

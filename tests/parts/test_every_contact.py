@@ -65,7 +65,7 @@ def test_words_and_numbers(name):
     text = str(system.describe())
     assert "contacts" in text and "where closed 1 row each" in text
     assert "c.mode" in system.coordinate_names() and "c.restitution" in mb.parameters(system)
-    assert mb.with_parameters(system, {"c.restitution": 0.5}).contact_numbers.restitution == 0.5
+    assert mb.with_parameters(system, {"c.restitution": 0.5}).contact_numbers(0.0).restitution == 0.5
 
 
 def test_one_of_two_balls_may_be_a_point():

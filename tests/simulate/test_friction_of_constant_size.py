@@ -166,7 +166,7 @@ def test_words_and_numbers():
     alone = mb.Scene(
         [BLOCK], joints=[RAIL], forces=[mb.JointFriction("rub", "rail.displacement", force=1.0, exact=True)]
     )
-    assert mb.with_parameters(alone.compile(), {"rub.force": 0.5}).contact_numbers.limit == 0.5
+    assert mb.with_parameters(alone.compile(), {"rub.force": 0.5}).contact_numbers(0.0).limit == 0.5
     with pytest.raises(ValueError, match="joints must hold constraints, got JointFriction 'rub'; it belongs in force"):
         mb.Scene([BLOCK], joints=[RAIL, RUB])
 

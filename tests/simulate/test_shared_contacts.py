@@ -13,6 +13,7 @@ import jaxmb as mb
 from jaxmb import spatial
 from jaxmb.contacts.dry_laws import Dry
 from jaxmb.contacts.friction import frictional
+from jaxmb.contacts.shares import Sharing
 
 G = 9.81
 CORNERS = np.array([(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2), (-0.3, -0.2)])
@@ -33,7 +34,7 @@ def on_ropes():
 
 def test_four_ropes_are_known_to_share_and_three_are_not():
     system = on_ropes()
-    assert system.contacts.shared
+    assert isinstance(system.contacts.sharing, Sharing)
     three = mb.Scene(
         [spatial.Body("box", mass=2.0, inertia=INERTIA, position=(0.0, 0.0, -1.1))],
         joints=[
@@ -42,7 +43,7 @@ def test_four_ropes_are_known_to_share_and_three_are_not():
         ],
         forces=[DOWN],
     ).compile()
-    assert not three.contacts.shared
+    assert not isinstance(three.contacts.sharing, Sharing)
 
 
 @pytest.mark.slow

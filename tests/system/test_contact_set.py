@@ -26,7 +26,7 @@ def scene(contacts=True):
 @pytest.mark.slow
 def test_laws_of_contacts_and_friction():
     system = scene()
-    contacts, numbers = system.contacts, system.contact_numbers
+    contacts, numbers = system.contacts, system.contact_numbers(0.0)
     assert contacts and contacts == system.contacts
     assert (contacts.n, contacts.m) == (1, 3)
     assert contacts.contact_names == ("floor",) and sorted(contacts.friction_names) == ["brake", "rub"]
@@ -74,4 +74,4 @@ def test_a_system_without_contacts():
     assert not contacts and (contacts.n, contacts.m) == (0, 0)
     assert contacts.gaps(system, jnp.zeros(()), q).size == contacts.modes(q).open.size == 0
     np.testing.assert_array_equal(contacts.bound(q), q)
-    assert all(x.size == 0 for x in system.contact_numbers)
+    assert all(x.size == 0 for x in system.contact_numbers(0.0))

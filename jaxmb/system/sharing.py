@@ -1,0 +1,57 @@
+"""What closed contacts that imply each other add to the laws of contacts and dry friction: the interface."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from jaxtyping import Array, Bool, Float
+
+from .._types import State
+from ..parts.modes import Modes
+
+
+@dataclasses.dataclass(frozen=True)
+class NoSharing:
+    """Contacts that do not imply each other: each force is determined, and nothing is added.
+
+    `contacts.shares.Sharing` is for the others.
+    """
+
+    def shut(self, modes: Modes, gap: Float[Array, "n"], near: Float[Array, ""]) -> Bool[Array, "n"]:
+        """The contacts that are shut; `near`: gaps at which a step ends that was meant to end at an event [m, rad]."""
+        del gap, near
+        return modes.shut
+
+    def guarded(
+        self, modes: Modes, gap: Float[Array, "n"], near: Callable[[], Float[Array, ""]], values: Float[Array, "n"]
+    ) -> Float[Array, "n"]:
+        """The guards of contacts without a force [m, rad], with those of contacts that others imply."""
+        del modes, gap, near
+        return values
+
+    def reserves(self, at: Any, multipliers: Float[Array, "m"], reserves: Callable[..., Any]) -> Float[Array, "laws"]:
+        """The forces of contacts, and the reserve of friction that sticks, at an instant.
+
+        **Arguments:** `reserves`: these as a function of the system, time, coordinates, velocities and multipliers.
+        """
+        return reserves(at.system, at.t, at.q, at.u, multipliers)
+
+    def determined(self, laws: Any, settled: Any, implied: Bool[Array, "n"]) -> Any:
+        """Whether slip after an event is the same for all shares of the forces of contacts."""
+        del laws, settled, implied
+        return True
+
+    def multipliers(self, at: Any, multipliers: Float[Array, "m"]) -> Float[Array, "m"]:
+        """Multipliers at an instant in which implied contacts have their shares of the forces."""
+        del at
+        return multipliers
+
+    def bearing(self, contacts: Any, ys: State) -> State:
+        """States in which implied contacts bear forces as other closed contacts do."""
+        del contacts
+        return ys
+
+    def about(self, contacts: Any) -> str:
+        """What to say of contacts without a possible motion."""
+        del contacts
+        return ""
