@@ -50,8 +50,9 @@ class ContactGuards(AbstractGuards):
         q = system.normalize(t, y.q)
         modes = contacts.modes(q)
         gap = contacts.gaps(system, t, q)
+        at = Instant(system, t, q, y.u)
         free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers(t).peaks), system.length)
-        free = contacts.sharing.guarded(modes, gap, lambda: self.tolerance.in_metres(system).near, free)
+        free = contacts.sharing.guarded(at, gap, lambda: self.tolerance.in_metres(system).near, free)
         acts = self.forces(y)
         if contacts.m:
             rates = contacts.rates(system, t, q, y.u)[contacts.n :]

@@ -21,10 +21,11 @@ from ..linalg.sums import with_entries
 from ..parts.modes import CLOSED, IMPLIED
 from ..system.equation import AbstractEquation
 from ..system.sharing import NoSharing
-from .forces import directions
+from .forces import directions, friction_coefficients
 
-# Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact.
-_UNDETERMINED = 1e-6
+# Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact; along a
+# motion it is seen at the second one.
+_UNDETERMINED, _SEEN = 1e-6, 1e-3
 
 
 class Shares(NamedTuple):
@@ -44,10 +45,7 @@ class Shares(NamedTuple):
         contacts = system.contacts
         modes = contacts.modes(q)
         closed, implied = modes.closed, modes.shut & ~modes.closed
-        rows, others = directions(system, t, q, u)
-        rows, projector = rows[: contacts.n], others.projector(system.inertia(t, q, u))
-        none = jnp.zeros(system.acceleration_rows, q.dtype)
-        influence = rows @ jax.vmap(lambda row: projector.solve(row, none)[0])(rows).T
+        influence = _influence(system, t, q, u)[: contacts.n, : contacts.n]
         instead = _instead(influence, closed, implied)
         shares = lax.stop_gradient(jnp.any(jnp.abs(instead) > PIVOT, axis=1))
         return cls(implied, instead, implied | (closed & shares))
@@ -76,9 +74,16 @@ class Sharing(NoSharing):
         # Contacts that others implied may have parted.
         return modes.shut & (modes.closed | (gap <= 0.5 * near))
 
-    def guarded(self, modes, gap, near, values):
-        # Contacts that others imply at one pose may part, or meet, at another.
-        return jnp.where(modes.shut & ~modes.closed, near() - jnp.abs(gap), values)
+    def guarded(self, at, gap, near, values):
+        system, contacts = at.system, at.system.contacts
+        n, modes = contacts.n, contacts.modes(at.q)
+        implied = modes.shut & ~modes.closed
+        influence = _influence(system, at.t, at.q, at.u)
+        coefficient, _ = friction_coefficients(system, at.t, at.q, at.u)
+        slips = modes.slips(contacts.rates(system, at.t, at.q, at.u)[n:])
+        change = _change(contacts, influence, coefficient, slips, modes.closed, implied)
+        # Contacts that others imply at one pose may part, or meet, at another; and slip may come to depend on shares.
+        return jnp.where(implied, near() * (1 - change / _SEEN) - jnp.abs(gap), values)
 
     def reserves(self, at, multipliers, reserves):
         contacts = at.system.contacts
@@ -91,19 +96,11 @@ class Sharing(NoSharing):
         return jnp.concatenate([least, reserves(at.system, at.t, bearing, at.u, shared)[contacts.n :]])
 
     def determined(self, laws, settled, implied):
-        contacts, last, struck = laws.contacts, settled.answers, settled.struck
-        n, m = contacts.n, contacts.m
-        if not m:
-            return True
-        left = reduced(laws.influence, jnp.concatenate([last.closed, jnp.zeros(m, bool)]))[n:, n:]
-        moved = _instead(laws.influence[:n, :n], last.closed, implied)
-        moved = moved + jnp.diag(jnp.where(implied, 1.0, 0.0))
+        last, struck, n = settled.answers, settled.struck, laws.contacts.n
         rate, ended = struck.rate[n:], struck.ended
         slips = jnp.where(ended, last.slips, rate / jnp.where(ended, 1.0, laws.sizes(rate)))
-        pushes = jnp.where(contacts.in_joints[:, None], 0.0, moved[np.array(contacts.contact_of)])
-        change = left @ ((laws.coefficient * slips)[:, None] * pushes)
-        size = laws.coefficient * jnp.diag(laws.influence)[n:]
-        return jnp.all(jnp.abs(change) <= _UNDETERMINED * jnp.max(size))
+        change = _change(laws.contacts, laws.influence, laws.coefficient, slips, last.closed, implied)
+        return change <= _UNDETERMINED
 
     def multipliers(self, at, multipliers):
         contacts = at.system.contacts
@@ -117,13 +114,32 @@ class Sharing(NoSharing):
         borne = jnp.where(jnp.round(modes) == IMPLIED, CLOSED, modes)
         return dataclasses.replace(ys, q=ys.q.at[..., places].set(borne))
 
-    def about(self, contacts):
-        if not contacts.m:
-            return ""
+    def about(self):
         return (
             " Or, if they slip in different directions, the motion is undetermined: it depends on the shares of a load "
             "that contacts which imply each other leave open. Three feet determine it, and so do compliant contacts."
         )
+
+
+def _influence(system, t, q, u):
+    """The accelerations along the laws by unit forces along them."""
+    rows, others = directions(system, t, q, u)
+    projector = others.projector(system.inertia(t, q, u))
+    none = jnp.zeros(system.acceleration_rows, q.dtype)
+    return rows @ jax.vmap(lambda row: projector.solve(row, none)[0])(rows).T
+
+
+def _change(contacts, influence, coefficient, slips, closed, implied):
+    """The largest change of the acceleration of slip by shares of forces, as a fraction of that by the friction of one
+    contact with a unit force.
+    """
+    n, m = contacts.n, contacts.m
+    left = reduced(influence, jnp.concatenate([closed, jnp.zeros(m, bool)]))[n:, n:]
+    moved = _instead(influence[:n, :n], closed, implied) + jnp.diag(jnp.where(implied, 1.0, 0.0))
+    pushes = jnp.where(contacts.in_joints[:, None], 0.0, moved[np.array(contacts.contact_of, int)])
+    change = left @ ((coefficient * slips)[:, None] * pushes)
+    size = jnp.max(coefficient * jnp.diag(influence)[n:], initial=0.0)
+    return jnp.max(jnp.abs(change), initial=0.0) / jnp.where(size > 0, size, 1.0)
 
 
 def _instead(influence, closed, implied):

@@ -93,7 +93,7 @@ def about_contacts(system, outcome: Outcome) -> str:
     touch = np.append(touch, [True] * contacts.m)
     names = ", ".join(dict.fromkeys(repr(name) for name, at in zip(contacts.names, touch, strict=True) if at))
     at = f"These are {names}, at t = {float(outcome.t):.6g}."
-    return f"{RESULTS[RESULTS.contacts_undetermined]} {at}{contacts.sharing.about(contacts)}"
+    return f"{RESULTS[RESULTS.contacts_undetermined]} {at}{contacts.sharing.about()}"
 
 
 def has_failed(result) -> Any:

@@ -23,10 +23,10 @@ class NoSharing:
         return modes.shut
 
     def guarded(
-        self, modes: Modes, gap: Float[Array, "n"], near: Callable[[], Float[Array, ""]], values: Float[Array, "n"]
+        self, at: Any, gap: Float[Array, "n"], near: Callable[[], Float[Array, ""]], values: Float[Array, "n"]
     ) -> Float[Array, "n"]:
-        """The guards of contacts without a force [m, rad], with those of contacts that others imply."""
-        del modes, gap, near
+        """The guards of contacts without a force at an instant [m, rad], with those of contacts that others imply."""
+        del at, gap, near
         return values
 
     def reserves(self, at: Any, multipliers: Float[Array, "m"], reserves: Callable[..., Any]) -> Float[Array, "laws"]:
@@ -51,7 +51,6 @@ class NoSharing:
         del contacts
         return ys
 
-    def about(self, contacts: Any) -> str:
-        """What to say of contacts without a possible motion."""
-        del contacts
+    def about(self) -> str:
+        """What to say of contacts with friction for which no motion was found."""
         return ""

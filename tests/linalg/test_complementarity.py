@@ -99,6 +99,18 @@ def test_the_largest_least_component_is_that_of_a_linear_program():
         np.testing.assert_allclose(found(x, instead, ~free, free), known, atol=1e-12)
 
 
+def test_derivatives_of_the_largest_least_component():
+    """By the components and by how they change, in both modes, against central differences."""
+    random = np.random.default_rng(3)
+    x, instead, free = choices(random, 6)
+    x = jnp.where(free, 0.0, jnp.asarray(random.uniform(-1.0, 1.0, 6)))
+    directions = jnp.asarray(random.normal(size=6)), jnp.where(instead != 0, jnp.asarray(random.normal(size=(6, 6))), 0)
+    found = jax.jit(lambda h: largest_least(x + h * directions[0], instead + h * directions[1], ~free, free))
+    step = 1e-5
+    known = (found(step) - found(-step)) / (2 * step)
+    np.testing.assert_allclose([jax.jacfwd(found)(0.0), jax.jacrev(found)(0.0)], known, rtol=1e-8)
+
+
 def test_the_least_norm_of_components_that_are_not_negative():
     """No allowed change lowers the sum of squares. Four feet under an eccentric load, by hand: their shares are a
     plane, until the foot opposite to the load has none.

@@ -27,6 +27,22 @@ def state_of(system, speed):
     return mb.assemble(system, rates={"rail.displacement": speed})
 
 
+def test_coefficients_and_forces_follow_their_inputs():
+    """The numbers of the laws at each time; stick never has the smaller one."""
+    brake = mb.Series([0.0, 1.0], [0.2, 0.6], "linear")
+    limits = {None: [0.3, 0.5], 0.4: [0.4, 0.5]}
+    for static, expected in limits.items():
+        numbers = [
+            mb.with_inputs(slider(static=static), {"rub.coefficient": brake}).contact_numbers(t) for t in (0.25, 0.75)
+        ]
+        np.testing.assert_allclose([x.coefficient[0] for x in numbers], [0.3, 0.5])
+        np.testing.assert_allclose([x.limit[0] for x in numbers], expected)
+    numbers = [mb.with_inputs(clamped(), {"clamp.force": brake}).contact_numbers(t) for t in (0.25, 0.75)]
+    np.testing.assert_allclose([x.coefficient[0] for x in numbers], [0.3, 0.5])
+    np.testing.assert_allclose([x.limit[0] for x in numbers], [0.3, 0.5])
+
+
+@pytest.mark.slow
 def test_a_brake_that_closes_in_steps():
     """The deceleration is G times the coefficient at each time; where that jumps, the velocity has a kink."""
     system = slider()
@@ -40,6 +56,40 @@ def test_a_brake_that_closes_in_steps():
     np.testing.assert_allclose(stop.time, 0.4 + v2 / (0.2 * G), rtol=1e-9)
     way = 0.2 * (2.0 + v1) / 2 + 0.2 * (v1 + v2) / 2 + v2**2 / (2 * 0.2 * G)
     np.testing.assert_allclose(motion["block"].position[-1, 0], way, rtol=1e-9)
+
+
+@functools.cache
+def clamped():
+    """A block of 2 kg on a level rail, with friction of constant size."""
+    rail = planar.Prismatic("rail", "ground", "block", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    block = planar.Body("block", mass=2.0, inertia=0.1)
+    clamp = mb.JointFriction("clamp", "rail.displacement", force=1.0, exact=True)
+    push = mb.JointForce("push", "rail.displacement", force=0.0)
+    return mb.Scene([block], joints=[rail], forces=[clamp, push]).compile()
+
+
+@pytest.mark.slow
+def test_a_clamp_of_constant_size_closes_and_fails():
+    """It stops the block, holds it against a push, and lets it go when its force falls below that push."""
+    system = clamped()
+    force = mb.Series([0.0, 0.5, 1.0, 2.0], [2.0, 6.0, 6.0, 0.0], "linear")
+
+    def found(push):
+        pushed = mb.with_parameters(system, {"push.force": push})
+        motion = mb.simulate(pushed, state_of(system, 1.0), t1=1.9, inputs={"clamp.force": force}, rtol=1e-10)
+        return motion["rail"].displacement_rate[-1], motion.events
+
+    # 2 v' = 3 - 2 - 8 t until t = 0.5, then 3 - 6; it goes on when 12 - 6 t = 3.
+    rate, events = found(3.0)
+    at_half = 1.0 + (0.5 - 4 * 0.5**2) / 2
+    stop, go = 0.5 + at_half / 1.5, 1.5
+    np.testing.assert_allclose([event.time for event in events], [stop, go], rtol=1e-8)
+    assert [event.kind for event in events] == ["stick", "slip"]
+    np.testing.assert_allclose(rate, 1.5 * (1.9 - go) ** 2, rtol=1e-7)
+    # d/dP of the integral of (P - 12 + 6 t) / 2 from 2 - P / 6 on.
+    slope = (1.9 - go) / 2
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(lambda push: found(push)[0]))(3.0), slope, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxmb as mb
-from jaxmb import spatial
+from jaxmb import planar, spatial
 from jaxmb.contacts.dry_laws import Dry
 from jaxmb.contacts.friction import frictional
 from jaxmb.contacts.shares import Sharing
@@ -130,6 +130,40 @@ def test_a_box_slides_on_four_feet():
     slides = mb.simulate(system, at(0.5, 0.0), t1=0.2)
     np.testing.assert_allclose(slides["box"].position[-1, 0], 0.5**2 / (2 * 0.3 * G), rtol=1e-8)
     assert slides.undetermined_reactions == tuple(f"foot {k}" for k in range(4))
+    turns = mb.simulate(system, at(0.0, 1.0), t1=0.1)
+    # The moment of friction about the centre is the same for all shares.
+    np.testing.assert_allclose(turns.events.times, [0.05 / (0.3 * 2.0 * G * np.hypot(0.3, 0.2))], rtol=1e-8)
+    assert [event.kind for event in turns.events] == ["stick"] * 4
     with pytest.raises(RuntimeError, match="motion is undetermined") as caught:
         mb.simulate(system, at(0.5, 1.0), t1=0.2)
     assert "'foot 0'" in str(caught.value) and "'rub 3'" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_the_time_at_which_a_box_tips_over_the_last_of_three_feet():
+    """A growing force beyond the feet: they share the load until its centre is above the last foot. The time at which
+    the others part has its derivative, in both modes and in a batch.
+    """
+    box = planar.Body("box", mass=2.0, inertia=0.1, position=(0.0, 0.1))
+    feet = [
+        mb.RigidContact(f"foot {k}", "box", terrain=mb.terrain.Flat(), centre=(x, -0.1))
+        for k, x in enumerate((-0.3, 0.0, 0.3))
+    ]
+    push = planar.PointForce("push", "box", force=(0.0, 0.0), point=(0.5, 0.0))
+    system = mb.Scene([box], joints=feet, forces=[mb.Gravity((0.0, -G)), push]).compile()
+    assert isinstance(system.contacts.sharing, Sharing)
+    start = mb.assemble(system)
+
+    def begins(rate):
+        force = mb.Series(jnp.array([0.0, 1.0]), rate * jnp.array([[0.0, 0.0], [0.0, -1.0]]), "linear")
+        return mb.simulate(system, mb.assemble(system), t1=1.0, inputs={"push.force": force}, rtol=1e-10).events.times[
+            0
+        ]
+
+    # The moment about the last foot is zero when 0.2 m of the force balance 0.3 m of the weight.
+    known, rate = lambda rate: 1.5 * 2.0 * G / rate, 60.0
+    np.testing.assert_allclose(begins(rate), known(rate), rtol=1e-8)
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(begins))(rate), -known(rate) / rate, rtol=1e-6)
+    rates = jnp.array([60.0, 50.0])
+    np.testing.assert_allclose(jax.vmap(begins)(rates), known(rates), rtol=1e-8)
