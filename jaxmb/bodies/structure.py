@@ -35,9 +35,7 @@ from .independence import JointBlocks, JointRows
 from .joint_graph import elimination_order, joint_order
 from .rigid_bodies import Implied, RigidBodySystem
 from .rigidity import check_rigid
-
-# Unit rows of contacts whose singular values are below this imply each other.
-_INDEPENDENT = 1e-6
+from .shared_contacts import imply_each_other
 
 
 def with_structure(system: RigidBodySystem) -> RigidBodySystem:
@@ -87,27 +85,10 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
     return dataclasses.replace(
         system,
         ranks=Ranks(position, position + invariants, velocity, acceleration),
-        shares=system.contacts.may_share and _are_shared(system, q),
+        shares=system.contacts.may_share and imply_each_other(system, q),
         implied=implied,
         elimination=elimination_order(system, dropped, absolute),
     )
-
-
-def _are_shared(system, q):
-    """Whether closed contacts imply each other; see `ContactSet`. Large scenes are not looked at."""
-    contacts, on_host = system.contacts, system.on_host(0.0)
-    if on_host is None:
-        return False
-    blocks = on_host.blocks(np.asarray(contacts.bound(q)))
-    entries = np.concatenate([*(np.asarray(b).ravel() for b in blocks), np.zeros(1)])
-    source = system.layout.jacobian_source(
-        [(g.group.body_index, g.rows) for g in system.constraints.groups], of_poses=False
-    )
-    rows = entries[source] * system.known_scales()[1]
-    rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), np.finfo(rows.dtype).tiny)
-    normals, others = rows[np.array(contacts.rows[: contacts.n])], np.delete(rows, contacts.rows, axis=0)
-    rank = lambda rows: int(np.linalg.matrix_rank(rows, tol=_INDEPENDENT)) if len(rows) else 0
-    return rank(np.concatenate([others, normals])) < rank(others) + len(normals)
 
 
 def _parts(system):

@@ -215,9 +215,9 @@ class DryFriction(AbstractDryFriction):
     Several contacts in space that stick, such as the feet of a table, share undetermined forces. These are as small as
     possible, and where a contact reaches its limit others take more. If the normal forces are undetermined too, as with
     four feet, their shares are as small as possible. In slip they may leave the motion undetermined, as of a table that
-    slides and spins: such a run ends with a failure that names contacts and friction. In the plane the run
-    finds a possible distribution, in which a foot of a body at rest may be at its limit: its mode is slip, at velocity
-    zero, and another foot bears the rest. The motion and the sum of the forces are determined.
+    slides and spins: the run ends there with a failure that names contacts and friction. In the plane the run finds a
+    possible distribution, in which a foot of a body at rest may be at its limit: its mode is slip, at velocity zero,
+    and another foot bears the rest. The motion and the sum of the forces are determined.
 
     `Trajectory.reactions["rub"]` is its force on the last body, in stick and in slip.
 
@@ -376,7 +376,8 @@ class JointFriction(AbstractCoordinateForce, AbstractScalarPart, AbstractForce):
 
     - `coordinate`: a number, of a joint or tendon, such as `"pin.angle"`, `"slide.displacement"` or `"cord.length"`.
     - `force` [N m, N] ≥ 0; `transition_speed` [rad/s, m/s] > 0, below which smooth friction is viscous, default 0.01.
-    - `exact`: whether it sticks; `static_force` ≥ `force` [N m, N] of exact friction in stick, default `force`.
+    - `exact`: whether it sticks; `static_force` ≥ `force` [N m, N] of exact friction in stick, default `force`. Both
+        forces may be inputs; stick never has the smaller one.
     """
 
     force: fields.Number = fields.parameter(unit=("N m", "N"), sign="non-negative")

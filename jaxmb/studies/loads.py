@@ -162,8 +162,8 @@ def loads(motion: Trajectory | RequiredForces, body: str) -> Loads:
     load, with the forces of drivers, stops and friction along its length.
 
     The load of inertia is `−m a` and the moment `−(J ω̇ + ω × J ω)`, so that all loads are in balance. Redundant joints
-    and closed contacts have the shares of least norm. `undetermined` names
-    both; under a trace it names joints only. The loads are differentiable, so that a design can bound them.
+    and closed contacts have the shares of least norm. `undetermined` names both; under a trace it names joints only.
+    The loads are differentiable, so that a design can bound them.
 
     **Arguments:** the `motion` of bodies, from `simulate` or `required_forces`; the name of the `body`.
 

@@ -51,7 +51,7 @@ class ContactSet:
         coefficients are forces, with a normal force of one.
     - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
     - `coupled`: whether the normal forces of friction in joints depend on friction itself, without other constraints.
-    - `sharing`: whether contacts imply each other if all of them are closed, at the pose for which the system was made.
+    - `sharing`: what is added if contacts imply each other when all are closed, see `shared_contacts`.
     """
 
     names: tuple[str, ...] = ()

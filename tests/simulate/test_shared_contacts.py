@@ -32,18 +32,43 @@ def on_ropes():
     return mb.Scene([box], joints=ropes, forces=[DOWN]).compile()
 
 
-def test_four_ropes_are_known_to_share_and_three_are_not():
-    system = on_ropes()
-    assert isinstance(system.contacts.sharing, Sharing)
-    three = mb.Scene(
-        [spatial.Body("box", mass=2.0, inertia=INERTIA, position=(0.0, 0.0, -1.1))],
-        joints=[
-            mb.Slack(f"rope {k}", "ground", "box", point_a=(*xy, 0.0), point_b=(*xy, 0.1), length=1.0)
-            for k, xy in enumerate(CORNERS[:3])
-        ],
-        forces=[DOWN],
-    ).compile()
-    assert not isinstance(three.contacts.sharing, Sharing)
+def shares(bodies, joints):
+    return isinstance(mb.Scene(bodies, joints=joints).compile().contacts.sharing, Sharing)
+
+
+def test_which_contacts_are_known_to_share():
+    """Those of one body, also while they are open and tilted."""
+    assert isinstance(on_ropes().contacts.sharing, Sharing)
+    tilted = [np.cos(0.2), np.sin(0.2), 0.0, 0.0]
+    box = spatial.Body("box", mass=2.0, inertia=INERTIA, position=(0.0, 0.0, 1.0), orientation=tilted)
+    foot = lambda k, xy: mb.RigidContact(f"foot {k}", "box", terrain=mb.terrain.Flat(), centre=(*xy, -0.1))
+    feet = [foot(k, xy) for k, xy in enumerate(CORNERS)]
+    assert shares([box], feet) and not shares([box], feet[:3])
+
+
+@pytest.mark.slow
+def test_which_contacts_of_several_bodies_are_known_to_share():
+    """Those that are closed. Not walls that face each other, nor balls of which few pairs can touch at once."""
+
+    def cart(height):
+        wheels = {"first": -1.0, "second": 0.0, "third": 1.0}
+        bodies = [planar.Body("cart", mass=1.0, inertia=0.1, position=(0.0, height))]
+        bodies += [planar.Body(k, mass=1.0, inertia=0.1, position=(x, height)) for k, x in wheels.items()]
+        pins = [planar.Revolute(f"{k} pin", "cart", k, point=(x, height)) for k, x in wheels.items()]
+        rolls = [mb.RigidContact(f"{k} rolls", k, terrain=mb.terrain.Flat(), radius=0.1) for k in wheels]
+        return bodies, [*pins, *rolls]
+
+    assert shares(*cart(0.1)) and not shares(*cart(0.2))
+    ball = planar.PointMass("ball", mass=1.0)
+    walls = [mb.RigidPlaneContact(f"wall {s}", "ground", "ball", normal=(s, 0), point_a=(-s, 0)) for s in (1, -1)]
+    assert not shares([ball], walls)
+    balls = [planar.PointMass(f"ball {k}", mass=1.0, position=(np.cos(k), np.sin(k))) for k in range(5)]
+    pairs = [
+        mb.RigidBallContact(f"{i} {k}", f"ball {i}", f"ball {k}", radius_a=0.1, radius_b=0.1)
+        for i in range(5)
+        for k in range(i)
+    ]
+    assert not shares(balls, pairs)
 
 
 @pytest.mark.slow
@@ -156,9 +181,8 @@ def test_the_time_at_which_a_box_tips_over_the_last_of_three_feet():
 
     def begins(rate):
         force = mb.Series(jnp.array([0.0, 1.0]), rate * jnp.array([[0.0, 0.0], [0.0, -1.0]]), "linear")
-        return mb.simulate(system, mb.assemble(system), t1=1.0, inputs={"push.force": force}, rtol=1e-10).events.times[
-            0
-        ]
+        motion = mb.simulate(system, start, t1=1.0, inputs={"push.force": force}, rtol=1e-10)
+        return motion.events.times[0]
 
     # The moment about the last foot is zero when 0.2 m of the force balance 0.3 m of the weight.
     known, rate = lambda rate: 1.5 * 2.0 * G / rate, 60.0
