@@ -72,22 +72,22 @@ def clamped():
 def test_a_clamp_of_constant_size_closes_and_fails():
     """It stops the block, holds it against a push, and lets it go when its force falls below that push."""
     system = clamped()
-    force = mb.Series([0.0, 0.5, 1.0, 2.0], [2.0, 6.0, 6.0, 0.0], "linear")
+    force = mb.Series([0.0, 0.5, 1.25, 2.25], [2.0, 6.0, 6.0, 0.0], "linear")
 
     def found(push):
         pushed = mb.with_parameters(system, {"push.force": push})
-        motion = mb.simulate(pushed, state_of(system, 1.0), t1=1.9, inputs={"clamp.force": force}, rtol=1e-10)
+        motion = mb.simulate(pushed, state_of(system, 1.0), t1=2.15, inputs={"clamp.force": force}, rtol=1e-10)
         return motion["rail"].displacement_rate[-1], motion.events
 
-    # 2 v' = 3 - 2 - 8 t until t = 0.5, then 3 - 6; it goes on when 12 - 6 t = 3.
+    # 2 v' = 3 - 2 - 8 t until t = 0.5, then 3 - 6; it goes on when 13.5 - 6 t = 3.
     rate, events = found(3.0)
     at_half = 1.0 + (0.5 - 4 * 0.5**2) / 2
-    stop, go = 0.5 + at_half / 1.5, 1.5
+    stop, go = 0.5 + at_half / 1.5, 1.75
     np.testing.assert_allclose([event.time for event in events], [stop, go], rtol=1e-8)
     assert [event.kind for event in events] == ["stick", "slip"]
-    np.testing.assert_allclose(rate, 1.5 * (1.9 - go) ** 2, rtol=1e-7)
-    # d/dP of the integral of (P - 12 + 6 t) / 2 from 2 - P / 6 on.
-    slope = (1.9 - go) / 2
+    np.testing.assert_allclose(rate, 1.5 * (2.15 - go) ** 2, rtol=1e-7)
+    # The derivative by P of the integral of (P - 13.5 + 6 t) / 2 from 2.25 - P / 6 on.
+    slope = (2.15 - go) / 2
     for mode in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(jax.jit(mode(lambda push: found(push)[0]))(3.0), slope, rtol=1e-6)
 
