@@ -52,7 +52,7 @@ class ContactGuards(AbstractGuards):
         gap = contacts.gaps(system, t, q)
         at = Instant(system, t, q, y.u)
         free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers(t).peaks), system.length)
-        free = contacts.sharing.guarded(at, gap, lambda: self.tolerance.in_metres(system).near, free)
+        free = contacts.sharing.guarded(at, gap, self.tolerance, free)
         acts = self.forces(y)
         if contacts.m:
             rates = contacts.rates(system, t, q, y.u)[contacts.n :]

@@ -529,7 +529,7 @@ class Impacting:
             modes=(self.modes.numbers, modes),
             rest=jnp.pad(settled.rest, (0, self.contacts.m)),
             energy=0.5 * (kinetic(when.u) - kinetic(after)),
-            solvable=settled.solvable & self.contacts.sharing.determined(self.laws, settled, implied),
+            solvable=settled.solvable & self.contacts.sharing.determined(self.laws, settled, implied, self.slow),
             share=struck.share,
             compression=self.compressed(settled.compression),
         )

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.complementarity import PIVOT, largest_least, least_norm, reduced
 from ..linalg.elimination import solve
+from ..linalg.pairs import sizes_of
 from ..linalg.sums import with_entries
 from ..parts.modes import CLOSED, IMPLIED
 from ..system.equation import AbstractEquation
@@ -26,6 +27,8 @@ from .forces import directions, friction_coefficients
 # Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact; along a
 # motion it is seen at the second one.
 _UNDETERMINED, _SEEN = 1e-6, 1e-3
+# Slip above this multiple of the slow velocity has a known direction.
+_FAST = 1e4
 
 
 class Shares(NamedTuple):
@@ -74,16 +77,17 @@ class Sharing(NoSharing):
         # Contacts that others implied may have parted.
         return modes.shut & (modes.closed | (gap <= 0.5 * near))
 
-    def guarded(self, at, gap, near, values):
+    def guarded(self, at, gap, tolerance, values):
         system, contacts = at.system, at.system.contacts
         n, modes = contacts.n, contacts.modes(at.q)
         implied = modes.shut & ~modes.closed
         influence = _influence(system, at.t, at.q, at.u)
         coefficient, _ = friction_coefficients(system, at.t, at.q, at.u)
-        slips = modes.slips(contacts.rates(system, at.t, at.q, at.u)[n:])
+        rates, tolerance = contacts.rates(system, at.t, at.q, at.u)[n:], tolerance.in_metres(system)
+        slips = jnp.where(_is_fast(contacts.pairs, rates, tolerance.slow(system, at.u)), modes.slips(rates), 0.0)
         change = _change(contacts, influence, coefficient, slips, modes.closed, implied)
         # Contacts that others imply at one pose may part, or meet, at another; and slip may come to depend on shares.
-        return jnp.where(implied, near() * (1 - change / _SEEN) - jnp.abs(gap), values)
+        return jnp.where(implied, tolerance.near * (1 - change / _SEEN) - jnp.abs(gap), values)
 
     def reserves(self, at, multipliers, reserves):
         contacts = at.system.contacts
@@ -95,10 +99,13 @@ class Sharing(NoSharing):
         bearing = self.bearing(contacts, State(at.q, at.u)).q
         return jnp.concatenate([least, reserves(at.system, at.t, bearing, at.u, shared)[contacts.n :]])
 
-    def determined(self, laws, settled, implied):
+    def determined(self, laws, settled, implied, slow):
         last, struck, n = settled.answers, settled.struck, laws.contacts.n
         rate, ended = struck.rate[n:], struck.ended
-        slips = jnp.where(ended, last.slips, rate / jnp.where(ended, 1.0, laws.sizes(rate)))
+        sliding = jnp.where(
+            _is_fast(laws.contacts.pairs, rate, slow), rate / jnp.where(ended, 1.0, laws.sizes(rate)), 0.0
+        )
+        slips = jnp.where(ended, last.slips, sliding)
         change = _change(laws.contacts, laws.influence, laws.coefficient, slips, last.closed, implied)
         return change <= _UNDETERMINED
 
@@ -114,6 +121,10 @@ class Sharing(NoSharing):
         borne = jnp.where(jnp.round(modes) == IMPLIED, CLOSED, modes)
         return dataclasses.replace(ys, q=ys.q.at[..., places].set(borne))
 
+    def where_stuck(self, contacts):
+        names = ", ".join(dict.fromkeys(map(repr, contacts.names)))
+        return f" It may be the contacts and the friction {names}, of which several share a load.{self.about()}"
+
     def about(self):
         return (
             " Or, if they slip in different directions, the motion is undetermined: it depends on the shares of a load "
@@ -127,6 +138,11 @@ def _influence(system, t, q, u):
     projector = others.projector(system.inertia(t, q, u))
     none = jnp.zeros(system.acceleration_rows, q.dtype)
     return rows @ jax.vmap(lambda row: projector.solve(row, none)[0])(rows).T
+
+
+def _is_fast(pairs, rates, slow):
+    """Whether directions of slip are known; near the end of slip they have rounding errors."""
+    return jnp.max(sizes_of(pairs, rates), initial=0.0) > _FAST * slow
 
 
 def _change(contacts, influence, coefficient, slips, closed, implied):

@@ -188,7 +188,8 @@ def message_of_failure(system, result, span: Span, outcome: Outcome, stats, solv
         return RESULTS[result] + about_entries(system, outcome.y)
     if result == RESULTS.inconsistent_constraints:
         return contradiction(system, outcome.t, outcome.y)
-    return f"{how_far(outcome, span)} {reason_of_failure(system, result, span, outcome)}"
+    shares = system.contacts.sharing.where_stuck(system.contacts)
+    return f"{how_far(outcome, span)} {reason_of_failure(system, result, span, outcome)}{shares}"
 
 
 def about_entries(system, y) -> str:

@@ -22,11 +22,9 @@ class NoSharing:
         del gap, near
         return modes.shut
 
-    def guarded(
-        self, at: Any, gap: Float[Array, "n"], near: Callable[[], Float[Array, ""]], values: Float[Array, "n"]
-    ) -> Float[Array, "n"]:
+    def guarded(self, at: Any, gap: Float[Array, "n"], tolerance: Any, values: Float[Array, "n"]) -> Float[Array, "n"]:
         """The guards of contacts without a force at an instant [m, rad], with those of contacts that others imply."""
-        del at, gap, near
+        del at, gap, tolerance
         return values
 
     def reserves(self, at: Any, multipliers: Float[Array, "m"], reserves: Callable[..., Any]) -> Float[Array, "laws"]:
@@ -36,9 +34,9 @@ class NoSharing:
         """
         return reserves(at.system, at.t, at.q, at.u, multipliers)
 
-    def determined(self, laws: Any, settled: Any, implied: Bool[Array, "n"]) -> Any:
-        """Whether slip after an event is the same for all shares of the forces of contacts."""
-        del laws, settled, implied
+    def determined(self, laws: Any, settled: Any, implied: Bool[Array, "n"], slow: Float[Array, ""]) -> Any:
+        """Whether slip after an event is the same for all shares of the forces of contacts; `slow`: see `Impacting`."""
+        del laws, settled, implied, slow
         return True
 
     def multipliers(self, at: Any, multipliers: Float[Array, "m"]) -> Float[Array, "m"]:
@@ -50,6 +48,11 @@ class NoSharing:
         """States in which implied contacts bear forces as other closed contacts do."""
         del contacts
         return ys
+
+    def where_stuck(self, contacts: Any) -> str:
+        """What to say of contacts and friction if a run got stuck."""
+        del contacts
+        return ""
 
     def about(self) -> str:
         """What to say of contacts with friction for which no motion was found."""

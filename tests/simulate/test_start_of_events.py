@@ -7,6 +7,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar
+from jaxmb.contacts.events import AtStart, ContactEvents
 
 G = 9.81
 DOWN = mb.Gravity((0.0, -G))
@@ -27,6 +28,7 @@ def kinds(motion):
     return [(event.part, event.kind) for event in motion.events.at_start]
 
 
+@pytest.mark.slow
 def test_the_table_begins_with_what_holds_at_the_start():
     """It slides to its stop; the same program lies at rest, where a foot at its limit does not slip. Bodies at rest
     have no events, also with restitution and with speeds of rounding errors. Events on the way are counted alone.
@@ -47,6 +49,7 @@ def test_the_table_begins_with_what_holds_at_the_start():
             assert len(rests.events) == 0 and len(str(rests.events).splitlines()) == 5
 
 
+@pytest.mark.slow
 def test_an_end_of_bounces_after_the_motion_is_not_listed():
     ball = planar.PointMass("ball", mass=1.0, position=(0.0, 1e-9))
     floor = mb.RigidContact("floor", "ball", terrain=mb.terrain.Flat(), restitution=0.5)
@@ -71,3 +74,31 @@ def test_the_start_in_a_batch_and_under_jit():
     np.testing.assert_allclose(jax.vmap(impulse)(jnp.array([0.5, 1.0])), [1.5, 3.0], rtol=1e-12)
     for mode in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(jax.jit(mode(impulse))(1.0), 3.0, rtol=1e-12)
+
+
+def test_the_table_of_known_numbers():
+    """A contact that is closed, one that strikes at the start, and friction; an end of bounces only within the motion."""
+    start = AtStart(
+        time=np.array(0.0),
+        impulses=np.array([0.0, 3.0, 0.0, 0.0, 0.0]),
+        kinetic_energy_lost=np.array(1.5),
+        before=np.array([1.0, 0.0, 1.0, 1.0, 0.0]),
+        after=np.array([1.0, 0.0, 1.0, 1.0, 0.0]),
+        rest=np.zeros(5),
+        moves=np.array([False, False, True, False, False]),
+    )
+    closes = np.array([[0.0, 2.0, 0.0, 0.0, 0.0]])
+    modes = np.array([[1.0, 0.0, 1.0, 1.0, 0.0]]), np.array([[1.0, 1.0, 1.0, 1.0, 0.0]])
+    rest, names = np.array([[0.0, 0.25, 0.0, 0.0, 0.0]]), ("lies", "strikes", "slips", "holds", "idle")
+    for end, kinds in ((0.6, ["close"]), (0.8, ["close", "rest"])):
+        events = ContactEvents(
+            names, 2, np.array([0.5]), closes, np.array([2.0]), *modes, rest, start=start, end=np.array(end)
+        )
+        assert [(event.part, event.kind) for event in events.at_start] == [
+            ("lies", "closed at start"),
+            ("strikes", "impact at start"),
+            ("slips", "slip at start"),
+            ("holds", "stick at start"),
+        ]
+        assert [event.kind for event in events] == kinds
+        assert len(str(events).splitlines()) == 5 + len(kinds) == 1 + len(events.to_pandas())
