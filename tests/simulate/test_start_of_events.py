@@ -77,7 +77,7 @@ def test_the_start_in_a_batch_and_under_jit():
 
 
 def test_the_table_of_known_numbers():
-    """A contact that is closed, one that strikes at the start, and friction; an end of bounces only within the motion."""
+    """Contacts that are closed or strike at the start, and friction; an end of bounces only within the motion."""
     start = AtStart(
         time=np.array(0.0),
         impulses=np.array([0.0, 3.0, 0.0, 0.0, 0.0]),
