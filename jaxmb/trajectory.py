@@ -446,7 +446,7 @@ class Trajectory(eqx.Module):
         def single(t, y):
             at = Instant.of(self.system, t, y)
             udot, multipliers = accelerations_at(at, self.formulation)
-            return udot, self.system.contacts.sharing.multipliers(at, least_multipliers(at, multipliers))
+            return udot, least_multipliers(at, multipliers)
 
         return vmap_states(single, self.system.acceleration_rows * self.system.nu)(self.ts, self.ys)
 

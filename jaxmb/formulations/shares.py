@@ -16,7 +16,13 @@ from .formulation import row_levels
 
 
 def least_multipliers(at: Instant, multipliers: Float[Array, "m"]) -> Float[Array, "m"]:
-    """The multipliers of least norm with the same constraint force; they are the same if no row is redundant."""
+    """The multipliers of least norm with the same constraint force, where no contact pulls; they are the same if no row
+    is redundant and no contacts imply each other.
+    """
+    return at.system.contacts.sharing.multipliers(at, _of_redundant_rows(at, multipliers))
+
+
+def _of_redundant_rows(at, multipliers):
     system = at.system
     dropped = system.acceleration_rows - system.acceleration_rank
     if not dropped:

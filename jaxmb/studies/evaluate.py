@@ -71,7 +71,8 @@ def evaluate(system: AbstractSystem, state: State, names: str | Sequence[str], *
 
 def _value(motion, measures, name, solved) -> Array:
     if name in measures:
-        return _quantity(motion, measures[name].view, measures[name].place, solved)
+        measure = measures[name]
+        return _quantity(motion, measure.view, measure.place, solved if measure.of_forces else None)
     return _energy(motion, name) if name in _ENERGIES else _wrenches(motion, name, solved)
 
 
@@ -87,7 +88,8 @@ def _short(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @_short
 def _quantity(motion, view, place, solved):
-    return view(motion.system, place, motion.ts, motion.ys, solved)[0]
+    states = motion.ys if solved is None else motion.bearing
+    return view(motion.system, place, motion.ts, states, solved)[0]
 
 
 @_short
@@ -97,7 +99,7 @@ def _energy(motion, name):
 
 @_short
 def _wrenches(motion, name, solved):
-    return motion.system.catalogue.applied_wrenches(name, motion.ts, motion.ys, solved.multipliers)[0]
+    return motion.system.catalogue.applied_wrenches(name, motion.ts, motion.bearing, solved.multipliers)[0]
 
 
 @_short
