@@ -57,8 +57,8 @@ FAULTS = [
     ),
     Fault(
         "parts/coordinate_parts.py",
-        "law = lambda x, v: self.force.reshape(-1)",
-        "law = lambda x, v: -self.force.reshape(-1)",
+        "return self.force.reshape(-1)",
+        "return -self.force.reshape(-1)",
     ),
     Fault("parts/coordinate_parts.py", "return self.value + self.rate * t", "return self.value"),
     Fault(
@@ -70,9 +70,9 @@ FAULTS = [
         "parts/coordinate_parts.py", "self.exponent + 1)) / (self.exponent + 1)", "self.exponent + 1)) / self.exponent"
     ),
     Fault(
-        "parts/coordinate_parts.py",
-        "-self.force * jnp.tanh(v / self.transition_speed)",
-        "-self.force * jnp.tanh(v * self.transition_speed)",
+        "parts/dry_friction.py",
+        "jnp.tanh(v / self.transition_speed))",
+        "jnp.tanh(v * self.transition_speed))",
     ),
     Fault("parts/coordinate_parts.py", "jnp.round(angle / (2 * np.pi))", "jnp.floor(angle / (2 * np.pi))"),
     Fault("parts/cylinder.py", "push - self.rod_pressure * self.rod_area", "push + self.rod_pressure * self.rod_area"),
@@ -211,7 +211,7 @@ FAULTS = [
     ),
     Fault(
         "parts/dry_friction.py",
-        "return self.coefficient if self.static_coefficient is None else self.static_coefficient",
+        "return jnp.maximum(self.coefficient, self.static_coefficient)",
         "return self.coefficient",
     ),
     Fault(
@@ -386,8 +386,8 @@ FAULTS = [
     ),
     Fault(
         "parts/planar/torsion.py",
-        "(-self.stiffness * angle - self.damping * rate)",
-        "(-self.stiffness * angle + self.damping * rate)",
+        "-spring.stiffness * (angle - spring.free_angle) - spring.damping * rate",
+        "-spring.stiffness * (angle - spring.free_angle) + spring.damping * rate",
     ),
     Fault(
         "parts/planar/track.py",
@@ -589,13 +589,11 @@ FAULTS = [
         '(True, False): "close", (False, True): "open"',
         '(True, False): "open", (False, True): "close"',
     ),
-    Fault(
-        "contacts/events.py", "Event(time + float(self.rest[k, i]), name", "Event(time - float(self.rest[k, i]), name"
-    ),
+    Fault("contacts/events.py", "Event(time + float(rest), name", "Event(time - float(rest), name"),
     Fault(
         "contacts/forces.py",
-        "system.contact_numbers.limit * normal - sizes_of",
-        "system.contact_numbers.coefficient * normal - sizes_of",
+        "system.contact_numbers(t).limit * normal - sizes_of",
+        "system.contact_numbers(t).coefficient * normal - sizes_of",
     ),
     Fault(
         "contacts/friction.py",
@@ -609,8 +607,8 @@ FAULTS = [
     ),
     Fault(
         "contacts/guards.py",
-        "gap * (1 - 0.5 * gap / system.contact_numbers.peaks)",
-        "gap * (1 - gap / system.contact_numbers.peaks)",
+        "gap * (1 - 0.5 * gap / system.contact_numbers(t).peaks)",
+        "gap * (1 - gap / system.contact_numbers(t).peaks)",
     ),
     Fault("contacts/guards.py", "modes.of_friction * rates, system.length)", "rates, system.length)"),
     Fault("contacts/impact.py", "dlate = dlate + _release(", "dlate = dlate - _release("),
@@ -629,8 +627,8 @@ FAULTS = [
     Fault("contacts/impacting.py", "closing**2 - 2 * curve[:n] * gap", "closing**2 + 2 * curve[:n] * gap"),
     Fault(
         "contacts/impacting.py",
-        "again = self.system.contact_numbers.restitution * impulses[: self.contacts.n]",
-        "again = self.system.contact_numbers.restitution**2 * impulses[: self.contacts.n]",
+        "again = self.system.contact_numbers(self.t).restitution * impulses[: self.contacts.n]",
+        "again = self.system.contact_numbers(self.t).restitution**2 * impulses[: self.contacts.n]",
     ),
     Fault("contacts/impacting.py", "2 * rate / (falls * (1 - ratio))", "2 * rate / falls"),
     Fault(
@@ -640,7 +638,7 @@ FAULTS = [
     ),
     Fault(
         "contacts/phases.py",
-        "bounce = _restitution(at[0]) * jnp.maximum(-rates[: contacts.n], 0.0)",
+        "bounce = _restitution(*at[:2]) * jnp.maximum(-rates[: contacts.n], 0.0)",
         "bounce = jnp.maximum(-rates[: contacts.n], 0.0)",
     ),
     # Formulations

@@ -33,6 +33,7 @@ def pulled_to(force, static_force, mass, t=END):
     return (RAMP * (t**3 - t0**3) / 6 - force * (t**2 - t0**2) / 2 - speed(t0) * (t - t0)) / mass
 
 
+@pytest.mark.slow
 def test_a_block_pulled_by_a_ramp_sticks_until_the_force_breaks_it_away():
     motion = pulled(PULLED, [0.5, 1.5, END])
     (slip,) = motion.events

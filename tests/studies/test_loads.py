@@ -202,6 +202,7 @@ def test_needed_forces_are_loads_as_forces_of_a_drive(space, by):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_parts_along_a_cylinder_share_its_row():
     """Its pressure, a spring along it and friction of its seals; a tendon without a force of its own has no row."""
     bar = planar.Body("bar", mass=2.0, inertia=0.5, position=(0.5, 0.0))
