@@ -133,7 +133,7 @@ def test_derivatives_by_the_values_of_a_brake():
     start = state_of(system, 2.0)
 
     def found(values):
-        brake = mb.Series(jnp.array([0.0, 0.2, 1.5]), values[jnp.array([0, 1, 1])], "held")
+        brake = mb.Series([0.0, 0.2, 1.5], values[jnp.array([0, 1, 1])], "held")
         motion = mb.simulate(system, start, t1=1.5, inputs={"rub.coefficient": brake}, rtol=1e-11)
         return jnp.array([motion["block"].position[-1, 0], motion.events.times[0]])
 
