@@ -12,6 +12,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# The programs that the short tests of a file may compile, eager operations with them, unless it states its `PROGRAMS`.
+PROGRAMS = 60
 # Where Linux lists the memory maps of this process, and with how many of them compiled programs are given back.
 MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
 
@@ -76,6 +78,25 @@ def pytest_configure(config):
     for name, value in settings.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_programs(request):
+    """Fail a file whose short tests compile more programs than it states: most of the tests' time is compiling."""
+    before, most = _compiled["programs"], getattr(request.module, "PROGRAMS", PROGRAMS)
+    yield
+    count = _compiled["programs"] - before
+    if not request.config.getoption("--all"):
+        assert count <= most, f"{request.module.__name__} compiles {count} programs, and may compile {most}"
+
+
+def _note_compilation(event, seconds, **details):
+    del seconds, details
+    _compiled["programs"] += event == "/jax/core/compile/backend_compile_duration"
+
+
+_compiled = collections.Counter()
+jax.monitoring.register_event_duration_secs_listener(_note_compilation)
 
 
 @pytest.fixture(autouse=True, scope="module")
