@@ -511,6 +511,9 @@ class Impacting:
         held, lost = self.lost(settled, implied)
         after = struck.u + lost @ self.moves.by_unit
         kinetic = lambda u: jnp.dot(u, self.inertia.product(u))
+        impulses = self.seen(struck.impulses, self.sizes_of_rates(after, when.u))
+        # Without an impulse, the kinetic energy changes by rounding errors.
+        energy = jnp.where(jnp.any(impulses != 0), 0.5 * (kinetic(when.u) - kinetic(after)), 0.0)
         group, first, hits = self.firsts(settled, modes)
         return Event(
             late=when.late,
@@ -525,10 +528,10 @@ class Impacting:
             held=held,
             low=settled.low,
             slips=struck.answers.slips,
-            impulses=self.seen(struck.impulses, self.sizes_of_rates(after, when.u)),
+            impulses=impulses,
             modes=(self.modes.numbers, modes),
             rest=jnp.pad(settled.rest, (0, self.contacts.m)),
-            energy=0.5 * (kinetic(when.u) - kinetic(after)),
+            energy=energy,
             solvable=settled.solvable & self.contacts.sharing.determined(self.laws, settled, implied, self.slow),
             share=struck.share,
             compression=self.compressed(settled.compression),

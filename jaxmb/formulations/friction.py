@@ -50,11 +50,14 @@ def find_multipliers(
     def correct(carry):
         x, _, before = carry
         force, push = jax.linearize(law, x)
+        by_each = jax.vmap(push)(one)
         # As sums: for small matrices a library call takes longer than all the rest.
-        slope = jnp.sum(influence[:, None] * jax.vmap(push)(one)[None], axis=2)
+        slope = jnp.sum(influence[:, None] * by_each[None], axis=2)
         step = solve_coupled(one - slope, start + influence @ force - x)
-        # Relative to the summands of a multiplier: free of units, and above rounding errors.
-        size = sizes[0] + jnp.abs(x) + sizes[1] @ jnp.abs(force)
+        # Relative to the summands of a multiplier: free of units, and above rounding errors. Forces of several
+        # multipliers may cancel.
+        force = jnp.maximum(jnp.abs(force), jnp.abs(x) @ jnp.abs(by_each))
+        size = sizes[0] + jnp.abs(x) + sizes[1] @ force
         size = jnp.max(jnp.abs(step) / jnp.where(size > 0, size, 1.0))
         # Corrections shrink quadratically, so the size of the next one is known.
         shrinks = jnp.where(before > 0, size / before, 1.0)

@@ -212,6 +212,26 @@ def test_equation_of_several_multipliers():
     assert contracts(jnp.array([[0.0, 0.5], [1.9, 0.0]])) and not contracts(jnp.array([[0.0, 0.5], [2.1, 0.0]]))
 
 
+def test_a_foot_without_load_whose_friction_cancels():
+    """Of a box that turns in place, two feet across bear it: their frictions cancel, and those of the third are
+    rounding errors. Its load is found, at any slow drift.
+    """
+    rng = np.random.default_rng(0)
+    # Loads of 9.81 N, and their changes by a force in the plane and its moments.
+    start = jnp.array([9.81, 1e-16, 9.81])
+    influence = jnp.array([[-0.5, 0.1, 1.7], [0.1, -2.5, -1.7], [-0.5, 2.5, 0.1]])
+
+    def find(drift):
+        across = jnp.array([[-0.2, 0.3], [0.2, 0.3], [0.2, -0.3]]) + drift[None]
+        friction = 0.3 * across / jnp.linalg.norm(across, axis=1, keepdims=True)
+        wrenches = jnp.concatenate([friction, -0.1 * friction[:, :1]], axis=1)
+        return find_multipliers(lambda x: x @ wrenches, influence, start, np.ones(3, bool))
+
+    x, _, failed = jax.vmap(find)(jnp.asarray(1e-14 * rng.normal(size=(200, 2))))
+    assert not np.any(failed)
+    np.testing.assert_allclose(x, np.broadcast_to(start, x.shape), atol=1e-12)
+
+
 # Other joints
 
 

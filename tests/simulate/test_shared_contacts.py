@@ -165,6 +165,75 @@ def test_a_box_slides_on_four_feet():
 
 
 @pytest.mark.slow
+def test_a_box_turns_in_place_to_its_stop():
+    """`I ω̇ = −μ m g r` at all tolerances and final times, and rest afterwards. The stop has no impulse and no energy.
+    The angle at the stop has its derivatives by the coefficient and the speed, in both modes.
+    """
+    system, state = on_feet(), mb.assemble(on_feet())
+    coefficients = [f"rub {k}.coefficient" for k in range(4)]
+    slowing = lambda mu: mu * 2.0 * G * np.hypot(0.3, 0.2) / INERTIA[2, 2]
+
+    def turned(mu, spin, t1, rtol):
+        start = dataclasses.replace(state, u=state.u.at[5].set(spin))
+        motion = mb.simulate(mb.with_parameters(system, dict.fromkeys(coefficients, mu)), start, t1=t1, rtol=rtol)
+        attitude = motion["box"].orientation[-1]
+        return 2 * jnp.arctan2(attitude[3], attitude[0]), motion
+
+    cases = [(1.0, 0.05, 1e-4), (1.0, 0.1, 1e-7), (1.0, 0.1, 1e-8), (1.0, 1.0, 1e-10)]
+    for spin, t1, rtol in [*cases, (0.37, 0.1, 1e-6), (0.37, 0.0713, 1e-8), (-0.37, 0.05, 1e-9)]:
+        angle, motion = turned(0.3, spin, t1, rtol)
+        stop = abs(spin) / slowing(0.3)
+        np.testing.assert_allclose(angle, spin * stop / 2, rtol=10 * rtol)
+        np.testing.assert_allclose(motion.events.times[-1], stop, rtol=10 * rtol)
+        np.testing.assert_allclose(motion.ys.u[-1], 0.0, atol=1e-15)
+        ends = [event for event in motion.events if event.time == motion.events.times[-1]]
+        assert [event.kind for event in ends] == ["stick"] * 4
+        assert all(event.impulse == event.kinetic_energy_lost == 0 for event in ends)
+    at_stop = lambda x: turned(*x, 0.06, 1e-9)[0]
+    known = 1 / (2 * slowing(0.3))
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(at_stop))(jnp.array([0.3, 1.0])), [-known / 0.3, 2 * known], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_box_on_three_feet_slides_and_turns_to_its_stop():
+    """Slip and spin vanish together; against the equations of the plane, with loads by statics."""
+    points = 0.3 * np.stack([np.cos(2 * np.pi * np.arange(3) / 3), np.sin(2 * np.pi * np.arange(3) / 3)], axis=1)
+    box = spatial.Body("box", mass=2.0, inertia=INERTIA, position=(0.0, 0.0, 0.1))
+    feet = [
+        mb.RigidContact(f"foot {k}", "box", terrain=mb.terrain.Flat(), centre=(*xy, -0.1))
+        for k, xy in enumerate(points)
+    ]
+    rubs = [mb.DryFriction(f"rub {k}", f"foot {k}", coefficient=0.3) for k in range(3)]
+    system = mb.Scene([box], joints=feet, forces=[DOWN, *rubs]).compile()
+    start = mb.assemble(system)
+    start = dataclasses.replace(start, u=start.u.at[0].set(0.2).at[5].set(1.0))
+
+    def rates(t, y):
+        (c, s), v, spin = (np.cos(y[2]), np.sin(y[2])), y[3:5], y[5]
+        arms = points @ np.array([[c, s], [-s, c]])
+        slip = v + spin * np.stack([-arms[:, 1], arms[:, 0]], axis=1)
+        against = -0.3 * slip / np.linalg.norm(slip, axis=1, keepdims=True)
+        # The weight, and no moment about the horizontal axes through the mass centre.
+        balance = [np.ones(3), arms[:, 1] + 0.1 * against[:, 1], arms[:, 0] + 0.1 * against[:, 0]]
+        forces = np.linalg.solve(balance, [2.0 * G, 0.0, 0.0])[:, None] * against
+        moment = np.sum(arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0])
+        return np.concatenate([y[3:], np.sum(forces, axis=0) / 2.0, [moment / INERTIA[2, 2]]])
+
+    nearly = lambda t, y: np.linalg.norm([*y[3:5], 0.3 * y[5]]) - 1e-6
+    nearly.terminal = True
+    known = solve_ivp(rates, (0, 1), [0.0, 0.0, 0.0, 0.2, 0.0, 1.0], rtol=1e-11, atol=1e-13, events=nearly)
+    assert known.status == 1
+    for rtol in (1e-5, 1e-8):
+        motion = mb.simulate(system, start, t1=0.3, rtol=rtol)
+        attitude = np.asarray(motion["box"].orientation[-1])
+        pose = [*motion["box"].position[-1, :2], 2 * np.arctan2(attitude[3], attitude[0])]
+        np.testing.assert_allclose(pose, known.y[:3, -1], atol=10 * rtol)
+        np.testing.assert_allclose(motion.events.times[-1], known.t[-1], atol=1e-5)
+        np.testing.assert_allclose(motion.ys.u[-1], 0.0, atol=1e-15)
+
+
+@pytest.mark.slow
 def test_the_time_at_which_a_box_tips_over_the_last_of_three_feet():
     """A growing force beyond the feet: they share the load until its centre is above the last foot. The time at which
     the others part has its derivative, in both modes and in a batch.
