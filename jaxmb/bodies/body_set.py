@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -64,7 +65,8 @@ class BodySet(eqx.Module):
     def prepared_poses(self, q: Coordinates) -> BodyPoses:
         """Prepared poses of the bodies, of scalar coordinates and of the ground."""
         prepare = self.layout.space.prepare
-        ground = prepare(jnp.asarray(self.layout.space.ground, q.dtype))
+        constant: Any = np.array(self.layout.space.ground)
+        ground = jnp.asarray(prepare(constant), q.dtype)
         # A barrier: XLA would compute cheap values anew in each kernel that uses them.
         return lax.optimization_barrier(jnp.concatenate([jax.vmap(prepare)(self._poses(q)), ground[None]]))
 
@@ -141,9 +143,12 @@ class BodySet(eqx.Module):
 
     def invariants(self, t: Scalar, q: Coordinates) -> list[Float[Array, "_"]]:
         """Residuals of the invariants, as consecutive pieces."""
-        p, poses = self.poses(q)[np.array(self.layout.turning, int), 3:], self.prepared_poses(q)
-        counts = [g.residual(t, poses).reshape(-1) for g in self.turn_counts]
-        return [*counts, 0.5 * (jnp.sum(p * p, axis=1) - 1.0)]
+        p = self.poses(q)[np.array(self.layout.turning, int), 3:]
+        lengths = 0.5 * (jnp.sum(p * p, axis=1) - 1.0)
+        if not self.turn_counts:
+            return [lengths]
+        poses = self.prepared_poses(q)
+        return [*(g.residual(t, poses).reshape(-1) for g in self.turn_counts), lengths]
 
     def attitude_gradients(self, q: Coordinates) -> Float[Array, "turning nq"]:
         """Derivatives of the residuals of Euler parameters with respect to q."""

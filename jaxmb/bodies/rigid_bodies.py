@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced
 from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
+from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import DenseJacobian
 from ..parts.base import AbstractLink
 from ..parts.unilateral import AbstractUnilateralConstraint
@@ -62,8 +63,8 @@ class RigidBodySystem(AbstractSystem):
 
     **Fields:** the sets of `bodies`, `constraints` and `forces`; the groups of `frames`, and of `free_joints`, which
     have no rows; `guess`, the state given with the bodies; `length` [m], the scene's size; `ranks`; `implied` rows;
-    `elimination`, the joints' order of elimination, or None; `design` variables; whether contacts imply each other,
-    so that they have `shares` of forces; the `contacts` and dry friction.
+    `elimination`, the joints' order of elimination, or None; `design` variables; the `mass_matrix` of a prepared
+    system; whether contacts imply each other, so that they have `shares` of forces; the `contacts` and dry friction.
     """
 
     bodies: BodySet
@@ -77,6 +78,7 @@ class RigidBodySystem(AbstractSystem):
     implied: tuple[Implied, ...] = eqx.field(static=True)
     elimination: JointOrder | None = eqx.field(static=True)
     design: tuple[DesignVariables, ...] = ()
+    mass_matrix: AbstractInertia | None = None
     shares: bool = eqx.field(static=True, default=False)
     contacts: ContactSet = eqx.field(static=True, init=False)  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -179,6 +181,8 @@ class RigidBodySystem(AbstractSystem):
         return held if self.rates_are_velocities else self.bodies.held_velocities(held)
 
     def inertia(self, t, q, u):
+        if self.mass_matrix is not None:
+            return self.mass_matrix
         return self.bodies.inertia(self.constraints.scalar_inertias)
 
     @eqx.filter_jit
@@ -362,7 +366,11 @@ class RigidBodySystem(AbstractSystem):
     # Motions and assembly
 
     def prepared(self):
-        return dataclasses.replace(self, constraints=self.constraints.prepared())
+        mass = self.mass_matrix
+        if mass is None:
+            mass = self.bodies.inertia(self.constraints.scalar_inertias)
+            mass = mass.with_inverse(self.guess.u) if self.spatial and self.acceleration_rows else mass
+        return dataclasses.replace(self, constraints=self.constraints.prepared(), mass_matrix=mass)
 
     def closing(self):
         # In the plane a residual distinguishes full turns; a product of vectors does not.

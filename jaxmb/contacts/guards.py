@@ -11,7 +11,7 @@ from ..formulations import AbstractFormulation
 from ..linalg.pairs import for_first, of_pairs, placed_pairs
 from ..linalg.rotations import norm
 from ..parts.modes import BEGUN
-from ..solvers.manifold_term import AbstractGuards
+from ..solvers.manifold_term import AbstractGuards, GuardsSeen
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .forces import contact_forces, largest_force, reserves
@@ -44,29 +44,42 @@ class ContactGuards(AbstractGuards):
     def near(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.tolerance.near
 
-    def values(self, t, y):
+    def seen(self, t, y):
         system, y = lax.stop_gradient((self.system, y))
         contacts, t = system.contacts, jnp.asarray(t, y.q.dtype)
         q = system.normalize(t, y.q)
-        modes = contacts.modes(q)
-        gap = contacts.gaps(system, t, q)
-        at = Instant(system, t, q, y.u)
-        free = jnp.where(modes.open, gap * (1 - 0.5 * gap / system.contact_numbers(t).peaks), system.length)
-        free = contacts.sharing.guarded(at, gap, self.tolerance, free)
-        acts = self.forces(y)
+        modes, gaps, rates = contacts.modes(q), contacts.gaps(system, t, q), contacts.rates(system, t, q, y.u)
+        closing, slips = rates[: contacts.n], modes.of_friction * rates[contacts.n :]
+        at, peaks, touch = Instant(system, t, q, y.u), system.contact_numbers(t).peaks, self.touch * system.length
+        free = jnp.where(modes.open, gaps * (1 - 0.5 * gaps / peaks), system.length)
+        free = contacts.sharing.guarded(at, gaps, self.tolerance, free)
+        begins = modes.open & (gaps <= touch)
         if contacts.m:
-            rates = contacts.rates(system, t, q, y.u)[contacts.n :]
-            slips = jnp.where(modes.slides, modes.of_friction * rates, system.length)
-            free = jnp.concatenate([free, self._in_plane(slips, modes, rates, y.u)])
+            slides = jnp.where(modes.slides, slips, system.length)
+            free = jnp.concatenate([free, self._in_plane(slides, modes, rates[contacts.n :], y.u)])
+            sets_in = modes.slides & (slips <= touch)
+            if contacts.pairs:
+                sets_in = for_first(contacts.pairs, modes.in_plane.begun, sets_in)
+            begins = jnp.concatenate([begins, sets_in])
+        closing = closing * (1 - gaps / peaks) / system.length
+        # The rates of bodies that move side by side are rounding errors, and close nothing.
+        least = _RATE * jnp.finfo(closing.dtype).eps * jnp.max(jnp.abs(y.u) / system.velocity_scale())
+        closing = jnp.where(jnp.abs(closing) > least, closing, 0.0)
+        closing = jnp.where(modes.open, closing, jnp.inf)
+        closing = jnp.pad(closing, (0, contacts.m), constant_values=jnp.inf)
+        return GuardsSeen(self._with_forces(at, y, free / system.length), closing, begins)
+
+    def _with_forces(self, at, y, free):
+        """The guards, from those of contacts and friction without a force, in a state `y` that `at` normalises."""
+        contacts, acts = at.system.contacts, self.forces(y)
 
         def forces(_):
-            here = system.at(y)
-            _, multipliers = contact_forces(here, t, q, y.u)
-            largest = largest_force(here, t, dataclasses.replace(y, q=q), multipliers)
-            return contacts.sharing.reserves(Instant(here, t, q, y.u), multipliers, reserves) / largest
+            here = at.system.at(y)
+            _, multipliers = contact_forces(here, at.t, at.q, at.u)
+            largest = largest_force(here, at.t, dataclasses.replace(y, q=at.q), multipliers)
+            return contacts.sharing.reserves(Instant(here, at.t, at.q, at.u), multipliers, reserves) / largest
 
-        reserves_of_active = cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free)
-        return jnp.where(acts, reserves_of_active, free / system.length)
+        return jnp.where(acts, cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free), free)
 
     def _in_plane(self, slips, modes, rates, u):
         """The slips, with guards for slip in two directions: it has neither turned by more than 60 degrees from its
@@ -102,33 +115,6 @@ class ContactGuards(AbstractGuards):
     def forces(self, y):
         modes = self.system.contacts.modes(y.q)
         return jnp.concatenate([modes.closed, modes.held])
-
-    def begins(self, t, y):
-        system, y = lax.stop_gradient((self.system, y))
-        contacts, touch, t = system.contacts, self.touch * system.length, jnp.asarray(t, y.q.dtype)
-        q = system.normalize(t, y.q)
-        modes = contacts.modes(q)
-        gaps = contacts.gaps(system, t, q)
-        opens = modes.open & (gaps <= touch)
-        if not contacts.m:
-            return opens
-        rates = contacts.rates(system, t, q, y.u)[contacts.n :]
-        begins = modes.slides & (modes.of_friction * rates <= touch)
-        if contacts.pairs:
-            begins = for_first(contacts.pairs, modes.in_plane.begun, begins)
-        return jnp.concatenate([opens, begins])
-
-    def rates(self, t, y):
-        system, y = lax.stop_gradient((self.system, y))
-        contacts, t = system.contacts, jnp.asarray(t, y.q.dtype)
-        q = system.normalize(t, y.q)
-        slopes = 1 - contacts.gaps(system, t, q) / system.contact_numbers(t).peaks
-        rates = contacts.rates(system, t, q, y.u)[: contacts.n] * slopes / system.length
-        # The rates of bodies that move side by side are rounding errors, and close nothing.
-        least = _RATE * jnp.finfo(rates.dtype).eps * jnp.max(jnp.abs(y.u) / system.velocity_scale())
-        rates = jnp.where(jnp.abs(rates) > least, rates, 0.0)
-        rates = jnp.where(contacts.modes(q).open, rates, jnp.inf)
-        return jnp.pad(rates, (0, contacts.m), constant_values=jnp.inf)
 
 
 def contact_guards(

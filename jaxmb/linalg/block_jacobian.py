@@ -138,7 +138,10 @@ class BlockJacobian(AbstractJacobian):
     def scatter_rows(self, values):
         return self._all_rows(jnp.where(self.order.kept, values, 0.0))
 
-    def gram(self, inertia):
+    def responses(self, inertia):
+        return None
+
+    def gram(self, inertia, responses):
         return BlockGram(self, inertia)
 
     def dense(self):

@@ -10,7 +10,10 @@ from jaxtyping import Array, Float
 
 from .blocks import matrix_products
 from .elimination import cholesky, solve_positive
-from .rotations import cross
+from .sums import unchecked_take
+
+# Up to this number of velocities a full matrix has fewer instructions than its blocks, and is as fast.
+_SMALL = 18
 
 
 class AbstractInertia(eqx.Module):
@@ -32,6 +35,13 @@ class AbstractInertia(eqx.Module):
     def transpose(self) -> "AbstractInertia":
         """The transpose; it differs from the matrix only for a root."""
 
+    def with_inverse(self, like: Float[Array, "n"]) -> "AbstractInertia":
+        """The same matrix for vectors of this kind, which keeps its inverse if solutions are cheaper so."""
+        if like.size > _SMALL:
+            return self
+        unit = jnp.eye(like.size, dtype=like.dtype)
+        return InvertedInertia(DenseInertia(self.product(unit)), DenseInertia(self.solve(unit)))
+
 
 class DiagonalInertia(AbstractInertia):
     """Planar bodies about their mass centres. `diagonal`: shape (n,) [kg, kg m²]."""
@@ -49,6 +59,25 @@ class DiagonalInertia(AbstractInertia):
 
     def transpose(self):
         return self
+
+
+class InvertedInertia(AbstractInertia):
+    """A `matrix` with its `inverse`."""
+
+    matrix: AbstractInertia
+    inverse: AbstractInertia
+
+    def product(self, v):
+        return self.matrix.product(v)
+
+    def solve(self, f):
+        return self.inverse.product(f)
+
+    def root(self):
+        return self.matrix.root()
+
+    def transpose(self):
+        return InvertedInertia(self.matrix.transpose(), self.inverse.transpose())
 
 
 class BlockInertia(AbstractInertia):
@@ -69,7 +98,7 @@ class BlockInertia(AbstractInertia):
         return self._apply(lambda w: matrix_products(self.inertia, w), self.mass, v)
 
     def solve(self, f):
-        return self._apply(lambda n: matrix_products(_inverse_3x3(self.inertia), n), 1 / self.mass, f)
+        return self._apply(lambda n: matrix_products(inverses_3x3(self.inertia), n), 1 / self.mass, f)
 
     def root(self):
         return BlockInertia(jnp.sqrt(self.mass), jax.vmap(cholesky)(self.inertia))
@@ -96,7 +125,21 @@ class DenseInertia(AbstractInertia):
         return DenseInertia(self.matrix.T)
 
 
-def _inverse_3x3(J):
-    # Row k of the cofactors is the vector product of the two rows after row k.
-    cofactors = jax.vmap(jax.vmap(cross))(J[:, np.array([1, 2, 0])], J[:, np.array([2, 0, 1])])
-    return cofactors.swapaxes(1, 2) / jnp.sum(J[:, 0] * cofactors[:, 0], axis=-1)[:, None, None]
+def inverses_3x3(J: Float[Array, "b 3 3"]) -> Float[Array, "b 3 3"]:
+    """Inverses of 3 × 3 matrices, as the transpose of cofactors over the determinant."""
+    entries = J.reshape(-1, 9).T
+    (first, second), (third, fourth) = _COFACTORS
+    product = lambda a, b: unchecked_take(entries, a) * unchecked_take(entries, b)
+    cofactors = product(first, second) - product(third, fourth)
+    determinant = jnp.sum(entries[:3] * cofactors[:3], axis=0)
+    return (unchecked_take(cofactors, _TRANSPOSED) / determinant).T.reshape(J.shape)
+
+
+def _places_of_cofactors():
+    """The entries, as places in the raveled matrix, whose products differ by the cofactors."""
+    row, column = np.divmod(np.arange(9), 3)
+    place = lambda by, along: 3 * ((row + by) % 3) + (column + along) % 3
+    return (place(1, 1), place(2, 2)), (place(1, 2), place(2, 1))
+
+
+_COFACTORS, _TRANSPOSED = _places_of_cofactors(), np.arange(9).reshape(3, 3).T.reshape(-1)

@@ -57,7 +57,11 @@ class AbstractJacobian(eqx.Module):
         """The values of all rows from the values of the independent ones: zero for implied rows."""
 
     @abc.abstractmethod
-    def gram(self, inertia: AbstractInertia) -> AbstractPositiveDefinite:
+    def responses(self, inertia: AbstractInertia) -> Float[Array, "n r"] | None:
+        """`M⁻¹ Aᵀ` for the independent rows; None where the products are cheaper without this matrix."""
+
+    @abc.abstractmethod
+    def gram(self, inertia: AbstractInertia, responses: Float[Array, "n r"] | None) -> AbstractPositiveDefinite:
         """`A M⁻¹ Aᵀ` for the independent rows."""
 
     @abc.abstractmethod
@@ -82,19 +86,22 @@ class AbstractJacobian(eqx.Module):
 
     def projector(self, metric: AbstractInertia, factor: AbstractPositiveFactor | None = None) -> "MassProjector":
         """The projector in a metric M. `factor`: an existing factor of a Gram matrix of the same value."""
-        gram = self.gram(metric)
-        return MassProjector(self, metric, gram.eliminate() if factor is None else factor.for_matrix(gram))
+        responses = self.responses(metric)
+        gram = self.gram(metric, responses)
+        known = gram.eliminate() if factor is None else factor.for_matrix(gram)
+        return MassProjector(self, metric, known, responses)
 
 
 class MassProjector(eqx.Module):
     """Displacements along `M⁻¹ Aᵀ`, the shortest ones in the metric M that change the constraint rows.
 
-    **Fields:** the `jacobian` A; the `metric` M; the `factor` of `A M⁻¹ Aᵀ`.
+    **Fields:** the `jacobian` A; the `metric` M; the `factor` of `A M⁻¹ Aᵀ`; the `responses` `M⁻¹ Aᵀ`, if kept.
     """
 
     jacobian: AbstractJacobian
     metric: AbstractInertia
     factor: AbstractPositiveFactor
+    responses: Float[Array, "n r"] | None
 
     def solve(self, force: Float[Array, "n"], rows: Float[Array, "m"]) -> tuple[Float[Array, "n"], Float[Array, "m"]]:
         """x and λ of `M x = f + Aᵀ λ`, `A x = b`, for a metric without infinite entries; λ is zero for implied rows.
@@ -109,6 +116,8 @@ class MassProjector(eqx.Module):
         """
         jacobian, n = self.jacobian, force.size
         target = jacobian.gather_rows(rows)
+        if target.size == 0:
+            return self.metric.solve(force), jnp.zeros_like(rows)
         fixed = lax.stop_gradient(self)
 
         # One vector for both: the transpose of a solution needs a derivative of every part of the right-hand side.
@@ -137,7 +146,7 @@ class MassProjector(eqx.Module):
 
         def refined(x, multipliers, residual, k):
             change = self.factor.substitute(residual)
-            x = x + self.direction(jacobian.scatter_rows(change))
+            x = x + self._along(change)
             return x, multipliers + change, target - jacobian.gather_rows(jacobian.product(x)), k + 1
 
         def inexact(carry):
@@ -155,6 +164,12 @@ class MassProjector(eqx.Module):
     def multipliers(self, values: Float[Array, "m"]) -> Float[Array, "m"]:
         """`(A M⁻¹ Aᵀ)⁻¹ x`; zero for implied rows."""
         return self.jacobian.scatter_rows(self.factor.solve(self.jacobian.gather_rows(values)))
+
+    def _along(self, multipliers):
+        """`M⁻¹ Aᵀ λ` by multipliers of the independent rows."""
+        if self.responses is None:
+            return self.direction(self.jacobian.scatter_rows(multipliers))
+        return self.responses @ multipliers
 
     def direction(self, multipliers: Float[Array, "m"]) -> Float[Array, "n"]:
         """`M⁻¹ Aᵀ λ`."""
@@ -260,9 +275,12 @@ class DenseJacobian(AbstractJacobian):
             return unchecked_take(jnp.append(values, jnp.zeros((), values.dtype)), place)
         return jnp.zeros(m, values.dtype).at[self.rows].set(values)
 
-    def gram(self, inertia):
-        A = self.independent
-        return DensePositiveDefinite(A @ inertia.solve(A.T))
+    def responses(self, inertia):
+        return inertia.solve(self.independent.T)
+
+    def gram(self, inertia, responses):
+        assert responses is not None, "a full matrix keeps its responses"
+        return DensePositiveDefinite(self.independent @ responses)
 
     def dense(self):
         return self

@@ -169,7 +169,8 @@ def crossing(
         t = t0 + s * (t1 - t0)
         inside = lambda y0, y1, y: jnp.where(s == 0, y0, jnp.where(s == 1, y1, y))
         t, y = t * sign, jax.tree.map(inside, y0, y1, at(t))
-        return guards.values(t, y), guards.rates(t, y) * sign.astype(none.dtype), guards.begins(t, y)
+        seen = guards.seen(t, y)
+        return seen._replace(rates=seen.rates * sign.astype(none.dtype))
 
     def advance(packed):
         # One evaluation for all phases, so that the guards are compiled once.
@@ -187,7 +188,7 @@ def crossing(
 
     zero, no = jnp.zeros((), none.dtype), jnp.array(False)
     bracket = Bracket(jnp.zeros_like(one), one, zero, zero, jnp.array(0))
-    begins = None if guards.begins(t0 * sign, y0) is None else none > 0
+    begins = None if jax.eval_shape(guards.seen, t0 * sign, y0).begins is None else none > 0
     first = _Search(
         phase=jnp.array(_LOOK),
         s=one,

@@ -76,6 +76,20 @@ class AbstractFieldJacobian(eqx.Module):
         """Factor `1 - r J`."""
 
 
+class GuardsSeen(NamedTuple):
+    """The guards at a time.
+
+    **Fields:** their `values`; their `rates`, where guards can be negative inside a step but not at its ends, or their
+    zeros are crossed in one direction; otherwise infinite. `begins`: which guards begin to grow from zero if a step
+    starts here; None if no guard does. Such a guard may be smaller than the error of the step between its ends, so it
+    counts only at the step's end, as long as its rate is positive.
+    """
+
+    values: Float[Array, " guards"]
+    rates: Float[Array, " guards"]
+    begins: Bool[Array, " guards"] | None = None
+
+
 class AbstractGuards(eqx.Module):
     """The guards of a term, functions of time and state, both in the term's time.
 
@@ -87,14 +101,8 @@ class AbstractGuards(eqx.Module):
     near: AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
-    def values(self, t: Any, y: PyTree[Array]) -> Float[Array, "guards"]:
-        """The guards."""
-
-    @abc.abstractmethod
-    def rates(self, t: Any, y: PyTree[Array]) -> Float[Array, "guards"]:
-        """The rates of guards that can be negative inside a step but not at its ends, or whose zeros are crossed in one
-        direction; otherwise infinite.
-        """
+    def seen(self, t: Any, y: PyTree[Array]) -> GuardsSeen:
+        """The guards at a time, in a state."""
 
     @abc.abstractmethod
     def forces(self, y: PyTree[Array]) -> Bool[Array, "guards"]:
@@ -103,15 +111,6 @@ class AbstractGuards(eqx.Module):
     @abc.abstractmethod
     def changed(self, before: PyTree[Array], after: PyTree[Array]) -> Bool[Array, ""]:
         """Whether something changed in an event, from the states before and after it."""
-
-    def begins(self, t: Any, y: PyTree[Array]) -> Bool[Array, "guards"] | None:
-        """Which guards begin to grow from zero at the start of a step; None if no guard does.
-
-        Such a guard may be smaller than the error of the step between its ends. So it counts only at the step's end, as
-        long as its rate is positive.
-        """
-        del t, y
-        return None
 
 
 class GapsSeen(NamedTuple):

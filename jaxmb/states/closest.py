@@ -171,7 +171,8 @@ def meet_in_blocks(start: Instant, fixed: Bool[np.ndarray, "nu"]) -> Float[Array
         at = start.with_(q=q)
         before, jacobian = at.position_residual, at.binding_velocities
         largest = largest_residual(before, jacobian.row_norms(scale)[: system.position_rows])
-        factor = jacobian.gram(metric).eliminate(jnp.clip(_OF_RESIDUAL * largest, least, _OF_RESIDUAL))
+        gram = jacobian.gram(metric, jacobian.responses(metric))
+        factor = gram.eliminate(jnp.clip(_OF_RESIDUAL * largest, least, _OF_RESIDUAL))
         multipliers = factor.refined(jacobian.gather_rows(at.position_rows))
         step = -metric.solve(jacobian.transpose_product(jacobian.scatter_rows(multipliers)))
         longest = jnp.max(jnp.abs(step) / scale)
