@@ -126,14 +126,9 @@ class ConstraintSet(eqx.Module):
     ) -> Float[Array, "rows nq"]:
         """Derivatives of position residuals and of the `counts` of turns by the coordinates."""
         space, moves = self.layout.space, None
-
-        def along(x):
-            units = jnp.eye(space.pose_size, dtype=poses.dtype)
-            return jax.vmap(lambda dx: jax.jvp(space.prepare, (x,), (dx,))[1])(units)
-
         groups = (*self.position, *counts)
         if self.elements is None or not all(map(is_elementary, groups)):
-            moves = jax.vmap(along)(poses[:, : space.pose_size])
+            moves = jax.vmap(space.coordinate_moves)(poses)
         of_group: Any = lambda g: g.along(t, poses, moves)
         # In the plane rates of poses are velocities.
         of_rows = lambda elements: (

@@ -132,7 +132,7 @@ def inverses_3x3(J: Float[Array, "b 3 3"]) -> Float[Array, "b 3 3"]:
     product = lambda a, b: unchecked_take(entries, a) * unchecked_take(entries, b)
     cofactors = product(first, second) - product(third, fourth)
     determinant = jnp.sum(entries[:3] * cofactors[:3], axis=0)
-    return (unchecked_take(cofactors, _TRANSPOSED) / determinant).T.reshape(J.shape)
+    return (unchecked_take(cofactors, _TRANSPOSED) / determinant[None]).T.reshape(J.shape)
 
 
 def _places_of_cofactors():

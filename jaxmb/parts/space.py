@@ -86,6 +86,10 @@ class AbstractSpace(abc.ABC):
         """Rates of a prepared pose along each unit velocity."""
 
     @abc.abstractmethod
+    def coordinate_moves(self, pose: Pose) -> Float[Array, "p p"]:
+        """Rates of a prepared pose along unit rates of its coordinates."""
+
+    @abc.abstractmethod
     def pull_back(self, pose: Pose, gradient: Pose) -> Wrench:
         """Wrench `Nᵀ g` that does the work of a gradient with respect to the pose."""
 

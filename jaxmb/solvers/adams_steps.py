@@ -125,6 +125,9 @@ class AdamsSteps(AbstractSteps):
     def chosen(self, solver_state):
         return solver_state.chosen
 
+    def again(self, solver, *step):
+        return solver.step_again(*step)
+
     def memory(self, solver_state):
         return solver_state.memory
 

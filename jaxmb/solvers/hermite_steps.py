@@ -89,6 +89,9 @@ class HermiteSteps(AbstractSteps):
     def chosen(self, solver_state):
         return solver_state.chosen
 
+    def again(self, solver, *step):
+        return solver.step_again(*step)
+
     def memory(self, solver_state):
         return solver_state.memory
 

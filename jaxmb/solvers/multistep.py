@@ -145,12 +145,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         made_jump: Any,
     ) -> tuple[Y, StepEstimate | Crossing | Hidden | None, dict[str, Any], Any, diffrax.RESULTS]:
         first = y0
-        y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
-        before = state.chart
-        y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
-        chart = chart_after_step(terms, t1, y1, state.chart, args)
-        state = eqx.tree_at(lambda state: state.chart, state, chart, is_leaf=lambda x: x is None)
-        off = refused(terms, chart, before)
+        y0, before = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1, estimate, dense_info, state, failed = self._advanced(terms, t1, y0, args, before)
+        off = refused(terms, state.chart, before.chart)
         if off is not False:
             failed, estimate = failed | off, refuse(estimate, off)
         estimate = None if self.tolerances.fixed else estimate
@@ -166,6 +163,28 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)
         return y1, estimate, dense_info, state, result
+
+    @eqx.filter_jit
+    def step_again(
+        self,
+        terms: PyTree[diffrax.AbstractTerm],
+        t0: Any,
+        t1: Any,
+        y0: Y,
+        args: Args,
+        solver_state: Any,
+        made_jump: Any,
+    ) -> tuple[Y, Any]:
+        """The end of an accepted step, and the solver state there: `step` without a search for events."""
+        y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1, _, _, state, _ = self._advanced(terms, t1, y0, args, state)
+        return y1, state
+
+    def _advanced(self, terms, t1, y0: Y, args: Args, state: Any):
+        y1, estimate, dense_info, state, failed = self.advance(terms, t1, y0, args, state)
+        chart = chart_after_step(terms, t1, y1, state.chart, args)
+        state = eqx.tree_at(lambda state: state.chart, state, chart, is_leaf=lambda x: x is None)
+        return y1, estimate, dense_info, state, failed
 
     def restarted(self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any) -> tuple[Y, Any]:
         """The state and the solver state, restarted after a jump and otherwise unchanged."""

@@ -133,7 +133,7 @@ class Segments(eqx.Module):
             tprev = t if choice.tprev is None else choice.tprev
             made_jump = False if choice.made_jump is None else choice.made_jump
             old = Between(tprev, choice.tnext, y, made_jump, solver_state)
-            y, _, _, after, _ = solver.step(terms, old.tprev, old.tnext, y, args, solver_state, made_jump)
+            y, after = steps.again(solver, terms, old.tprev, old.tnext, y, args, solver_state, made_jump)
             if choice.chosen is not None:
                 after = eqx.tree_at(steps.chosen, after, choice.chosen)
             row_numbers = steps.row(terms, old, Between(old.tnext, old.tnext, y, made_jump, after))

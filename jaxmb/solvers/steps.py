@@ -72,6 +72,11 @@ class AbstractSteps(eqx.Module):
         """The same for runs that begin with a state, and not with the memory of another run."""
         return self
 
+    def again(self, solver: Any, *step: Any) -> tuple[PyTree[Array], Any]:
+        """The end of an accepted step that is repeated, and the solver's state there, from the arguments of `step`."""
+        y, _, _, solver_state, _ = solver.step(*step)
+        return y, solver_state
+
     @abc.abstractmethod
     def memory(self, solver_state: Any) -> PyTree[Array]:
         """The numbers of a solver's state, or of its tangent, that a step depends on smoothly."""

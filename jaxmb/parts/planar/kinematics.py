@@ -58,6 +58,9 @@ class PlanarSpace(AbstractSpace):
         turned = jnp.concatenate([zero, zero, one, -pose[4:5], pose[3:4]])
         return jnp.concatenate([jnp.eye(2, 5, dtype=pose.dtype), turned[None]])
 
+    def coordinate_moves(self, pose):
+        return self.moves(pose)
+
     def pull_back(self, pose, gradient):
         if not _prepared(pose):
             return gradient

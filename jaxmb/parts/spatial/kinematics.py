@@ -31,7 +31,24 @@ def _places_of_moves():
     return place
 
 
-_MOVES = _places_of_moves()
+def _places_of_coordinate_moves():
+    """The indices of the rates of a prepared pose along unit rates of its coordinates: each rate is 0, 1, twice an
+    Euler parameter, or the negative of this.
+    """
+    place = np.zeros((7, 16), int)
+    place[np.arange(7), np.arange(7)] = 1
+    units = np.eye(4)
+    for k in range(4):
+        for j in range(4):
+            # The matrix is a quadratic form of the parameters.
+            both = rot.rotation_matrix(units[j] + units[k])
+            changed = (both - rot.rotation_matrix(units[j]) - rot.rotation_matrix(units[k])).reshape(-1)
+            for i in np.flatnonzero(changed):
+                place[3 + k, 7 + i] = 2 + j + (0 if changed[i] > 0 else 4)
+    return place
+
+
+_MOVES, _COORDINATE_MOVES = _places_of_moves(), _places_of_coordinate_moves()
 
 
 class SpatialSpace(AbstractSpace):
@@ -82,6 +99,11 @@ class SpatialSpace(AbstractSpace):
         half, matrix = 0.5 * pose[3:7], pose[7:]
         zero, one = jnp.zeros_like(pose[:1]), jnp.ones_like(pose[:1])
         return unchecked_take(jnp.concatenate([zero, one, half, -half, matrix, -matrix]), _MOVES)
+
+    def coordinate_moves(self, pose):
+        twice = 2.0 * pose[3:7]
+        zero, one = jnp.zeros_like(pose[:1]), jnp.ones_like(pose[:1])
+        return unchecked_take(jnp.concatenate([zero, one, twice, -twice]), _COORDINATE_MOVES)
 
     def pull_back(self, pose, gradient):
         moment = rot.pull_back(pose[3:7], gradient[3:7])
