@@ -12,8 +12,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# The programs that the short tests of a file may compile, eager operations with them, unless it states its `PROGRAMS`.
-PROGRAMS = 60
+# The programs that the short tests of a file may compile, eager operations with them, unless it states its `MOST_PROGRAMS`.
+MOST_PROGRAMS = 60
 # Where Linux lists the memory maps of this process, and with how many of them compiled programs are given back.
 MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
 
@@ -83,7 +83,7 @@ def pytest_configure(config):
 @pytest.fixture(autouse=True, scope="module")
 def _few_programs(request):
     """Fail a file whose short tests compile more programs than it states: most of the tests' time is compiling."""
-    before, most = _compiled["programs"], getattr(request.module, "PROGRAMS", PROGRAMS)
+    before, most = _compiled["programs"], getattr(request.module, "MOST_PROGRAMS", MOST_PROGRAMS)
     yield
     count = _compiled["programs"] - before
     if not request.config.getoption("--all"):
