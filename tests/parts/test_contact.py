@@ -194,26 +194,6 @@ def test_ball_rolls_down_a_slope():
 
 
 @pytest.mark.slow
-def test_point_bounces_without_loss():
-    """It lands, leaves and lands again at the times of free fall and of half an oscillation on the spring."""
-    mass, stiffness, height, g = 2.0, 1e5, 0.5, 9.81
-    point = planar.PointMass("point", mass=mass, position=(0.0, height))
-    ground = planar.Contact("floor", "point", terrain=terrain.Flat(), normal=contact.Linear(stiffness), smoothing=1e-7)
-    system = mb.Scene([point], forces=[ground, mb.Gravity((0.0, -g))]).compile()
-    omega, fall = np.sqrt(stiffness / mass), np.sqrt(2 * height / g)
-    # On the spring y + g/ω² oscillates from g/ω² with speed −g fall, until it is there again.
-    contact_time = 2 / omega * (np.pi / 2 + np.arctan(g / (g * fall * omega)))
-    period = 2 * fall + contact_time
-    times = jnp.array([0.5 * period, period, 3 * period])
-    sol = mb.simulate(system, mb.assemble(system), t1=float(times[-1]), saveat=times, rtol=1e-12)
-    np.testing.assert_allclose(sol["point"].position[1:, 1], height, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(sol["point"].velocity[1:, 1], 0.0, atol=1e-4)
-    np.testing.assert_allclose(sol.energy, mass * g * height, rtol=1e-8)
-    depth = g / omega**2 + np.hypot(g / omega**2, g * fall / omega)
-    np.testing.assert_allclose(sol["point"].position[0, 1], -depth, rtol=1e-5)
-
-
-@pytest.mark.slow
 def test_derivatives_through_an_impact_converge():
     """A disc bounces off a floor whose level is a parameter: what it gains in height is twice that of the floor."""
     floor = planar.Contact(

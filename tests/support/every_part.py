@@ -528,10 +528,13 @@ METHODS = {
 }
 
 
-def compiled(example, *more):
-    """The scene of an example, and of more joints."""
-    part, bodies, forces = example.part, example.bodies, list(example.forces)
-    forces += [part] if isinstance(part, AbstractForce | AbstractNonIdeal) else []
-    joints = [*example.joints, *([] if part in bodies or part in forces else [part]), *more]
+def compiled(*examples, more=()):
+    """The scene of examples side by side, and of more joints."""
+    bodies, joints, forces = [], [], []
+    for example in examples:
+        own = list(example.forces)
+        own += [example.part] if isinstance(example.part, AbstractForce | AbstractNonIdeal) else []
+        joints += [*example.joints, *([] if example.part in example.bodies or example.part in own else [example.part])]
+        bodies, forces = bodies + example.bodies, forces + own
     gravity = mb.Gravity((0.0, -9.81) if bodies[0].dimension == 2 else (0.0, 0.0, -9.81))
-    return mb.Scene(bodies, joints=joints, forces=[*forces, gravity]).compile()
+    return mb.Scene(bodies, joints=[*joints, *more], forces=[*forces, gravity]).compile()
