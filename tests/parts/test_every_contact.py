@@ -43,6 +43,13 @@ GAPS = {
 }
 
 
+def test_gap_of_a_slack_rope_is_the_length_that_it_lacks():
+    poses = np.array([(*A, 0.2), (*B, -0.4)])
+    rope = mb.Rope("c", [("a", ON_A), ("b", ON_B)], length=3.0, slack=True).resolve(PLANE, poses)
+    _, law = rope.components()
+    np.testing.assert_allclose(law.gap(PLANE, poses), 3.0 - np.linalg.norm(BETWEEN), rtol=1e-12)
+
+
 @pytest.mark.parametrize("part, gap", GAPS.values(), ids=GAPS)
 def test_gap_by_hand(part, gap):
     poses = np.array([(*A, 0.2), (*B, -0.4)])[: len(part.bodies)]

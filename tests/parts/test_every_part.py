@@ -98,6 +98,9 @@ def test_joint_reaction_has_no_net_wrench(space, key):
     own = joint(space, key)
     for row in own.rows.jacobian.reshape(-1, own.case.bodies, SPACES[space].velocity_size):
         np.testing.assert_allclose(net_wrench(own.rows.moved, row), 0.0, atol=1e-12)
+        if key == "Distance":
+            # Its multiplier is the force of the rod.
+            np.testing.assert_allclose(np.linalg.norm(row[1, : SPACES[space].dimension]), 1.0, rtol=1e-12)
 
 
 @of_joints

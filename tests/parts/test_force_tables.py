@@ -31,12 +31,12 @@ def test_derivatives_by_the_points_of_a_table():
     @jax.jit
     def every(x):
         _, pull = jax.vjp(seen, x)
-        moved = jax.vmap(seen)(x[None] + 1e-3 * np.outer([1, -1, 2, -2], along))
+        moved = jax.vmap(seen)(x[None] + 2e-4 * np.outer([1, -1, 2, -2], along))
         return jax.jvp(seen, (x,), (along,))[1], pull(jnp.asarray(weights))[0], moved
 
     forward, reverse, (near, back, far, beyond) = map(np.asarray, every(points))
     np.testing.assert_allclose(reverse @ along, weights @ forward, rtol=1e-12)
-    np.testing.assert_allclose(forward, (8 * (near - back) - (far - beyond)) / 12e-3, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(forward, (8 * (near - back) - (far - beyond)) / 24e-4, rtol=1e-7, atol=1e-7)
 
 
 def test_the_integral_of_the_spline():
@@ -179,26 +179,6 @@ def test_an_angle_in_space_counts_from_the_middle_of_the_table():
     for angle in (3.0, 3.5 - 2 * np.pi):
         expected = -at(angle % (2 * np.pi) - 3.0)
         np.testing.assert_allclose(moment(wheel(spatial, table, angle=angle)), expected, rtol=1e-11)
-
-
-@pytest.mark.slow
-def test_a_spring_and_a_damper_move_a_wheel():
-    """In space, the motion by SciPy; energy is lost to the damper alone."""
-    rates, forces = np.array([-3.0, -0.5, 0.0, 0.5, 3.0]), np.array([-0.4, -0.2, 0.0, 0.1, 0.3])
-    parts = (
-        mb.TableSpring("spring", "pin.angle", values=X, forces=5 * Y + 3),
-        mb.TableDamper("damper", "pin.angle", rates=rates, forces=forces),
-    )
-    system = wheel(spatial, *parts, angle=0.3, rate=0.5)
-    ts = np.linspace(0.0, 0.8, 5)
-    motion = mb.simulate(system, mb.assemble(system), t1=ts[-1], saveat=ts, rtol=1e-10, atol=1e-12)
-    pull = jax.jit(lambda s: local_spline.value(jnp.asarray(X), jnp.asarray(5 * Y + 3), s))
-    drag = jax.jit(lambda v: local_spline.value(jnp.asarray(rates), jnp.asarray(forces), v))
-    moves = lambda t, y: [y[1], -float(pull(y[0]) + drag(y[1])) / INERTIA, -y[1] * float(drag(y[1]))]
-    start = [0.3, 0.5, float(motion.energy[0])]
-    expected = solve_ivp(moves, (0.0, ts[-1]), start, t_eval=ts, rtol=1e-9, atol=1e-11).y
-    found = motion["pin"].angle, motion["pin"].angle_rate, motion.energy
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow

@@ -222,28 +222,6 @@ def test_factors_out_of_their_range_are_refused(key, value):
         spatial.MagicFormulaTyre("tyre", "wheel", own, terrain=mb.terrain.Flat()).check(3)
 
 
-@pytest.mark.slow
-@VERSIONS
-def test_derivatives_by_slip_load_and_coefficients(version):
-    own = {key: jnp.asarray(value) for key, value in data(version).items()}
-    x = jnp.array([0.04, -0.06, 0.03, 3300.0, 2.1e5])
-    names = ["PDY1", "PKX1", "QDZ1", "LMUX", "QSY1", "RBX1", "QHZ3", "PKY2"]
-    outputs = jax.jit(lambda values, x: forces(version, own | dict(zip(names, values, strict=True)), *x))
-    values = jnp.stack([own[name] for name in names])
-    forward = jax.jit(jax.jacfwd(outputs, argnums=(0, 1)))(values, x)
-    reverse = jax.jit(jax.jacrev(outputs, argnums=(0, 1)))(values, x)
-    for k, (a, b, point) in enumerate(zip(forward, reverse, (values, x), strict=True)):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-9)
-        for j in range(len(point)):
-            h = 1e-5 * abs(point[j])
-            moved = [
-                outputs(*((point.at[j].add(s * h), x) if k == 0 else (values, point.at[j].add(s * h)))) for s in (1, -1)
-            ]
-            np.testing.assert_allclose(
-                (moved[0] - moved[1]) / (2 * h), a[:, j], rtol=1e-6, atol=1e-6 * np.max(np.abs(a[:, j]))
-            )
-
-
 # The load and the radii
 
 

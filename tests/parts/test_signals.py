@@ -78,8 +78,7 @@ def driven_rod(space, motion, parameters):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("space", [planar, spatial])
-@pytest.mark.parametrize("by_input", [False, True])
+@pytest.mark.parametrize("space, by_input", [(planar, False), (spatial, True)])
 def test_a_move_from_rest_to_rest(space, by_input):
     """As the motion of a driver and as an input: angle, rate, and the moment that accelerates the rod."""
     rise, duration, late = 0.9, 0.6, 0.2

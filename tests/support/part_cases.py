@@ -213,69 +213,49 @@ def cardan(point, axis, second):
     return spatial.Universal("J", "a", "b", point=point, axis_a_W=axis, axis_b_W=second)
 
 
+def ring(point, axis, second):
+    return planar.PointOnCurve("J", "a", "b", circle, point_b=POINTS[2][1], parameters={"radius": second})
+
+
+def gears(point, axis, second):
+    return planar.Gear("J", "a", "b", ratio=RATIO, carrier="c")
+
+
+def rack(point, axis, second):
+    return planar.RackAndPinion("J", "a", "b", radius=RADIUS, axis_b=axis, point_a=POINTS[2][0], point_b=POINTS[2][1])
+
+
 JOINTS = {
     "planar": {
-        "Revolute": Case(2, at_point(planar.Revolute), of_b(lambda b, point, a, s, x: move(b, x[0], point))),
+        "Revolute": Case(2, at_point(planar.Revolute), of_b(lambda b, p, a, s, x: move(b, x[0], p))),
         "Fixed": Case(3, at_point(planar.Fixed), lambda q, *args: q),
-        "PointOnLine": Case(
-            1, world(planar.PointOnLine), of_b(lambda b, point, a, s, x: move(b, x[0], point, x[1] * a))
-        ),
-        "Prismatic": Case(2, world(planar.Prismatic), of_b(lambda b, point, a, s, x: move(b, 0.0, point, x[0] * a))),
+        "PointOnLine": Case(1, world(planar.PointOnLine), of_b(lambda b, p, a, s, x: move(b, x[0], p, x[1] * a))),
+        "Prismatic": Case(2, world(planar.Prismatic), of_b(lambda b, p, a, s, x: move(b, 0.0, p, x[0] * a))),
         "Distance": Case(1, between_points(planar.Distance), on_link),
-        "PointOnCurve": Case(
-            1,
-            lambda point, axis, second: planar.PointOnCurve(
-                "J", "a", "b", circle, point_b=POINTS[2][1], parameters={"radius": second}
-            ),
-            on_circle,
-        ),
-        "Gear": Case(
-            1,
-            lambda point, axis, second: planar.Gear("J", "a", "b", ratio=RATIO, carrier="c"),
-            meshed,
-            bodies=3,
-            freedoms=8,
-            numbers=10,
-        ),
-        "RackAndPinion": Case(
-            1,
-            lambda point, axis, second: planar.RackAndPinion(
-                "J", "a", "b", radius=RADIUS, axis_b=axis, point_a=POINTS[2][0], point_b=POINTS[2][1]
-            ),
-            on_rack,
-            freedoms=5,
-        ),
+        "PointOnCurve": Case(1, ring, on_circle),
+        "Gear": Case(1, gears, meshed, bodies=3, freedoms=8, numbers=10),
+        "RackAndPinion": Case(1, rack, on_rack, freedoms=5),
     },
     "spatial": {
-        "Spherical": Case(3, at_point(spatial.Spherical), of_b(lambda b, point, a, s, x: move(b, turn_3(x), point))),
-        "Revolute": Case(5, world(spatial.Revolute), of_b(lambda b, point, a, s, x: move(b, turn(a, x[0]), point))),
-        "Universal": Case(
-            4,
-            cardan,
-            of_b(lambda b, point, a, s, x: move(b, product(turn(a, x[0]), turn(s, x[1])), point)),
-        ),
-        "Gimbal": Case(3, gimbal, of_b(lambda b, point, a, s, x: move(b, turn_3(x), point))),
+        "Spherical": Case(3, at_point(spatial.Spherical), of_b(lambda b, p, a, s, x: move(b, turn_3(x), p))),
+        "Revolute": Case(5, world(spatial.Revolute), of_b(lambda b, p, a, s, x: move(b, turn(a, x[0]), p))),
+        "Universal": Case(4, cardan, of_b(lambda b, p, a, s, x: move(b, product(turn(a, x[0]), turn(s, x[1])), p))),
+        "Gimbal": Case(3, gimbal, of_b(lambda b, p, a, s, x: move(b, turn_3(x), p))),
         "Cylindrical": Case(
-            4, world(spatial.Cylindrical), of_b(lambda b, point, a, s, x: move(b, turn(a, x[0]), point, x[1] * a))
+            4, world(spatial.Cylindrical), of_b(lambda b, p, a, s, x: move(b, turn(a, x[0]), p, x[1] * a))
         ),
         "Screw": Case(5, world(spatial.Screw, pitch=PITCH), of_b(on_thread)),
-        "Prismatic": Case(5, world(spatial.Prismatic), of_b(lambda b, point, a, s, x: slid(b, x[0] * a))),
-        "Planar": Case(
-            3, world(spatial.Planar), of_b(lambda b, point, a, s, x: move(b, turn(a, x[2]), point, along(a, x)))
-        ),
+        "Prismatic": Case(5, world(spatial.Prismatic), of_b(lambda b, p, a, s, x: slid(b, x[0] * a))),
+        "Planar": Case(3, world(spatial.Planar), of_b(lambda b, p, a, s, x: move(b, turn(a, x[2]), p, along(a, x)))),
         "Fixed": Case(6, at_point(spatial.Fixed), lambda q, *args: q),
         "Composite": composite("hinge", "hinge"),
         "Composite of all kinds": composite("hinge", "slide", "hinge", "slide", "hinge"),
         "Distance": Case(1, between_points(spatial.Distance), on_link),
         "PointOnPlane": Case(
-            1,
-            world(spatial.PointOnPlane),
-            of_b(lambda b, point, a, s, x: move(b, turn_3(x[2:]), point, along(a, x))),
+            1, world(spatial.PointOnPlane), of_b(lambda b, p, a, s, x: move(b, turn_3(x[2:]), p, along(a, x)))
         ),
         "PointOnLine": Case(
-            2,
-            world(spatial.PointOnLine),
-            of_b(lambda b, point, a, s, x: move(b, turn_3(x[1:]), point, x[0] * a)),
+            2, world(spatial.PointOnLine), of_b(lambda b, p, a, s, x: move(b, turn_3(x[1:]), p, x[0] * a))
         ),
     },
 }
