@@ -105,8 +105,7 @@ LONG = ("Contact", "Tyre", "spatial")
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * any(own in name for own in LONG)) for name in WITHOUT_POINTS],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * any(own in name for own in LONG)) for name in WITHOUT_POINTS]
 )
 def test_a_point_that_is_left_out_is_the_origin_of_the_frame(name):
     """On a body with its mass centre elsewhere the part is that with its points given where the origin is."""

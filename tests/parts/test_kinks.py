@@ -181,27 +181,6 @@ class Touching(Case):
         return numbers, [0.0, 0.25, 0.0], random.normal(size=3), {}, [0.0, random.choice([-1, 1]), 0.0]
 
 
-class HertzTouching(Touching):
-    """The same by Hertz's law."""
-
-    law = mb.contact.Hertz(1e4)
-
-
-class StopEnd(Case):
-    """A joint at the end of its range: its law is smooth there."""
-
-    def scene(self):
-        stop = mb.JointStop("stop", "pin.angle", lower=-0.5, upper=1.0, stiffness=100.0, damping=1.0, exponent=1.5)
-        return arm(stop)
-
-    def sample(self, random, system):
-        lower = dyadic(random, -1, 0)
-        upper = lower + dyadic(random, 1, 2)
-        numbers = {"stop.lower": lower, "stop.upper": upper, "stop.smoothing": 10 ** random.uniform(-2, -1)}
-        angle, sign = random.choice([lower, upper]), random.choice([-1, 1])
-        return numbers, [0.5, 0.0, angle], [0.0, 0.0, random.normal()], {}, [0.0, 0.0, sign]
-
-
 class BoxEdge(Case):
     """The direction of a hard contact with a box, of a ball above an edge of its top: constant on the top."""
 
@@ -242,20 +221,8 @@ class GearEnds(Case):
         return numbers, q, u, {}, along
 
 
-class TableEnds(Case):
-    """A spring by a table at its points, with straight lines beyond its ends."""
-
-    def scene(self):
-        return arm(mb.TableSpring("spring", "pin.angle", values=(-1.0, 0.0, 0.5, 2.0), forces=(-1.0, 0.0, 2.0, 3.0)))
-
-    def sample(self, random, system):
-        values = np.cumsum([dyadic(random, 0.25, 1) for _ in range(4)]) - 1.0
-        numbers = {"spring.values": values, "spring.forces": np.cumsum(random.uniform(0.5, 2, 4))}
-        return numbers, [0.5, 0.0, random.choice(values)], np.zeros(3), {}, [0.0, 0.0, random.choice([-1, 1])]
-
-
 CASES = [Control, Range, ForceRange, Activation, FullThrottle, Unstretched, RopeEnergy, BumpEnds, Touching]
-CASES += [HertzTouching, StopEnd, BoxEdge, GearEnds, TableEnds]
+CASES += [BoxEdge, GearEnds]
 
 
 @pytest.mark.slow(but=("ForceRange",))

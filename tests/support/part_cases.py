@@ -335,10 +335,7 @@ def pairs(name):
             "body Torque": spatial.Torque("F", "b", **moment, frame="body"),
         }
     module = planar if name == "planar" else spatial
-    return springs(name, 1.0) | {
-        "RotationalDamper": module.RotationalDamper("F", "a", "b", damping=2.0),
-        **more,
-    }
+    return springs(name, 1.0) | {"RotationalDamper": module.RotationalDamper("F", "a", "b", damping=2.0), **more}
 
 
 def forces(name):

@@ -136,10 +136,7 @@ def test_derivatives_of_an_oblique_collision_with_friction():
     "part, message",
     [
         (lambda: plate(("disc",), **SHARP), "the disc's body and then at least one other"),
-        (
-            lambda: plate(edge=1.1, **SHARP),
-            "edge must be at most half as long as a plate, got 1.1 m, with 2 m",
-        ),
+        (lambda: plate(edge=1.1, **SHARP), "edge must be at most half as long as a plate, got 1.1 m, with 2 m"),
         (lambda: plate(start=(1.0, 0.0), **SHARP), "with 0 m from start to end"),
         (lambda: plate(start=(0.0, 0.0, 0.0), **SHARP), r"start must have shape \(2,\) or \(1, 2\), got \(3,\)"),
         (lambda: plate(normal=3.0), "normal must be a law from jaxmb.contact"),
