@@ -169,12 +169,9 @@ class BumpEnds(Case):
 class Touching(Case):
     """A disc that just touches soft ground: its law is smooth there."""
 
-    law = mb.contact.Linear(1e4)
-
     def scene(self):
-        return block(
-            planar.Contact("floor", "block", terrain=mb.terrain.Flat(), normal=self.law, radius=0.25, damping=10.0)
-        )
+        laws = {"terrain": mb.terrain.Flat(), "normal": mb.contact.Linear(1e4), "damping": 10.0}
+        return block(planar.Contact("floor", "block", radius=0.25, **laws))
 
     def sample(self, random, system):
         numbers = {"floor.smoothing": 10 ** random.uniform(-2, -1), "floor.damping": random.uniform(0, 10)}
