@@ -289,7 +289,7 @@ def test_a_length_that_is_an_input():
     length = float(mb.parameters(system)["rope.length"])
     system = mb.with_inputs(system, {"rope.length": lambda t: length - 0.5 * t})
     state = mb.assemble(system, fix={"rope.mode": -1})
-    np.testing.assert_allclose(state.u, [0.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(state.u[:2], [0.0, 0.5], atol=1e-12)
     tensions = instants(system, state)("rope.tension")[0]
     np.testing.assert_allclose(tensions, 2.0 * G * np.array([np.exp(0.2 * np.pi), 1.0]), rtol=1e-10)
     slip = system.contacts.rates(system, jnp.zeros(()), state.q, state.u)
