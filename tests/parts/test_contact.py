@@ -33,31 +33,54 @@ def three_wheels(kind=planar.Contact, **changes):
 
 # Laws
 
+SLIPS = np.array([1e-9, 1e-4, 0.02, 1.0, -3.0])
+
+
+@pytest.fixture(scope="module")
+def laws():
+    """Of each law of the normal force its force at many depths, and its energy; of each of friction its force."""
+    vector = lambda x: jnp.stack([x, 0.0])
+    engaged, one = 0.5 * jnp.ones(()), jnp.ones(())
+    normal = lambda law, depth: (law.force(depth), law.energy(depth))
+    rubs = lambda law, slip: law.force(2e3 * one, engaged, vector(slip), vector(4.0 * one))
+
+    @jax.jit
+    def every(depths, slips):
+        of = {name: jax.vmap(lambda depth, law=law: normal(law, depth))(depths) for name, law in LAWS.items()}
+        return of | {name: jax.vmap(lambda slip, law=law: rubs(law, slip))(slips) for name, law in FRICTION.items()}
+
+    # A power of the depth that is a multiple of a tenth is a polynomial of its tenth root.
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    root = 0.5 * 0.03**0.1 * (1 + nodes)
+    found = jax.tree.map(np.asarray, every(np.append(root**10, [0.03, 0.04]), SLIPS))
+    return found, 0.5 * 0.03**0.1 * weights * 10 * root**9
+
 
 @pytest.mark.parametrize("name", LAWS)
-def test_energy_is_the_work_of_the_normal_force(name):
-    law = LAWS[name]
-    work, _ = quad(lambda depth: float(law.force(jnp.array(depth))), 0.0, 0.03, epsabs=0.0, epsrel=1e-10)
-    np.testing.assert_allclose(law.energy(jnp.array(0.03)), work, rtol=1e-9)
+def test_energy_is_the_work_of_the_normal_force(laws, name):
+    found, weights = laws
+    force, energy = found[name]
+    np.testing.assert_allclose(energy[-2], weights @ force[:-2], rtol=1e-10)
 
 
-def test_bekker_is_pressure_times_area():
-    law, z = LAWS["soft soil"], 0.04
-    np.testing.assert_allclose(law.force(jnp.array(z)), 0.05 * (2e3 / 0.3 + 8e5) * z**0.7, rtol=1e-14)
+def test_bekker_is_pressure_times_area(laws):
+    np.testing.assert_allclose(laws[0]["soft soil"][0][-1], 0.05 * (2e3 / 0.3 + 8e5) * 0.04**0.7, rtol=1e-14)
 
 
-@pytest.mark.parametrize("slip", [1e-9, 1e-4, 0.02, 1.0, -3.0])
-def test_laws_of_friction(slip):
-    vector = lambda x: jnp.array([x, 0.0])
-    coulomb = contact.Coulomb(0.7, transition_speed=0.3)
-    force = coulomb.force(jnp.array(2e3), jnp.array(1.0), vector(slip), vector(4.0))
-    np.testing.assert_allclose(force, [-0.7 * 2e3 * np.tanh(slip / 0.3), 0.0], rtol=1e-13)
-    # The mean of the shear stress over the patch.
+def test_coulomb_friction(laws):
+    expected = np.stack([-0.7 * 2e3 * np.tanh(SLIPS / 0.3), 0.0 * SLIPS], axis=1)
+    np.testing.assert_allclose(laws[0]["coulomb"], expected, rtol=1e-13)
+
+
+def test_janosi_friction_is_the_mean_shear_stress_over_the_patch(laws):
+    """In half contact there is half of the cohesion."""
     speed = lambda v: np.hypot(v, 0.05)
-    ratio = abs(slip) / (0.5 * (speed(4.0) + speed(4.0 - slip) + speed(slip)))
-    mean, _ = quad(lambda s: -np.expm1(-ratio * 0.4 * s / 0.02), 0.0, 1.0, epsrel=1e-13)
-    force = JANOSI.force(jnp.array(2e3), jnp.array(1.0), vector(slip), vector(4.0))
-    np.testing.assert_allclose(force, [-np.sign(slip) * (3e3 * 0.1 + 2e3 * np.tan(0.5)) * mean, 0.0], rtol=1e-9)
+    for slip, found in zip(SLIPS, laws[0]["janosi"], strict=True):
+        ratio = abs(slip) / (0.5 * (speed(4.0) + speed(4.0 - slip) + speed(slip)))
+        mean, _ = quad(lambda s, ratio=ratio: -np.expm1(-ratio * 0.4 * s / 0.02), 0.0, 1.0, epsrel=1e-13)
+        np.testing.assert_allclose(
+            found, [-np.sign(slip) * (0.5 * 3e3 * 0.1 + 2e3 * np.tan(0.5)) * mean, 0.0], rtol=1e-9
+        )
 
 
 # Contact
@@ -69,35 +92,26 @@ def states(rng, space, k):
     poses[:, 0] = rng.uniform(3.9, 5.6, size=k)
     if space is SPACE:
         poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    return jnp.asarray(poses), jnp.asarray(rng.normal(size=(k, space.velocity_size)))
+    return poses, np.asarray(rng.normal(size=(k, space.velocity_size)))
 
 
-@pytest.mark.slow
 def test_wheels_of_the_tracked_vehicle():
     """Spring with the slope's share, damping that sets in linearly, traction at the rim: as in the model's equations,
     deep in the ground, at its surface and far above.
     """
-    part = three_wheels(WheelContact).resolve(PLANE, jnp.zeros((3, 3)))
+    part = three_wheels(WheelContact).resolve(PLANE, np.zeros((3, 3)))
     q = np.array([[4.3, 0.2, 0.4], [5.0, 0.4071, 0.1], [4.5, 30.0, 0.0]])
     v = np.array([[1.0, 0.3, -1.0], [0.3, 0.2, 0.5], [1.0, -1.0, 0.0]])
     ground, slope = oracle.bump(q[:, 0])
     depth, share = oracle.plus(0.305 + ground - q[:, 1])
     traction = -0.7 * 8e5 * depth * np.tanh((v[:, 0] + 0.305 * v[:, 2]) / 0.3)
     normal = 8e5 * depth * share
-    expected = np.stack(
-        [
-            traction - normal * slope,
-            normal - 2e4 * np.clip(depth / 0.01, 0, 1) * v[:, 1],
-            0.305 * traction,
-        ],
-        axis=1,
-    )
-    np.testing.assert_allclose(
-        part.wrenches(PLANE, jnp.asarray(q), jnp.asarray(v), 0.0), expected, rtol=1e-9, atol=1e-8
-    )
+    damped = normal - 2e4 * np.clip(depth / 0.01, 0, 1) * v[:, 1]
+    expected = np.stack([traction - normal * slope, damped, 0.305 * traction], axis=1)
+    found = jax.jit(lambda q, v: part.wrenches(PLANE, q, v, 0.0))(q, v)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)
 
 
-@pytest.mark.slow("plane", "space")
 @pytest.mark.parametrize(
     "space, kind, law",
     [(PLANE, planar.Contact, "soft soil"), (PLANE, WheelContact, "linear"), (SPACE, spatial.Contact, "hertz")],
@@ -106,29 +120,32 @@ def test_wheels_of_the_tracked_vehicle():
 def test_power_of_the_spring_is_loss_of_energy_and_the_rest_dissipates(space, kind, law):
     rng = np.random.default_rng(1)
     poses, velocities = states(rng, space, 3)
-    rates = jax.vmap(space.rates)(poses, velocities)
-    places = {} if kind is WheelContact else {"centres": jnp.asarray(0.1 * rng.normal(size=(3, space.dimension)))}
+    places = {} if kind is WheelContact else {"centres": 0.1 * rng.normal(size=(3, space.dimension))}
     build = lambda **options: three_wheels(kind, normal=LAWS[law], **places, **options).resolve(space, poses)
     smooth = contact.Coulomb(0.0, transition_speed=1.0)
     elastic, rough = build(friction=smooth, damping=0.0), build(friction=JANOSI, damping=3e3)
-    energy, rate = jax.jvp(lambda q: elastic.energy(space, q, 0.0), (poses,), (rates,))
-    power = lambda part: jnp.sum(part.wrenches(space, poses, velocities, 0.0) * velocities)
+
+    @jax.jit
+    def seen(poses, velocities):
+        rates = jax.vmap(space.rates)(poses, velocities)
+        energy = jax.jvp(lambda q: elastic.energy(space, q, 0.0), (poses,), (rates,))
+        return energy, [jnp.sum(part.wrenches(space, poses, velocities, 0.0) * velocities) for part in (elastic, rough)]
+
+    (energy, rate), (power, loss) = seen(poses, velocities)
     assert energy > 1.0
-    np.testing.assert_allclose(power(elastic), -rate, rtol=1e-10)
-    assert power(rough) + rate < -1.0
+    np.testing.assert_allclose(power, -rate, rtol=1e-10)
+    assert loss + rate < -1.0
 
 
-@pytest.mark.slow("coulomb-linear", "janosi-linear", "janosi-hertz")
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("friction", FRICTION)
+@pytest.mark.parametrize("friction, law", [("coulomb", "hertz"), ("janosi", "soft soil")])
 def test_derivatives_are_finite_where_laws_have_kinks(friction, law):
     """At the surface, far off it, and without slip or speed."""
-    part = three_wheels(normal=LAWS[law], friction=FRICTION[friction]).resolve(PLANE, jnp.zeros((3, 3)))
-    poses, still = jnp.array([[0.0, 0.305, 0.0], [1.0, 1e4, 0.0], [2.0, 0.2, 0.0]]), jnp.zeros((3, 3))
+    part = three_wheels(normal=LAWS[law], friction=FRICTION[friction]).resolve(PLANE, np.zeros((3, 3)))
+    poses, still = np.array([[0.0, 0.305, 0.0], [1.0, 1e4, 0.0], [2.0, 0.2, 0.0]]), np.zeros((3, 3))
     wrenches = lambda *args: (part.wrenches(PLANE, *args, 0.0),) * 2
     jacobians, value = jax.jit(jax.jacfwd(wrenches, (0, 1), has_aux=True))(poses, still)
     assert all(np.all(np.isfinite(jacobian)) for jacobian in jacobians)
-    np.testing.assert_array_equal(value[:, [0, 2]], 0.0)
+    np.testing.assert_array_equal(np.asarray(value)[:, [0, 2]], 0.0)
 
 
 def test_one_terrain_for_all_bodies_is_one_parameter():
@@ -144,64 +161,9 @@ def test_one_terrain_for_all_bodies_is_one_parameter():
     assert "road.friction.transition_speed" in known and "road.normal.stiffness" in known
     q = system.guess.q
     lift = jax.jit(lambda peak: mb.with_parameters(system, {"road.terrain.peak": peak}).force(0.0, q, 0.0 * q)[1::3])
-    assert np.all(lift(0.13) - lift(0.12) > 100.0)
+    assert np.all(np.asarray(lift(0.13)) - np.asarray(lift(0.12)) > 100.0)
     with pytest.raises(ValueError, match=r"road\.terrain\.peak"):
         mb.with_parameters(system, {"road.terrain.height": 0.2})
-
-
-@pytest.mark.slow
-def test_ball_rolls_down_a_slope():
-    """After its slip has settled a ball gains 5/7 g sin α along the slope, and stays as deep in the ground."""
-    angle, radius, mass = 0.2, 0.1, 2.0
-    stiffness, g = 1e5, 9.81
-    normal = np.array([-np.sin(angle), 0.0, np.cos(angle)])
-    start = (radius - mass * g * np.cos(angle) / stiffness) * normal
-    ball = spatial.Body("ball", mass=mass, inertia=0.4 * mass * radius**2 * np.eye(3), position=start)
-    ground = spatial.Contact(
-        "floor",
-        "ball",
-        terrain=terrain.Slope(np.tan(angle)),
-        normal=contact.Linear(stiffness),
-        friction=contact.Coulomb(0.5, transition_speed=0.02),
-        radius=radius,
-        smoothing=1e-9,
-    )
-    system = mb.Scene([ball], forces=[ground, mb.Gravity((0.0, 0.0, -g))]).compile()
-    sol = mb.simulate(system, mb.assemble(system), t1=0.5, saveat=jnp.array([0.3, 0.5]), rtol=1e-9)
-    motion = sol["ball"]
-    gain = 5 / 7 * g * np.sin(angle) * np.array([-np.cos(angle), 0.0, -np.sin(angle)])
-    np.testing.assert_allclose((motion.velocity[1] - motion.velocity[0]) / 0.2, gain, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(motion.position @ normal, start @ normal, rtol=0, atol=1e-9)
-    # Friction is what the applied force reports along the slope.
-    down = np.array([-np.cos(angle), 0.0, -np.sin(angle)])
-    np.testing.assert_allclose(sol.forces["floor"][:, 0, :3] @ down, -2 / 7 * mass * g * np.sin(angle), rtol=1e-6)
-    with pytest.raises(ValueError, match="floor"):
-        sol.forces["flor"]
-
-
-@pytest.mark.slow
-def test_point_bounces_without_loss():
-    """It lands, leaves and lands again at the times of free fall and of half an oscillation on the spring."""
-    mass, stiffness, height, g = 2.0, 1e5, 0.5, 9.81
-    point = planar.PointMass("point", mass=mass, position=(0.0, height))
-    ground = planar.Contact("floor", "point", terrain=terrain.Flat(), normal=contact.Linear(stiffness), smoothing=1e-7)
-    system = mb.Scene([point], forces=[ground, mb.Gravity((0.0, -g))]).compile()
-    omega, fall = np.sqrt(stiffness / mass), np.sqrt(2 * height / g)
-    # On the spring y + g/ω² oscillates from g/ω² with speed −g fall, until it is there again.
-    contact_time = 2 / omega * (np.pi / 2 + np.arctan(g / (g * fall * omega)))
-    period = 2 * fall + contact_time
-    times = jnp.array([0.5 * period, period, 3 * period])
-    sol = mb.simulate(system, mb.assemble(system), t1=float(times[-1]), saveat=times, rtol=1e-12)
-    np.testing.assert_allclose(sol["point"].position[1:, 1], height, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(sol["point"].velocity[1:, 1], 0.0, atol=1e-4)
-    np.testing.assert_allclose(sol.energy, mass * g * height, rtol=1e-8)
-    depth = g / omega**2 + np.hypot(g / omega**2, g * fall / omega)
-    np.testing.assert_allclose(sol["point"].position[0, 1], -depth, rtol=1e-5)
-
-
-def primitives(part):
-    wrenches = lambda q, v: part.resolve(PLANE, jnp.zeros((3, 3))).wrenches(PLANE, q, v, 0.0)
-    return str(jax.make_jaxpr(wrenches)(jnp.zeros((3, 3)), jnp.zeros((3, 3))))
 
 
 @pytest.mark.slow
@@ -226,11 +188,6 @@ def test_derivatives_through_an_impact_converge():
         np.testing.assert_allclose(forward(jnp.zeros(()), rtol), slope, rtol=1e-9)
 
 
-def test_nothing_of_friction_without_friction():
-    assert "tanh" in primitives(three_wheels())
-    assert "tanh" not in primitives(three_wheels(friction=None))
-
-
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -245,6 +202,6 @@ def test_nothing_of_friction_without_friction():
         ({"friction": dataclasses.replace(JANOSI, length=0.0)}, "friction.length must be positive"),
     ],
 )
-def test_bad_input(changes, message):
+def test_contact_that_is_refused(changes, message):
     with pytest.raises(ValueError, match=f"'road': {message}"):
-        three_wheels(**changes).resolve(PLANE, jnp.zeros((3, 3)))
+        three_wheels(**changes).resolve(PLANE, np.zeros((3, 3)))

@@ -80,13 +80,12 @@ def stroke(t):
 
 
 @pytest.mark.slow
-@SPACES
-def test_the_pressure_for_a_prescribed_length_moves_the_boom_likewise(space):
+def test_the_pressure_for_a_prescribed_length_moves_the_boom_likewise():
     """By the closed form, and by a motion under that pressure as an input."""
     rod = {"rod_area": ANNULUS, "rod_pressure": 1e5}
-    own = lift(space, **rod)
+    own = lift(spatial, **rod)
     ts = np.linspace(0.0, 0.5, 6)
-    driven = boom(space, own, joints=[mb.JointDriver("move", "lift.length")])
+    driven = boom(spatial, own, joints=[mb.JointDriver("move", "lift.length")])
     driven = mb.with_inputs(driven, {"move.value": stroke})
     motion = mb.simulate(driven, mb.assemble(driven), t1=ts[-1], saveat=ts, rtol=1e-10)
     np.testing.assert_allclose(motion["lift"].length, jax.vmap(stroke)(ts), rtol=0, atol=1e-12)
@@ -94,53 +93,9 @@ def test_the_pressure_for_a_prescribed_length_moves_the_boom_likewise(space):
     closed = jax.vmap(lambda t: (needed_force(stroke, t) + 1e5 * ANNULUS) / BORE)
     np.testing.assert_allclose(pressure, closed(ts), rtol=1e-9)
 
-    pushed = mb.with_inputs(boom(space, own), {"lift.pressure": lambda t: closed(t[None])[0]})
+    pushed = mb.with_inputs(boom(spatial, own), {"lift.pressure": lambda t: closed(t[None])[0]})
     free = mb.simulate(pushed, mb.assemble(pushed), t1=ts[-1], saveat=ts, rtol=1e-10)
     np.testing.assert_allclose(free["lift"].length, motion["lift"].length, rtol=0, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_the_work_of_pressures_is_the_change_of_energy():
-    rod = {"rod_area": ANNULUS, "rod_pressure": 1e5}
-    system = boom(planar, lift(planar, **rod))
-    inputs = {"lift.pressure": lambda t: 6e5 * (1 + 0.4 * jnp.sin(9.0 * t)), "lift.rod_pressure": lambda t: 4e5 * t}
-    # Gauss points in eight intervals.
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    edges = np.linspace(0.0, 0.4, 9)
-    half = np.diff(edges)[:, None] / 2
-    inner = (edges[:-1, None] + half * (1 + nodes)).ravel()
-    ts = np.concatenate([[0.0], inner, [0.4]])
-    motion = mb.simulate(system, mb.assemble(system), t1=0.4, saveat=ts, rtol=1e-10, inputs=inputs)
-    force = jax.vmap(lambda t: inputs["lift.pressure"](t) * BORE - inputs["lift.rod_pressure"](t) * ANNULUS)(ts)
-    power = (force * motion["lift"].length_rate)[1:-1]
-    work = np.sum((half * weights).ravel() * power)
-    np.testing.assert_allclose(motion.energy[-1] - motion.energy[0], work, rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_derivatives_by_pressures_and_areas_in_a_batch():
-    """Forward = reverse = central differences of a tighter solution, and the plane = space."""
-    names = ("lift.pressure", "lift.bore_area", "lift.rod_pressure", "lift.rod_area")
-    values = jnp.array([7e5, BORE, 1e5, ANNULUS])
-
-    def end(space):
-        system = boom(space, lift(space, pressure=7e5, rod_area=ANNULUS, rod_pressure=1e5))
-
-        def end(shares, rtol):
-            changed = mb.with_parameters(system, dict(zip(names, values * (1 + shares), strict=True)))
-            return mb.simulate(changed, mb.assemble(changed), t1=0.3, rtol=rtol)["lift"].length[-1]
-
-        return end
-
-    in_plane, still = end(planar), jnp.zeros(4)
-    forward = jax.jit(jax.jacfwd(in_plane))(still, 1e-9)
-    reverse = jax.jit(jax.grad(in_plane))(still, 1e-9)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    h = 1e-3 * jnp.eye(4)
-    tight = jax.jit(jax.vmap(lambda shares: in_plane(shares, 1e-12)))(jnp.concatenate([h, -h, 2 * h, -2 * h]))
-    up, down, up_2, down_2 = tight.reshape(4, 4)
-    np.testing.assert_allclose(forward, (8 * (up - down) - (up_2 - down_2)) / 12e-3, rtol=1e-7)
-    np.testing.assert_allclose(end(spatial)(still, 1e-10), in_plane(still, 1e-10), rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

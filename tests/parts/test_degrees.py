@@ -36,59 +36,51 @@ class Catch(parts.AbstractForce):
         return velocities * self.beyond
 
 
+JANOSI = {"cohesion": 0.0, "shear_modulus": 0.01, "length": 0.1, "area": 0.01, "transition_speed": 0.1}
+
+
+def on_ground(**law):
+    laws = {"terrain": terrain.Flat(-2.0), "radius": 0.1, "normal": contact.Linear(1e3)}
+    return planar.Contact("part", "rod", friction=contact.Janosi(**JANOSI, **law), **laws)
+
+
+def along(cls, coordinate="pin.angle", **numbers):
+    return cls("part", coordinate, **numbers)
+
+
+# A number in degrees, its value, and the part.
 DEGREES = {
-    "Stop": (lambda: mb.Stop("part", "pin.angle", lower=-45.0), "lower", -45.0),
-    "JointStop": (lambda: mb.JointStop("part", "pin.angle", lower=-1.0, upper=30.0, stiffness=1.0), "upper", 30.0),
-    "JointDriver": (lambda: mb.JointDriver("part", "pin.angle", value=90.0), "value", 90.0),
-    "JointSpring": (lambda: mb.JointSpring("part", "pin.angle", stiffness=1.0, free=60.0), "free", 60.0),
+    "Stop": ("lower", -45.0, along(mb.Stop, lower=-45.0)),
+    "JointStop": ("upper", 30.0, along(mb.JointStop, lower=-1.0, upper=30.0, stiffness=1.0)),
+    "JointDriver": ("value", 90.0, along(mb.JointDriver, value=90.0)),
+    "JointSpring": ("free", 60.0, along(mb.JointSpring, stiffness=1.0, free=60.0)),
     "JointCoupling": (
-        lambda: mb.JointCoupling("part", "rail.displacement", "pin.angle", coefficients=(0.0, 1.0), other_zero=30.0),
         "other_zero",
         30.0,
+        mb.JointCoupling("part", "rail.displacement", "pin.angle", coefficients=(0.0, 1.0), other_zero=30.0),
     ),
-    "TableSpring": (
-        lambda: mb.TableSpring("part", "pin.angle", values=(-30.0, 0.0, 30.0), forces=(-1.0, 0.0, 1.0)),
-        "values",
-        -30.0,
-    ),
-    "Motor": (
-        lambda: mb.Motor("part", "pin.angle", mode="position", command=30.0, gain=1.0, lag=0.1),
-        "command",
-        30.0,
-    ),
+    "TableSpring": ("values", -30.0, along(mb.TableSpring, values=(-30.0, 0.0, 30.0), forces=(-1.0, 0.0, 1.0))),
+    "Motor": ("command", 30.0, along(mb.Motor, mode="position", command=30.0, gain=1.0, lag=0.1)),
     "TorsionalSpringDamper": (
-        lambda: planar.TorsionalSpringDamper("part", "ground", "rod", stiffness=1.0, free_angle=180.0),
         "free_angle",
         180.0,
+        planar.TorsionalSpringDamper("part", "ground", "rod", stiffness=1.0, free_angle=180.0),
     ),
     "Bushing": (
-        lambda: planar.Bushing("part", "ground", "rod", stiffness=np.ones(3), point=(0.0, 0.0), free_angle=15.0),
         "free_angle",
         15.0,
+        planar.Bushing("part", "ground", "rod", stiffness=np.ones(3), point=(0.0, 0.0), free_angle=15.0),
     ),
-    "a law": (
-        lambda: planar.Contact(
-            "part",
-            "rod",
-            terrain=terrain.Flat(-2.0),
-            radius=0.1,
-            normal=contact.Linear(1e3),
-            friction=contact.Janosi(
-                cohesion=0.0, friction_angle=30.0, shear_modulus=0.01, length=0.1, area=0.01, transition_speed=0.1
-            ),
-        ),
-        "friction.friction_angle",
-        30.0,
-    ),
-    "a user's part": (lambda: Catch("part", "rod", beyond=20.0), "beyond", 20.0),
+    "a law": ("friction.friction_angle", 30.0, on_ground(friction_angle=30.0)),
+    "a user's part": ("beyond", 20.0, Catch("part", "rod", beyond=20.0)),
 }
 
 
 @pytest.mark.slow(but=("Stop", "JointDriver", "Motor"))
 @pytest.mark.parametrize("name", DEGREES)
 def test_degrees_are_warned_of(name):
-    make, field, value = DEGREES[name]
-    scene = of(make())
+    field, value, part = DEGREES[name]
+    scene = of(part)
     text = rf"'part', {field}: the angle {value:g} rad is more than a full turn; .*np.deg2rad\({value:g}\)"
     with pytest.warns(UserWarning, match=text) as caught:
         scene.compile()
@@ -106,15 +98,15 @@ def test_degrees_in_space_and_in_frames_are_warned_of():
 
 # Numbers that look like degrees and are not angles, and angles of several turns.
 RIGHT = {
-    "a length": lambda: mb.Stop("part", "rail.displacement", lower=-30.0, upper=30.0),
-    "a speed": lambda: mb.JointDriver("part", "pin.angle", value=0.0, rate=30.0),
-    "a command of speed": lambda: mb.Motor("part", "pin.angle", mode="speed", command=30.0, gain=1.0, lag=0.1),
-    "a command of force": lambda: mb.Motor("part", "pin.angle", command=30.0, lag=0.1),
-    "a position": lambda: mb.Motor("part", "rail.displacement", mode="position", command=30.0, gain=1.0, lag=0.1),
-    "a moment": lambda: mb.JointForce("part", "pin.angle", force=30.0),
-    "turns of a winch": lambda: mb.JointStop("part", "pin.angle", lower=0.0, upper=40 * np.pi, stiffness=1.0),
-    "a turn and a half": lambda: mb.JointDriver("part", "pin.angle", value=3 * np.pi),
-    "less than a turn": lambda: mb.Stop("part", "pin.angle", lower=-5.0, upper=5.0),
+    "a length": along(mb.Stop, "rail.displacement", lower=-30.0, upper=30.0),
+    "a speed": along(mb.JointDriver, value=0.0, rate=30.0),
+    "a command of speed": along(mb.Motor, mode="speed", command=30.0, gain=1.0, lag=0.1),
+    "a command of force": along(mb.Motor, command=30.0, lag=0.1),
+    "a position": along(mb.Motor, "rail.displacement", mode="position", command=30.0, gain=1.0, lag=0.1),
+    "a moment": along(mb.JointForce, force=30.0),
+    "turns of a winch": along(mb.JointStop, lower=0.0, upper=40 * np.pi, stiffness=1.0),
+    "a turn and a half": along(mb.JointDriver, value=3 * np.pi),
+    "less than a turn": along(mb.Stop, lower=-5.0, upper=5.0),
 }
 
 
@@ -123,7 +115,7 @@ RIGHT = {
 def test_other_numbers_are_not_warned_of(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        of(RIGHT[name]()).compile()
+        of(RIGHT[name]).compile()
 
 
 def test_degrees_of_a_changed_parameter_are_warned_of():
@@ -138,16 +130,15 @@ def test_degrees_of_a_changed_parameter_are_warned_of():
 
 # Parts that act on the ground alone.
 ON_GROUND = {
-    "PointForce": lambda: planar.PointForce("part", "ground", force=(1.0, 0.0)),
-    "PointForce on a frame": lambda: planar.PointForce("part", "post", force=(1.0, 0.0)),
-    "SpringDamper": lambda: planar.SpringDamper("part", "ground", "post", stiffness=1.0, point_a=(0.0, 1.0)),
-    "Torque": lambda: planar.Torque("part", "post", torque=1.0),
-    "Force": lambda: mb.Force("part", "ground", lambda x, v, t, p: x),
-    "Contact": lambda: planar.Contact("part", "ground", terrain=terrain.Flat(), radius=0.1, normal=contact.Linear(1e3)),
-    "RigidContact": lambda: mb.RigidContact("part", "ground", terrain=terrain.Flat(-1.0), radius=0.1),
-    "Revolute": lambda: planar.Revolute("part", "ground", "post", point=(0.0, 0.0)),
-    "KnifeEdge": lambda: planar.KnifeEdge("part", "ground"),
-    "Rope": lambda: mb.Rope("part", [("ground", (0.0, 0.0)), ("post", (1.0, 0.0))], stiffness=10.0),
+    "PointForce": planar.PointForce("part", "ground", force=(1.0, 0.0)),
+    "PointForce on a frame": planar.PointForce("part", "post", force=(1.0, 0.0)),
+    "SpringDamper": planar.SpringDamper("part", "ground", "post", stiffness=1.0, point_a=(0.0, 1.0)),
+    "Force": mb.Force("part", "ground", lambda x, v, t, p: x),
+    "Contact": planar.Contact("part", "ground", terrain=terrain.Flat(), radius=0.1, normal=contact.Linear(1e3)),
+    "RigidContact": mb.RigidContact("part", "ground", terrain=terrain.Flat(-1.0), radius=0.1),
+    "Revolute": planar.Revolute("part", "ground", "post", point=(0.0, 0.0)),
+    "KnifeEdge": planar.KnifeEdge("part", "ground"),
+    "Rope": mb.Rope("part", [("ground", (0.0, 0.0)), ("post", (1.0, 0.0))], stiffness=10.0),
 }
 
 
@@ -155,7 +146,7 @@ ON_GROUND = {
 @pytest.mark.parametrize("name", ON_GROUND)
 def test_parts_that_act_on_the_ground_alone_are_refused(name):
     with pytest.raises(ValueError, match=r"'part' acts on the ground alone, .*; name a body"):
-        of(ON_GROUND[name](), frames=[planar.Frame("post", "ground", position=(0.0, 0.5))]).compile()
+        of(ON_GROUND[name], frames=[planar.Frame("post", "ground", position=(0.0, 0.5))]).compile()
 
 
 @pytest.mark.slow

@@ -8,42 +8,88 @@ from every_contact import CONTACTS, system_of
 
 import jaxmb as mb
 from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.parts import terrain
 from jaxmb.parts.modes import CLOSED, OPEN
 from jaxmb.parts.planar.kinematics import PLANE
-from jaxmb.system.instant import Instant
+
+A, B, R, S = np.array([0.4, 0.9]), np.array([1.5, 2.0]), 0.1, 0.25
+# On a body at A that is turned by 0.2, and on one at B that is turned by −0.4.
+ON_A, ON_B = np.array([0.3, -0.2]), np.array([-0.1, 0.2])
 
 
-@pytest.mark.slow(but=("a contact of a user",))
+def turned(angle, v):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+
+
+BETWEEN = B + turned(-0.4, ON_B) - A - turned(0.2, ON_A)
+IN_A = turned(-0.2, BETWEEN)
+POINTS = {"point_a": ON_A, "point_b": ON_B}
+# Contacts, and their gaps by hand.
+GAPS = {
+    "balls": (mb.RigidBallContact("c", "a", "b", radius_a=R, radius_b=S, **POINTS), np.linalg.norm(BETWEEN) - R - S),
+    "plane": (mb.RigidPlaneContact("c", "a", "b", normal=(0.6, 0.8), radius=R, **POINTS), BETWEEN @ [0.6, 0.8] - R),
+    "corner": (
+        mb.RigidBoxContact("c", "a", "b", size=(0.6, 0.8), radius=R, **POINTS),
+        np.hypot(*(IN_A - [0.3, 0.4])) - R,
+    ),
+    "face": (mb.RigidBoxContact("c", "a", "b", size=(0.6, 9.0), radius=R, **POINTS), IN_A[0] - 0.3 - R),
+    "slack": (mb.Slack("c", "a", "b", length=3.0, **POINTS), (9.0 - BETWEEN @ BETWEEN) / 6.0),
+    # To first order in its curvature the distance from the ground is that along the normal.
+    "ground": (
+        mb.RigidContact("c", "a", terrain=terrain.Slope(0.75, level=-2.0), centre=ON_A, radius=R),
+        0.8 * ((A + turned(0.2, ON_A)) @ [-0.75, 1.0] + 2.0) - R,
+    ),
+}
+
+
+def test_gap_of_a_slack_rope_is_the_length_that_it_lacks():
+    poses = np.array([(*A, 0.2), (*B, -0.4)])
+    rope = mb.Rope("c", [("a", ON_A), ("b", ON_B)], length=3.0, slack=True).resolve(PLANE, poses)
+    _, law = rope.components()
+    np.testing.assert_allclose(law.gap(PLANE, poses), 3.0 - np.linalg.norm(BETWEEN), rtol=1e-12)
+
+
+@pytest.mark.parametrize("part, gap", GAPS.values(), ids=GAPS)
+def test_gap_by_hand(part, gap):
+    poses = np.array([(*A, 0.2), (*B, -0.4)])[: len(part.bodies)]
+    found = part.resolve(PLANE, poses).gap(PLANE, poses)
+    np.testing.assert_allclose(found, gap, rtol=1e-12)
+    assert gap > 0.1
+
+
+@pytest.mark.slow(but=("a contact of a user", "Stop in the plane"))
 @pytest.mark.parametrize("name", CONTACTS)
 def test_gap_and_its_derivatives(name):
     """Rates and second derivatives are those of the gap along a motion; the row of a closed contact is its gradient."""
     system = system_of(name)
-    state = mb.assemble(system)
-    t, q, u = jnp.zeros(()), state.q, state.u
-    of = system.contacts
-    gap = of.gaps(system, t, q)
-    assert gap.shape == (1,) and gap[0] > 0 and of.names == of.contact_names == ("c",)
+    of, t, u = system.contacts, jnp.zeros(()), system.guess.u
+    rows = np.array(of.rows)
 
     @jax.jit
-    def ahead(s):
-        q_s = Instant(system, t, q, u).moved(s * u).q
-        return of.gaps(system, t, q_s)[0], of.rates(system, t, q_s, u)[0]
+    def seen(q):
+        gap = lambda q: of.gaps(system, t, q)
+        ahead = lambda q: jax.jvp(gap, (q,), (system.rates(t, q, u),))[1]
+        gap_rate, bend = jax.jvp(ahead, (q,), (system.rates(t, q, u),))
+        own = of.rates(system, t, q, u), of.accelerations(system, t, q, u, jnp.zeros_like(u))
+        gradients = of.gradients(system, t, q, u), system.jacobian(t, of.with_modes(q, CLOSED), u)[rows]
+        return gap(q), own, (gap_rate, bend), gradients
 
-    h = 1e-5
-    slope = [(a - b) / (2 * h) for a, b in zip(ahead(h), ahead(-h), strict=True)]
-    np.testing.assert_allclose(of.rates(system, t, q, u)[0], slope[0], rtol=1e-7, atol=1e-9)
-    none = jnp.zeros_like(u)
-    np.testing.assert_allclose(of.accelerations(system, t, q, u, none)[0], slope[1], rtol=1e-6, atol=1e-8)
-    gradient = of.gradients(system, t, q, u)
-    np.testing.assert_allclose(gradient @ u, of.rates(system, t, q, u), rtol=1e-12, atol=1e-15)
-    closed = of.with_modes(q, CLOSED)
-    rows = system.jacobian(t, closed, u)[np.array(of.rows)]
-    np.testing.assert_allclose(rows, gradient, rtol=1e-12, atol=1e-14)
+    gap, own, along, (gradient, closed) = jax.tree.map(np.asarray, seen(system.guess.q))
+    assert gap.shape == (1,) and gap[0] > 0 and of.names == of.contact_names == ("c",)
+    np.testing.assert_allclose(own, along, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(gradient @ u, own[0], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(closed, gradient, rtol=1e-12, atol=1e-14)
+
+    text = str(system.describe())
+    assert "contacts" in text and "where closed 1 row each" in text
+    assert "c.mode" in system.coordinate_names() and "c.restitution" in mb.parameters(system)
+    assert mb.with_parameters(system, {"c.restitution": 0.5}).contact_numbers(0.0).restitution == 0.5
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["Stop in the plane", "RigidContact in space", "RigidBallContact"])
-def test_an_open_contact_does_nothing_and_a_closed_one_pushes_or_pulls(name):
+def test_contact_that_is_open_does_nothing_and_one_that_is_closed_pushes(name):
     system = system_of(name)
     state = mb.assemble(system)
     # Balls that fall side by side would neither push nor pull.
@@ -59,26 +105,9 @@ def test_an_open_contact_does_nothing_and_a_closed_one_pushes_or_pulls(name):
     assert (forces[row] > 0) == (of.accelerations(system, t, state.q, u, free)[0] < 0)
 
 
-@pytest.mark.parametrize("name", CONTACTS)
-def test_words_and_numbers(name):
-    system = system_of(name)
-    text = str(system.describe())
-    assert "contacts" in text and "where closed 1 row each" in text
-    assert "c.mode" in system.coordinate_names() and "c.restitution" in mb.parameters(system)
-    assert mb.with_parameters(system, {"c.restitution": 0.5}).contact_numbers(0.0).restitution == 0.5
-
-
 def test_one_of_two_balls_may_be_a_point():
-    bodies = [mb.planar.PointMass("a", mass=1.0), mb.planar.PointMass("b", mass=1.0, position=(1.0, 0.0))]
     meet = lambda radius: mb.RigidBallContact("meet", "a", "b", radius_a=0.0, radius_b=radius)
-    mb.Scene(bodies, joints=[meet(0.1)]).compile()
+    poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
+    np.testing.assert_allclose(meet(0.1).resolve(PLANE, poses).gap(PLANE, poses), 0.9, rtol=1e-15)
     with pytest.raises(ValueError, match="'meet': only one of radius_a and radius_b may be zero; give the other"):
-        mb.Scene(bodies, joints=[meet(0.0)]).compile()
-
-
-def test_the_gap_of_a_taut_rope_is_the_length_that_it_lacks():
-    rope = mb.Slack("rope", "ground", "a", length=2.0)
-    at = lambda distance: jnp.array([[0.0, 0.0, 0.0], [0.6 * distance, -0.8 * distance, 0.0]])
-    part = rope.resolve(PLANE, at(2.0))
-    gap, rate = jax.value_and_grad(lambda distance: part.gap(PLANE, at(distance)))(2.0)
-    np.testing.assert_allclose([gap, rate, part.gap(PLANE, at(1.2))], [0.0, -1.0, 0.64], atol=1e-15)
+        meet(0.0).resolve(PLANE, poses)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivative_checks import central_differences
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
 
 import jaxmb as mb
@@ -13,7 +13,6 @@ from jaxmb import planar, spatial
 from jaxmb.parts import local_spline
 
 MASS, INERTIA = 1.5, 0.4
-SPACES = pytest.mark.parametrize("space", [planar, spatial])
 X, Y = np.array([-0.7, 0.1, 0.4, 1.0, 1.1]), np.array([0.3, -1.0, 0.8, 0.5, 2.0])
 value = jax.jit(jax.vmap(local_spline.value, in_axes=(None, None, 0)))
 
@@ -26,25 +25,41 @@ def test_derivatives_by_the_points_of_a_table():
         at, functions = jnp.array([-1.0, -0.2, 0.37, 1.05, 1.4]), (local_spline.value, local_spline.integral)
         return jnp.concatenate([jax.vmap(function, (None, None, 0))(x, y, at) for function in functions])
 
-    points, compiled = jnp.concatenate([X, Y]), jax.jit(seen)
-    forward, reverse = jax.jit(jax.jacfwd(seen))(points), jax.jit(jax.jacrev(seen))(points)
-    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(forward, central_differences(compiled, points), rtol=1e-7, atol=1e-7)
+    points, rng = np.concatenate([X, Y]), np.random.default_rng(0)
+    weights, along = rng.normal(size=10), rng.normal(size=points.size) * np.abs(points)
+
+    @jax.jit
+    def every(x):
+        _, pull = jax.vjp(seen, x)
+        moved = jax.vmap(seen)(x[None] + 2e-4 * np.outer([1, -1, 2, -2], along))
+        return jax.jvp(seen, (x,), (along,))[1], pull(jnp.asarray(weights))[0], moved
+
+    forward, reverse, (near, back, far, beyond) = map(np.asarray, every(points))
+    np.testing.assert_allclose(reverse @ along, weights @ forward, rtol=1e-12)
+    np.testing.assert_allclose(forward, (8 * (near - back) - (far - beyond)) / 24e-4, rtol=1e-7, atol=1e-7)
 
 
 def test_the_integral_of_the_spline():
     """Inside and beyond the table; its derivative is the spline, and the spline has two continuous derivatives."""
-    x, y = jnp.asarray(X), jnp.asarray(Y)
     at = np.array([-2.0, -0.7, -0.2, 0.1, 0.37, 0.4, 1.05, 1.1, 3.0])
-    integral, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda s: local_spline.integral(x, y, s))))(at)
-    one = jax.jit(lambda s: local_spline.value(x, y, s))
-    expected = [quad(one, X[0], s, points=[v for v in X[1:] if v < s] or None, epsabs=1e-12)[0] for s in at]
-    np.testing.assert_allclose(integral, expected, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(slope, value(x, y, at), rtol=0, atol=1e-13)
-    np.testing.assert_allclose(value(x, y, X), Y, rtol=0, atol=1e-14)
-    rates = jax.jit(jax.vmap(lambda s: jnp.stack([jax.grad(one)(s), jax.grad(jax.grad(one))(s)])))
-    np.testing.assert_allclose(rates(X - 1e-9), rates(X + 1e-9), rtol=0, atol=1e-4)
-    np.testing.assert_allclose(value(x, y, np.array([-1.7, 2.1])), [Y[0] - np.diff(Y)[0] / 0.8, 17.0], rtol=1e-12)
+    one = lambda s: local_spline.value(jnp.asarray(X), jnp.asarray(Y), s)
+    work = lambda s: local_spline.integral(jnp.asarray(X), jnp.asarray(Y), s)
+    single = lambda s: (one(s), jax.grad(one)(s), jax.grad(jax.grad(one))(s), work(s), jax.grad(work)(s))
+    # From point to point of the table the spline is a polynomial: by Gauss's rule, up to each place.
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    edges = np.sort([np.append(np.clip(X, *sorted((X[0], s))), s) for s in at], axis=1)
+    half = 0.5 * np.diff(edges, axis=1)[..., None]
+    inner = edges[:, :-1, None] + half * (1 + nodes)
+    places = np.concatenate([at, X, X - 1e-9, X + 1e-9, [-1.7, 2.1], inner.ravel()])
+    values, slopes, curvatures, integrals, forces = map(np.asarray, jax.jit(jax.vmap(single))(places))
+    work_of = np.sum(half * weights * values[26:].reshape(inner.shape), axis=(1, 2))
+    expected = np.where(at < X[0], -1.0, 1.0) * work_of
+    np.testing.assert_allclose(integrals[:9], expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(forces, values, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(values[9:14], Y, rtol=0, atol=1e-14)
+    for rates in (slopes, curvatures):
+        np.testing.assert_allclose(rates[14:19], rates[19:24], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(values[24:26], [Y[0] - np.diff(Y)[0] / 0.8, 17.0], rtol=1e-12)
 
 
 def steep_tables(number):
@@ -107,15 +122,24 @@ def test_derivatives_by_the_points_of_a_steep_table():
 def test_a_damper_and_a_spring_of_a_table_with_a_knee():
     """The force stays between its points, so the damper dissipates ever more, and the spring's energy is convex."""
     knee = np.array([0.0, 0.1, 0.2, 1.0]), np.array([0.0, 100.0, 101.0, 102.0])
-    rates = jnp.linspace(0.1, 0.2, 11)
-    system = wheel(planar, mb.TableDamper("part", "pin.angle", rates=knee[0], forces=knee[1]))
-    drag = jax.jit(jax.vmap(lambda v: -system.force(0.0, system.guess.q, jnp.zeros(3).at[2].set(v))[2]))(rates)
-    assert np.all(np.diff(drag) > 0)
-    np.testing.assert_allclose(drag[jnp.array([0, -1])], (100.0, 101.0), rtol=1e-12)
-    system = wheel(planar, mb.TableSpring("part", "pin.angle", values=knee[0], forces=knee[1]))
-    energy = jax.jit(jax.vmap(jax.value_and_grad(lambda a: system.potential_energy(0.0, jnp.zeros(3).at[2].set(a)))))
-    _, slopes = energy(rates)
-    np.testing.assert_allclose(slopes, drag, rtol=1e-12)
+    parts = (
+        mb.TableDamper("damper", "pin.angle", rates=knee[0], forces=knee[1]),
+        mb.TableSpring("spring", "pin.angle", values=knee[0], forces=knee[1]),
+    )
+    system = wheel(planar, *parts)
+
+    @jax.jit
+    @jax.vmap
+    def seen(x):
+        own = jnp.zeros(3).at[2].set(x)
+        slope = jax.grad(lambda q: system.potential_energy(0.0, q))(own)
+        return system.force(0.0, own, jnp.zeros(3))[2], system.force(0.0, jnp.zeros(3), own)[2], slope[2]
+
+    push, drag, slopes = map(np.asarray, seen(np.linspace(0.1, 0.2, 11)))
+    assert np.all(np.diff(drag) < 0)
+    np.testing.assert_allclose(drag[[0, -1]], (-100.0, -101.0), rtol=1e-12)
+    np.testing.assert_allclose(push, drag, rtol=1e-12)
+    np.testing.assert_allclose(slopes, -drag, rtol=1e-12)
 
 
 def wheel(space, *forces, rate=0.0, angle=0.0):
@@ -140,15 +164,14 @@ def at(s):
     return float(value(jnp.asarray(X), jnp.asarray(Y), np.array([s]))[0])
 
 
-@SPACES
-def test_forces_by_tables(space):
+def test_forces_by_tables():
     spring = mb.TableSpring("part", "pin.angle", values=X, forces=Y)
     damper = mb.TableDamper("part", "pin.angle", rates=X, forces=Y)
-    np.testing.assert_allclose(moment(wheel(space, spring, angle=0.3)), -at(0.3), rtol=1e-12)
-    np.testing.assert_allclose(moment(wheel(space, damper, rate=0.3)), -at(0.3), rtol=1e-12)
+    np.testing.assert_allclose(moment(wheel(planar, spring, angle=0.3)), -at(0.3), rtol=1e-12)
+    np.testing.assert_allclose(moment(wheel(planar, damper, rate=0.3)), -at(0.3), rtol=1e-12)
     motor = lambda control: mb.TableMotor("part", "pin.angle", speeds=X, torques=Y, gear=3.0, control=control)
     for control, factor, speed in ((0.5, 0.5, 0.9), (-0.25, -0.25, -0.9), (-7.0, -1.0, -0.9)):
-        np.testing.assert_allclose(moment(wheel(space, motor(control), rate=0.3)), 3 * factor * at(speed), rtol=1e-12)
+        np.testing.assert_allclose(moment(wheel(planar, motor(control), rate=0.3)), 3 * factor * at(speed), rtol=1e-12)
 
 
 def test_an_angle_in_space_counts_from_the_middle_of_the_table():
@@ -156,27 +179,6 @@ def test_an_angle_in_space_counts_from_the_middle_of_the_table():
     for angle in (3.0, 3.5 - 2 * np.pi):
         expected = -at(angle % (2 * np.pi) - 3.0)
         np.testing.assert_allclose(moment(wheel(spatial, table, angle=angle)), expected, rtol=1e-11)
-
-
-@pytest.mark.slow
-@SPACES
-def test_a_spring_and_a_damper_move_a_wheel(space):
-    """The motion by SciPy; energy is lost to the damper alone."""
-    rates, forces = np.array([-3.0, -0.5, 0.0, 0.5, 3.0]), np.array([-0.4, -0.2, 0.0, 0.1, 0.3])
-    parts = (
-        mb.TableSpring("spring", "pin.angle", values=X, forces=5 * Y + 3),
-        mb.TableDamper("damper", "pin.angle", rates=rates, forces=forces),
-    )
-    system = wheel(space, *parts, angle=0.3, rate=0.5)
-    ts = np.linspace(0.0, 0.8, 5)
-    motion = mb.simulate(system, mb.assemble(system), t1=ts[-1], saveat=ts, rtol=1e-10, atol=1e-12)
-    pull = jax.jit(lambda s: local_spline.value(jnp.asarray(X), jnp.asarray(5 * Y + 3), s))
-    drag = jax.jit(lambda v: local_spline.value(jnp.asarray(rates), jnp.asarray(forces), v))
-    moves = lambda t, y: [y[1], -float(pull(y[0]) + drag(y[1])) / INERTIA, -y[1] * float(drag(y[1]))]
-    start = [0.3, 0.5, float(motion.energy[0])]
-    expected = solve_ivp(moves, (0.0, ts[-1]), start, t_eval=ts, rtol=1e-9, atol=1e-11).y
-    found = motion["pin"].angle, motion["pin"].angle_rate, motion.energy
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow

@@ -33,19 +33,6 @@ def test_a_force_on_one_body_may_return_a_vector(space):
     np.testing.assert_array_equal(vector.force(0.0, state.q, state.u), row.force(0.0, state.q, state.u))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("space", [planar, spatial])
-def test_the_motion_under_a_force_that_returns_a_vector(space):
-    d, size = space_of(space), 3 if space is planar else 6
-    system = pulled(space, lambda w: w)
-    motion = mb.simulate(system, system.guess, t1=1.0, rtol=1e-8)
-    start, rate = np.arange(1.0, 1.0 + d), np.sqrt(3.0)
-    np.testing.assert_allclose(motion["body"].position[0], start * np.cos(rate), rtol=1e-6)
-    assert motion.forces["spring"].shape == (1, 1, size)
-    np.testing.assert_allclose(motion.forces["spring"][0, 0, :d], -3.0 * motion["body"].position[0])
-    np.testing.assert_allclose(motion.energy[-1], 1.5 * start @ start, rtol=1e-6)
-
-
 def test_a_force_on_two_bodies_returns_a_row_for_each():
     bodies = [planar.Body(name, mass=1.0, inertia=1.0) for name in ("a", "b")]
     lone = mb.Force("lone", ("a", "b"), lambda x, v, t, p: v[0])

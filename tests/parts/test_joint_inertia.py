@@ -2,7 +2,6 @@
 
 from typing import ClassVar
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +11,6 @@ from every_formulation import FORMULATIONS
 import jaxmb as mb
 from jaxmb import parts, planar, spatial
 from jaxmb.formulations import accelerations
-from jaxmb.solvers import Hermite
 
 X, Y, Z = np.eye(3)
 J = np.array([[0.05, 0.01, 0.0], [0.01, 0.09, 0.02], [0.0, 0.02, 0.07]])
@@ -122,7 +120,6 @@ def test_a_machine_that_floats_conserves_energy_and_momentum():
 
 
 INERTIA, STIFFNESS, WINDING, START, RATE = 0.3, 2.0, 0.3, 0.4, 8.0
-TS = np.linspace(0.0, 5.0, 6)
 
 
 def wheel():
@@ -137,37 +134,20 @@ def wheel():
     return mb.Scene([spatial.Body("wheel", mass=1.0, inertia=J)], joints=joints, forces=[spring]).compile()
 
 
-def angle_of_wheel(inertia, t):
-    """It vibrates by more than a full turn to either side."""
-    omega = WINDING * jnp.sqrt(STIFFNESS / (J[1, 1] + inertia))
-    return START * jnp.cos(omega * t) + RATE / omega * jnp.sin(omega * t)
-
-
-def motion_of_wheel(system, start, inertia=INERTIA, **options):
-    changed = mb.with_parameters(system, {"rotor.inertia": inertia})
-    return mb.simulate(changed, start, t1=5.0, rtol=1e-9, saveat=TS, **options)
-
-
-def start_of_wheel(system):
-    return mb.assemble(system, fix={"axle.angle": START}, rates={"axle.angle": RATE})
-
-
-def check_wheel(motion):
-    expected = angle_of_wheel(INERTIA, TS)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"manifold": mb.manifold.Projection()}], ids=["default", "projection"])
+def test_wheel_with_a_rotor_winds_up_a_cord(options):
+    """It vibrates by more than a full turn to either side, which the angle of a hinge in space is known up to."""
+    system, ts = wheel(), np.linspace(0.0, 5.0, 6)
+    start = mb.assemble(system, fix={"axle.angle": START}, rates={"axle.angle": RATE})
+    motion = mb.simulate(system, start, t1=5.0, rtol=1e-9, saveat=ts, **options)
+    omega = WINDING * np.sqrt(STIFFNESS / (J[1, 1] + INERTIA))
+    expected = START * np.cos(omega * ts) + RATE / omega * np.sin(omega * ts)
     assert np.max(expected) > 2 * np.pi
     np.testing.assert_allclose(motion["rotor"].angle, expected, rtol=0, atol=1e-7)
     np.testing.assert_allclose(motion["axle"].angle, motion["rotor"].angle, rtol=0, atol=1e-9)
     np.testing.assert_allclose(motion["cord"].length, WINDING * expected, rtol=0, atol=1e-7)
     np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-8)
-    assert np.max(motion.constraint_violation) < 1e-11
-
-
-@pytest.mark.slow
-def test_a_wheel_with_a_rotor_winds_up_a_cord():
-    """Through full turns, which the angle of a hinge in space is known up to."""
-    system = wheel()
-    motion = motion_of_wheel(system, start_of_wheel(system))
-    check_wheel(motion)
     pull = -STIFFNESS * WINDING * motion["cord"].length
     acceleration = pull / (J[1, 1] + INERTIA)
     np.testing.assert_allclose(motion["rotor"].angle_acceleration, acceleration, rtol=0, atol=1e-9)
@@ -175,26 +155,6 @@ def test_a_wheel_with_a_rotor_winds_up_a_cord():
     # On the wheel acts what accelerates it alone.
     moment = pull + motion.reactions["rotor"].moment[:, 1]
     np.testing.assert_allclose(moment, J[1, 1] * acceleration, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "options", [{"manifold": mb.manifold.Projection()}, {"solver": Hermite()}, {"solver": diffrax.Dopri8()}]
-)
-def test_a_cord_is_wound_up_by_every_method(options):
-    system = wheel()
-    check_wheel(motion_of_wheel(system, start_of_wheel(system), **options))
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_wheel_with_a_rotor_and_a_cord():
-    system = wheel()
-    start, inertias = start_of_wheel(system), jnp.array([0.2, INERTIA])
-    end = lambda inertia: motion_of_wheel(system, start, inertia)["rotor"].angle[-1]
-    forward = lambda x: jax.jvp(end, (x,), (jnp.ones(()),))[1]
-    expected = jax.vmap(jax.grad(lambda x: angle_of_wheel(x, 5.0)))(inertias)
-    np.testing.assert_allclose(jax.jit(jax.vmap(forward))(inertias), expected, rtol=1e-6)
-    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(end)))(inertias), expected, rtol=1e-6)
 
 
 def geared(n):
@@ -214,41 +174,16 @@ def geared(n):
 
 @pytest.mark.slow
 def test_sparse_elimination():
-    """Of many links: the accelerations of dense matrices, and by two methods the same motion."""
-    system = geared(8)
+    """Of many links: the accelerations of dense matrices, and motions on the constraints."""
+    system = geared(7)
     assert system.elimination is not None
-    start = mb.assemble(system, rates={f"hinge{k}.angle": 0.5 for k in range(8)})
+    start = mb.assemble(system, rates={f"hinge{k}.angle": 0.5 for k in range(7)})
     sparse, dense = (
         accelerations(system, FORMULATIONS[name], 0.0, start.q, start.u)[0] for name in ("multipliers", "null_space")
     )
     np.testing.assert_allclose(sparse, dense, rtol=0, atol=1e-10 * np.max(np.abs(dense)))
-    ts = np.linspace(0.0, 0.5, 3)
-    partitioned = {"solver": Hermite(), "manifold": mb.manifold.Partition()}
-    ends = [mb.simulate(system, start, t1=0.5, rtol=1e-9, saveat=ts, **own) for own in ({}, partitioned)]
-    np.testing.assert_allclose(ends[1].ys.q, ends[0].ys.q, rtol=0, atol=1e-7)
-    for motion in ends:
-        assert np.max(motion.constraint_violation) < 1e-10
-
-
-@pytest.mark.slow
-def test_a_geared_flywheel_moves_the_same():
-    """In the plane: a flywheel on a bearing beside the machine, coupled to the joint."""
-    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0))
-    hip = planar.Revolute("hip", "ground", "rod", point=(0.0, 0.0))
-    fly = planar.Body("fly", mass=1.0, inertia=INERTIA / 9)
-    bearing = planar.Revolute("bearing", "ground", "fly", point=(0.0, 0.0))
-    gear = mb.JointCoupling("gear", "bearing.angle", "hip.angle", coefficients=(0.0, 3.0))
-    weight = [mb.Gravity((0.0, -9.81))]
-    scenes = (
-        mb.Scene([rod, fly], joints=[hip, bearing, gear], forces=weight),
-        mb.Scene([rod], joints=[hip, mb.JointInertia("rotor", "hip.angle", inertia=INERTIA)], forces=weight),
-    )
-    angles = []
-    for scene in scenes:
-        system = scene.compile()
-        motion = mb.simulate(system, mb.assemble(system), t1=3.0, rtol=1e-11, saveat=np.linspace(0.0, 3.0, 7))
-        angles.append(motion["hip"].angle)
-    np.testing.assert_allclose(angles[1], angles[0], rtol=0, atol=1e-8)
+    motion = mb.simulate(system, start, t1=0.2, rtol=1e-8, manifold=mb.manifold.Partition())
+    assert np.max(motion.constraint_violation) < 1e-10
 
 
 @pytest.mark.slow

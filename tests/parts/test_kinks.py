@@ -17,9 +17,10 @@ G = mb.Gravity((0.0, -9.81))
 
 def test_one_sided_derivatives():
     """At both ends of a range, for all three arguments; a missing number stays missing."""
-    slopes = jax.vmap(jax.grad(clipped, (0, 1, 2)), (0, None, None))(jnp.array([-2.0, -1.0, 0.5, 3.0, 4.0]), -1.0, 3.0)
+    at = np.array([-2.0, -1.0, 0.5, 3.0, 4.0])
+    slopes = jax.jit(jax.vmap(jax.grad(clipped, (0, 1, 2)), (0, None, None)))(at, -1.0, 3.0)
     np.testing.assert_array_equal(np.stack(slopes), [[0, 1, 1, 1, 0], [1, 0, 0, 0, 0], [0, 0, 0, 0, 1]])
-    np.testing.assert_array_equal(jax.vmap(jax.grad(excess))(jnp.array([-1.0, 0.0, 1.0])), [0.0, 1.0, 1.0])
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.grad(excess)))(np.array([-1.0, 0.0, 1.0])), [0.0, 1.0, 1.0])
     assert np.isnan(clipped(jnp.array(jnp.nan), -1.0, 3.0)) and np.isnan(excess(jnp.array(jnp.nan)))
 
 
@@ -168,37 +169,13 @@ class BumpEnds(Case):
 class Touching(Case):
     """A disc that just touches soft ground: its law is smooth there."""
 
-    law = mb.contact.Linear(1e4)
-
     def scene(self):
-        return block(
-            planar.Contact("floor", "block", terrain=mb.terrain.Flat(), normal=self.law, radius=0.25, damping=10.0)
-        )
+        laws = {"terrain": mb.terrain.Flat(), "normal": mb.contact.Linear(1e4), "damping": 10.0}
+        return block(planar.Contact("floor", "block", radius=0.25, **laws))
 
     def sample(self, random, system):
         numbers = {"floor.smoothing": 10 ** random.uniform(-2, -1), "floor.damping": random.uniform(0, 10)}
         return numbers, [0.0, 0.25, 0.0], random.normal(size=3), {}, [0.0, random.choice([-1, 1]), 0.0]
-
-
-class HertzTouching(Touching):
-    """The same by Hertz's law."""
-
-    law = mb.contact.Hertz(1e4)
-
-
-class StopEnd(Case):
-    """A joint at the end of its range: its law is smooth there."""
-
-    def scene(self):
-        stop = mb.JointStop("stop", "pin.angle", lower=-0.5, upper=1.0, stiffness=100.0, damping=1.0, exponent=1.5)
-        return arm(stop)
-
-    def sample(self, random, system):
-        lower = dyadic(random, -1, 0)
-        upper = lower + dyadic(random, 1, 2)
-        numbers = {"stop.lower": lower, "stop.upper": upper, "stop.smoothing": 10 ** random.uniform(-2, -1)}
-        angle, sign = random.choice([lower, upper]), random.choice([-1, 1])
-        return numbers, [0.5, 0.0, angle], [0.0, 0.0, random.normal()], {}, [0.0, 0.0, sign]
 
 
 class BoxEdge(Case):
@@ -241,20 +218,8 @@ class GearEnds(Case):
         return numbers, q, u, {}, along
 
 
-class TableEnds(Case):
-    """A spring by a table at its points, with straight lines beyond its ends."""
-
-    def scene(self):
-        return arm(mb.TableSpring("spring", "pin.angle", values=(-1.0, 0.0, 0.5, 2.0), forces=(-1.0, 0.0, 2.0, 3.0)))
-
-    def sample(self, random, system):
-        values = np.cumsum([dyadic(random, 0.25, 1) for _ in range(4)]) - 1.0
-        numbers = {"spring.values": values, "spring.forces": np.cumsum(random.uniform(0.5, 2, 4))}
-        return numbers, [0.5, 0.0, random.choice(values)], np.zeros(3), {}, [0.0, 0.0, random.choice([-1, 1])]
-
-
 CASES = [Control, Range, ForceRange, Activation, FullThrottle, Unstretched, RopeEnergy, BumpEnds, Touching]
-CASES += [HertzTouching, StopEnd, BoxEdge, GearEnds, TableEnds]
+CASES += [BoxEdge, GearEnds]
 
 
 @pytest.mark.slow(but=("ForceRange",))
@@ -266,6 +231,7 @@ def test_laws_at_kinks(case):
     assert max(sizes) > 0 or case is BoxEdge
 
 
+@pytest.mark.slow
 def test_linearisation_at_the_end_of_a_range():
     """A control at an end of its range, and within it: a torque of 10 times the control on an arm of 0.35 kg m²."""
     system = arm(mb.Actuator("servo", "pin.angle", gain=(10.0, 0.0, 0.0), control_range=(-1.0, 1.0)))
@@ -273,20 +239,6 @@ def test_linearisation_at_the_end_of_a_range():
         changed = mb.with_parameters(system, {"servo.control_range": limits})
         found = np.asarray(mb.linearise(changed, mb.assemble(changed), inputs=["servo.control"]).B)
         np.testing.assert_allclose(found[1, 0], 10 / 0.35, rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_gradients_at_the_end_of_a_range():
-    """Derivatives of a motion in both modes: the torque 10 c turns the arm by ½ 10 c / 0.35 in a second."""
-    system = arm(mb.Actuator("servo", "pin.angle", gain=(10.0, 0.0, 0.0), control_range=(-1.0, 0.0)))
-    state = mb.assemble(system)
-
-    def angle(c):
-        return mb.simulate(mb.with_parameters(system, {"servo.control": c}), state, t1=1.0)["arm"].angle[-1]
-
-    np.testing.assert_allclose(jax.jit(jax.grad(angle))(0.0), 5 / 0.35, rtol=1e-10)
-    np.testing.assert_allclose(jax.jvp(angle, (0.0,), (1.0,))[1], 5 / 0.35, rtol=1e-10)
-    np.testing.assert_allclose(jax.vmap(jax.grad(angle))(jnp.array([0.0, 0.5])), [5 / 0.35, 0.0], rtol=1e-10)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The Magic Formula: against its equations in NumPy, its properties, and files of coefficients."""
 
+import functools
 from pathlib import Path
 
 import jax
@@ -44,7 +45,31 @@ def forces(version, coefficients, kappa, alpha, gamma, load, pressure=2.2e5, spe
     return jnp.stack(point.forces(kappa, alpha, speed, slip_speed, travel))
 
 
-def grid(seed, count=4000):
+MANY = 4000
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _along(version, own, rows):
+    """One program for all coefficients of a version."""
+
+    def single(x):
+        return forces(version, own, *x), at(version, own, x[3], x[2], x[4]).relaxation_lengths()
+
+    return jax.vmap(single)(rows)
+
+
+def along(version, own, kappa=0.0, alpha=0.0, gamma=0.0, load=4000.0, pressure=2.2e5, speed=20.0, travel=1.0):
+    """Forces and moments, and relaxation lengths, at as many values."""
+    columns = np.broadcast_arrays(*np.atleast_1d(kappa, alpha, gamma, load, pressure, speed, travel))
+    rows = np.ones((MANY, 7))
+    rows[: len(columns[0])] = np.stack(columns, axis=1)
+    own = {key: float(value) if isinstance(value, int | float) else value for key, value in own.items()}
+    numbers = {key: value for key, value in own.items() if isinstance(value, float)}
+    found = _along(version, numbers, rows)
+    return [np.asarray(x)[: len(columns[0])] for x in found]
+
+
+def grid(seed, count=MANY):
     """Slips, inclinations, loads, pressures and speeds, some of them zero."""
     rng = np.random.default_rng(seed)
     low, high = np.array([-1.0, -1.0, -0.25, 200.0, 1.5e5, 3.0]), np.array([1.0, 1.0, 0.25, 8000.0, 3.0e5, 50.0])
@@ -74,11 +99,7 @@ def test_forces_and_moments_are_those_of_the_equations(version):
         expected, *sigma = oracle.version_61(numbers, load, kappa, alpha, gamma, pressure, speed)
     else:
         expected, *sigma = oracle.version_52(numbers, load, kappa, alpha, gamma, speed)
-    function = lambda k, a, g, n, p, v: (
-        forces(version, own, k, a, g, n, p, v),
-        at(version, own, n, g, p).relaxation_lengths(),
-    )
-    found, lengths = jax.jit(jax.vmap(function))(kappa, alpha, gamma, load, pressure, speed)
+    found, lengths = along(version, own, kappa, alpha, gamma, load, pressure, speed)
     for value, reference in zip(found.T, expected, strict=True):
         np.testing.assert_allclose(value, reference, rtol=1e-12, atol=1e-12 * np.max(np.abs(reference)))
     np.testing.assert_allclose(lengths, np.maximum(np.stack(sigma, axis=1), 0.1 * 0.32), rtol=1e-13)
@@ -90,11 +111,9 @@ def test_a_symmetric_tyre_has_odd_forces(version):
     own = symmetric(version)
     kappa, alpha, gamma, load, *_ = grid(3, 200)
     side = np.array([1.0, -1.0, -1.0, 1.0, -1.0])
-    function = jax.jit(jax.vmap(lambda k, a, g, n: forces(version, own, k, a, g, n)))
-    found, mirrored = function(kappa, alpha, gamma, load), function(kappa, -alpha, -gamma, load)
-    np.testing.assert_allclose(mirrored, side * np.array(found), rtol=1e-12, atol=1e-9)
-    upright = 0.0 * gamma
-    driven, braked = function(kappa, alpha, upright, load), function(-kappa, alpha, upright, load)
+    found, mirrored = (along(version, own, kappa, s * alpha, s * gamma, load)[0] for s in (1, -1))
+    np.testing.assert_allclose(mirrored, side * found, rtol=1e-12, atol=1e-9)
+    driven, braked = (along(version, own, s * kappa, alpha, 0.0, load)[0] for s in (1, -1))
     np.testing.assert_allclose(braked[:, 0], -driven[:, 0], rtol=1e-12, atol=1e-9)
 
 
@@ -111,12 +130,12 @@ def test_slopes_and_peaks_are_those_of_the_equations(version):
     trail = (own["QDZ1"] + own["QDZ2"] * point.dfz) * share * 0.32 * 3000.0 / 4000.0
     np.testing.assert_allclose(slopes[4, 1], -trail * slopes[1, 1], rtol=1e-12)
     slips = np.linspace(0.0, 1.2, 400)
-    along = jax.jit(jax.vmap(lambda k: forces(version, own, k, 0.0, 0.0, 3000.0)[0]))(slips)
-    across = jax.jit(jax.vmap(lambda a: forces(version, own, 0.0, a, 0.0, 3000.0)))(slips)
+    ahead = along(version, own, slips, load=3000.0)[0][:, 0]
+    across = along(version, own, 0.0, slips, load=3000.0)[0]
     by_pressure = lambda a, b: 1 + own.get(a, 0.0) * point.dpi + own.get(b, 0.0) * point.dpi**2
     largest_x = 3000.0 * (own["PDX1"] + own["PDX2"] * point.dfz) * by_pressure("PPX3", "PPX4")
     largest_y = 3000.0 * (own["PDY1"] + own["PDY2"] * point.dfz) * by_pressure("PPY3", "PPY4")
-    np.testing.assert_allclose(np.max(along), largest_x, rtol=1e-4)
+    np.testing.assert_allclose(np.max(ahead), largest_x, rtol=1e-4)
     np.testing.assert_allclose(np.max(-across[:, 1]), largest_y, rtol=1e-4)
     # The aligning moment turns the wheel to where it moves, and changes its sign at large slip.
     moment = across[1:, 4]
@@ -126,8 +145,7 @@ def test_slopes_and_peaks_are_those_of_the_equations(version):
 @VERSIONS
 def test_combined_slip_leaves_less_of_each_force(version):
     own = symmetric(version)
-    function = jax.jit(lambda k, a: forces(version, own, k, a, 0.0, 4000.0))
-    pure_x, pure_y, both = function(0.1, 0.0), function(0.0, 0.1), function(0.1, 0.1)
+    pure_x, pure_y, both = along(version, own, np.array([0.1, 0.0, 0.1]), np.array([0.0, 0.1, 0.1]))[0]
     assert 0 < both[0] < pure_x[0] and pure_y[1] < both[1] < 0
     assert np.hypot(*both[:2]) < 1.05 * max(pure_x[0], -pure_y[1])
 
@@ -136,13 +154,12 @@ def test_combined_slip_leaves_less_of_each_force(version):
 def test_forces_beyond_the_limits(version):
     """As at the limits, and below the least load in proportion to it."""
     own = data(version)
-    function = jax.jit(jax.vmap(lambda k, a, g, n, p: forces(version, own, k, a, g, n, p)))
     inside = np.array([1.5, 1.2, 0.3, 1e4, 4e5])
     beyond = np.array([2.5, 1.3, 0.9, 3e4, 9e5])
-    found = function(*np.stack([inside, beyond], axis=1))
+    found, _ = along(version, own, *np.stack([inside, beyond], axis=1))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-14)
     loads = np.array([100.0, 25.0, 0.0])
-    found = function(*np.full((3, 3), 0.1), loads, np.full(3, 2e5))
+    found, _ = along(version, own, 0.1, 0.1, 0.1, loads, 2e5)
     np.testing.assert_allclose(found, loads[:, None] / 100.0 * found[:1], rtol=1e-13, atol=1e-13)
 
 
@@ -150,12 +167,10 @@ def test_forces_beyond_the_limits(version):
 def test_a_wheel_that_rolls_backwards(version):
     """The trail lies behind the contact, and the moments resist the motion; forces at a slip stay."""
     own = symmetric(version)
-    forwards, backwards = (forces(version, own, 0.0, 0.05, 0.0, 4000.0, travel=way) for way in (1.0, -1.0))
-    np.testing.assert_allclose(
-        backwards, np.array([1.0, 1.0, 1.0, -1.0, -1.0]) * np.array(forwards), rtol=1e-12, atol=1e-9
-    )
-    still = forces(version, data(version), 0.0, 0.0, 0.0, 4000.0, speed=0.0, travel=0.0)
-    np.testing.assert_allclose(still[jnp.array([0, 1, 3, 4])], 0.0, atol=1e-12)
+    forwards, backwards = along(version, own, alpha=0.05, travel=np.array([1.0, -1.0]))[0]
+    np.testing.assert_allclose(backwards, forwards * [1.0, 1.0, 1.0, -1.0, -1.0], rtol=1e-12, atol=1e-9)
+    (still,), _ = along(version, data(version), speed=0.0, travel=0.0)
+    np.testing.assert_allclose(still[[0, 1, 3, 4]], 0.0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -182,16 +197,16 @@ def test_a_road_without_friction(version):
     to zero; without any friction there are only the parts that need none.
     """
     names, base = ("LMUX", "LMUY", "LCX", "LCY"), data(version)
-    slips = jnp.array([(0.05, -0.02, 0.03), (0.0, 0.04, 0.0), (-0.2, 0.0, -0.05)])
+    slips = np.array([(0.05, -0.02, 0.03), (0.0, 0.04, 0.0), (-0.2, 0.0, -0.05)])
 
     def seen(factors, slip):
         own = base | dict(zip(names, factors, strict=True))
         return forces(version, own, *slip, 4200.0)
 
-    each = jnp.concatenate([jnp.ones((4, 4)) - np.eye(4), jnp.zeros((1, 4))])
+    each = np.concatenate([1.0 - np.eye(4), np.zeros((1, 4))])
     both = jax.jit(jax.vmap(jax.vmap(lambda *x: (seen(*x), jax.jacrev(seen)(*x)), (None, 0)), (0, None)))
-    values, slopes = both(each, slips)
-    near, near_slopes = both(jnp.where(each == 0, 1e-9, each), slips)
+    values, slopes = map(np.asarray, both(each, slips))
+    near, near_slopes = map(np.asarray, both(np.where(each == 0, 1e-9, each), slips))
     assert np.all(np.isfinite(values)) and np.all(np.isfinite(slopes))
     np.testing.assert_allclose(values, near, rtol=0, atol=1e-4)
     # By the factors that are zero, at slips that are not.
@@ -207,44 +222,26 @@ def test_factors_out_of_their_range_are_refused(key, value):
         spatial.MagicFormulaTyre("tyre", "wheel", own, terrain=mb.terrain.Flat()).check(3)
 
 
-@pytest.mark.slow
-@VERSIONS
-def test_derivatives_by_slip_load_and_coefficients(version):
-    own = {key: jnp.asarray(value) for key, value in data(version).items()}
-    x = jnp.array([0.04, -0.06, 0.03, 3300.0, 2.1e5])
-    names = ["PDY1", "PKX1", "QDZ1", "LMUX", "QSY1", "RBX1", "QHZ3", "PKY2"]
-    outputs = jax.jit(lambda values, x: forces(version, own | dict(zip(names, values, strict=True)), *x))
-    values = jnp.stack([own[name] for name in names])
-    forward = jax.jit(jax.jacfwd(outputs, argnums=(0, 1)))(values, x)
-    reverse = jax.jit(jax.jacrev(outputs, argnums=(0, 1)))(values, x)
-    for k, (a, b, point) in enumerate(zip(forward, reverse, (values, x), strict=True)):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-9)
-        for j in range(len(point)):
-            h = 1e-5 * abs(point[j])
-            moved = [
-                outputs(*((point.at[j].add(s * h), x) if k == 0 else (values, point.at[j].add(s * h)))) for s in (1, -1)
-            ]
-            np.testing.assert_allclose(
-                (moved[0] - moved[1]) / (2 * h), a[:, j], rtol=1e-6, atol=1e-6 * np.max(np.abs(a[:, j]))
-            )
-
-
 # The load and the radii
 
 
 def test_the_load_of_a_wheel_that_stands_and_turns():
     own = data("6.1")
-    load, _ = jax.jit(lambda depth: magic_formula.elastic(own, 2.2e5, depth))(0.02)
     ratio, first = 0.02 / 0.32, np.sqrt((2e5 * 0.32 / 4000) ** 2 - 4 * 14.0)
+
+    @jax.jit
+    def seen(pressure, depth):
+        both = lambda depth: jnp.stack(magic_formula.elastic(own, pressure, depth))
+        return both(depth), jax.jacfwd(both)(depth), jnp.stack(magic_formula.by_spin(own, -100.0))
+
+    (load, _), (_, slope), by_spin = seen(2.2e5, 0.02)
     np.testing.assert_allclose(load, 4000 * 1.07 * (first * ratio + 14.0 * ratio**2), rtol=1e-12)
-    slope = jax.grad(lambda depth: magic_formula.elastic(own, 2.2e5, depth)[1])(0.02)
     np.testing.assert_allclose(slope, load, rtol=1e-12)
-    factor, growth = magic_formula.by_spin(own, -100.0)
-    np.testing.assert_allclose([factor, growth], [1 + 0.04 * 2.0, 0.32 * 0.0008 * 4.0], rtol=1e-12)
+    np.testing.assert_allclose(by_spin, [1 + 0.04 * 2.0, 0.32 * 0.0008 * 4.0], rtol=1e-12)
     # At the nominal load the stiffness is that of the file.
-    depth = jax.jit(jax.grad(lambda d: magic_formula.elastic(own, 2e5, d)[0]))
     at_nominal = (np.sqrt(first**2 + 4 * 14.0) - first) / (2 * 14.0) * 0.32
-    np.testing.assert_allclose(depth(at_nominal), 2e5, rtol=1e-12)
+    _, (stiffness, _), _ = seen(2e5, at_nominal)
+    np.testing.assert_allclose(stiffness, 2e5, rtol=1e-12)
 
 
 def test_the_load_of_version_5_2_is_linear():

@@ -1,5 +1,8 @@
 """Modes of contacts and dry friction: their numbers, the laws that they say, and the direction of slip."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -23,20 +26,27 @@ from jaxmb.parts.modes import (
 ALONG = np.array([0.6, -0.8])
 
 
-def modes_of(contacts, single, both):
-    return Modes.of(jnp.array([*contacts, *single, *both], float), len(contacts), (len(single),))
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _laws(numbers, contacts, single):
+    modes = Modes.of(numbers, contacts, (single,))
+    whole = {name: getattr(modes, name) for name in ("open", "shut", "closed", "slides", "sticks", "held", "kinds")}
+    in_plane = [getattr(modes.in_plane, name) for name in ("begun", "slides", "slips")]
+    return whole | {"slips": modes.slips(jnp.ones(len(numbers) - contacts)), "in plane": in_plane}
 
 
-@pytest.mark.slow
+def laws_of(contacts, single, both):
+    return _laws(np.array([*contacts, *single, *both], float), len(contacts), len(single))
+
+
 def test_modes_of_contacts_and_of_friction_in_one_direction():
     """Rounding errors of the numbers do not count."""
-    modes = modes_of([OPEN + 1e-9, CLOSED - 1e-9, IMPLIED], [-FORWARD + 1e-9], [FREE, FREE])
-    np.testing.assert_array_equal(modes.open, [True, False, False])
-    np.testing.assert_array_equal(modes.shut, [False, True, True])
-    np.testing.assert_array_equal(modes.closed, [False, True, False])
-    np.testing.assert_array_equal(modes.slides, [True, False, False])
-    np.testing.assert_array_equal(modes.slips(jnp.ones(3)), [-1, 0, 0])
-    np.testing.assert_array_equal(modes.kinds, [0, 1, 2, -1, 0, 0])
+    laws = laws_of([OPEN + 1e-9, CLOSED - 1e-9, IMPLIED], [-FORWARD + 1e-9], [FREE, FREE])
+    np.testing.assert_array_equal(laws["open"], [True, False, False])
+    np.testing.assert_array_equal(laws["shut"], [False, True, True])
+    np.testing.assert_array_equal(laws["closed"], [False, True, False])
+    np.testing.assert_array_equal(laws["slides"], [True, False, False])
+    np.testing.assert_array_equal(laws["slips"], [-1, 0, 0])
+    np.testing.assert_array_equal(laws["kinds"], [0, 1, 2, -1, 0, 0])
 
 
 @pytest.mark.parametrize(
@@ -51,18 +61,17 @@ def test_modes_of_contacts_and_of_friction_in_one_direction():
     ids=["free", "begun", "slides", "sticks", "implied"],
 )
 def test_modes_of_friction_in_two_directions(mode, sticks, held, begun, slides, kind):
-    modes = modes_of([OPEN], [FREE], mode)
-    np.testing.assert_array_equal(modes.sticks, [False, sticks, sticks])
-    np.testing.assert_array_equal(modes.held, [False, held, held])
-    in_plane = modes.in_plane
-    assert (in_plane.begun, in_plane.slides, in_plane.slips) == (begun, slides, begun or slides)
-    np.testing.assert_array_equal(modes.kinds, [OPEN, FREE, kind, kind])
+    laws = laws_of([OPEN], [FREE], mode)
+    np.testing.assert_array_equal(laws["sticks"], [False, sticks, sticks])
+    np.testing.assert_array_equal(laws["held"], [False, held, held])
+    np.testing.assert_array_equal(np.ravel(laws["in plane"]), [begun, slides, begun or slides])
+    np.testing.assert_array_equal(laws["kinds"], [OPEN, FREE, kind, kind])
 
 
 def test_the_direction_of_slip():
     """That of the slip, on the side of the modes; that of the modes where slip has begun, or there is none."""
-    slip, none = 3.0 * jnp.array([0.8, 0.6]), jnp.zeros(2)
-    direction = lambda mode, slip: slip_direction(jnp.asarray(mode, float), slip)
+    slip, none, along = 3.0 * np.array([0.8, 0.6]), np.zeros(2), jax.jit(slip_direction)
+    direction = lambda mode, slip: along(np.asarray(mode, float), slip)
     np.testing.assert_allclose(direction([1.0, 0.0], slip), [0.8, 0.6], rtol=1e-15)
     np.testing.assert_allclose(direction([-1.0, 0.0], slip), [-0.8, -0.6], rtol=1e-15)
     np.testing.assert_allclose(direction(BEGUN * ALONG, slip), ALONG, rtol=1e-15)
@@ -74,11 +83,11 @@ def test_the_direction_of_slip():
 
 
 def test_laws_are_coded_as_they_are_read():
-    yes, no = jnp.array([True, False, False, False]), jnp.array([False, True, False, False])
+    yes, no = np.eye(2, 4, dtype=bool)
     of_contacts = modes_of_contacts(yes, no)
     np.testing.assert_array_equal(of_contacts, [CLOSED, IMPLIED, OPEN, OPEN])
-    slips = jnp.array([0.0, 0.0, *ALONG])
-    begun = jnp.array([False, False, True, True])
+    slips = np.array([0.0, 0.0, *ALONG])
+    begun = np.array([False, False, True, True])
     of_friction = modes_of_friction(yes, no, slips, begun)
     modes = Modes.of(jnp.concatenate([of_contacts, of_friction]), 4, (2,))
     np.testing.assert_array_equal(modes.sticks, yes)

@@ -168,24 +168,6 @@ def test_another_module_is_refused(linkage, name, value, message):
         mb.with_parameters(linkage, {name: value})
 
 
-def test_wrong_weights_of_parts(linkage):
-    rod = planar.Body("rod", mass=1.0, inertia=0.1)
-    law = lambda poses, velocities, t, parameters: parameters["net"](velocities)
-    with pytest.raises(ValueError, match=r"Force 'f': net: Ratio has no weights"):
-        mb.Force("f", "rod", law, parameters={"net": Ratio(0.5)})
-    with pytest.raises(ValueError, match=r"Drag 'd': net: expected an equinox module, such as an eqx\.nn\.MLP, got 3"):
-        Drag("d", "rod", net=3.0)
-    not_finite = Ratio(jnp.array([1.0, jnp.nan]))
-    for force in (mb.Force("f", "rod", law, parameters={"net": not_finite}), Drag("f", "rod", net=not_finite)):
-        with pytest.raises(ValueError, match=r"'f': net must be finite, got \[ 1\. nan\]"):
-            mb.Scene([rod], forces=[force]).compile()
-    with pytest.raises(ValueError, match=r"'drag_b': net must be finite"):
-        mb.with_parameters(linkage, {"drag_b.net": not_finite})
-    with pytest.raises(ValueError, match=r"The start of 'drag_b\.net' must be numbers, got a Ratio; leave it out"):
-        data = {"crank.angle": np.zeros(3)}
-        mb.identify(linkage, data, ts=np.arange(1.0, 4.0), free={"drag_b.net": NETS["drag_b.net"]})
-
-
 @pytest.mark.slow
 def test_weights_are_identified():
     """A falling body tells both weights of its law of drag."""
@@ -204,3 +186,38 @@ def test_weights_are_identified():
     np.testing.assert_allclose(fit.parameters["drag.net"], true.factors, rtol=1e-4)
     found = mb.modules(mb.with_parameters(system, fit.parameters))["drag.net"]
     np.testing.assert_allclose(found(2.0), true(2.0), rtol=1e-5)
+
+
+NAN = Ratio(jnp.array([1.0, jnp.nan]))
+ROD = planar.Body("rod", mass=1.0, inertia=0.1)
+
+
+def law(poses, velocities, t, parameters):
+    return parameters["net"](velocities)
+
+
+REFUSED = {
+    "no weights": (lambda system: mb.Force("f", "rod", law, parameters={"net": Ratio(0.5)}), "Ratio has no weights"),
+    "no module": (lambda system: Drag("d", "rod", net=3.0), r"'d': net: expected an equinox module, .*, got 3"),
+    "of a force": (
+        lambda system: mb.Scene([ROD], forces=[mb.Force("f", "rod", law, parameters={"net": NAN})]).compile(),
+        r"'f': net must be finite, got \[ 1\. nan\]",
+    ),
+    "of a part": (
+        lambda system: mb.Scene([ROD], forces=[Drag("f", "rod", net=NAN)]).compile(),
+        "'f': net must be finite",
+    ),
+    "changed": (lambda system: mb.with_parameters(system, {"drag_b.net": NAN}), "'drag_b': net must be finite"),
+    "the start of a fit": (
+        lambda system: mb.identify(
+            system, {"crank.angle": np.zeros(3)}, ts=np.arange(1.0, 4.0), free={"drag_b.net": NETS["drag_b.net"]}
+        ),
+        r"The start of 'drag_b\.net' must be numbers, got a Ratio; leave it out",
+    ),
+}
+
+
+@pytest.mark.parametrize("build, message", REFUSED.values(), ids=REFUSED)
+def test_weights_that_are_refused(linkage, build, message):
+    with pytest.raises(ValueError, match=message):
+        build(linkage)

@@ -4,63 +4,85 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws import BUMP, TERRAINS
+from laws import TERRAINS
 from oracles import tracked_vehicle as oracle
 
 from jaxmb.parts import terrain
 
 
-@pytest.mark.slow("bump", "spline")
+def smooth_step(s):
+    s = np.clip(s, 0.0, 1.0)
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+# A spline has the heights of its points.
+HEIGHTS = {
+    "flat": lambda x: np.full_like(x, 0.3),
+    "bump": lambda x: oracle.bump(x)[0],
+    "sinusoid": lambda x: 0.1 * np.sin(np.pi * x + 0.4),
+    "slope": lambda x: 1.0 - 0.2 * x,
+    "ramp": lambda x: -0.5 * smooth_step((x - 3.0) / 2.0),
+    "surface": lambda x: 0.2 * np.cos(x),
+}
+X = np.linspace(2.5, 6.5, 4001)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """At many places the height, slope and curvature, the outward normal, and the distance of a point at height 1."""
+
+    def at(of, x):
+        height = lambda x: of.height(x[None])
+        point = jnp.stack([x, jnp.ones_like(x)])
+        derivatives = height(x), jax.grad(height)(x), jax.grad(jax.grad(height))(x)
+        return *derivatives, terrain.outward(of, point), terrain.distance(of, point)
+
+    every = jax.jit(jax.vmap(lambda x: {name: at(of, x) for name, of in TERRAINS.items()}))
+    return jax.tree.map(np.asarray, every(X))
+
+
 @pytest.mark.parametrize("name", TERRAINS)
-def test_heights_and_slopes_are_continuous(name):
-    """And curvatures but for those of the bump at its ends."""
-    of = TERRAINS[name]
-    height = lambda x: of.height(x[None])
-    slope = jax.grad(height)
-    x = jnp.linspace(2.5, 6.5, 4001)
-    values = [np.asarray(jax.vmap(f)(x)) for f in (height, slope, jax.grad(slope))]
-    h = float(x[1] - x[0])
+def test_terrain_height_and_slope(seen, name):
+    """They are those of the formula, and continuous, as curvatures are but for those of the bump at its ends."""
+    height, slope, curvature, normal, distance = seen[name]
+    if name in HEIGHTS:
+        np.testing.assert_allclose(height, HEIGHTS[name](X), rtol=0, atol=1e-14)
+    h, largest = X[1] - X[0], np.max(np.abs(curvature)) + 1.0
     # Jumps would show as differences that do not become small with the distance.
-    curvature = np.max(np.abs(values[2])) + 1.0
-    assert np.max(np.abs(np.diff(values[1]))) <= 1.1 * h * curvature
+    assert np.max(np.abs(np.diff(slope))) <= 1.1 * h * largest
     if name != "bump":
-        assert np.max(np.abs(np.diff(values[2]))) <= 100 * h * curvature
-    np.testing.assert_allclose(
-        np.diff(values[0]) / h, 0.5 * (values[1][1:] + values[1][:-1]), rtol=0, atol=h * curvature
-    )
+        assert np.max(np.abs(np.diff(curvature))) <= 100 * h * largest
+    np.testing.assert_allclose(np.diff(height) / h, 0.5 * (slope[1:] + slope[:-1]), rtol=0, atol=h * largest)
+    size = np.hypot(slope, 1.0)
+    np.testing.assert_allclose(normal, np.stack([-slope / size, 1.0 / size], axis=1), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(distance, (1.0 - height) / size, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", TERRAINS)
-def test_the_outward_normal_is_normal_to_the_slope_and_upward(name):
-    for x in (2.7, 4.1, 5.3):
-        slope = float(jax.grad(lambda x: TERRAINS[name].height(x[None]))(x))
-        normal = np.asarray(terrain.outward(TERRAINS[name], jnp.array([x, 0.0])))
-        np.testing.assert_allclose(normal, np.array([-slope, 1.0]) / np.hypot(slope, 1.0), rtol=0, atol=1e-14)
+def test_bump_slope_is_that_of_the_vehicle(seen):
+    np.testing.assert_allclose(seen["bump"][1], oracle.bump(X)[1], rtol=0, atol=1e-14)
 
 
-def test_bump_is_that_of_the_vehicle():
-    x = np.linspace(3.5, 6.0, 101)
-    height, slope = oracle.bump(x)
-    np.testing.assert_allclose(jax.vmap(BUMP.height)(x[:, None]), height, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(jax.vmap(jax.grad(BUMP.height))(x[:, None])[:, 0], slope, rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
 def test_spline_goes_through_its_points_and_follows_parabolas():
-    x = np.array([-1.0, 0.0, 0.3, 1.0, 1.5, 2.5])
-    at = lambda part, x: jax.vmap(part.height)(jnp.asarray(x)[:, None])
-    wild = np.sin(7 * x)
-    spline = terrain.Spline(x=x, heights=wild)
-    np.testing.assert_allclose(at(spline, x), wild, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(at(spline, [-3.0, 4.5])[0], wild[0] - 2 * (wild[1] - wild[0]), rtol=1e-13)
+    x, between = np.array([-1.0, 0.0, 0.3, 1.0, 1.5, 2.5]), np.linspace(0.0, 1.5, 31)
     parabola = lambda x: 0.3 - 0.2 * x + 0.5 * x**2
-    between = np.linspace(0.0, 1.5, 31)
-    np.testing.assert_allclose(
-        at(terrain.Spline(x=x, heights=parabola(x)), between), parabola(between), rtol=0, atol=1e-14
-    )
-    with pytest.raises(ValueError, match="must ascend"):
-        terrain.Spline(x=[0.0, 0.0, 1.0], heights=[0.0, 0.0, 1.0])
-    with pytest.raises(ValueError, match="same length"):
-        terrain.Spline(x=[0.0, 1.0], heights=[0.0, 0.0])
-    with pytest.raises(ValueError, match="length must be positive"):
-        terrain.Bump(start=0.0, length=0.0, peak=0.1)
+    wild, beyond = np.sin(7 * x), np.array([-3.0, 4.5])
+    splines = terrain.Spline(x=x, heights=wild), terrain.Spline(x=x, heights=parabola(x))
+    of = lambda heights, x: jax.vmap(terrain.Spline(x=splines[0].x, heights=heights).height)(x[:, None])
+    at = np.concatenate([x, beyond, between])
+    found = np.asarray(jax.jit(jax.vmap(of, (0, None)))(jnp.stack([s.heights for s in splines]), at))
+    np.testing.assert_allclose(found[0, :6], wild, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found[0, 6], wild[0] - 2 * (wild[1] - wild[0]), rtol=1e-13)
+    np.testing.assert_allclose(found[1, 8:], parabola(between), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "build, message",
+    [
+        (lambda: terrain.Spline(x=[0.0, 0.0, 1.0], heights=[0.0, 0.0, 1.0]), "must ascend"),
+        (lambda: terrain.Spline(x=[0.0, 1.0], heights=[0.0, 0.0]), "same length"),
+        (lambda: terrain.Bump(start=0.0, length=0.0, peak=0.1), "length must be positive"),
+    ],
+)
+def test_terrain_that_is_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

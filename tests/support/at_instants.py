@@ -1,4 +1,6 @@
-"""Quantities of a scene at one instant, and point masses in the plane."""
+"""Quantities of a scene at a few instants by one program, and point masses in the plane."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +10,22 @@ from jaxmb import planar
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.system.quantities import Solved
 
+FIELDS = ("acceleration", "angular_acceleration", "length", "wrap", "tension")
 
-def instant(system, state, t=0.0):
-    """Quantities by name at one state, in the plane and in space."""
-    udot, multipliers = accelerations(system.at(state), Multipliers(), t, state.q, state.u)
-    along = jnp.full(1, t), jax.tree.map(lambda x: x[None], state), Solved(udot[None], multipliers[None])
-    return lambda name: np.asarray(system.quantities()[name].value(*along)[0])
+
+@functools.partial(jax.jit, static_argnames="names")
+def _along(system, ys, names):
+    ts = jnp.zeros(len(ys.q))
+    solved = Solved(*jax.vmap(lambda t, y: accelerations(system, Multipliers(), t, y.q, y.u))(ts, ys))
+    return {name: system.quantities()[name].value(ts, ys, solved) for name in names}
+
+
+def instants(system, *states):
+    """Accelerations of bodies, and what ropes have, at the states, by name."""
+    ys = jax.tree.map(lambda *x: np.stack(x), *states)
+    names = sorted(name for name in system.quantities() if name.rsplit(".", 1)[-1] in FIELDS)
+    values = {name: np.asarray(value) for name, value in _along(system, ys, tuple(names)).items()}
+    return values.__getitem__
 
 
 def point(name, mass, *position, **state):

@@ -95,6 +95,10 @@ def turn(t, p):
     return p["start"] + p["rate"] * t**3
 
 
+def driven(quantity, start):
+    return {"quantity": quantity, "motion": turn, "parameters": {"start": start, "rate": 25.0}}
+
+
 def circle(point, p):
     return jnp.dot(point, point) - p["radius"] ** 2
 
@@ -136,6 +140,9 @@ TYRE_3D = tir.read("", TYRE_FILE).coefficients | {
     "FZMIN": 0.1,
     "FZMAX": 1e3,
 }
+CYLINDER_2D = {"bore_area": 2e-3, "pressure": 8e3, "rod_area": 1.5e-3, "rod_pressure": 2e3}
+DRAFT_GEAR = {"stiffness": 300.0, "preload": 5.0, "travel": 0.2, "stop_stiffness": 500.0, "transition_speed": 0.5}
+DRAFT_GEAR |= {"smoothing": 0.05}
 POINT_MASS_2D = planar.PointMass("PointMass", mass=1.2, position=(0.4, 0.2))
 BODY_2D = body_2d("Body", velocity=(1.0, 0.0))
 
@@ -150,22 +157,8 @@ PLANAR = [
     of_ground_2d(planar.PointOnCurve, "radius", curve=circle, parameters={"radius": 0.5}),
     gears(),
     rack(),
-    of_ground_2d(
-        planar.Driver,
-        "rate",
-        quantity="angle",
-        motion=turn,
-        parameters={"start": 0.2, "rate": 25.0},
-        joints=(pin_2d,),
-    ),
-    of_ground_2d(
-        planar.Driver,
-        "rate",
-        name="Driver of a distance",
-        quantity="distance",
-        motion=turn,
-        parameters={"start": 0.5, "rate": 25.0},
-    ),
+    of_ground_2d(planar.Driver, "rate", joints=(pin_2d,), **driven("angle", 0.2)),
+    of_ground_2d(planar.Driver, "rate", name="Driver of a distance", **driven("distance", 0.5)),
     on_body_2d(planar.KnifeEdge, "point", point=(0.2, 0.0)),
     of_ground_2d(planar.SpringDamper, "stiffness", stiffness=30.0, damping=0.5, free_length=0.1, point_b=(0.1, 0.2)),
     of_ground_2d(planar.Damper, "damping", damping=3.0, point_b=(0.1, 0.2)),
@@ -174,27 +167,8 @@ PLANAR = [
     of_ground_2d(planar.TorsionalSpringDamper, "stiffness", stiffness=5.0, damping=0.2, free_angle=0.8),
     of_ground_2d(planar.RotationalDamper, "damping", damping=0.3),
     of_ground_2d(planar.Bushing, "stiffness", stiffness=(30.0, 20.0, 3.0), damping=(1.0, 1.0, 0.1), point=(0.0, 0.0)),
-    of_ground_2d(
-        planar.Cylinder,
-        "bore_area",
-        bore_area=2e-3,
-        pressure=8e3,
-        rod_area=1.5e-3,
-        rod_pressure=2e3,
-        point_a=(0.1, -0.6),
-        point_b=(0.1, 0.2),
-    ),
-    of_ground_2d(
-        planar.DraftGear,
-        "preload",
-        stiffness=300.0,
-        preload=5.0,
-        travel=0.2,
-        stop_stiffness=500.0,
-        transition_speed=0.5,
-        smoothing=0.05,
-        free_length=0.3,
-    ),
+    of_ground_2d(planar.Cylinder, "bore_area", point_a=(0.1, -0.6), point_b=(0.1, 0.2), **CYLINDER_2D),
+    of_ground_2d(planar.DraftGear, "preload", free_length=0.3, **DRAFT_GEAR),
     track(),
     on_body_2d(planar.Contact, "normal.stiffness", **GROUND_2D),
     on_body_2d(planar.Tyre, "slip_stiffness", **TYRE_2D),
@@ -286,6 +260,9 @@ def roped():
     return Example(part, [own, reel], "radii", (pin_2d(reel, (0.0, 0.9)),), (hold_2d(own),))
 
 
+ACTUATOR = {"control": 0.3, "gain": (5.0, 0.0, 0.0), "bias": (0.0, -5.0, -0.2)}
+TORQUES = {"speeds": (-3.0, 0.0, 3.0, 9.0), "torques": (0.2, 0.2, 0.15, 0.0), "control": 0.7}
+
 FUNCTIONS = [
     of_joint(mb.JointStop, "stiffness", stiffness=90.0, damping=0.1, lower=-0.1, upper=0.1, smoothing=0.05),
     of_joint(
@@ -298,17 +275,8 @@ FUNCTIONS = [
         upper=0.1,
     ),
     of_joint(mb.JointFriction, "force", force=0.3, transition_speed=0.5),
-    of_joint(mb.Actuator, "gain", control=0.3, gain=(5.0, 0.0, 0.0), bias=(0.0, -5.0, -0.2)),
-    of_joint(
-        mb.Actuator,
-        "lag",
-        name="Actuator with a lag",
-        lag=0.05,
-        control=0.3,
-        gain=(5.0, 0.0, 0.0),
-        bias=(0.0, -5.0, -0.2),
-        rests=False,
-    ),
+    of_joint(mb.Actuator, "gain", **ACTUATOR),
+    of_joint(mb.Actuator, "lag", name="Actuator with a lag", lag=0.05, rests=False, **ACTUATOR),
     coupled(),
     of_tendon(mb.FixedTendon("FixedTendon", "FixedTendon body pin.angle", coefficients=(0.4,)), "coefficients"),
     of_tendon(mb.Tendon("Tendon", [("ground", (0.0, 1.0)), ("Tendon body", (0.2, 0.1))]), "points"),
@@ -317,16 +285,7 @@ FUNCTIONS = [
     of_joint(mb.JointForce, "force", force=0.8),
     of_joint(mb.TableSpring, "forces", values=(-0.4, 0.1, 0.3, 0.8), forces=(-4.0, -1.0, 1.0, 3.0)),
     of_joint(mb.TableDamper, "forces", rates=(-2.0, -0.5, 0.5, 3.0), forces=(-3.0, -1.0, 0.8, 2.0)),
-    of_joint(
-        mb.TableMotor,
-        "torques",
-        speeds=(-3.0, 0.0, 3.0, 9.0),
-        torques=(0.2, 0.2, 0.15, 0.0),
-        control=0.7,
-        gear=5.0,
-        lag=0.05,
-        rests=False,
-    ),
+    of_joint(mb.TableMotor, "torques", gear=5.0, lag=0.05, rests=False, **TORQUES),
     of_joint(mb.JointDriver, "value", value=0.25, rate=0.3, rests=False),
     of_joint(mb.JointInertia, "inertia", inertia=0.4),
     of_joint(mb.Motor, "gain", mode="position", command=0.6, gain=9.0, damping=0.5, lag=0.05, limit=5.0, rests=False),
@@ -356,13 +315,7 @@ def body_3d(name, **state):
 def hold_3d(body):
     place = {"point_b": (0.2, 0.1, 0.05)} if isinstance(body, spatial.Body) else {}
     return spatial.SpringDamper(
-        f"{body.name} spring",
-        "ground",
-        body.name,
-        stiffness=40.0,
-        free_length=0.2,
-        point_a=(0.7, 0.3, 1.1),
-        **place,
+        f"{body.name} spring", "ground", body.name, stiffness=40.0, free_length=0.2, point_a=(0.7, 0.3, 1.1), **place
     )
 
 
@@ -471,9 +424,7 @@ SPATIAL = [
         lambda angles: [mb.JointFriction("JointFriction on a gimbal", angles[1], force=0.3, transition_speed=0.5)],
     ),
     on_gimbal(
-        "inertia",
-        "JointInertia",
-        lambda angles: [mb.JointInertia("JointInertia on a gimbal", angles[1], inertia=0.2)],
+        "inertia", "JointInertia", lambda angles: [mb.JointInertia("JointInertia on a gimbal", angles[1], inertia=0.2)]
     ),
     tendon_3d(),
     roped_3d(),
@@ -485,15 +436,7 @@ SPATIAL = [
     of_ground_3d(spatial.Distance, "length", point_b=(0.1, 0.0, 0.0)),
     of_ground_3d(spatial.PointOnPlane, "point_b", point=O, axis=AXIS),
     of_ground_3d(spatial.PointOnLine, "point_b", point=O, axis=AXIS),
-    of_ground_3d(
-        spatial.Driver,
-        "rate",
-        quantity="angle",
-        motion=turn,
-        parameters={"start": 0.0, "rate": 25.0},
-        axis=AXIS,
-        joints=(pin_3d,),
-    ),
+    of_ground_3d(spatial.Driver, "rate", axis=AXIS, joints=(pin_3d,), **driven("angle", 0.0)),
     on_body_3d(spatial.KnifeEdge, "point", point=(0.2, 0.0, 0.0)),
     # A disc at rest falls over.
     on_body_3d(spatial.RollingDisc, "radius", position=(0.5, 0.1, 0.3), radius=0.3, axis=(0.0, 1.0, 0.0), rests=False),
@@ -528,10 +471,13 @@ METHODS = {
 }
 
 
-def compiled(example, *more):
-    """The scene of an example, and of more joints."""
-    part, bodies, forces = example.part, example.bodies, list(example.forces)
-    forces += [part] if isinstance(part, AbstractForce | AbstractNonIdeal) else []
-    joints = [*example.joints, *([] if part in bodies or part in forces else [part]), *more]
+def compiled(*examples, more=()):
+    """The scene of examples side by side, and of more joints."""
+    bodies, joints, forces = [], [], []
+    for example in examples:
+        own = list(example.forces)
+        own += [example.part] if isinstance(example.part, AbstractForce | AbstractNonIdeal) else []
+        joints += [*example.joints, *([] if example.part in example.bodies or example.part in own else [example.part])]
+        bodies, forces = bodies + example.bodies, forces + own
     gravity = mb.Gravity((0.0, -9.81) if bodies[0].dimension == 2 else (0.0, 0.0, -9.81))
-    return mb.Scene(bodies, joints=joints, forces=[*forces, gravity]).compile()
+    return mb.Scene(bodies, joints=[*joints, *more], forces=[*forces, gravity]).compile()
