@@ -169,49 +169,22 @@ def motion(names):
     return scope["motion"]
 
 
-@pytest.mark.slow(
-    "shapes",
-    "mechanisms",
-    "mechanisms.ride",
-    "importers",
-    "manifold",
-    "simulate",
-    "Trajectory",
-    "load",
-    "ContactEvents",
-    "Event",
-    "RESULTS",
-    "identify",
-    "Identification",
-    "Experiment",
-    "optimise",
-    "Optimum",
-    "robust",
-    "linearise",
-    "Linearisation",
-    "root_locus",
-    "RootLocus",
-    "steady_motion",
-    "floquet",
-    "Floquet",
-    "sweep",
-    "mechanisms.Shoes",
-    "viz.show",
-    "viz.plot_root_locus",
-    "report.stress_test",
-    "report.work_precision",
-    "formulations.Multipliers",
-    "formulations.NullSpace",
-    "formulations.Poincare",
-    "formulations.UdwadiaKalaba",
-    "manifold.Baumgarte",
-    "manifold.Partition",
-    "manifold.Projection",
-    "solvers.Adams",
-    "solvers.MultistepController",
-    "solvers.Hermite",
-    "Trajectory.events",
+# Of more than about a second.
+LONG = (
+    *("shapes", "mechanisms", "mechanisms.ride", "importers", "manifold", "simulate", "Trajectory", "load"),
+    *("ContactEvents", "Event", "RESULTS", "identify", "Identification", "Experiment", "optimise", "Optimum"),
+    *("robust", "linearise", "Linearisation", "root_locus", "RootLocus", "steady_motion", "floquet", "Floquet"),
+    *("sweep", "mechanisms.Shoes", "viz.show", "viz.plot_root_locus", "report.stress_test", "report.work_precision"),
+    *("formulations.Multipliers", "formulations.NullSpace", "formulations.Poincare", "formulations.UdwadiaKalaba"),
+    *("manifold.Baumgarte", "manifold.Partition", "manifold.Projection", "solvers.Adams"),
+    *("solvers.MultistepController", "solvers.Hermite", "Trajectory.events", "Rope", "planar.Cylinder"),
+    *("kinematics_and_compliance", "required_forces", "KinematicsAndCompliance", "RequiredForces", "Servo"),
+    *("formulations.Partitioned", "lagrangian.QuasiVelocities", "formulations.accelerations", "system"),
+    *("lagrangian.LagrangianSystem", "spatial.MagicFormulaTyre", "assembly_gap", "planar.Friction", "modules"),
 )
+
+
+@pytest.mark.slow(*LONG)
 @pytest.mark.parametrize("name", TOGETHER)
 def test_examples(name, names, request, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -324,19 +297,15 @@ def test_every_public_name_has_an_example():
     assert not without
 
 
+LONG_OF_JOINTS = ("Screw", "Composite", "KnifeEdge", "RollingDisc", "RollingSphere", "Driver", "PointOnLine")
+
+
 def test_every_joint_has_an_example():
     kinds = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)
     assert exported(planar, kinds) == PLANAR.keys() and exported(spatial, kinds) == SPATIAL.keys()
 
 
-@pytest.mark.slow(
-    "jaxmb.spatial-Screw",
-    "jaxmb.spatial-Composite",
-    "jaxmb.spatial-KnifeEdge",
-    "jaxmb.spatial-RollingDisc",
-    "jaxmb.spatial-RollingSphere",
-    "jaxmb.spatial-Driver",
-)
+@pytest.mark.slow(*(f"jaxmb.spatial-{name}" for name in LONG_OF_JOINTS))
 @pytest.mark.parametrize(("module", "name"), JOINTS, ids=lambda own: getattr(own, "__name__", own))
 def test_examples_of_joints(module, name):
     """Their docstrings say what they connect, and which coordinates they have, with these values in the example."""

@@ -325,24 +325,6 @@ def test_a_multistep_solver():
 
 
 @pytest.mark.slow
-def test_derivatives_with_a_multistep_solver():
-    """Forward mode = reverse mode, and both = differences of a tighter solution, on a pendulum that is constrained."""
-    pendulum = mechanisms.get("pendulum")
-
-    def end(weight, rtol):
-        system = mb.with_parameters(pendulum.system, {"gravity.acceleration": jnp.stack([0.0 * weight, -weight])})
-        y = mb.simulate(system, pendulum.state, t1=0.5, solver=TwoStep(), rtol=rtol, max_steps=2**14).ys
-        return jnp.concatenate([y.q[-1], y.u[-1]])
-
-    forward, reverse, value = jax.jit(jax.jacfwd(end)), jax.jit(jax.jacrev(end)), jax.jit(end)
-    slope, h = forward(G, 1e-6), 0.05
-    scale = np.max(np.abs(slope))
-    np.testing.assert_allclose(reverse(G, 1e-6), slope, rtol=0, atol=1e-11 * scale)
-    central = (value(G + h, 1e-8) - value(G - h, 1e-8)) / (2 * h)
-    np.testing.assert_allclose(slope, central, rtol=0, atol=1e-4 * scale)
-
-
-@pytest.mark.slow
 def test_a_formulation():
     """The same accelerations, constraint forces and motion as by multipliers, of a machine with a redundant row."""
     mechanism = mechanisms.get("parallelogram")
