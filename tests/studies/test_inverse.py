@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiled
 from oracles import four_bar_forces
 from trajectories import motion_of
 
@@ -102,19 +103,17 @@ def test_measured_positions_and_series():
 
 BARS = {"driver": "turn", "joint_driver": "turn_joint", "servo": "follow", "motor": "drive", "rough": "push"}
 BARS |= {"added": "added.angle", "turned": "engine.torque"}
+# Of bars with a control, its range, which their motion exceeds.
+RANGES, CONTROL, GAIN = {"shut": (0.0, 1.0), "below": (100.0, 200.0), "free": None}, 30.0, 0.35
+BARS |= {name: f"of_{name}.control" for name in RANGES}
 MASS, INERTIA = 2.0, 0.5
 INERTIA_AT_PIN, WEIGHT = INERTIA + MASS / 4, MASS * GRAVITY / 2
 
 
-def pinned(names):
-    """The bodies of some bars, and their pins."""
-    places = {name: (0.0, 3.0 * k) for k, name in enumerate(names)}
-    bodies = [planar.Body(name, mass=MASS, inertia=INERTIA, position=(0.5, y)) for name, (_, y) in places.items()]
-    return bodies, [planar.Revolute(f"pin_{name}", "ground", name, point=place) for name, place in places.items()]
-
-
 def bars():
-    bodies, pins = pinned(BARS)
+    places = {name: (0.0, 3.0 * k) for k, name in enumerate(BARS)}
+    bodies = [planar.Body(name, mass=MASS, inertia=INERTIA, position=(0.5, y)) for name, (_, y) in places.items()]
+    pins = [planar.Revolute(f"pin_{name}", "ground", name, point=place) for name, place in places.items()]
     ramp = {"motion": lambda t, p: p["rate"] * t**2, "parameters": {"rate": 0.5}}
     driver = lambda name, body: planar.Driver(name, "ground", body, quantity="angle", **ramp)
     joints = [
@@ -129,13 +128,20 @@ def bars():
         mb.JointForce("push", "pin_rough.angle", force=3.0),
         mb.JointForce("push_added", "pin_added.angle", force=3.0),
         planar.Torque("engine", "turned", torque=0.0),
+        *(
+            mb.Actuator(f"of_{name}", f"pin_{name}.angle", gain=(GAIN, 0.0, 0.0), control_range=limits)
+            for name, limits in RANGES.items()
+        ),
     ]
     system = mb.Scene(bodies, joints=[*pins, *joints], forces=forces).compile()
     return mb.with_inputs(system, {"turn_joint.value": lambda t: 0.5 * t**2, "engine.torque": lambda t: jnp.sin(t)})
 
 
 def test_actuators_of_every_kind_have_the_torque_of_a_bar_on_a_pin():
-    """The servo is off its program, where the force along the angle is less than its multiplier."""
+    """The servo is off its program, where the force along the angle is less than its multiplier.
+
+    Controls beyond their ranges are found with a warning.
+    """
     system, ts = bars(), np.array([0.3, 0.8])
     angles = np.array([0.5 * ts**2 if "driver" in name else 0.4 - 0.9 * ts for name in BARS])
     rates = np.array([ts if "driver" in name else -0.9 + 0.0 * ts for name in BARS])
@@ -144,8 +150,14 @@ def test_actuators_of_every_kind_have_the_torque_of_a_bar_on_a_pin():
         at = [system.coordinate_names()[f"{name}.{x}"][0] for x in ("x", "y", "angle")]
         q[:, at] = np.stack([0.5 * np.cos(angle), 3.0 * k + 0.5 * np.sin(angle), angle], axis=1)
         u[:, at] = rate[:, None] * np.stack([-0.5 * np.sin(angle), 0.5 * np.cos(angle), np.ones(2)], axis=1)
-    motion = motion_of(system, ts, q, u, np.full((2, 1), 1.5))
-    found = mb.required_forces(system, motion, by=list(BARS.values()))
+    wide = {f"of_{name}.control_range": (-100.0, 100.0) for name, limits in RANGES.items() if limits is not None}
+    wide |= {f"of_{name}.control": CONTROL for name in RANGES}
+    motion = motion_of(mb.with_parameters(system, wide), ts, q, u, np.full((2, 1), 1.5))
+    with pytest.warns(UserWarning, match="beyond its range") as caught:
+        found = mb.required_forces(system, motion, by=list(BARS.values()))
+    said, needs = " ".join(str(warning.message) for warning in caught), f"needs {CONTROL:g} to {CONTROL:g}, beyond its"
+    assert len(caught) == 2 and f"of_shut.control {needs} range from 0 to 1, most of all at t = 0." in said
+    assert f"of_below.control {needs} range from 100 to 200, most of all at t = 0." in said
     accelerations = np.asarray(motion.accelerations)
     for name, angle, rate in zip(BARS, angles, rates, strict=True):
         turning = accelerations[:, system.coordinate_names()[f"{name}.angle"][0]]
@@ -157,40 +169,17 @@ def test_actuators_of_every_kind_have_the_torque_of_a_bar_on_a_pin():
             pull = np.linalg.norm(MASS * (0.5 * swing + [0.0, GRAVITY]), axis=1)
             torque = torque + 0.3 * 0.05 * pull * np.tanh(0.05 * rate / 0.01)
         torque = torque - 3.0 * (name == "added")
-        actuator = BARS[name]
-        np.testing.assert_allclose(found[actuator], torque, rtol=1e-9, atol=1e-9, err_msg=name)
+        actuator, gain = BARS[name], GAIN if name in RANGES else 1.0
+        np.testing.assert_allclose(found[actuator], torque / gain, rtol=1e-9, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(found.power[actuator], torque * rate, rtol=1e-9, atol=1e-9, err_msg=name)
         if name in ("driver", "joint_driver", "servo", "motor"):
             np.testing.assert_allclose(motion[actuator].drive_force, torque, rtol=1e-9, err_msg=name)
     given = {"drive": 1.5, "push": 3.0, "added.angle": 0.0, "engine.torque": np.sin(ts)}
+    given |= {f"of_{name}.control": CONTROL for name in RANGES}
     for name, force in given.items():
         np.testing.assert_allclose(found[name], force, rtol=1e-9, atol=1e-9, err_msg=name)
     with pytest.raises(ValueError, match="do not determine drive"):
         mb.required_forces(system, {"pin_motor.angle": lambda t: 0.2}, ts=[0.0, 1.0], by=["engine.torque"])
-
-
-# Of bars with a control, its range.
-RANGES = {"shut": (0.0, 1.0), "below": (100.0, 200.0), "free": None}
-
-
-def test_controls_beyond_their_ranges_are_found_with_a_warning():
-    bodies, pins = pinned(RANGES)
-    servos = [
-        mb.Actuator(f"of_{name}", f"pin_{name}.angle", gain=(0.35, 0.0, 0.0), control_range=limits)
-        for name, limits in RANGES.items()
-    ]
-    system = mb.Scene(bodies, joints=pins, forces=[mb.Gravity((0.0, -GRAVITY)), *servos]).compile()
-    ts = np.linspace(0.0, 1.0, 5)
-    path = {f"pin_{name}.angle": mb.Series(ts, 0.2 + ts**2, "cubic") for name in RANGES}
-    with pytest.warns(UserWarning, match="beyond its range") as caught:
-        found = mb.required_forces(system, path, by=[f"of_{name}.control" for name in RANGES])
-    control = (2.0 * INERTIA_AT_PIN + WEIGHT * np.cos(0.2 + ts**2)) / 0.35
-    for name in RANGES:
-        np.testing.assert_allclose(found[f"of_{name}.control"], control, rtol=1e-9, err_msg=name)
-    said = " ".join(str(warning.message) for warning in caught)
-    needs = f"needs {np.min(control):.4g} to {np.max(control):.4g}, beyond its range from"
-    assert len(caught) == 2 and f"of_shut.control {needs} 0 to 1, most of all at t = 0." in said
-    assert f"of_below.control {needs} 100 to 200, most of all at t = 1." in said
 
 
 def swung(system, speed=2.0):
@@ -426,6 +415,10 @@ def test_a_motion_may_touch_contacts_and_not_pass_through_them(names):
     for name in names:
         expected = 0.5 / 3.0 + 0.5 * GRAVITY * np.cos(curved(-0.5 if name == "stop" else -0.499))
         np.testing.assert_allclose(found[f"pin_{name}.angle"], expected, rtol=1e-10)
+    # Another motion has the same programs.
+    with compiled() as programs:
+        turned(stop=-0.45)
+    assert not programs
     for name in names:
         with pytest.raises(ValueError, match=rf"at t = 1 the motion passes through {name} by [\d.]+ \[m, rad\]"):
             turned(**{name: -0.52})
@@ -469,8 +462,6 @@ REFUSED: list[tuple[dict, str]] = [
     ({"by": ["elbow.angle", "elbow.angle"]}, "each actuator once"),
     ({"by": ["elbow", "shoulder.angle"]}, "a Revolute, which drives nothing; name its coordinate 'elbow.angle'"),
     ({"by": ["wind", "shoulder.angle"]}, "PointForce.*'wind.force'"),
-    ({"motion": {"elbow.angle": jnp.cos}}, "leave .* free"),
-    ({"motion": SWING | {"cart.x": jnp.cos}}, "cart.x is not a freedom"),
     ({"motion": {"elbow": jnp.cos}}, "'elbow.angle'"),
     ({"motion": {"elbow.angle": mb.Series([0.0, 1.0], [0.0, 1.0])}}, "'cubic'"),
     ({"ts": None}, "ts is missing"),
@@ -479,8 +470,10 @@ REFUSED: list[tuple[dict, str]] = [
     ({"weights": {"elbow.angle": 1.0}}, "missing for shoulder.angle"),
     ({"weights": {"elbow.angle": 1.0, "shoulder.angle": -1.0}}, "weight of 'shoulder.angle' must be positive"),
 ]
-# Of these the motion is solved for first.
+# Of these something is solved for first.
 SOLVED: list[tuple[dict, str]] = [
+    ({"motion": {"elbow.angle": jnp.cos}}, "leave .* free"),
+    ({"motion": SWING | {"cart.x": jnp.cos}}, "cart.x is not a freedom"),
     ({"by": ["shoulder.angle"]}, r"2 freedoms and 1 force, shoulder\.angle, so .* is free"),
     ({"by": ["shoulder.angle", "cart.x"]}, "the constraints hold cart.x"),
     ({"by": ["shoulder.angle", "arm.angle"]}, "the motion of .*: arm.angle adds nothing"),

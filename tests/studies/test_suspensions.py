@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiled
 from oracles import suspensions
 
 import jaxmb as mb
@@ -105,6 +106,11 @@ def test_curves_of_a_right_wheel_are_those_of_the_geometry_of_the_left():
     assert np.max(np.abs(found.motion_ratio["constant"])) < 1e-12
     places = {(i, j): (travel[i], steer[j]) for i in (0, 1) for j in (0, 2)}
     check(found, suspensions.wishbone, suspensions.WISHBONE, places, sign=-1.0)
+    # Other numbers have the same programs.
+    stiffer = mb.with_parameters(system, {"spring.stiffness": 5e4})
+    with compiled() as programs:
+        curves_of(stiffer, travel=travel + 0.01, steer={"tie_rod.point_a[1]": steer})
+    assert not programs
 
 
 @pytest.mark.slow

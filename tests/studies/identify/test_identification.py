@@ -24,7 +24,6 @@ from jaxmb.studies.identify.prediction import predict
 from jaxmb.studies.identify.profile import profile
 from jaxmb.studies.identify.sensors import readings_of
 from jaxmb.studies.minimise import Linearised, levenberg_marquardt, minimise_together
-from jaxmb.studies.ranges import second_moments
 
 TS = np.linspace(0.0, 1.0, 31)[1:]
 # Compiles faster than Adams, where the solver does not matter.
@@ -210,55 +209,22 @@ def test_segments_have_the_minimum_of_the_whole_motion():
 
 
 @pytest.mark.slow
-def test_a_density_has_the_same_gradient_by_both_modes(three):
-    """Also as central differences; and under a batch, with a member whose simulation fails."""
+def test_derivatives_of_a_density(three):
+    """By both modes and as differences; in a batch with a member whose simulation fails; with prior and volume."""
     density = three.logdensity()
     z = density.start + 0.01
-    gradient = jax.grad(density)(z)
-    np.testing.assert_allclose(_forward(density, z), gradient, rtol=1e-8)
-    np.testing.assert_allclose(jax.jacfwd(density)(z), gradient, rtol=1e-12)
-    h = 1e-5
-    for k, e in enumerate(np.eye(z.size)):
-        central = (density(z + h * e) - density(z - h * e)) / (2 * h)
-        np.testing.assert_allclose(central, gradient[k], rtol=1e-5, atol=1e-3)
-    broken = z.at[1].set(jnp.nan)
-    values, gradients = jax.vmap(jax.value_and_grad(density))(jnp.stack([z, broken]))
-    np.testing.assert_allclose(gradients[0], gradient, rtol=1e-6)
+    value, gradient = jax.value_and_grad(density)(z)
+    of_problem = lambda z: density.problem.free.log_volume(z) - density.problem.objective(z)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(of_problem))(z), gradient, rtol=1e-8)
+    h, units = 1e-5, np.eye(z.size)
+    central = [(density(z + h * e) - density(z - h * e)) / (2 * h) for e in units]
+    np.testing.assert_allclose(central, gradient, rtol=1e-5, atol=1e-3)
+    values, gradients = jax.vmap(jax.value_and_grad(density))(jnp.stack([z, z.at[1].set(jnp.nan)]))
+    np.testing.assert_allclose([values[0], *gradients[0]], [value, *gradient], rtol=1e-6)
     assert values[1] == -jnp.inf and not np.any(gradients[1])
     chain = density.parameters(density.start[None])
     assert list(chain) == list(density.parameters(density.start)) == list(three.parameters)
     np.testing.assert_allclose(chain["gyro.gain"][0], three.parameters["gyro.gain"])
-
-
-def _forward(density, z):
-    """The gradient by forward mode through the simulation."""
-    of_problem = lambda z: density.problem.free.log_volume(z) - density.problem.objective(z)
-    return jax.jit(jax.jacfwd(of_problem))(z)
-
-
-@pytest.mark.slow
-def test_the_density_includes_prior_likelihood_and_volume(three):
-    """The difference between two points, written out."""
-    density = three.logdensity()
-    problem, z = three.problem, three.z
-
-    def by_hand(z):
-        values = {name: float(value) for name, value in problem.free(z).items()}
-        out = -0.5 * ((values["spring.stiffness"] - 6.1) / 0.5) ** 2
-        # Positive ones are exponentials, one with an upper bound as well; the others are linear.
-        out += np.log(values["encoder.sigma"]) + np.log(TS[0] - values["encoder.delay"])
-        for number in range(2):
-            seen = problem.trials[number].seen(
-                *problem.start(number, z), problem.own(number, problem.free(z)), problem.options
-            )
-            for sensor, data in zip(("encoder", "gyro"), problem.trials[number].channels, strict=True):
-                level = values["encoder.sigma"] if sensor == "encoder" else SIGMA["gyro"]
-                misfit = (np.asarray(seen.readings[sensor]) - np.asarray(data.values)) / level
-                out -= 0.5 * np.sum(misfit**2) + misfit.size * np.log(level)
-        return out
-
-    other = z + 0.003
-    np.testing.assert_allclose(density(other) - density(z), by_hand(other) - by_hand(z), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -289,28 +255,6 @@ def test_a_level_is_a_probability():
         for ask in (predict, profile):
             with pytest.raises(ValueError, match=f"level must.*{message}"):
                 ask(fit, "rod.angle", level=level)
-
-
-@pytest.mark.slow
-def test_a_profile_is_what_fits_with_a_known_value_give(motion):
-    """Without known noise; the interval's ends are where the likelihood ratio says."""
-    own = swing()
-    data = {"theta": motion + 0.02 * np.random.default_rng(3).standard_normal(TS.size)}
-    common = {"ts": TS, "fix": {"theta": 0.5}, "solver": TSIT5}
-    fit = mb.identify(own, data, free=["length", "damping"], **common)
-    found = fit.profile("length")
-    assert found.fits.all() and np.all(np.diff(found.values) > 0)
-    limit = float(ndtri(0.975)) ** 2
-    for value in found.interval:
-        known = mb.with_parameters(own, {"length": value})
-        again = mb.identify(known, data, free=["damping"], **common)
-        ratio = TS.size * np.log(np.sum(again.residuals**2) / np.sum(fit.residuals**2))
-        np.testing.assert_allclose(ratio, limit, rtol=2e-3)
-    low, high = found.interval
-    np.testing.assert_allclose((high - low) / (2 * 1.96 * fit.deviations["length"]), 1.0, atol=0.15)
-    given = fit.profile("length", values=[0.8, 0.81])
-    known = mb.identify(mb.with_parameters(own, {"length": 0.81}), data, free=["damping"], **common)
-    np.testing.assert_allclose(given.parameters["damping"][1], known.parameters["damping"], rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -452,25 +396,6 @@ def test_sensors_with_times_of_their_own(motion):
 
 
 @pytest.mark.slow
-def test_a_second_start_that_fits_as_well():
-    """The sign of an angle of which only the square is seen."""
-    own = swing()
-    start = mb.assemble(own, fix={"theta": 0.5})
-    seen = np.asarray(mb.simulate(own, start, t1=TS[-1], saveat=TS, solver=TSIT5)["theta"]) ** 2
-    fit = mb.identify(
-        own,
-        ts=TS,
-        residual=lambda motion: (motion["theta"] ** 2 - seen) / 1e-3,
-        free={"initial.theta": 0.4},
-        starts=[{"initial.theta": -0.4}],
-        solver=TSIT5,
-    )
-    (words,) = fit.warnings
-    assert not fit.converged and "another start fits as well with initial.theta = " in words
-    np.testing.assert_allclose(abs(fit.parameters["initial.theta"]), 0.5, rtol=1e-6)
-
-
-@pytest.mark.slow
 def test_a_prior_is_one_more_measurement():
     """With a strong one the estimate is its mean; without data on a parameter, its deviation is the prior's."""
     own = swing()
@@ -532,31 +457,27 @@ def test_a_start_that_fails_leaves_the_others_alone():
     np.testing.assert_allclose(good.z, [1.0, 1.0])
 
 
-@pytest.mark.slow
-def test_inertia_matrices_stay_those_of_bodies():
-    """Second moments of mass are positive, so principal moments satisfy the triangle inequalities."""
-    inertia = np.diag([2.0, 1.5, 1.0])
-    own = mb.Scene([spatial.Body("top", mass=1.0, inertia=inertia)]).compile()
-    free = free_parameters(own, ["top.inertia"])
-    for z in np.random.default_rng(0).normal(size=(10, 6)):
-        value = free(jnp.asarray(z))["top.inertia"]
-        assert np.all(np.linalg.eigvalsh(second_moments(value)) > 0)
-        moments = np.linalg.eigvalsh(value)
-        assert moments[2] < moments[0] + moments[1]
-        np.testing.assert_allclose(free.locate({"top.inertia": value}), z, atol=1e-9)
-    with pytest.raises(ValueError, match="slightly thicker"):
-        free_parameters(own, {"top.inertia": np.diag([1.0, 1.0, 2.0])})
-
-
-@pytest.mark.slow
-def test_vectors_of_values_and_back(system):
-    """For every kind of range, with the volume of a change."""
+def test_ranges_of_unknowns_have_inverses_and_volumes(system):
+    """Of every kind; second moments of mass stay positive, so principal moments satisfy the triangle inequalities."""
+    top = mb.Scene([spatial.Body("top", mass=1.0, inertia=np.diag([2.0, 1.5, 1.0]))]).compile()
     names = {"rod.mass": 3.0, "spring.stiffness": 7.0, "pin.point_b": [-0.4, 0.1], "spring.damping": 0.2}
-    free = free_parameters(system, names, {"spring.stiffness": (5.0, 9.0), "spring.damping": (None, 1.0)})
-    z = jnp.asarray(np.random.default_rng(0).normal(size=free.size))
-    np.testing.assert_allclose(free.locate(free(z)), z, atol=1e-12)
-    np.testing.assert_allclose(free.log_volume(z), np.linalg.slogdet(jax.jacfwd(free.flat)(z))[1], rtol=1e-12)
-    assert free.place("pin.point_b") == slice(2, 4)
+    bounds = {"spring.stiffness": (5.0, 9.0), "spring.damping": (None, 1.0)}
+    several, of_matrix = free_parameters(system, names, bounds), free_parameters(top, ["top.inertia"])
+    assert several.place("pin.point_b") == slice(2, 4) and of_matrix.size == 6
+    for free in (several, of_matrix):
+        every = lambda z, free=free: (free(z), free.locate(free(z)), free.log_volume(z), jax.jacfwd(free.flat)(z))
+        z = np.vstack([np.zeros(free.size), np.random.default_rng(0).normal(size=(5, free.size))])
+        values, again, volumes, slopes = jax.jit(jax.vmap(every))(z)
+        np.testing.assert_allclose(again, z, atol=1e-9)
+        np.testing.assert_allclose(volumes, np.linalg.slogdet(np.asarray(slopes))[1], rtol=1e-10)
+    inertia = np.asarray(values["top.inertia"])
+    np.testing.assert_allclose(inertia[0], np.diag([2.0, 1.5, 1.0]), atol=1e-14)
+    moments = np.linalg.eigvalsh(inertia)
+    assert np.all(moments > 0) and np.all(moments[:, 2] < moments[:, 0] + moments[:, 1])
+    with pytest.raises(ValueError, match="slightly thicker"):
+        free_parameters(top, {"top.inertia": np.diag([1.0, 1.0, 2.0])})
+    # An unknown moves to larger values with the vector.
+    assert np.all(np.diag(jax.jit(jax.jacfwd(several.flat))(np.zeros(5)))[:4] > 0)
 
 
 def test_measurements_from_files_and_tables(tmp_path):

@@ -4,7 +4,8 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from identifying import pendulum, slider_crank, swing
+from compiling import compiled
+from identifying import slider_crank, swing
 from scipy.stats import binom
 
 import jaxmb as mb
@@ -178,20 +179,6 @@ def test_right_fits_of_a_slider_crank_are_not_accused(crank, stroke):
         assert abs(fit.parameters["spring.stiffness"] - 200) <= 5 * fit.deviations["spring.stiffness"] + 1e-4
 
 
-@pytest.mark.slow
-def test_right_fits_of_a_pendulum_are_not_accused():
-    """Of three sensors with four components together."""
-    own, ts, free = pendulum(), np.linspace(0.0, 2.0, 61)[1:], {"spring.stiffness": 8.0, "spring.damping": 0.2}
-    start, sigma = {"rod.angle": 0.5}, {"rod.angle": 1e-3, "rod.position": 1e-3, "rod.angular_velocity": 1e-2}
-    motion = mb.simulate(own, mb.assemble(own, fix=start), t1=ts[-1], saveat=ts, solver=TSIT5)
-    exact = {name: np.asarray(motion.quantity(name)) for name in sigma}
-    for seed in range(5):
-        random = np.random.default_rng(seed)
-        data = {name: x + sigma[name] * (seed > 0) * random.standard_normal(x.shape) for name, x in exact.items()}
-        known = sigma if seed % 2 else None
-        assert mb.identify(own, data, ts=ts, free=free, fix=start, sigma=known, solver=TSIT5).converged
-
-
 FIXED = Bias(free=False)
 
 
@@ -235,24 +222,6 @@ def test_what_was_tried_already_is_not_advised():
 
 
 OFFSETS = np.array([0.1, -0.2])
-
-
-@pytest.mark.slow
-def test_an_offset_that_is_free_for_all_components_together():
-    """What is advised instead of freeing it frees it for each, and the fit is right."""
-    own, ts = pendulum(), np.linspace(0.0, 1.0, 41)[1:]
-    known = {"fix": {"rod.angle": 0.5}, "sigma": {"rod.position": 1e-3}, "solver": TSIT5}
-    motion = mb.simulate(own, mb.assemble(own, fix=known["fix"]), t1=ts[-1], saveat=ts, solver=TSIT5)
-    noise = 1e-3 * np.random.default_rng(0).standard_normal((ts.size, 2))
-    data = {"rod.position": np.asarray(motion["rod"].position) + OFFSETS + noise}
-    fits = [
-        mb.identify(own, data, ts=ts, free={"spring.stiffness": 7.0, "rod.position.bias": bias}, **known)
-        for bias in (0.0, np.zeros(2))
-    ]
-    assert not fits[0].converged and "not noise" in fits[0].message and "can be free" not in fits[0].message
-    assert "its offset, 'rod.position.bias', is one number for all components" in fits[0].message
-    assert fits[1].converged
-    np.testing.assert_allclose(fits[1].parameters["rod.position.bias"], OFFSETS, atol=2e-3)
 
 
 @pytest.mark.slow
@@ -376,8 +345,12 @@ def test_outliers_are_marked(system, exact):
     measured = samples(exact, 200, NOISE, 9)
     there = np.flatnonzero(np.isfinite(measured["theta"]))[[20, 77]]
     measured["theta"][there] += [0.09, -0.08]
+    fitted(system, samples(exact, 200, NOISE, 1), None)
     for sigma in (NOISE, None):
-        fit = fitted(system, measured, sigma)
+        # Other data have the same programs.
+        with compiled() as programs:
+            fit = fitted(system, measured, sigma)
+        assert not programs
         assert [own.sample for own in fit.outliers] == [(int(k),) for k in there]
         assert [own.t for own in fit.outliers] == list(TS[there])
         assert fit.outliers[0].residual < -5 < 5 < fit.outliers[1].residual
