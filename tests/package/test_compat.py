@@ -456,6 +456,7 @@ def test_solvers_are_told_tolerances(compat):
     assert set(seen) == {(0.25, 0.125, jnp.max)}, about
 
 
+@pytest.mark.slow(but=("forward",))
 @pytest.mark.parametrize(
     "adjoint, kind",
     [
