@@ -122,8 +122,8 @@ def at_one_instant(examples, formulation):
     return Case(system, machines, observe, outputs=5)
 
 
-def named(space, *names):
-    return [EXAMPLES[f"{space}: {name}"] for name in names]
+def named(space, names):
+    return [EXAMPLES[f"{space}: {name}"] for name in names.split(", ")]
 
 
 def on_the_ground():
@@ -149,60 +149,31 @@ def on_the_ground():
     return examples
 
 
-PLANAR_FORCES = named(
-    "planar",
-    "Body",
-    "PointMass",
-    "SpringDamper",
-    "Damper",
-    "PointForce",
-    "Torque",
-    "TorsionalSpringDamper",
-    "RotationalDamper",
-    "Bushing",
-    "Cylinder",
-    "DraftGear",
-    "Track",
-    "Contact",
-    "Tyre",
-    "PlateContact",
-    "DiscContact",
+OF_BOTH = (
+    "Body, PointMass, SpringDamper, Damper, PointForce, Torque, RotationalDamper, Bushing, Cylinder, Contact, Tyre"
 )
-SPATIAL_FORCES = named(
-    "spatial",
-    "Body",
-    "PointMass",
-    "SpringDamper",
-    "Damper",
-    "PointForce",
-    "Torque",
-    "RotationalDamper",
-    "Bushing",
-    "Cylinder",
-    "Contact",
-    "Tyre",
-    "MagicFormulaTyre",
-)
+PLANAR_FORCES = named("planar", f"{OF_BOTH}, TorsionalSpringDamper, DraftGear, Track, PlateContact, DiscContact")
+SPATIAL_FORCES = named("spatial", f"{OF_BOTH}, MagicFormulaTyre")
 # Examples, and how they are integrated.
-GROUPS = {"planar joints": (named("planar", "Revolute", "Fixed", "PointOnLine", "Prismatic", "Distance"), FIXED)}
+GROUPS = {"planar joints": (named("planar", "Revolute, Fixed, PointOnLine, Prismatic, Distance"), FIXED)}
 # Examples that are not moved, which takes a third of the time, and how their accelerations are solved for.
 INSTANTS = {
     "planar gears and drivers": (
-        named("planar", "PointOnCurve", "Gear", "RackAndPinion", "Driver", "Driver of a distance"),
+        named("planar", "PointOnCurve, Gear, RackAndPinion, Driver, Driver of a distance"),
         Poincare(),
     ),
     "planar velocities, laws and functions": ([*named("planar", "KnifeEdge"), *FUNCTIONS], Multipliers()),
     "planar forces": (PLANAR_FORCES, Multipliers()),
     "spatial joints": (
-        named("spatial", "Spherical", "Revolute", "Universal", "Gimbal", "Cylindrical"),
+        named("spatial", "Spherical, Revolute, Universal, Gimbal, Cylindrical"),
         UdwadiaKalaba(),
     ),
     "spatial slides": (
-        named("spatial", "Screw", "Prismatic", "Planar", "Fixed", "Composite"),
+        named("spatial", "Screw, Prismatic, Planar, Fixed, Composite"),
         UdwadiaKalaba("inverses"),
     ),
-    "spatial points": (named("spatial", "Distance", "PointOnPlane", "PointOnLine", "Driver"), NullSpace()),
-    "spatial rolling": (named("spatial", "KnifeEdge", "RollingDisc", "RollingSphere"), UdwadiaKalaba("singular_mass")),
+    "spatial points": (named("spatial", "Distance, PointOnPlane, PointOnLine, Driver"), NullSpace()),
+    "spatial rolling": (named("spatial", "KnifeEdge, RollingDisc, RollingSphere"), UdwadiaKalaba("singular_mass")),
     "spatial friction": ([rubbing_3d()], Partitioned()),
     "spatial forces": (SPATIAL_FORCES, Multipliers()),
     "ground": (on_the_ground(), Multipliers()),
@@ -355,8 +326,8 @@ def linearised():
 
 def equilibria():
     """Where gravity, springs, joints and the ground hold bodies at rest."""
-    joints = named("planar", "Revolute", "Prismatic", "Distance")
-    springs = named("planar", "SpringDamper", "TorsionalSpringDamper", "Bushing", "Contact", "Track")
+    joints = named("planar", "Revolute, Prismatic, Distance")
+    springs = named("planar", "SpringDamper, TorsionalSpringDamper, Bushing, Contact, Track")
     examples = [*joints, *springs]
     system = scene_of(examples)
     machines = machines_of(system, examples, ("position", "angle"))

@@ -549,12 +549,9 @@ TREE = """
   <default><geom type="capsule" size="0.05"/><joint damping="0.2" stiffness="1.5"/></default>
   <worldbody>
     <body name="trunk"><joint name="turn" axis="0 0 1"/><geom fromto="0 0 0 0 0.1 0.6"/>
-      <body name="arm" pos="0 0.1 0.6"><joint name="lift" axis="1 0.2 0"/><geom fromto="0 0 0 0.7 0 0"/>
-        <body name="rod" pos="0.7 0 0"><joint name="slide" type="slide" axis="1 0 0.3"/><geom fromto="0 0 0 0 0.4 0"/>
-        </body>
+      <body name="rod" pos="0 0.1 0.6"><joint name="slide" type="slide" axis="1 0 0.3"/><geom fromto="0 0 0 0 0.4 0"/>
       </body>
-      <body name="leg" pos="0 0 0.3"><joint name="hip" axis="0 1 0" armature="0.1"/><geom fromto="0 0 0 0 0 -0.5"/>
-        <body name="shin" pos="0 0 -0.5"><joint name="knee" axis="0 1 0.4"/><geom fromto="0 0 0 0.2 0 -0.5"/></body>
+      <body name="leg" pos="0 0 0.3"><joint name="hip" axis="0 1 0.4" armature="0.1"/><geom fromto="0 0 0 0 0 -0.5"/>
       </body>
     </body>
   </worldbody>

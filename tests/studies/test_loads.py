@@ -1,6 +1,7 @@
 """Loads of bodies along motions."""
 
 import csv
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -112,6 +113,11 @@ def test_loads_at_the_worst_instants_and_in_files(boom, tmp_path):
     found = mb.loads(boom, "boom")
     sizes = np.max(np.linalg.norm(np.asarray(found.forces), axis=2)[:, :4], axis=1)
     np.testing.assert_array_equal(found.worst(count=3).ts, np.argsort(-sizes))
+    # Gravity and inertia do not count, whatever their sizes.
+    reverse = 1e6 * np.argsort(np.argsort(-sizes))[:, None, None]
+    large = np.concatenate([found.forces[:, :4], np.tile(reverse, (1, 2, 3))], axis=1)
+    heavy = dataclasses.replace(found, forces=jnp.asarray(large))
+    np.testing.assert_array_equal(heavy.worst(count=3).ts, np.argsort(-sizes))
     moments = np.abs(found["inertia"].moment[:, 2])
     assert float(found.worst(lambda loads: jnp.abs(loads["inertia"].moment[:, 2])).ts[0]) == int(np.argmax(moments))
     found.to_csv(tmp_path / "boom.csv")

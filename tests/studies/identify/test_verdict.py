@@ -291,6 +291,16 @@ def test_a_robust_loss_expects_outliers():
     assert "10 of 500 are beyond 5 σ: if these are outliers, take loss='soft_l1'" in said([series(few)])
 
 
+def test_outliers_are_measured_by_the_median_of_many_residuals_or_the_square_of_few():
+    many = np.append(np.random.default_rng(0).uniform(-1.0, 1.0, 40), 30.0)
+    (found,) = outliers((series(many, known=False),))
+    np.testing.assert_allclose(found.residual, 30.0 / (np.median(np.abs(many)) / 0.6745), rtol=1e-14)
+    assert (found.sample, found.t) == ((40,), 40.0)
+    assert not outliers((series(many[-8:], known=False),))
+    (found,) = outliers((series(many),))
+    assert found.residual == 30.0
+
+
 @pytest.mark.parametrize("count, directions", [(10, 1), (30, 10), (100, 20)])
 @pytest.mark.parametrize("rough", [False, True])
 def test_probabilities_hold(count, directions, rough):

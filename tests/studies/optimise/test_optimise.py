@@ -386,14 +386,15 @@ def open_(v):
     """Not a number where the gap is positive."""
     x = v["x"]
     gap = jnp.maximum(jnp.hypot(x[0], x[1]) - 1.0, 0.0)
-    return {"f": jnp.where(gap > 0, jnp.nan, (x[0] - 0.2) ** 2 + x[1] ** 2), "gap": gap}
+    return {"f": jnp.where(gap > 0, jnp.nan, (x[0] - 0.2) ** 2 + x[1] ** 2), "gap": gap, "room": -gap}
 
 
 def test_a_start_that_fails_is_led_to_one_that_does_not():
-    best = mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f", constraints={"gap": (None, 0)})
-    assert best.success and np.isnan(best.before["f"]) and best.before["gap"] > 0
-    np.testing.assert_allclose(best.parameters["x"], [0.2, 0.0], atol=1e-4)
-    assert "led from the failed start" in best.message
+    for limits in ({"gap": (None, 0)}, {"room": (0, None)}):
+        best = mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f", constraints=limits)
+        assert best.success and np.isnan(best.before["f"]) and best.before["gap"] > 0
+        np.testing.assert_allclose(best.parameters["x"], [0.2, 0.0], atol=1e-4)
+        assert "led from the failed start" in best.message
     with pytest.raises(ValueError, match=r"'f' is not finite.*assembly_gap"):
         mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f")
     with pytest.raises(ValueError, match="no violated constraint leads away"):
