@@ -57,32 +57,6 @@ class Maxwell(parts.AbstractPair, parts.AbstractDynamicForce):
         return {"tension": self.stiffness * (jnp.dot(d, rate) / jnp.linalg.norm(d) - self.tension / self.damping)}
 
 
-class Kutta(diffrax.AbstractSolver):
-    """Kutta's method of order three, with the midpoint rule for its error."""
-
-    term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
-
-    def order(self, terms):
-        return 3
-
-    def init(self, terms, t0, t1, y0, args):
-        return None
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        over = terms.contr(t0, t1)
-        change = lambda t, y: terms.vf_prod(t, y, args, over)
-        k1 = change(t0, y0)
-        k2 = change((t0 + t1) / 2, jax.tree.map(lambda y, a: y + a / 2, y0, k1))
-        k3 = change(t1, jax.tree.map(lambda y, a, b: y - a + 2 * b, y0, k1, k2))
-        y1 = jax.tree.map(lambda y, a, b, c: y + (a + 4 * b + c) / 6, y0, k1, k2, k3)
-        error = jax.tree.map(lambda end, y, b: end - (y + b), y1, y0, k2)
-        return y1, error, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
-
-
 class TwoStepState(solvers.AbstractMultistepState):
     """The last two times and derivatives."""
 
@@ -286,19 +260,6 @@ def test_a_force_with_an_internal_state():
     exact = np.stack([scipy.linalg.expm(t * rates) @ [1.0, 0.3, 2.0] for t in ts])
     found = np.stack([motion["bob"].position[:, 0], motion["bob"].velocity[:, 0], motion["element"].tension], axis=1)
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_one_step_solver():
-    """Of its order in steps of one length, and as accurate as asked for where it chooses them."""
-    pendulum = mechanisms.get("pendulum")
-    run = lambda **options: mb.simulate(pendulum.system, pendulum.state, t1=0.5, max_steps=4096, **options).ys.q[-1]
-    exact = run(rtol=1e-12)
-    fixed = {"solver": Kutta(), "stepsize_controller": diffrax.ConstantStepSize()}
-    coarse, fine = (np.max(np.abs(run(dt0=h, **fixed) - exact)) for h in (0.02, 0.01))
-    assert 1e-7 < coarse < 1e-3
-    assert 7.0 < coarse / fine < 9.0
-    np.testing.assert_allclose(run(solver=Kutta(), rtol=1e-8), exact, rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow

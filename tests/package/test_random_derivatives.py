@@ -440,11 +440,8 @@ FRONTS = {
     # Derivatives by the times of jumps are known to multistep methods.
     "jumps": (jumps, {}),
     "body of a user": (body_of_a_user, FIXED),
-    "assembly in the plane": (functools.partial(assembled, "four_bar"), {}),
     "assembly in space": (functools.partial(assembled, "spatial_slider_crank"), {}),
     "equilibria": (equilibria, {}),
-    "linear inputs": (functools.partial(inputs, "linear"), DOPRI8),
-    "held inputs": (functools.partial(inputs, "held"), DOPRI8),
     "cubic inputs with Hermite": (functools.partial(inputs, "cubic"), {"solver": solvers.Hermite()}),
     "linearised": (linearised, {}),
 }
