@@ -172,7 +172,7 @@ def test_the_spring_of_a_fast_slider_crank(crank, stroke, zero, known):
 
 @pytest.mark.slow
 def test_right_fits_of_a_slider_crank_are_not_accused(crank, stroke):
-    for seed in range(5):
+    for seed in range(3):
         measured = stroke + 2e-4 * (seed > 0) * np.random.default_rng(seed).standard_normal(stroke.size)
         fit = spring_of(crank, measured, 199.5, **({} if seed % 2 else {"sigma": None}))
         assert fit.converged, fit
