@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from precision import single_precision
+from trajectories import motion_of
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -55,51 +56,10 @@ REFUSED = {
     "inertia": (lambda: mb.Scene([bar(inertia=-1.0)]).compile(), "bar.*inertia must be positive"),
     "complex mass": (lambda: bar(mass=1.0 + 1.0j), "expected a real number"),
     "not finite": (lambda: mb.Scene([bar(position=(np.nan, 0.0))]).compile(), "bar.*position must be finite"),
-    "triangle inequality": (
-        lambda: mb.Scene([spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 3.0))]).compile(),
-        "body.*triangle inequality",
-    ),
-    "shape": (lambda: mb.Scene([bar()], joints=[pin(point=(0, 0, 0))]).compile(), r"pin.*point must have shape \(2,\)"),
     "gravity's shape": (lambda: mb.Scene([bar()], forces=[mb.Gravity((0, 0, -9.81))]).compile(), "gravity.*shape"),
-    "missing point": (lambda: mb.Scene([bar()], joints=[pin(point=None)]).compile(), "pin.*give point_a and point_b"),
-    "points twice": (lambda: mb.Scene([bar()], joints=[pin(point_a=(0, 0))]).compile(), "pin.*not both"),
-    "zero axis": (
-        lambda: mb.Scene(
-            [bar()], joints=[planar.PointOnLine("slot", "ground", "bar", point=(0, 0), axis=(0, 0))]
-        ).compile(),
-        "slot.*axis must be a unit vector.*give a direction",
-    ),
-    "axis of length two": (
-        lambda: mb.Scene(
-            [bar()], joints=[planar.PointOnLine("slot", "ground", "bar", point=(0, 0), axis=(2, 0))]
-        ).compile(),
-        "slot.*axis must be a unit vector.*divide",
-    ),
     "infinite stiffness": (
         lambda: mb.Scene([bar()], forces=[planar.SpringDamper("s", "ground", "bar", stiffness=np.inf)]).compile(),
         "'s': stiffness must be finite",
-    ),
-    "negative stiffness": (
-        lambda: mb.Scene([bar()], forces=[planar.SpringDamper("s", "ground", "bar", stiffness=-1.0)]).compile(),
-        "'s': stiffness must be non-negative",
-    ),
-    "unknown quantity": (
-        lambda: planar.Driver("drive", "ground", "bar", quantity="angel", motion=lambda t, p: t),
-        "drive.*quantity must be one of",
-    ),
-    "points of an angle": (
-        lambda: mb.Scene(
-            [bar()],
-            joints=[planar.Driver("d", "ground", "bar", quantity="angle", motion=lambda t, p: t, point_b=(1, 0))],
-        ).compile(),
-        "'d': point_b has no meaning for quantity='angle'",
-    ),
-    "turning a point mass": (
-        lambda: mb.Scene(
-            [planar.PointMass("m", mass=1.0)],
-            joints=[planar.Revolute("r", "ground", "m", point_a=(1, 0), point_b=(1, 0))],
-        ).compile(),
-        "'r' acts on the rotation of a PointMass",
     ),
     "open loop": (
         lambda: mb.Scene(
@@ -147,25 +107,6 @@ def pendulum():
 
 
 @pytest.mark.slow
-def test_unknown_names(pendulum):
-    with pytest.raises(ValueError, match=r"Unknown parameter 'bar.mas'; did you mean 'bar.mass'"):
-        mb.with_parameters(pendulum, {"bar.mas": 1.0})
-    with pytest.raises(ValueError, match=r"Parameter 'pin.point_b' has shape \(2,\), got \(\)"):
-        mb.with_parameters(pendulum, {"pin.point_b": 1.0})
-    with pytest.raises(ValueError, match=r"Unknown coordinate 'bar.angel'; did you mean 'bar.angle'"):
-        mb.assemble(pendulum, fix={"bar.angel": 0.1})
-    with pytest.raises(ValueError, match=r"Unknown rate 'baar.angle'"):
-        mb.assemble(pendulum, rates={"baar.angle": 0.1})
-    sol = mb.simulate(pendulum, mb.assemble(pendulum), t1=0.1)
-    with pytest.raises(ValueError, match=r"Unknown body, joint or frame 'baar'; did you mean 'bar'\?"):
-        sol["baar"]
-    with pytest.raises(ValueError, match="Unknown joint 'pim'; did you mean 'pin'"):
-        sol.reactions["pim"]
-    with pytest.raises(ValueError, match="dense=True"):
-        sol.at(0.05)
-
-
-@pytest.mark.slow
 def test_assembly_names_what_cannot_be_fixed(pendulum):
     with pytest.raises(ValueError, match=r"cannot be assembled with bar.x, bar.y fixed.*pin"):
         mb.assemble(pendulum, fix={"bar.x": 2.0, "bar.y": 2.0})
@@ -190,19 +131,16 @@ def test_more_rates_than_freedoms_may_be_given_if_they_agree(pendulum):
     np.testing.assert_allclose(jax.jacfwd(turn)(2.0), (0.0, 0.5, 1.0), rtol=0, atol=1e-14)
 
 
-NUMBERS = {"text": "0.3", "None": None, "complex": 0.3j, "ragged": [[1.0], [2.0, 3.0]]}
-
-
-@pytest.mark.parametrize("value", NUMBERS.values(), ids=NUMBERS.keys())
-def test_prescribed_values_are_real_numbers(pendulum, value):
-    with pytest.raises(ValueError, match=r"Coordinate 'bar.angle' must be a real number"):
-        mb.assemble(pendulum, fix={"bar.angle": value})
-    with pytest.raises(ValueError, match=r"Rate 'bar.velocity' must be a real number"):
-        mb.assemble(pendulum, rates={"bar.velocity": value})
-    with pytest.raises(ValueError, match=r"Coordinate 'bar.angle' must be a real number"):
-        mb.equilibrium(pendulum, fix={"bar.angle": value})
-    with pytest.raises(ValueError, match=r"t must be a real number"):
-        mb.assemble(pendulum, t=value)
+def test_prescribed_values_are_real_numbers(pendulum):
+    for value in ("0.3", None, 0.3j, [[1.0], [2.0, 3.0]]):
+        for call, message in (
+            (lambda value: mb.assemble(pendulum, fix={"bar.angle": value}), "Coordinate 'bar.angle'"),
+            (lambda value: mb.assemble(pendulum, rates={"bar.velocity": value}), "Rate 'bar.velocity'"),
+            (lambda value: mb.equilibrium(pendulum, fix={"bar.angle": value}), "Coordinate 'bar.angle'"),
+            (lambda value: mb.assemble(pendulum, t=value), "t"),
+        ):
+            with pytest.raises(ValueError, match=f"{message} must be a real number"):
+                call(value)
 
 
 @pytest.mark.parametrize("function", [mb.assemble, mb.equilibrium])
@@ -224,31 +162,7 @@ def test_arguments_of_wrong_types(pendulum, function):
         function(pendulum, t=(0.0, 1.0))
 
 
-@pytest.mark.parametrize("rtol", [0.0, -1e-3, 2.0, np.nan, 1e-17])
-def test_tolerances(pendulum, rtol):
-    with pytest.raises(ValueError, match="rtol"):
-        mb.simulate(pendulum, mb.assemble(pendulum), t1=0.1, rtol=rtol)
-
-
-def test_combinations(pendulum):
-    state = mb.assemble(pendulum)
-    with pytest.raises(ValueError, match="Partition needs a solver that knows charts"):
-        mb.simulate(pendulum, state, t1=0.1, solver=diffrax.Tsit5(), manifold=mb.manifold.Partition())
-    with pytest.raises(ValueError, match="coordinates and"):
-        mb.simulate(pendulum, mb.State(jnp.zeros(2), jnp.zeros(3)), t1=0.1)
-    with pytest.raises(ValueError, match="MultistepController"):
-        mb.simulate(pendulum, state, t1=0.1, stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
-
-
-def test_given_steps_for_a_method_of_many_orders(pendulum):
-    """They need tolerances of the solver's own, by which it chooses the order."""
-    state = mb.assemble(pendulum)
-    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01, "t1": 0.1}
-    for solver in (None, mb.solvers.Hermite()):
-        with pytest.raises(ValueError, match=r"(Adams|Hermite)\(rtol=1e-8, atol=1e-10\)"):
-            mb.simulate(pendulum, state, solver=solver, **fixed)
-
-
+@pytest.mark.slow
 def test_nothing_to_solve_implicitly():
     turned = planar.Driver("drive", "ground", "bar", quantity="angle", motion=lambda t, p: 2.0 * t)
     system = mb.Scene([bar()], joints=[pin(), turned]).compile()
@@ -267,17 +181,16 @@ def test_single_precision_warns(pendulum):
 
 
 def test_precision_switched_after_the_scene_was_compiled(pendulum):
-    scene, state = mb.Scene([bar()], joints=[pin()]), mb.assemble(pendulum)
+    scene = mb.Scene([bar()], joints=[pin()])
     with single_precision():
         early = scene.compile()
         with pytest.raises(ValueError, match="numbers of float64, and JAX now makes float32"):
             mb.assemble(pendulum)
-    for function, call in (
-        ("simulate", lambda: mb.simulate(early, state, t1=0.1)),
-        ("linearise", lambda: mb.linearise(early, state)),
-    ):
-        with pytest.raises(ValueError, match=f"{function}: .*float32, and JAX now makes float64.*jax_enable_x64"):
-            call()
+    for function in (lambda *of: mb.simulate(*of, t1=0.1), mb.linearise):
+        with pytest.raises(
+            ValueError, match=r"^(simulate|linearise): .*float32, and JAX now makes float64.*enable_x64"
+        ):
+            function(early, pendulum.guess)
 
 
 def steady_turn(t, p):
@@ -339,105 +252,97 @@ ARGUMENTS = {
         r"solver must be an object, such as jaxmb.solvers.Adams\(\), jaxmb.solvers.Hermite\(\) or diffrax.Tsit5\(\), "
         "or one of the words 'auto' and 'switch'; got 'rk45'",
     ),
-    "number as a solver": ({"solver": 3}, "solver must be .*got 3"),
     "name of a manifold": ({"manifold": "partition"}, r"manifold must be .*Partition\(\), got 'partition'"),
-    "class of a manifold": ({"manifold": mb.manifold.Partition}, "manifold must be .*the class Partition"),
-    "solver as a manifold": ({"manifold": mb.solvers.Adams()}, "manifold must be .*got an object of type Adams"),
     "name of a formulation": ({"formulation": "multipliers"}, r"formulation must be .*Multipliers\(\), got"),
-    "class of a formulation": (
-        {"formulation": mb.formulations.Multipliers},
-        "formulation must be .*the class",
-    ),
     "controller": ({"stepsize_controller": 1e-6}, "stepsize_controller must be .*MultistepController"),
     "adjoint": ({"adjoint": "forward"}, "adjoint must be .*ForwardMode"),
     "event": ({"event": lambda t, y, args, **kwargs: t - 1.0}, "event must be .*diffrax.Event"),
     "progress meter": ({"progress_meter": True}, "progress_meter must be .*got True"),
     "no bound of steps": ({"max_steps": None}, "max_steps must be an integer of at least 1, got None"),
-    "no steps": ({"max_steps": 0}, "max_steps must be an integer of at least 1, got 0"),
     "half a step": ({"max_steps": 1.5}, "max_steps must be an integer of at least 1, got 1.5"),
     "first step of zero": ({"dt0": 0.0}, "dt0 must be a finite step from t0 = 0.0 towards t1 = 0.1.*leave it out"),
     "first step back": ({"dt0": -1e-3}, "dt0 must be a finite step"),
     "first step forward in time that runs back": ({"dt0": 1e-3, "t1": -1.0}, "dt0 must be a finite step"),
-    "endless first step": ({"dt0": np.inf}, "dt0 must be a finite step"),
-    "first step in words": ({"dt0": "small"}, "dt0 must be a real number, got 'small'"),
     "no end": ({"t1": None}, "t1 must be a real number, got None"),
-    "NaN as the end": ({"t1": np.nan}, "t1 must not be NaN"),
-    "end in words": ({"t1": "10"}, "t1 must be a real number, got '10'"),
     "two ends": ({"t1": [1.0, 2.0]}, "t1 must be a real number"),
     "NaN as the start": ({"t0": np.nan}, "t0 must not be NaN"),
-    "endless past": ({"t0": -np.inf}, "t0 must be finite"),
     "endless future": ({"t1": np.inf}, "t1 must be finite, got inf"),
     "complex start": ({"t0": 1j}, "t0 must be a real number"),
     "tolerance in words": ({"rtol": "1e-6"}, "rtol must be a real number"),
-    "no tolerance": ({"rtol": None}, "rtol must be a real number, got None"),
     "tolerances of the wrong number": (
         {"atol": [1e-6, 1e-6]},
         r"atol must have shape \(\) or \(6,\), got \(2,\)",
     ),
     "negative tolerance": ({"atol": -1e-6}, "atol must be between 0 and 1"),
     "times in words": ({"saveat": "all"}, "saveat must be an array of real numbers, got 'all'"),
-    "times in a list of words": ({"saveat": ["0", "1"]}, "saveat must be an array of real numbers"),
-    "one time": ({"saveat": 0.05}, "saveat must be a vector of times"),
     "no times": ({"saveat": []}, "saveat must be a vector of times"),
     "NaN among the times": ({"saveat": [0.0, np.nan]}, "saveat must not be NaN"),
     "no state": ({"state": None}, "state must be a jaxmb.State, got None; jaxmb.assemble"),
-    "state in words": ({"state": "rest"}, "state must be a jaxmb.State, got 'rest'"),
     "state as a pair": ({"state": (np.zeros(3), np.zeros(3))}, "state must be a jaxmb.State, got"),
-    "empty state": ({"state": mb.State(None, None)}, "state.q must be an array of real numbers, got None"),
     "complex state": ({"state": mb.State(np.zeros(3) + 0j, np.zeros(3))}, "state.q must be an array of real numbers"),
-    "system in words": ({"system": "pendulum"}, "system must be a compiled system, got 'pendulum'"),
     "no system": ({"system": None}, "system must be a compiled system, got None"),
     "scene that is not compiled": (
         {"system": mb.Scene([bar()])},
         r"system must be a compiled.*scene.compile\(\)",
     ),
+    "manifold of other solvers": (
+        {"solver": diffrax.Tsit5(), "manifold": mb.manifold.Partition()},
+        "Partition needs a solver that knows charts",
+    ),
+    "state of another system": ({"state": mb.State(np.zeros(2), np.zeros(3))}, "coordinates and"),
+    "controller of other solvers": (
+        {"stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)},
+        "MultistepController",
+    ),
+    # They need tolerances of the solver's own, by which it chooses the order.
+    **{
+        f"given steps for {solver}": (
+            {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01, "solver": solver},
+            r"(Adams|Hermite)\(rtol=1e-8, atol=1e-10\)",
+        )
+        for solver in (None, mb.solvers.Hermite())
+    },
+    **{f"tolerance {rtol}": ({"rtol": rtol}, "rtol") for rtol in (0.0, -1e-3, 2.0, np.nan, 1e-17)},
 }
 
 
-@pytest.mark.parametrize("case", ARGUMENTS)
-def test_arguments_of_simulate(pendulum, case):
-    changes, message = ARGUMENTS[case]
-    arguments = {"system": pendulum, "state": pendulum.guess, "t1": 0.1} | changes
-    with pytest.raises(ValueError, match=message) as refused:
-        mb.simulate(arguments.pop("system"), arguments.pop("state"), **arguments)
-    assert "\n" not in str(refused.value)
+def test_arguments_of_simulate(pendulum):
+    for changes, message in ARGUMENTS.values():
+        arguments = {"system": pendulum, "state": pendulum.guess, "t1": 0.1} | changes
+        with pytest.raises(ValueError, match=message) as refused:
+            mb.simulate(arguments.pop("system"), arguments.pop("state"), **arguments)
+        assert "\n" not in str(refused.value)
 
 
 NAMES = {
     "an argument of numpy.savez": ("file", "'file' has another meaning"),
     "a column of the motion": ("energy", "'energy' has another meaning"),
     "a path": ("../x", "'../x' cannot be saved.*slashes"),
-    "a folder": ("a/b", "'a/b' cannot be saved"),
-    "a path of Windows": ("a\\b", "cannot be saved"),
     "a drive": ("c:", "'c:' cannot be saved"),
     "hidden": (".x", "'.x' cannot be saved"),
     "empty": ("", "a non-empty string, got ''"),
     "number": (1, "a non-empty string, got 1"),
-    "none": (None, "a non-empty string, got None"),
-    "list": (["x"], "a non-empty string"),
 }
 
 
-@pytest.mark.parametrize("case", NAMES)
-def test_names_of_coordinates(case):
-    name, message = NAMES[case]
-    with pytest.raises(ValueError, match=message):
-        mb.lagrangian.LagrangianSystem(lambda t, q, v, p: v @ v, q=[1.0, 2.0], coordinates=("y", name))
+def test_names_of_coordinates():
+    for name, message in NAMES.values():
+        with pytest.raises(ValueError, match=message):
+            mb.lagrangian.LagrangianSystem(lambda t, q, v, p: v @ v, q=[1.0, 2.0], coordinates=("y", name))
 
 
-@pytest.mark.slow
 def test_what_only_bodies_have():
     system = mb.lagrangian.LagrangianSystem(lambda t, q, v, p: v @ v, q=[1.0])
-    motion = mb.simulate(system, system.guess, t1=0.1)
-    with pytest.raises(ValueError, match="this system has constraint_forces"):
-        _ = motion.reactions
-    with pytest.raises(ValueError, match="this system has none"):
-        _ = motion.forces
-    for name in ("linear_momentum", "angular_momentum"):
-        with pytest.raises(ValueError, match="Momentum is defined for bodies"):
-            getattr(motion, name)
-    with pytest.raises(ValueError, match=r"Unknown quantity 'q0\.rat'; did you mean 'q0_rate'"):
-        motion.quantity("q0.rat")
+    motion = motion_of(system, [0.0], np.ones((1, 1)), np.zeros((1, 1)))
+    for ask, message in (
+        (lambda: motion.reactions, "this system has constraint_forces"),
+        (lambda: motion.forces, "this system has none"),
+        (lambda: motion.linear_momentum, "Momentum is defined for bodies"),
+        (lambda: motion.angular_momentum, "Momentum is defined for bodies"),
+        (lambda: motion.quantity("q0.rat"), r"Unknown quantity 'q0\.rat'; did you mean 'q0_rate'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ask()
 
 
 def test_a_scene_is_compiled_before_it_is_traced():

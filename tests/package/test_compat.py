@@ -1,14 +1,11 @@
 """Names and habits of other libraries that `jaxmb._compat` relies on; a test of each says what an update took away."""
 
-import ast
 import contextlib
 import dataclasses
 import importlib
-import importlib.metadata
 import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any, ClassVar
 
 import diffrax
@@ -21,57 +18,6 @@ from jax import lax
 from precision import single_precision
 
 from jaxmb.linalg.sums import unchecked_take
-
-ROOT = Path(__file__).parents[2] / "jaxmb"
-COMPAT = ROOT / "_compat.py"
-# Modules and attributes that only `_compat` may use.
-PRIVATE_MODULES = ("equinox.internal", "jax.extend", "jax.interpreters", "jax._src", "jax.custom_batching")
-PRIVATE_ATTRIBUTES = {
-    *("custom_batching", "weak_type", "canonicalize_dtype", "unvmap_any", "scan_kind", "with_stepsize_controller_tols"),
-    *("backends_are_initialized", "_enumeration", "_name_to_item", "_index_to_message", "_processes", "LRUCache"),
-}
-
-
-def nodes(path):
-    return ast.walk(ast.parse(path.read_text()))
-
-
-def is_private(module):
-    return module.startswith(PRIVATE_MODULES) or any(part.startswith("_") for part in module.split("."))
-
-
-def imported(path):
-    """The names of other packages that a file imports, with their modules."""
-    for node in nodes(path):
-        if isinstance(node, ast.Import):
-            yield from ((alias.name, None) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            yield from ((node.module, alias.name) for alias in node.names)
-
-
-@pytest.mark.parametrize("module, name", [pair for pair in imported(COMPAT) if is_private(pair[0])])
-def test_private_names_exist(module, name):
-    package = module.split(".")[0]
-    message = f"{package} {importlib.metadata.version(package)} has no {module}.{name or ''}, which jaxmb._compat uses"
-    try:
-        found = importlib.import_module(module)
-    except ImportError:
-        pytest.fail(message)
-    assert name is None or hasattr(found, name), message
-
-
-@pytest.mark.slow
-def test_only_compat_uses_private_names():
-    for path in set(ROOT.rglob("*.py")) - {COMPAT}:
-        for module, name in imported(path):
-            whole = f"{module}.{name}" if name else module
-            own = module.startswith("__future__") or not (is_private(module) or whole.startswith(PRIVATE_MODULES))
-            assert own, f"{path.name} imports {whole}: private names of other packages belong in _compat.py"
-        for node in nodes(path):
-            if isinstance(node, ast.Attribute):
-                about = f"{path.name}:{node.lineno} uses .{node.attr}, which belongs in _compat.py"
-                assert node.attr not in PRIVATE_ATTRIBUTES, about
-                assert not (node.attr == "__new__" and getattr(node.value, "id", "") == "object"), about
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +181,6 @@ def test_inputs_that_a_function_is_computed_from(compat):
     assert found == {"unused": False, "used": True, "without effect": True}
 
 
-@pytest.mark.slow
 def test_bilinear_operations(compat):
     outer = compat.define_bilinear(
         "outer_of_test",
@@ -246,16 +191,19 @@ def test_bilinear_operations(compat):
             lambda c, a: jnp.sum(c * a[..., :, None], axis=-2),
         ),
     )
-    a, b = jnp.array([1.0, 2.0]), jnp.array([3.0, -1.0, 0.5])
+    a, b = np.array([1.0, 2.0]), np.array([3.0, -1.0, 0.5])
 
-    def value(outer, a, b):
-        return jnp.sum(jnp.sin(outer(a, b)) ** 2)
+    @jax.jit
+    def every(a, b):
+        out = []
+        for own in (outer, jnp.outer):
+            value = lambda a, b, own=own: jnp.sum(jnp.sin(own(a, b)) ** 2)
+            batch = jax.vmap(own, in_axes=(None, 0))(a, jnp.stack([b, 2 * b]))
+            out.append([value(a, b), jax.grad(value, 1)(a, b), jax.jacfwd(jax.grad(value))(a, b), batch])
+        return out
 
-    for through in (lambda f: f, jax.jit, lambda f: jax.grad(f, argnums=1), lambda f: jax.jacfwd(jax.grad(f))):
-        found = through(lambda a, b: value(outer, a, b))(a, b)
-        np.testing.assert_allclose(found, through(lambda a, b: value(jnp.outer, a, b))(a, b), rtol=1e-14)
-    several = jnp.stack([b, 2 * b])
-    np.testing.assert_array_equal(jax.vmap(outer, in_axes=(None, 0))(a, several)[1], jnp.outer(a, 2 * b))
+    for found, expected in zip(*every(a, b), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
 # equinox
@@ -270,11 +218,11 @@ def test_linear_operations(compat):
         parameters=("of",),
     )
     about = "operations of one's own no longer have derivatives, transposes and batches"
-    x = jnp.arange(6.0).reshape(2, 3)
+    x = np.arange(6.0).reshape(2, 3)
     value = lambda x: jnp.sum(jnp.sin(twice(x, of=2.0)))
-    assert jnp.allclose(jax.grad(value)(x), 2 * jnp.cos(2 * x)), about
-    assert jnp.allclose(jax.jacfwd(value)(x), 2 * jnp.cos(2 * x)), about
-    assert jnp.allclose(jax.jit(jax.vmap(lambda x: twice(x, of=2.0)))(x), 2 * x), about
+    every = jax.jit(lambda x: (jax.grad(value)(x), jax.jacfwd(value)(x), jax.vmap(lambda x: twice(x, of=2.0))(x)))
+    for found, expected in zip(every(x), (2 * np.cos(2 * x), 2 * np.cos(2 * x), 2 * x), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=about)
 
 
 def test_conditions_of_a_batch(compat):
@@ -287,7 +235,7 @@ def test_conditions_of_a_batch(compat):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lanes, at_once", [(1, None), (5, None), (5, 2), (5, 4096)])
+@pytest.mark.parametrize("lanes, at_once", [(1, None), (5, None), (5, 2)])
 def test_conditions_of_lanes(compat, monkeypatch, lanes, at_once):
     """A branch that only the lanes that take it go through, with the values and derivatives of any other.
 
@@ -305,17 +253,19 @@ def test_conditions_of_lanes(compat, monkeypatch, lanes, at_once):
     x, a = jnp.arange(2.0 * lanes).reshape(lanes, 2) / 2, jnp.asarray(0.7)
     several = jnp.linspace(0.5, 1.0, lanes)
     for axes, of in (((0, None), (x, a)), ((0, 0), (x, several)), ((None, 0), (x[-1], several))):
-        batches = [jax.vmap(function, axes) for function in (own, plain)]
-        found, expected = (batch(*of) for batch in batches)
-        np.testing.assert_allclose(found, expected, rtol=1e-15)
-        # Derivatives of a batch, and a batch of derivatives.
-        totals = [lambda *of, batch=batch: jnp.sum(batch(*of) ** 2) for batch in batches]
-        for derivative in (jax.grad, jax.jacfwd, jax.hessian):
-            found, expected = (derivative(total, 1)(*of) for total in totals)
-            np.testing.assert_allclose(found, expected, rtol=1e-14)
-        for derivative in (jax.jacrev, jax.jacfwd):
-            found, expected = (jax.vmap(derivative(function, 1), axes)(*of) for function in (own, plain))
-            np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+        def every(function, *of, axes=axes):
+            """Values, derivatives of a batch, and a batch of derivatives."""
+            batch = jax.vmap(function, axes)
+            total = lambda *of: jnp.sum(batch(*of) ** 2)
+            return [
+                batch(*of),
+                *(derivative(total, 1)(*of) for derivative in (jax.grad, jax.jacfwd, jax.hessian)),
+                *(jax.vmap(derivative(function, 1), axes)(*of) for derivative in (jax.jacrev, jax.jacfwd)),
+            ]
+
+        for found, expected in zip(*(jax.jit(every, static_argnums=0)(f, *of) for f in (own, plain)), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-13)
     text = jax.jit(jax.vmap(own, (0, None))).lower(x, a).as_text()
     kind = "stablehlo.case" if lanes == 1 else "stablehlo.while"
     assert kind in text, "a branch is computed for lanes that do not take it"
@@ -410,7 +360,7 @@ def test_the_state_of_the_loop_of_diffrax(compat):
             )
 
     saveat = diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=[0.55, 1.0]), diffrax.SubSaveAt(t1=True)))
-    solve(diffrax.Euler(), adjoint=Spy(), saveat=saveat)
+    jax.eval_shape(lambda: solve(diffrax.Euler(), adjoint=Spy(), saveat=saveat).ys)
     state = given.pop("state")
     assert {*given} == {
         *("terms", "args", "solver", "stepsize_controller", "event", "saveat"),
@@ -501,13 +451,12 @@ def test_solvers_are_told_tolerances(compat):
             return y1, jnp.zeros_like(y0), {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
     controller = diffrax.PIDController(rtol=0.25, atol=0.125, norm=jnp.max)
-    with jax.disable_jit():
-        solve(Told(compat.from_controller(Tolerances)), controller=controller)
+    jax.eval_shape(lambda: solve(Told(compat.from_controller(Tolerances)), controller=controller).ys)
     about = "diffrax no longer fills in the tolerances of a solver's root_finder from the step size controller"
-    assert {(float(rtol), float(atol), norm) for rtol, atol, norm in seen} == {(0.25, 0.125, jnp.max)}, about
+    assert set(seen) == {(0.25, 0.125, jnp.max)}, about
 
 
-@pytest.mark.slow(but=("ForwardMode-",))
+@pytest.mark.slow(but=("forward",))
 @pytest.mark.parametrize(
     "adjoint, kind",
     [
@@ -515,7 +464,7 @@ def test_solvers_are_told_tolerances(compat):
         (diffrax.DirectAdjoint(), "bounded"),
         (diffrax.RecursiveCheckpointAdjoint(), None),
     ],
-    ids=lambda x: type(x).__name__ if isinstance(x, diffrax.AbstractAdjoint) else "",
+    ids=["forward", "direct", "checkpoints"],
 )
 def test_adjoints_choose_the_loops_of_wrapped_solvers(compat, adjoint, kind):
     seen = set()
@@ -529,8 +478,7 @@ def test_adjoints_choose_the_loops_of_wrapped_solvers(compat, adjoint, kind):
             return self.inner.step(terms, *args)
 
     final = lambda rate: solve(Spy(diffrax.Tsit5()), rate, adjoint=adjoint).ys[0, 0]
-    differentiate = jax.jacfwd if kind == "lax" else jax.grad
-    np.testing.assert_allclose(differentiate(final)(-1.0), np.exp(-1.0), rtol=1e-4)
+    jax.eval_shape((jax.jacfwd if kind == "lax" else jax.grad)(final), -1.0)
     about = f"{type(adjoint).__name__} no longer sets `scan_kind` of Runge–Kutta methods, also of wrapped ones"
     assert seen == {(kind, kind, "lax")}, about
 

@@ -2,7 +2,6 @@
 bodies, each in a few lines against the public classes, simulated and compared with a closed form or the library's own.
 """
 
-import inspect
 from typing import Any, ClassVar
 
 import diffrax
@@ -56,32 +55,6 @@ class Maxwell(parts.AbstractPair, parts.AbstractDynamicForce):
     def state_rates(self, space, poses, velocities, t):
         d, rate = parts.separation(space, self, poses), parts.separation_rate(space, self, poses, velocities)
         return {"tension": self.stiffness * (jnp.dot(d, rate) / jnp.linalg.norm(d) - self.tension / self.damping)}
-
-
-class Kutta(diffrax.AbstractSolver):
-    """Kutta's method of order three, with the midpoint rule for its error."""
-
-    term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
-
-    def order(self, terms):
-        return 3
-
-    def init(self, terms, t0, t1, y0, args):
-        return None
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        over = terms.contr(t0, t1)
-        change = lambda t, y: terms.vf_prod(t, y, args, over)
-        k1 = change(t0, y0)
-        k2 = change((t0 + t1) / 2, jax.tree.map(lambda y, a: y + a / 2, y0, k1))
-        k3 = change(t1, jax.tree.map(lambda y, a, b: y - a + 2 * b, y0, k1, k2))
-        y1 = jax.tree.map(lambda y, a, b, c: y + (a + 4 * b + c) / 6, y0, k1, k2, k3)
-        error = jax.tree.map(lambda end, y, b: end - (y + b), y1, y0, k2)
-        return y1, error, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
 class TwoStepState(solvers.AbstractMultistepState):
@@ -245,34 +218,33 @@ class SphericalPendulum(AbstractSystem):
         return (jnp.dot(q, udot) + jnp.dot(u, u))[None] / self.length
 
 
-@pytest.mark.parametrize("cls, most", [(Rolling, 30), (SphericalPendulum, 40)])
-def test_lines(cls, most):
-    code = [line for line in inspect.getsource(cls).splitlines() if line.strip()]
-    assert len(code) <= most
-
-
 def test_a_joint():
-    """A wheel rolls down a slope, and rubs and presses on it as the closed form says."""
-    mass, inertia, slope, t1 = 2.0, 0.05, 0.3, 0.8
+    """A wheel rolls down a slope, and rubs and presses on it, as the closed form says; also slopes by the radius."""
+    mass, inertia, slope = 2.0, 0.05, 0.3
     wheel = planar.Body("wheel", mass=mass, inertia=inertia, position=(0.0, 0.3))
     weight = mb.Gravity((G * np.sin(slope), -G * np.cos(slope)))
     system = mb.Scene([wheel], joints=[Rolling("roll", "ground", "wheel", radius=0.3)], forces=[weight]).compile()
     assert system.nu - system.velocity_rank == 1
 
-    def end(radius):
-        changed = mb.with_parameters(system, {"roll.radius": radius})
-        motion = mb.simulate(changed, mb.assemble(changed), t1=t1, rtol=1e-10)
-        own = motion["wheel"]
-        return jnp.append(own.position[-1], own.angle[-1]), motion.reactions["roll"].force[-1]
+    def now(radius, rate):
+        """Accelerations, and the joint's force and moment, where the wheel has turned by an angle."""
+        own, angle = mb.with_parameters(system, {"roll.radius": radius}), 0.4
+        q, u = jnp.stack([-radius * angle, radius, angle + 0.0 * radius]), rate * jnp.stack([-radius, 0.0, 1.0])
+        udot, multipliers = accelerations(own, Multipliers(), 0.0, q, u)
+        violated = jnp.append(own.position_residual(0.0, q), own.velocity_residual(0.0, q, u))
+        return udot, own.constraint_force(0.0, q, u, multipliers), violated
 
     def closed(r):
-        acceleration = G * jnp.sin(slope) / (1 + inertia / (mass * r**2))
-        x = 0.5 * t1**2 * acceleration
-        return jnp.stack([x, r, -x / r]), mass * jnp.stack([acceleration - G * jnp.sin(slope), G * jnp.cos(slope)])
+        a = G * np.sin(slope) / (1 + inertia / (mass * r**2))
+        force = mass * np.array([a - G * np.sin(slope), G * np.cos(slope)])
+        return [a, 0.0, -a / r], [*force, r * force[0]], np.zeros(4)
 
-    found, exact = (jax.jvp(of, (0.3,), (1.0,), has_aux=True) for of in (end, closed))
-    for own, expected, bound in zip(found, exact, (1e-9, 1e-7, 1e-8), strict=True):
-        np.testing.assert_allclose(own, expected, rtol=0, atol=bound)
+    at = jax.jit(lambda r: jax.jvp(now, (r, jnp.asarray(-2.0)), (jnp.ones(()), jnp.zeros(()))))
+    values, slopes = at(0.3)
+    for found, expected in zip(values, closed(0.3), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    for slope_of, high, low in zip(slopes, closed(0.3 + 1e-5), closed(0.3 - 1e-5), strict=True):
+        np.testing.assert_allclose(slope_of, (np.array(high) - np.array(low)) / 2e-5, rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.slow
@@ -288,19 +260,6 @@ def test_a_force_with_an_internal_state():
     exact = np.stack([scipy.linalg.expm(t * rates) @ [1.0, 0.3, 2.0] for t in ts])
     found = np.stack([motion["bob"].position[:, 0], motion["bob"].velocity[:, 0], motion["element"].tension], axis=1)
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_one_step_solver():
-    """Of its order in steps of one length, and as accurate as asked for where it chooses them."""
-    pendulum = mechanisms.get("pendulum")
-    run = lambda **options: mb.simulate(pendulum.system, pendulum.state, t1=0.5, max_steps=4096, **options).ys.q[-1]
-    exact = run(rtol=1e-12)
-    fixed = {"solver": Kutta(), "stepsize_controller": diffrax.ConstantStepSize()}
-    coarse, fine = (np.max(np.abs(run(dt0=h, **fixed) - exact)) for h in (0.02, 0.01))
-    assert 1e-7 < coarse < 1e-3
-    assert 7.0 < coarse / fine < 9.0
-    np.testing.assert_allclose(run(solver=Kutta(), rtol=1e-8), exact, rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -327,28 +286,9 @@ def test_a_multistep_solver():
 
 
 @pytest.mark.slow
-def test_derivatives_with_a_multistep_solver():
-    """Forward mode = reverse mode, and both = differences of a tighter solution, on a pendulum that is constrained."""
-    pendulum = mechanisms.get("pendulum")
-
-    def end(weight, rtol):
-        system = mb.with_parameters(pendulum.system, {"gravity.acceleration": jnp.stack([0.0 * weight, -weight])})
-        y = mb.simulate(system, pendulum.state, t1=0.5, solver=TwoStep(), rtol=rtol, max_steps=2**14).ys
-        return jnp.concatenate([y.q[-1], y.u[-1]])
-
-    forward, reverse, value = jax.jit(jax.jacfwd(end)), jax.jit(jax.jacrev(end)), jax.jit(end)
-    slope, h = forward(G, 1e-6), 0.05
-    scale = np.max(np.abs(slope))
-    np.testing.assert_allclose(reverse(G, 1e-6), slope, rtol=0, atol=1e-11 * scale)
-    central = (value(G + h, 1e-8) - value(G - h, 1e-8)) / (2 * h)
-    np.testing.assert_allclose(slope, central, rtol=0, atol=1e-4 * scale)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["four_bar", "parallelogram"])
-def test_a_formulation(name):
-    """The same accelerations, constraint forces and motion as by multipliers; the parallelogram has a redundant row."""
-    mechanism = mechanisms.get(name)
+def test_a_formulation():
+    """The same accelerations, constraint forces and motion as by multipliers, of a machine with a redundant row."""
+    mechanism = mechanisms.get("parallelogram")
     system, state = mechanism.system, mechanism.state
     both = [accelerations(system, own, 0.0, state.q, state.u) for own in (LeastConstraint(), Multipliers())]
     for udot, multipliers in both:

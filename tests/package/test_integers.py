@@ -1,6 +1,7 @@
 """Integers of NumPy wherever a number is counted: they do what Python's do."""
 
-import jax.numpy as jnp
+import re
+
 import numpy as np
 import pytest
 
@@ -12,9 +13,8 @@ from jaxmb.solvers import Adams, Hermite
 from jaxmb.studies.sweep.cases import table
 
 
-@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8])
-def test_counts_of_studies(kind):
-    members = jnp.arange(6.0)
+def test_counts_of_studies(kind=np.uint8):
+    members = np.arange(6.0)
     np.testing.assert_array_equal(mb.batch(lambda x: x**2, size=kind(4))(members), members**2)
     found = mb.sweep(lambda a: {"b": 2 * a}, table(a=np.arange(3.0)), chunk=kind(2), processes=kind(1), progress=False)
     np.testing.assert_array_equal(found["b"], [0.0, 2.0, 4.0])
@@ -22,8 +22,7 @@ def test_counts_of_studies(kind):
     assert best.success
 
 
-@pytest.mark.parametrize("kind", [np.int64, np.uint8])
-def test_counts_of_methods_and_mechanisms(kind):
+def test_counts_of_methods_and_mechanisms(kind=np.int64):
     solver = Adams(min_order=kind(1), max_order=kind(5))
     assert solver == Adams(min_order=1, max_order=5) and type(solver.max_order) is int
     assert Hermite(past_points=(kind(1), kind(2))) == Hermite(past_points=(1, 2))
@@ -36,10 +35,7 @@ def test_half_an_order_is_named():
         Adams(max_order=2.5)
 
 
-@pytest.mark.parametrize("value", [True, 2.0, "2", None, np.float64(2.0), 0, -1])
-def test_what_is_no_count_is_named(value):
-    with pytest.raises(
-        ValueError,
-        match=f"number must be an integer of at least 1, got {value!r}".replace("(", r"\(").replace(")", r"\)"),
-    ):
-        whole_number("number", value)
+def test_what_is_no_count_is_named():
+    for value in (True, 2.0, "2", None, np.float64(2.0), 0, -1):
+        with pytest.raises(ValueError, match=re.escape(f"number must be an integer of at least 1, got {value!r}")):
+            whole_number("number", value)

@@ -36,11 +36,6 @@ def run(**how):
 """
 WAYS = {
     "processes": "run(processes=2)",
-    "pool": """
-import concurrent.futures, multiprocessing
-with concurrent.futures.ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-    run(executor=pool)
-""",
     "dask": """
 from distributed import Client, LocalCluster
 with LocalCluster(n_workers=1, processes=True, dashboard_address=None) as cluster, Client(cluster) as client:

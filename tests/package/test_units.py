@@ -39,17 +39,14 @@ def swing(metre, kilogram, second, solver):
     return sol["lower"].position[-1] / metre, int(sol.stats["num_steps"]), sol.constraint_violation.position[-1]
 
 
-@pytest.mark.parametrize(
-    "solver", ["Adams", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Dopri8", "Hermite"))]
-)
+@pytest.mark.parametrize("solver", ["Adams", "Hermite"])
 def test_a_machine_in_other_units(solver):
     place, steps, _ = swing(1.0, 1.0, 1.0, solver)
-    # In millimetres, grams and milliseconds; in micrometres, nanograms and microseconds.
-    for units in ((1e3, 1e3, 1e3), (1e6, 1e12, 1e6)):
-        other, count, violation = swing(*units, solver)
-        assert abs(count - steps) <= 0.02 * steps
-        np.testing.assert_allclose(other, place, rtol=1e-6)
-        assert violation < 1e-9
+    # In micrometres, nanograms and microseconds.
+    other, count, violation = swing(1e6, 1e12, 1e6, solver)
+    assert abs(count - steps) <= 0.02 * steps
+    np.testing.assert_allclose(other, place, rtol=1e-6)
+    assert violation < 1e-9
 
 
 @pytest.mark.parametrize("solver", ["Adams", "Dopri8"])

@@ -10,12 +10,7 @@ import pytest
 pytestmark = pytest.mark.slow
 
 TESTS = Path(__file__).parents[1]
-MODULES = [
-    "parts/planar/test_planar_parts.py",
-    "simulate/test_simulate.py",
-    "solvers/test_adams_accuracy.py",
-    "solvers/test_manifold_term.py",
-]
+MODULES = ["simulate/test_simulate.py", "solvers/test_manifold_term.py"]
 
 
 @pytest.mark.parametrize("module", MODULES)

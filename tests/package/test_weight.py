@@ -3,6 +3,7 @@ have. A new feature is an object that is chosen once, and not a condition in twe
 """
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -20,10 +21,15 @@ MOST_CONDITIONS = 145
 MOST_MEMBERS = 52
 
 
+@functools.cache
+def parsed(path):
+    return ast.parse(path.read_text())
+
+
 def trees(*folders):
     for folder in folders:
         for path in sorted((ROOT / folder).rglob("*.py")):
-            yield path.relative_to(ROOT), ast.parse(path.read_text())
+            yield path.relative_to(ROOT), parsed(path)
 
 
 def statements(function):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from identifying import free_parameters, pendulum
 from scipy.optimize import least_squares, minimize
+from trajectories import motion_of
 
 import jaxmb as mb
 from jaxmb import planar
@@ -16,9 +17,9 @@ from jaxmb.lagrangian import LagrangianSystem
 from jaxmb.studies.identify.covariance import covariance
 from jaxmb.studies.identify.loss import LOSSES
 from jaxmb.studies.identify.unknowns import unknowns
-from jaxmb.studies.minimise import Linearised, levenberg_marquardt
+from jaxmb.studies.minimise import Linearised, _step, levenberg_marquardt
 
-TS = jnp.linspace(0.0, 1.0, 31)[1:]
+TS = np.linspace(0.0, 1.0, 31)[1:]
 TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}
 SIGMA = {"rod.angle": 1e-3}
 # Compiles faster than Adams, where the solver does not matter.
@@ -35,27 +36,27 @@ def motion(system):
     return mb.simulate(system, mb.assemble(system), t1=TS[-1], saveat=TS)
 
 
-@pytest.mark.parametrize(
-    "free, given, assembled",
-    [
-        (("rod.mass", "spring.stiffness"), {}, True),
-        (("rod.mass",), {"fix": {"rod.angle": 0.3}, "rates": {"rod.angle": 1.0}}, True),
-        (("rod.mass",), {"fix": {"pin.angle": 0.3}}, False),
-        (("rod.mass",), {"free_initial": ["rod.angle"]}, False),
-        (("rod.mass", "pin.point_b"), {}, False),
-    ],
-)
-def test_an_initial_state_that_no_unknown_moves_is_assembled_once(system, free, given, assembled):
-    experiment = mb.Experiment(ts=[1.0], residual=lambda trajectory: trajectory.ts, **given)
-    found = unknowns(system, {"": experiment}, {}, free, None, None, None, LOSSES["linear"])
-    (trial,) = found.trials
-    assert trial.assembled == assembled
-    theta = {name: 1.1 * mb.parameters(system)[name] for name in free} | {"initial.rod.angle": jnp.asarray(0.2)}
-    changed, state = trial.start(system, theta)
-    fix = given.get("fix", {}) | ({"rod.angle": 0.2} if "free_initial" in given else {})
-    exact = mb.assemble(changed, fix=fix, rates=given.get("rates"))
-    np.testing.assert_allclose(state.q, exact.q, atol=1e-12)
-    np.testing.assert_allclose(state.u, exact.u, atol=1e-12)
+def test_an_initial_state_that_no_unknown_moves_is_assembled_once(system):
+    held = {"fix": {"rod.angle": 0.3}, "rates": {"rod.angle": 1.0}}
+    for free, given, is_assembled, is_compared in (
+        (("rod.mass", "spring.stiffness"), {}, True, False),
+        (("rod.mass",), held, True, True),
+        (("rod.mass",), {"fix": {"pin.angle": 0.3}}, False, False),
+        (("rod.mass",), {"free_initial": ["rod.angle"]}, False, True),
+        (("rod.mass", "pin.point_b"), {}, False, False),
+    ):
+        experiment = mb.Experiment(ts=[1.0], residual=lambda trajectory: trajectory.ts, **given)
+        found = unknowns(system, {"": experiment}, {}, free, None, None, None, LOSSES["linear"])
+        (trial,) = found.trials
+        assert trial.assembled == is_assembled
+        if not is_compared:
+            continue
+        theta = {"rod.mass": jnp.asarray(2.2), "initial.rod.angle": jnp.asarray(0.2)}
+        changed, state = trial.start(system, theta)
+        fix = given.get("fix", {}) | ({"rod.angle": 0.2} if "free_initial" in given else {})
+        exact = mb.assemble(changed, fix=fix, rates=given.get("rates"))
+        np.testing.assert_allclose(state.q, exact.q, atol=1e-12)
+        np.testing.assert_allclose(state.u, exact.u, atol=1e-12)
 
 
 def noisy(motion, seed):
@@ -66,55 +67,41 @@ def noisy(motion, seed):
 
 
 @pytest.mark.slow
-def test_recovers_parameters_with_honest_deviations(system, motion):
-    """Over many draws of the noise, errors divided by their standard deviations have unit size."""
-    scores = []
-    for seed in range(16):
-        start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
-        fit = mb.identify(system, noisy(motion, seed), ts=TS, free=start, sigma=SIGMA)
-        assert fit.converged and not fit.undetermined
-        scores += [(fit.parameters[name] - true) / fit.deviations[name] for name, true in TRUE.items()]
-    assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.4
+def test_result(system, motion, tmp_path):
+    """The result carries the fitted system, its state, and a table; NaN samples are left out.
 
-
-@pytest.mark.slow
-def test_result(system, motion):
-    """The result carries the fitted system, its state, and a table; NaN samples are left out."""
-    measured = noisy(motion, 0)
-    start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
-    fit = mb.identify(system, measured, ts=TS, free=start, sigma=SIGMA)
-    assert fit.residuals.size == TS.size - 2
-    assert 0.5 < fit.rms < 1.5
+    Without sigma the noise is estimated. Mass, inertia, stiffness and damping scaled together leave the motion as it
+    is. Few iterations do not end at the minimum.
+    """
+    measured, start = noisy(motion, 0), {"spring.stiffness": 10.0, "spring.damping": 0.1}
+    common = {"ts": TS, "solver": TSIT5}
+    fit = mb.identify(system, measured, free=start, sigma=SIGMA, **common)
+    for name, true in TRUE.items():
+        assert abs(fit.parameters[name] - true) < 4 * fit.deviations[name]
+    assert fit.converged and fit.residuals.size == TS.size - 2 and 0.5 < fit.rms < 1.5
     again = mb.simulate(fit.system, fit.state, t1=TS[-1], saveat=TS)["rod"].angle
     residuals = (np.asarray(again) - measured["rod.angle"]) / SIGMA["rod.angle"]
     np.testing.assert_allclose(residuals[np.isfinite(residuals)], fit.residuals, rtol=0, atol=1e-4)
     np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), np.concatenate([[v] for v in fit.deviations.values()]))
     assert "spring.stiffness" in str(fit) and "converged" in str(fit) and str(fit) in fit._repr_html_()
     assert repr([fit]).startswith("[Identification of spring.stiffness, spring.damping: converged")
+    assert str(fit.predict("rod.angle")) == f"Prediction: rod.angle ({TS.size},), with bands of 95%"
 
-
-@pytest.mark.slow
-def test_without_sigma_the_noise_is_estimated(system, motion):
-    start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
-    known = mb.identify(system, noisy(motion, 1), ts=TS, free=start, sigma=SIGMA)
-    estimated = mb.identify(system, noisy(motion, 1), ts=TS, free=start)
+    estimated = mb.identify(system, measured, free=start, **common)
     for name in TRUE:
-        np.testing.assert_allclose(known.parameters[name], estimated.parameters[name], rtol=1e-5)
-        assert 0.6 < estimated.deviations[name] / known.deviations[name] < 1.5
-    assert f"rms {estimated.rms:.3g} of the range, " in str(estimated) and f"rms {known.rms:.3g}, " in str(known)
-    assert str(known.predict("rod.angle")) == f"Prediction: rod.angle ({TS.size},), with bands of 95%"
+        np.testing.assert_allclose(fit.parameters[name], estimated.parameters[name], rtol=1e-5)
+        assert 0.6 < estimated.deviations[name] / fit.deviations[name] < 1.5
+    assert f"rms {estimated.rms:.3g} of the range, " in str(estimated) and f"rms {fit.rms:.3g}, " in str(fit)
 
-
-@pytest.mark.slow
-def test_names_what_the_data_do_not_determine(system, motion, tmp_path):
-    """Mass, inertia, stiffness and damping scaled together leave the motion as it is."""
     free = ["rod.mass", "rod.inertia", "spring.stiffness", "spring.damping"]
-    fit = mb.identify(system, noisy(motion, 2), ts=TS, free=free, sigma=SIGMA, solver=TSIT5)
-    assert "spring.stiffness" in fit.undetermined and "rod.mass" in fit.undetermined
-    assert np.isinf(fit.deviations["rod.mass"])
-    assert "do not determine" in str(fit)
+    lost = mb.identify(system, measured, free=free, sigma=SIGMA, **common)
+    assert "spring.stiffness" in lost.undetermined and "rod.mass" in lost.undetermined
+    assert np.isinf(lost.deviations["rod.mass"]) and "do not determine" in str(lost)
     # Without warnings of NumPy.
-    assert "Correlations" in fit.report(tmp_path).read_text()
+    assert "Correlations" in lost.report(tmp_path).read_text()
+
+    few = mb.identify(system, measured, free=start, sigma=SIGMA, max_iterations=2, **common)
+    assert not few.converged and "did not converge" in str(few)
 
 
 @pytest.mark.slow
@@ -130,23 +117,11 @@ def test_lengths_with_the_state_assembled_anew(system):
     assert fit.components == ("pin.point_b[0]", "pin.point_b[1]")
 
 
-@pytest.mark.slow
-def test_numbers_of_starts_are_integers_of_python_or_numpy(system, motion):
-    data = {"ts": TS, "free": ["spring.stiffness"], "solver": TSIT5}
-    fit = mb.identify(system, noisy(motion, 2), **data, starts=np.int64(2), max_iterations=np.int32(20))
-    assert fit.converged
-    for name, value in (
-        *(("starts", value) for value in (0, 2.0, True, "two")),
-        *(("segments", value) for value in (0, 2.0, "x")),
-        *(("max_iterations", value) for value in (0, 5.5, "x")),
-    ):
-        with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1.*, got {value!r}"):
-            mb.identify(system, noisy(motion, 2), **data, **{name: value})
-
-
-def test_everything_listed_can_be_measured(system, motion):
+def test_everything_listed_can_be_measured(system):
+    along = lambda x: np.tile(np.asarray(x), (TS.size, 1))
+    still = motion_of(system, TS, along(system.guess.q), along(system.guess.u))
     for name, own in system.quantities().items():
-        assert eqx.filter_eval_shape(mb.Trajectory.quantity, motion, name).shape == (TS.size, *own.shape)
+        assert eqx.filter_eval_shape(mb.Trajectory.quantity, still, name).shape == (TS.size, *own.shape)
 
 
 @pytest.fixture(scope="module")
@@ -172,9 +147,9 @@ def test_lagrangian_system(swing):
         assert motion.quantity(name).shape == (TS.size, *own.shape)
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
+def test_what_identify_refuses_of_a_lagrangian_system(swing):
+    right = {"measured": {"theta": np.zeros(30)}, "ts": TS, "free": ["length"]}
+    for change, message in (
         ({"free": ["lenght"]}, "did you mean 'length'"),
         ({"measured": {"thet": np.zeros(30)}}, "did you mean 'theta'"),
         ({"measured": {"theta": np.zeros((30, 1))}}, "must have shape"),
@@ -182,11 +157,9 @@ def test_lagrangian_system(swing):
         ({"fix": {"thet": 0.1}}, "Unknown coordinate 'thet'; did you mean 'theta'"),
         ({"rates": {"thet": 0.1}}, "Unknown rate 'thet'; did you mean 'theta'"),
         ({"sigma": {"omega": 1.0}}, "Unknown quantity 'omega'"),
-    ],
-)
-def test_messages_of_a_lagrangian_system(swing, change, message):
-    with pytest.raises(ValueError, match=message):
-        mb.identify(swing, **({"measured": {"theta": np.zeros(30)}, "ts": TS, "free": ["length"]} | change))
+    ):
+        with pytest.raises(ValueError, match=message):
+            mb.identify(swing, **(right | change))
 
 
 def test_names_of_a_lagrangian_system_mean_nothing():
@@ -234,119 +207,109 @@ def test_no_effect(system):
         mb.identify(system, ts=TS, free=["rod.mass"], residual=lambda trajectory: trajectory.ts, solver=TSIT5)
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"free": ["rod.mas"]}, "did you mean 'rod.mass'"),
-        ({"free": []}, "Nothing is free"),
-        ({"free": {"rod.mass": [1.0, 2.0]}}, "has shape"),
-        ({"free": {"rod.mass": -1.0}}, "strictly between"),
-        ({"bounds": {"rod.inertia": (0.0, 1.0)}}, "free parameter with bounds"),
-        ({"bounds": {"rod.mass": (3.0, 1.0)}}, r"bounds of 'rod.mass' must be \(low, high\) with low < high"),
-        ({"sensors": [mb.Sensor("rod.angle", name="encoder")]}, "data of sensor 'encoder' are missing.* 'rod.angle'"),
-        ({"sensors": [mb.Sensor("rod.angle", sigma=1.0)], "sigma": SIGMA}, "sigma of 'rod.angle' is given twice"),
-        ({"measured": {"rod.angl": np.zeros(30)}}, "did you mean 'rod.angle'"),
-        ({"measured": {"rod.angle": np.zeros(29)}}, "must have shape"),
-        ({"measured": {}}, "at least one quantity"),
-        ({"measured": None}, "either measured quantities"),
-        ({"sigma": {"rod.position": 1.0}}, "'rod.position', which is not measured"),
-        ({"sigma": {"rod.angle": 0.0}}, "must be positive"),
-        ({"ts": TS[::-1]}, "increasing"),
-        ({"ts": {"rod.angle": TS[::-1]}}, r"ts\['rod.angle'\] must be a vector of increasing times"),
-        ({"ts": {"rod.angl": TS}}, "did you mean 'rod.angle'"),
-        ({"ts": {}}, "not for 'rod.angle'"),
-        ({"ts": {"rod.angle": TS[1:]}}, r"must have shape \(29,\) for 29 times"),
-        ({"measured": mb.Measurements(np.asarray(TS), {"rod.angle": np.zeros(30)})}, "have their own times"),
-        ({"measured": None, "ts": {"a": TS}, "residual": lambda motion: motion.ts}, "needs one vector ts"),
-        ({"loss": "cauchy"}, "must be one of 'linear', 'soft_l1', 'huber'"),
-        ({"loss": "huber"}, "give sigma, as numbers"),
-        ({"loss": "huber", "free": ["rod.mass", "rod.angle.sigma"]}, "give sigma, as numbers"),
-        ({"t0": 0.5}, "after t0"),
-        (
-            {"measured": "run.csv"},
-            "measured is given by name.*jaxmb.read_measurements reads files and tables; got an object of type str",
-        ),
-        ({"bounds": {"rod.mass": 3.0}}, r"bounds of 'rod.mass' must be a pair \(low, high\)"),
-        ({"saveat": TS}, "identify sets 'saveat'"),
-        ({"sigma": 0.01}, "sigma is given by name"),
-        ({"bounds": [(0.0, 1.0)]}, "bounds is given by name"),
-        ({"measured": np.zeros(30)}, "measured is given by name"),
-    ],
-)
-def test_messages(system, change, message):
-    arguments = {"measured": {"rod.angle": np.zeros(30)}, "ts": TS, "free": ["rod.mass"]} | change
-    with pytest.raises(ValueError, match=message):
-        mb.identify(system, **arguments)
+REFUSED = [
+    ({"free": ["rod.mas"]}, "did you mean 'rod.mass'"),
+    ({"free": []}, "Nothing is free"),
+    ({"free": {"rod.mass": [1.0, 2.0]}}, "has shape"),
+    ({"free": {"rod.mass": -1.0}}, "strictly between"),
+    ({"bounds": {"rod.inertia": (0.0, 1.0)}}, "free parameter with bounds"),
+    ({"bounds": {"rod.mass": (3.0, 1.0)}}, r"bounds of 'rod.mass' must be \(low, high\) with low < high"),
+    ({"sensors": [mb.Sensor("rod.angle", name="encoder")]}, "data of sensor 'encoder' are missing.* 'rod.angle'"),
+    ({"sensors": [mb.Sensor("rod.angle", sigma=1.0)], "sigma": SIGMA}, "sigma of 'rod.angle' is given twice"),
+    ({"measured": {"rod.angl": np.zeros(30)}}, "did you mean 'rod.angle'"),
+    ({"measured": {"rod.angle": np.zeros(29)}}, "must have shape"),
+    ({"measured": {}}, "at least one quantity"),
+    ({"measured": None}, "either measured quantities"),
+    ({"sigma": {"rod.position": 1.0}}, "'rod.position', which is not measured"),
+    ({"sigma": {"rod.angle": 0.0}}, "must be positive"),
+    ({"ts": TS[::-1]}, "increasing"),
+    ({"ts": {"rod.angle": TS[::-1]}}, r"ts\['rod.angle'\] must be a vector of increasing times"),
+    ({"ts": {"rod.angl": TS}}, "did you mean 'rod.angle'"),
+    ({"ts": {}}, "not for 'rod.angle'"),
+    ({"ts": {"rod.angle": TS[1:]}}, r"must have shape \(29,\) for 29 times"),
+    ({"measured": mb.Measurements(np.asarray(TS), {"rod.angle": np.zeros(30)})}, "have their own times"),
+    ({"measured": None, "ts": {"a": TS}, "residual": lambda motion: motion.ts}, "needs one vector ts"),
+    ({"loss": "cauchy"}, "must be one of 'linear', 'soft_l1', 'huber'"),
+    ({"loss": "huber"}, "give sigma, as numbers"),
+    ({"loss": "huber", "free": ["rod.mass", "rod.angle.sigma"]}, "give sigma, as numbers"),
+    ({"t0": 0.5}, "after t0"),
+    (
+        {"measured": "run.csv"},
+        "measured is given by name.*jaxmb.read_measurements reads files and tables; got an object of type str",
+    ),
+    ({"bounds": {"rod.mass": 3.0}}, r"bounds of 'rod.mass' must be a pair \(low, high\)"),
+    ({"saveat": TS}, "identify sets 'saveat'"),
+    ({"sigma": 0.01}, "sigma is given by name"),
+    ({"bounds": [(0.0, 1.0)]}, "bounds is given by name"),
+    ({"measured": np.zeros(30)}, "measured is given by name"),
+    *(
+        ({"starts": value}, f"starts must be an integer of at least 1.*, got {value!r}")
+        for value in (0, 2.0, True, "two")
+    ),
+    *(({"segments": value}, f"segments must be an integer of at least 1.*, got {value!r}") for value in (0, 2.0, "x")),
+    ({"max_iterations": 5.5}, r"max_iterations must be an integer of at least 1.*, got 5\.5"),
+    ({"method": "lm"}, "no argument 'method' any more: it is Levenberg–Marquardt"),
+]
 
 
-def test_the_argument_of_the_last_release(system):
-    with pytest.raises(TypeError, match="no argument 'method' any more: it is Levenberg–Marquardt"):
-        mb.identify(system, {"rod.angle": np.zeros(30)}, ts=TS, free=["rod.mass"], method="lm")
+def test_what_identify_refuses(system):
+    for change, message in REFUSED:
+        arguments = {"measured": {"rod.angle": np.zeros(30)}, "ts": TS, "free": ["rod.mass"]} | change
+        with pytest.raises((ValueError, TypeError), match=message):
+            mb.identify(system, **arguments)
 
 
 def test_free_parameters_start_where_they_should(system):
     """Zero is the start; masses stay positive and bounded values within their bounds whatever the vector."""
     free = free_parameters(system, ["rod.mass", "spring.stiffness", "pin.point_b"], {"spring.stiffness": (5.0, 9.0)})
-    for name, value in free(jnp.zeros(free.size)).items():
-        np.testing.assert_allclose(value, mb.parameters(system)[name], rtol=1e-12)
-    for z in np.random.default_rng(0).normal(scale=5.0, size=(20, free.size)):
-        values = free(jnp.asarray(z))
-        assert values["rod.mass"] > 0 and 5.0 <= values["spring.stiffness"] <= 9.0
+    random = np.random.default_rng(0).normal(scale=5.0, size=(20, free.size))
+    values = jax.jit(jax.vmap(free))(np.vstack([np.zeros(free.size), random]))
+    for name in ("rod.mass", "spring.stiffness", "pin.point_b"):
+        np.testing.assert_allclose(values[name][0], mb.parameters(system)[name], rtol=1e-12)
+    assert np.all(values["rod.mass"] > 0)
+    assert np.all((values["spring.stiffness"] >= 5.0) & (values["spring.stiffness"] <= 9.0))
 
 
-@pytest.mark.slow
-def test_inertia_matrices_stay_positive_definite():
-    from jaxmb import spatial
-
-    inertia = np.array([[2.0, 0.1, 0.0], [0.1, 1.5, 0.2], [0.0, 0.2, 1.0]])
-    system = mb.Scene([spatial.Body("top", mass=1.0, inertia=inertia)]).compile()
-    free = free_parameters(system, ["top.inertia"])
-    assert free.size == 6
-    np.testing.assert_allclose(free(jnp.zeros(6))["top.inertia"], inertia, rtol=1e-12)
-    for z in np.random.default_rng(0).normal(size=(10, 6)):
-        value = free(jnp.asarray(z))["top.inertia"]
-        np.testing.assert_allclose(value, value.T)
-        assert np.all(np.linalg.eigvalsh(value) > 0)
-    assert np.linalg.matrix_rank(jax.jacfwd(free.flat)(jnp.zeros(6))) == 6
+def slopes(residuals, z):
+    """The Jacobian of residuals, by steps along the imaginary axis."""
+    step = 1e-30
+    columns = [residuals(z + 1j * step * e).imag / step for e in np.eye(z.size)]
+    return np.stack(columns, axis=1)
 
 
-@pytest.mark.slow
 def test_failed_trials_are_rejected():
     """A square root near its branch point, on whose far side the iteration tries to land."""
     trials = []
+    residuals = lambda z: np.stack([np.sqrt(z[0]) - 0.1, 10 * (z[1] - z[0] ** 2)])
 
-    def residuals(z):
-        jax.debug.callback(lambda x: trials.append(float(x)), z[0])
-        there = z[0] > 0
-        root = jnp.sqrt(jnp.where(there, z[0], 1.0))
-        return jnp.where(there, jnp.stack([root - 0.1, 10 * (z[1] - z[0] ** 2)]), jnp.inf)
+    def linearised(z):
+        z = np.asarray(z)
+        trials.append(z[0])
+        return (residuals(z), slopes(residuals, z)) if z[0] > 0 else (np.full(2, np.inf), np.full((2, 2), np.nan))
 
-    linearised = lambda z: (residuals(z), jax.jacfwd(residuals)(z))
     solution = levenberg_marquardt(linearised, jnp.array([3.0, 1.0]), tol=1e-10, limit=100)
-    jax.effects_barrier()
-    assert min(trials) < 0
-    assert solution.success
+    assert min(trials) < 0 and solution.success
     np.testing.assert_allclose(solution.z, [1e-2, 1e-4], rtol=1e-8)
 
 
 @pytest.mark.parametrize(
     "residuals, start",
     [
-        (lambda z: jnp.stack([10 * (z[1] - z[0] ** 2), 1 - z[0]]), [-1.2, 1.0]),
-        (lambda z: jnp.stack([z[0] - 1e6, z[1] - 2e-6, z[0] * z[1] - 2]), [1.0, 1.0]),
-        (lambda z: 3 * jnp.exp(-2 * TS) + 0.01 * jnp.sin(40 * TS) - z[0] * jnp.exp(-z[1] * TS), [1.0, 0.0]),
-        (lambda z: jnp.stack([z[0] * z[1] - 2, (z[0] * z[1]) ** 2 - 3.9]), [1.0, 1.0]),
+        (lambda z: np.stack([10 * (z[1] - z[0] ** 2), 1 - z[0]]), [-1.2, 1.0]),
+        (lambda z: np.stack([z[0] - 1e6, z[1] - 2e-6, z[0] * z[1] - 2]), [1.0, 1.0]),
+        (lambda z: 3 * np.exp(-2 * TS) + 0.01 * np.sin(40 * TS) - z[0] * np.exp(-z[1] * TS), [1.0, 0.0]),
+        (lambda z: np.stack([z[0] * z[1] - 2, (z[0] * z[1]) ** 2 - 3.9]), [1.0, 1.0]),
     ],
     ids=["curved valley", "badly scaled", "with noise", "undetermined"],
 )
 def test_least_squares_agree_with_scipy(residuals, start):
     """On the value of the objective; the minimum need not be unique."""
-    residuals = jax.jit(residuals)
-    linearised = lambda z: (residuals(z), jax.jacfwd(residuals)(z))
+    jacobian = lambda z: slopes(residuals, z)
+    linearised = lambda z: (residuals(np.asarray(z)), jacobian(np.asarray(z)))
     found = levenberg_marquardt(linearised, jnp.array(start), tol=1e-10, limit=100)
-    known = least_squares(residuals, start, jax.jacfwd(residuals), xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale="jac")
+    known = least_squares(residuals, start, jacobian, xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale="jac")
     assert found.success and found.iterations < 50
-    np.testing.assert_allclose(0.5 * np.sum(residuals(found.z) ** 2), known.cost, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(0.5 * np.sum(residuals(np.asarray(found.z)) ** 2), known.cost, rtol=1e-8, atol=1e-10)
 
 
 def test_residuals_under_equations_agree_with_scipy():
@@ -364,6 +327,13 @@ def test_residuals_under_equations_agree_with_scipy():
         assert found.success and found.iterations < 40
         np.testing.assert_allclose(gaps(np.asarray(found.z)), 0, atol=1e-9)
         np.testing.assert_allclose(found.value, known.fun, rtol=1e-8)
+    # A step closes the gaps, and along these it goes to the minimum of the damped squares.
+    model, damping = linearised(np.array([0.5, 0.5, 1.0])), 0.1
+    step, _ = _step(model, damping)
+    np.testing.assert_allclose(model.closing @ step, -model.gaps, atol=1e-14)
+    weights = damping * np.sum(model.jacobian**2, axis=0)
+    gradient = model.jacobian.T @ (model.residuals + model.jacobian @ step) + weights * step
+    np.testing.assert_allclose(np.cross(*model.closing) @ gradient, 0.0, atol=1e-13)
 
 
 DECAY = np.linspace(0.02, 1.0, 50)
@@ -394,12 +364,11 @@ def test_errors_of_the_motions_cost_few_iterations(errors, more):
         assert np.all(np.abs(found.z - known.z) <= 0.01 * deviations)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["soft_l1", "huber"])
 def test_robust_losses_agree_with_scipy(name):
     """On estimates and objective; errors divided by their standard deviations have unit size, with outliers as well."""
     loss, random, scores = LOSSES[name], np.random.default_rng(0), []
-    for _ in range(40):
+    for draw in range(40 if name == "soft_l1" else 4):
         noise = 0.05 * random.standard_normal(DECAY.size)
         noise[random.integers(DECAY.size, size=5)] *= 30
         measured = decays([3.0, 2.0])[0] + noise
@@ -411,29 +380,23 @@ def test_robust_losses_agree_with_scipy(name):
             return Linearised(*loss.weighted(r, jacobian(z)), 0.5 * float(np.sum(loss.rho(r**2))))
 
         found = levenberg_marquardt(linearised, jnp.array([1.0, 0.5]), tol=1e-10, limit=100)
-        known = least_squares(residuals, [1.0, 0.5], jacobian, loss=name, xtol=1e-14, ftol=1e-14, gtol=1e-14)
         assert found.success
-        np.testing.assert_allclose(found.value, known.cost, rtol=1e-10)
-        np.testing.assert_allclose(found.z, known.x, rtol=1e-6)
+        if draw < 4:
+            known = least_squares(residuals, [1.0, 0.5], jacobian, loss=name, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+            np.testing.assert_allclose(found.value, known.cost, rtol=1e-10)
+            np.testing.assert_allclose(found.z, known.x, rtol=1e-6)
         pull, slope = loss.influence(residuals(found.z))
         own = covariance(jacobian(found.z), np.eye(2), float(np.sum(pull**2)), DECAY.size, float(np.mean(slope)))
-        scores.append((found.z - np.array([3.0, 2.0])) / np.sqrt(np.diag(own.matrix)))
-    assert np.all(np.abs(np.std(scores, axis=0) - 1) < 0.25)
+        scores.append((np.asarray(found.z) - np.array([3.0, 2.0])) / np.sqrt(np.diag(own.matrix)))
+    assert name != "soft_l1" or np.all(np.abs(np.std(scores, axis=0) - 1) < 0.25)
 
 
-@pytest.mark.slow("huber")
-@pytest.mark.parametrize("name", ["soft_l1", "huber"])
-def test_derivatives_of_losses(name):
-    loss, squares, h = LOSSES[name], np.array([0.0, 1e-12, 0.5, 1.5, 40.0]), 1e-6
-    gradient = jax.vmap(jax.grad(loss.rho))(jnp.asarray(squares))
-    np.testing.assert_allclose(gradient, loss.slope(squares), rtol=1e-12)
-    np.testing.assert_allclose(jax.vmap(jax.jacfwd(loss.rho))(jnp.asarray(squares)), gradient, rtol=1e-12)
-    differences = (loss.slope(squares + h) - loss.slope(np.abs(squares - h))) / (2 * h)
-    np.testing.assert_allclose(differences[2:], loss.curvature(squares)[2:], rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_iterations_are_limited(system, motion):
-    start = {"spring.stiffness": 10.0, "spring.damping": 0.1}
-    fit = mb.identify(system, noisy(motion, 0), ts=TS, free=start, sigma=SIGMA, solver=TSIT5, max_iterations=2)
-    assert not fit.converged and "did not converge" in str(fit)
+def test_derivatives_of_losses():
+    squares, h = np.array([0.0, 1e-12, 0.5, 1.5, 40.0]), 1e-6
+    for loss in LOSSES.values():
+        slope = np.broadcast_to(loss.slope(squares), squares.shape)
+        of_both = lambda x, loss=loss: (jax.grad(loss.rho)(x), jax.jacfwd(loss.rho)(x))
+        for found in jax.jit(jax.vmap(of_both))(squares):
+            np.testing.assert_allclose(found, slope, rtol=1e-12)
+        differences = (loss.slope(squares + h) - loss.slope(np.abs(squares - h))) / (2 * h)
+        np.testing.assert_allclose(differences[2:], loss.curvature(squares)[2:], rtol=1e-6, atol=1e-9)

@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,8 @@ import scipy.integrate
 from scipy.special import ellipk, mathieu_a, mathieu_b
 
 import jaxmb as mb
-from jaxmb import lagrangian, planar
+from jaxmb import lagrangian, planar, spatial
+from jaxmb.studies.linear.floquet import Floquet, _return
 
 G = 9.81
 
@@ -68,38 +70,6 @@ def test_the_tongues_of_mathieu():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(trace))(borders[0]), slope, rtol=1e-5)
 
 
-@functools.cache
-def shaken():
-    """A rod that hangs from a block, which a driver shakes up and down."""
-    block = planar.Body("block", mass=1.0, inertia=1.0)
-    rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.0, -0.5), angle=-np.pi / 2)
-    joints = [
-        planar.Prismatic("guide", "ground", "block", point=(0.0, 0.0), axis=(0.0, 1.0)),
-        planar.Revolute("pin", "block", "rod", point=(0.0, 0.0)),
-        planar.Driver(
-            "shaker",
-            "ground",
-            "block",
-            quantity="y",
-            motion=lambda t, p: p["stroke"] * (jnp.cos(7.0 * t) - 1.0),
-            parameters={"stroke": 0.02},
-        ),
-    ]
-    return mb.Scene([block, rod], joints=joints, forces=[mb.Gravity((0.0, -G))]).compile()
-
-
-@pytest.mark.slow
-def test_a_shaken_rod_on_hinges():
-    system = shaken()
-    found = mb.floquet(system, mb.assemble(system), 2 * np.pi / 7.0, coordinates=["rod.angle"])
-    # 1/3 θ̈ + ½ (g + ÿ) θ = 0 with y = stroke (cos 7 t − 1); in 7 t the equation of Mathieu.
-    delta, epsilon = 1.5 * G / 49.0, -1.5 * 0.02
-    scale = np.diag([1.0, 7.0])
-    expected = scale @ monodromy(delta, epsilon) @ np.linalg.inv(scale)
-    assert found.states == ("rod.angle", "rod.angle_rate")
-    np.testing.assert_allclose(found.monodromy, expected, atol=1e-7)
-
-
 @pytest.mark.slow
 def test_a_swinging_rod_has_two_multipliers_of_one():
     rod = planar.Body("rod", mass=1.0, inertia=1 / 12, position=(0.0, -0.5), angle=-np.pi / 2)
@@ -114,16 +84,38 @@ def test_a_swinging_rod_has_two_multipliers_of_one():
         mb.floquet(system, state, 1.0)
 
 
+def test_floquet_has_multipliers_and_exponents():
+    """Of a hand-made map: the largest first, and their logarithms over the period."""
+    found = Floquet(jnp.diag(jnp.array([0.5, 2.0])), ("a", "b"), 1, jnp.eye(2), jnp.asarray(3.0))
+    multipliers, exponents = eqx.filter_jit(lambda found: (found.multipliers, found.exponents))(found)
+    np.testing.assert_allclose(multipliers, [2.0, 0.5], rtol=1e-14)
+    np.testing.assert_allclose(exponents, np.log([2.0, 0.5]) / 3.0, rtol=1e-14)
+
+
+def test_whole_turns_and_the_sign_of_euler_parameters_are_no_distance():
+    top = mb.Scene([spatial.Body("top", mass=1.0, inertia=(1.0, 1.0, 2.0), orientation=(0.6, 0.0, 0.8, 0.0))]).compile()
+    attitude = -np.asarray(top.guess.q[3:]) + np.array([0.0, 0.1, 0.0, 0.0])
+    flipped = np.concatenate([top.guess.q[:3], attitude, top.guess.u])
+    pushed = np.arange(26.0).reshape(13, 2)
+    distance, back = jax.jit(lambda end: _return(top, top.guess, end, jnp.asarray(pushed), np.zeros(0, int)))(flipped)
+    np.testing.assert_allclose(distance, np.eye(13)[4] * -0.1, atol=1e-15)
+    np.testing.assert_allclose(back, pushed * np.where((np.arange(13) > 2) & (np.arange(13) < 7), -1.0, 1.0)[:, None])
+    rod = mb.Scene([planar.Body("rod", mass=1.0, inertia=1.0)]).compile()
+    turned = np.concatenate([np.asarray(rod.guess.q) + np.array([3.0, 0.2, 4 * np.pi + 0.1]), rod.guess.u])
+    distance, _ = jax.jit(lambda end: _return(rod, rod.guess, end, jnp.zeros((6, 1)), np.array([0])))(turned)
+    np.testing.assert_allclose(distance, [0.0, 0.2, 0.1, 0.0, 0.0, 0.0], atol=1e-14)
+
+
 def test_periods_and_names_that_cannot_be():
     system = parametric()
-    state = mb.State(jnp.zeros(1), jnp.zeros(1))
-    for period in (0.0, -1.0, np.inf):
-        with pytest.raises(ValueError, match="period must be positive"):
-            mb.floquet(system, state, period)
-    with pytest.raises(ValueError, match="Unknown coordinate 'thet'; did you mean 'theta'"):
-        mb.floquet(system, state, 1.0, ignorable=["thet"])
-    with pytest.raises(ValueError, match="There are 1 independent coordinates"):
-        mb.floquet(system, state, 1.0, coordinates=["theta", "thet"])
+    for period, options, message in (
+        (0.0, {}, "period must be positive"),
+        (np.inf, {}, "period must be positive"),
+        (1.0, {"ignorable": ["thet"]}, "Unknown coordinate 'thet'; did you mean 'theta'"),
+        (1.0, {"coordinates": ["theta", "thet"]}, "There are 1 independent coordinates"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mb.floquet(system, mb.State(jnp.zeros(1), jnp.zeros(1)), period, **options)
 
 
 @pytest.mark.slow

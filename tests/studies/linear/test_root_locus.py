@@ -33,15 +33,23 @@ def test_modes_keep_their_places_where_they_cross():
     assert np.all(locus.stable())
 
 
+def test_stability_changes_where_the_largest_growth_crosses_zero():
+    """Modes that stay at zero neither grow nor decay."""
+    growth = np.array([-1.0, 3.0, 2.0, -2.0])
+    values = np.stack([growth + 5.0j, growth - 5.0j, -4.0 + 0.0 * growth, 0.0 * growth], axis=1)
+    locus = mb.RootLocus("speed", np.array([1.0, 2.0, 4.0, 5.0]), values, np.zeros((4, 1, 4)), ("a", "b", "c", "d"))
+    np.testing.assert_array_equal(locus.stable(), [True, False, False, True])
+    np.testing.assert_allclose(locus.boundaries(), [1.25, 4.5], rtol=1e-14)
+
+
 def test_what_cannot_be_followed():
     system = two_masses()
-    with pytest.raises(ValueError, match="Unknown parameter 'kk'; did you mean 'k'"):
-        mb.root_locus(system, "kk", [1.0, 2.0], state=mb.assemble)
-    with pytest.raises(ValueError, match="needs the state of each system"):
-        mb.root_locus(system, "k", [1.0, 2.0])
-    with pytest.raises(ValueError, match="shape \\(2,\\)"):
-        mb.root_locus(system, "c", [1.0, 2.0], state=mb.assemble)
-    with pytest.raises(ValueError, match="at least two finite numbers"):
-        mb.root_locus(system, "k", [1.0], state=mb.assemble)
-    with pytest.raises(ValueError, match="a compiled system, or a function"):
-        mb.root_locus(3.0, "k", [1.0, 2.0])
+    for model, name, values, options, message in (
+        (system, "kk", [1.0, 2.0], {"state": mb.assemble}, "Unknown parameter 'kk'; did you mean 'k'"),
+        (system, "k", [1.0, 2.0], {}, "needs the state of each system"),
+        (system, "c", [1.0, 2.0], {"state": mb.assemble}, r"shape \(2,\)"),
+        (system, "k", [1.0], {"state": mb.assemble}, "at least two finite numbers"),
+        (3.0, "k", [1.0, 2.0], {}, "a compiled system, or a function"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mb.root_locus(model, name, values, **options)

@@ -1,5 +1,6 @@
 """The optimiser: methods, constraints and multipliers, trials and starts that fail, several starts, robust designs."""
 
+import functools
 import re
 
 import diffrax
@@ -58,12 +59,12 @@ def test_a_problem_without_solution_names_the_constraint():
     assert re.search(r"most of all ('square' is .*, above 1|'x\[1\]' is .*, below 3)$", best.message)
 
 
-@pytest.mark.parametrize("inertia", [5.0, 31.7, 199.0])
-def test_a_flywheel_is_found_from_every_start(inertia):
+@pytest.mark.slow
+def test_a_flywheel_is_found_from_its_start_and_from_its_end():
     """The multiplier balances the gradient of the start but for rounding errors, which are no slope to follow."""
     wheel = lambda v: {"J": v["J"], "fluctuation": 1.88481475 / v["J"]}
     limits = {"constraints": {"fluctuation": (None, 0.02)}, "bounds": {"J": (0.05, 200.0)}}
-    best = mb.optimise(wheel, {"J": inertia}, objective="J", **limits)
+    best = mb.optimise(wheel, {"J": 199.0}, objective="J", **limits)
     assert best.success and best.trials < 30
     np.testing.assert_allclose(best.objective, 1.88481475 / 0.02, rtol=1e-6)
     again = mb.optimise(wheel, best.parameters, objective="J", **limits)
@@ -114,6 +115,7 @@ def test_a_start_from_which_linearised_constraints_show_no_way(function, start, 
     np.testing.assert_allclose(best.objective, least, rtol=1e-6)
 
 
+@pytest.mark.slow("equations")
 @pytest.mark.parametrize("twice", [2.0, (2.0, None)], ids=["equations", "an inequality"])
 def test_constraints_that_say_the_same_twice(twice):
     line = lambda v: {"f": v["x"] ** 2 + v["y"] ** 2, "a": v["x"] + v["y"], "b": 2 * v["x"] + 2 * v["y"]}
@@ -122,6 +124,7 @@ def test_constraints_that_say_the_same_twice(twice):
     np.testing.assert_allclose(best.objective, 0.5, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_more_equations_than_parameters_that_agree():
     three = lambda v: {"f": v["x"] ** 2, "a": v["x"] + v["y"], "b": v["x"] - v["y"], "c": v["x"] * v["y"]}
     best = mb.optimise(three, {"x": 3.0, "y": 1.0}, objective="f", constraints={"a": 3.0, "b": 1.0, "c": 2.0})
@@ -130,7 +133,8 @@ def test_more_equations_than_parameters_that_agree():
     assert not best.success and "violated" in best.message and "successfully" not in best.message
 
 
-@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+@pytest.mark.slow("1000000000000.0")
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
 def test_a_bound_of_zero_takes_the_size_of_its_output(unit):
     """The tolerance goes with the unit of the output, and the result has it; that of a bound is a millionth of it."""
     area = lambda v: {"sum": v["x"] + v["y"], "area": unit * (v["x"] * v["y"] - 2.0), "x": v["x"]}
@@ -143,12 +147,14 @@ def test_a_bound_of_zero_takes_the_size_of_its_output(unit):
     assert "within" in str(best)
 
 
+@pytest.mark.slow
 def test_a_bound_almost_zero_has_a_tolerance_above_rounding_errors():
     area = lambda v: {"f": v["x"] ** 2 + v["y"] ** 2, "area": v["x"] * v["y"] - 2.0}
     best = mb.optimise(area, {"x": 3.0, "y": 1.0}, objective="f", constraints={"area": 1e-12})
     assert best.success and best.trials < 30 and best.objective == pytest.approx(4.0)
 
 
+@pytest.mark.slow
 def test_the_tolerance_of_a_narrow_range_is_that_of_its_width():
     shifted = lambda v: {"x": v["x"], "far": 1e6 + v["x"]}
     best = mb.optimise(shifted, {"x": 3.0}, objective="x", constraints={"far": (1e6 + 0.5, 1e6 + 1.0)})
@@ -156,6 +162,7 @@ def test_the_tolerance_of_a_narrow_range_is_that_of_its_width():
     assert best.constraints[0].tolerance == pytest.approx(5e-7)
 
 
+@pytest.mark.slow
 def test_a_far_bound_does_not_loosen_the_other():
     area = lambda v: {"sum": v["x"] + v["y"], "area": v["x"] * v["y"]}
     options = {"bounds": {"x": (0.1, 10.0), "y": (0.1, 10.0)}, "objective": "sum"}
@@ -177,6 +184,7 @@ def test_multipliers_of_constraints_that_meet():
     np.testing.assert_allclose(best.constraints[0].multiplier, 1.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_unit_of_the_objective_has_no_effect():
     """Lengths of 1e-5, whose squares are small, in units that are powers of two: the same bits."""
     square = lambda v, unit: unit * jnp.mean((v["x"] - jnp.array([3e-5, -2e-5])) ** 2)
@@ -192,21 +200,15 @@ def steep(x):
     return (x[0] - 3) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2
 
 
-def round_(x):
-    return jnp.sum((x - jnp.array([3.0, -2.0])) ** 2)
-
-
-@pytest.mark.parametrize("varying, start", [(round_, [0.0, 0.0]), (steep, [0.5, 0.5])])
-def test_a_large_constant_part_of_the_objective_hides_nothing(varying, start):
-    best = mb.optimise(lambda v: 1e5 + varying(v["x"]), {"x": start})
-    assert best.success and varying(best.parameters["x"]) < 1e-8 * 1e5
-
-
-def test_a_large_constant_part_where_the_start_is_on_a_bound_and_a_constraint():
-    outputs = lambda v: {"f": 1e5 + round_(v["x"]), "sum": jnp.sum(v["x"])}
+def test_a_large_constant_part_of_the_objective_hides_nothing():
+    """In a valley, and where the start is on a bound and a constraint."""
+    best = mb.optimise(lambda v: 1e5 + steep(v["x"]), {"x": [0.5, 0.5]})
+    assert best.success and steep(best.parameters["x"]) < 1e-8 * 1e5
+    far = lambda x: jnp.sum((x - np.array([3.0, -2.0])) ** 2)
+    outputs = lambda v: {"f": 1e5 + far(v["x"]), "sum": jnp.sum(v["x"])}
     options = {"constraints": {"sum": (0.0, None)}, "bounds": {"x": ([0.0, -np.inf], None)}}
     best = mb.optimise(outputs, {"x": [0.0, 0.0]}, objective="f", **options)
-    assert best.success and round_(best.parameters["x"]) < 1e-8 * 1e5
+    assert best.success and far(best.parameters["x"]) < 1e-8 * 1e5
 
 
 @pytest.mark.slow("optax")
@@ -219,6 +221,7 @@ def test_bounds_by_every_method(method):
     assert best.parameters["x"][0] <= 0.8
 
 
+@pytest.mark.slow
 def test_equations_and_bounds_of_components():
     sides = {"square": 1.0, "x": ([0.0, None], None)}
     with pytest.raises(ValueError, match="The constraint of 'x': low must be an array of real numbers"):
@@ -230,6 +233,13 @@ def test_equations_and_bounds_of_components():
     assert [c.active for c in best.constraints] == [True, False, True]
 
 
+class Plain:
+    size = 2
+
+    def __call__(self, z):
+        return {"x": z}
+
+
 @pytest.mark.slow
 def test_both_modes_of_derivatives_agree():
     forward, reverse = (
@@ -238,13 +248,6 @@ def test_both_modes_of_derivatives_agree():
     )
     for a, b in zip(forward, reverse, strict=True):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-13), a, b)
-
-
-class Plain:
-    size = 2
-
-    def __call__(self, z):
-        return {"x": z}
 
 
 @pytest.mark.slow
@@ -280,6 +283,7 @@ def edge(v):
     return jnp.where(v["x"] < 0.5, (v["x"] - 1.0) ** 2, jnp.nan)
 
 
+@pytest.mark.slow("optax")
 @pytest.mark.parametrize("method", ["slsqp", optax.sgd(0.4)], ids=METHODS)
 def test_trials_that_fail_shorten_the_step(method):
     best = mb.optimise(edge, {"x": -3.0}, method=method, max_iterations=60)
@@ -312,30 +316,32 @@ def test_a_design_that_bounds_forbid_names_them_after_a_few_trials():
 SADDLE = lambda v: v["x"] ** 2 - v["y"] ** 2 + v["y"] ** 4
 
 
+STATIONARY = [
+    # Whether also by optax; the function, its start, and what is said.
+    (True, lambda v: -(v["x"] ** 2), {"x": 0.0}, "a maximum.*decreases where 'x'"),
+    (False, lambda v: v["x"] ** 3, {"x": 0.0}, "not a minimum.*'x' decreases"),
+    (True, SADDLE, {"x": 0.3, "y": 0.0}, "a saddle.*decreases where 'y'"),
+    (False, lambda v: jnp.floor(5 * v["x"]), {"x": 1.3}, "exactly zero.*in steps"),
+    (False, lambda v: 0 * v["x"] + 3.0, {"x": 1.3}, "does not change.*exactly zero"),
+    (
+        False,
+        lambda v: jnp.sum(jnp.arange(1.0, 13.0).at[7].set(-8.0) * v["x"] ** 2),
+        {"x": np.zeros(12)},
+        r"saddle.*'x\[7\]'",
+    ),
+]
+
+
+@pytest.mark.slow("optax")
 @pytest.mark.parametrize("method", ["slsqp", optax.sgd(0.4)], ids=METHODS)
-@pytest.mark.parametrize(
-    "function, start, words",
-    [
-        pytest.param(lambda v: -(v["x"] ** 2), {"x": 0.0}, "a maximum.*decreases where 'x'", id="maximum"),
-        pytest.param(lambda v: 1e5 - v["x"] ** 2, {"x": 0.0}, "a maximum", id="maximum beside a constant"),
-        pytest.param(lambda v: v["x"] ** 3, {"x": 0.0}, "not a minimum.*'x' decreases", id="inflection"),
-        pytest.param(SADDLE, {"x": 0.0, "y": 0.0}, "a saddle.*decreases where 'y'", id="saddle"),
-        pytest.param(SADDLE, {"x": 0.3, "y": 0.0}, "a saddle.*decreases where 'y'", id="saddle from its ridge"),
-        pytest.param(lambda v: jnp.floor(5 * v["x"]), {"x": 1.3}, "exactly zero.*in steps", id="steps"),
-        pytest.param(lambda v: 0 * v["x"] + 3.0, {"x": 1.3}, "does not change.*exactly zero", id="constant"),
-    ],
-)
-def test_a_stationary_point_that_is_no_minimum(method, function, start, words):
-    best = mb.optimise(function, start, method=method, max_iterations=2000)
-    assert not best.success and re.search(words, best.message)
+def test_a_stationary_point_that_is_no_minimum(method):
+    for is_tried, function, start, words in STATIONARY:
+        if is_tried or method == "slsqp":
+            best = mb.optimise(function, start, method=method, max_iterations=2000)
+            assert not best.success and re.search(words, best.message)
 
 
-def test_a_saddle_of_many_parameters():
-    weights = jnp.arange(1.0, 13.0).at[7].set(-8.0)
-    best = mb.optimise(lambda v: jnp.sum(weights * v["x"] ** 2), {"x": jnp.zeros(12)})
-    assert not best.success and "'x[7]'" in best.message
-
-
+@pytest.mark.slow
 def test_a_maximum_on_a_bound_and_on_constraints():
     best = mb.optimise(lambda v: -(v["x"] ** 2), {"x": 0.0}, bounds={"x": (0.0, 1.0)})
     assert not best.success and "where 'x' increases" in best.message
@@ -347,23 +353,24 @@ def test_a_maximum_on_a_bound_and_on_constraints():
     assert best.success and best.objective == pytest.approx(-1.0)
 
 
-@pytest.mark.parametrize(
-    "function, start, options",
-    [
-        pytest.param(lambda v: (v["x"] - 1) ** 4, {"x": 1.0}, {}, id="no curvature"),
-        pytest.param(lambda v: (v["x"] + v["y"] - 1) ** 2, {"x": 3.0, "y": 5.0}, {}, id="a valley"),
-        pytest.param(lambda v: (v["x"] - 1) ** 2 + 0 * v["y"], {"x": 0.0, "y": 1.0}, {}, id="no effect"),
-        pytest.param(lambda v: jnp.sum(v["x"]), {"x": [1.0, 1.0]}, {"bounds": {"x": (0.0, 2.0)}}, id="a corner"),
-        pytest.param(lambda v: -(v["x"] ** 2), {"x": 0.1}, {"bounds": {"x": (-1.0, 2.0)}}, id="concave to a bound"),
-        pytest.param(
-            lambda v: {"f": 0 * v["x"], "c": v["x"] ** 2},
-            {"x": 1.3},
-            {"objective": "f", "constraints": {"c": 2.0}},
-            id="constraints alone",
-        ),
-    ],
-)
-def test_minima_are_called_minima(function, start, options):
+MINIMA = {
+    "no curvature": (lambda v: (v["x"] - 1) ** 4, {"x": 1.0}, {}),
+    "a valley": (lambda v: (v["x"] + v["y"] - 1) ** 2, {"x": 3.0, "y": 5.0}, {}),
+    "no effect": (lambda v: (v["x"] - 1) ** 2 + 0 * v["y"], {"x": 0.0, "y": 1.0}, {}),
+    "a corner": (lambda v: jnp.sum(v["x"]), {"x": [1.0, 1.0]}, {"bounds": {"x": (0.0, 2.0)}}),
+    "concave to a bound": (lambda v: -(v["x"] ** 2), {"x": 0.1}, {"bounds": {"x": (-1.0, 2.0)}}),
+    "constraints alone": (
+        lambda v: {"f": 0 * v["x"], "c": v["x"] ** 2},
+        {"x": 1.3},
+        {"objective": "f", "constraints": {"c": 2.0}},
+    ),
+}
+
+
+@pytest.mark.slow("a valley", "no effect", "a corner")
+@pytest.mark.parametrize("name", MINIMA)
+def test_minima_are_called_minima(name):
+    function, start, options = MINIMA[name]
     assert mb.optimise(function, start, **options).success
 
 
@@ -379,14 +386,15 @@ def open_(v):
     """Not a number where the gap is positive."""
     x = v["x"]
     gap = jnp.maximum(jnp.hypot(x[0], x[1]) - 1.0, 0.0)
-    return {"f": jnp.where(gap > 0, jnp.nan, (x[0] - 0.2) ** 2 + x[1] ** 2), "gap": gap}
+    return {"f": jnp.where(gap > 0, jnp.nan, (x[0] - 0.2) ** 2 + x[1] ** 2), "gap": gap, "room": -gap}
 
 
 def test_a_start_that_fails_is_led_to_one_that_does_not():
-    best = mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f", constraints={"gap": (None, 0)})
-    assert best.success and np.isnan(best.before["f"]) and best.before["gap"] > 0
-    np.testing.assert_allclose(best.parameters["x"], [0.2, 0.0], atol=1e-4)
-    assert "led from the failed start" in best.message
+    for limits in ({"gap": (None, 0)}, {"room": (0, None)}):
+        best = mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f", constraints=limits)
+        assert best.success and np.isnan(best.before["f"]) and best.before["gap"] > 0
+        np.testing.assert_allclose(best.parameters["x"], [0.2, 0.0], atol=1e-4)
+        assert "led from the failed start" in best.message
     with pytest.raises(ValueError, match=r"'f' is not finite.*assembly_gap"):
         mb.optimise(open_, {"x": [3.0, 2.0]}, objective="f")
     with pytest.raises(ValueError, match="no violated constraint leads away"):
@@ -425,77 +433,86 @@ def test_design_variables_bring_bounds_and_scales():
         mb.optimise(lambda v: v["g"], ["h"], system=system)
 
 
-@pytest.mark.slow
-def test_mean_and_spread_of_a_robust_design():
-    """Two minima of equal depth, one of them wide: with scatter the wide one is better."""
+def landscape(v):
+    """Two minima of equal depth, one of them wide."""
     depth = lambda x, at, width: jnp.exp(-(((x - at) / width) ** 2))
-    landscape = lambda v: {"f": 1.0 + v["level"] - depth(v["x"], -1.0, 0.1) - depth(v["x"], 1.0, 1.0)}
+    return {"f": 1.0 + v["level"] - depth(v["x"], -1.0, 0.1) - depth(v["x"], 1.0, 1.0)}
+
+
+@functools.cache
+def scattered():
     rng = np.random.default_rng(0)
-    samples = {"x": 0.2 * rng.standard_normal(64), "level": rng.uniform(-0.1, 0.1, 64)}
-    scattered = mb.robust(landscape, samples, weight=2.0)
-    out = scattered({"x": jnp.asarray(-0.3)})
-    values = landscape({"x": -0.3 + samples["x"], "level": samples["level"]})["f"]
+    return {"x": 0.2 * rng.standard_normal(64), "level": rng.uniform(-0.1, 0.1, 64)}
+
+
+def test_robust_has_the_mean_and_the_spread_of_its_samples():
+    samples = scattered()
+    of_both = lambda x: (
+        mb.robust(landscape, samples, weight=2.0)({"x": x}),
+        landscape(samples | {"x": x + samples["x"]}),
+    )
+    out, exact = jax.jit(of_both)(-0.3)
+    values = np.asarray(exact["f"])
     np.testing.assert_allclose(out["f.mean"], np.mean(values))
     np.testing.assert_allclose(out["f.spread"], np.std(values, ddof=1))
     np.testing.assert_allclose(out["f"], np.mean(values) + 2.0 * np.std(values, ddof=1))
-    best = mb.optimise(scattered, {"x": -0.9}, objective="f", bounds={"x": (-2.0, 2.0)}, starts=16)
-    assert 0.5 < best.parameters["x"] < 1.5
     same = mb.robust(lambda v: v["x"] * 0.0, {"x": [0.0, 1.0]}, weight=1.0)
     assert float(jax.grad(lambda x: same({"x": x})["objective"])(1.0)) == 0.0
     for bad, message in (
         ({"x": [1.0]}, "at least two"),
-        ({"x": [1.0, 2.0], "y": [1.0] * 3}, "the same number"),
+        ({"x": [1.0, 2.0], "y": [1.0] * 3}, "equally many for every name"),
         ({}, "at least one"),
     ):
         with pytest.raises(ValueError, match=message):
             mb.robust(landscape, bad)
 
 
-@pytest.mark.parametrize(
-    "message, options",
-    [
-        ("Unknown output 'g'; there are 'f', 'square', 'x'", {"objective": "g"}),
-        ("Name the objective", {}),
-        ("must be a number, but 'x' has shape", {"objective": "x"}),
-        ("did you mean 'square'", {"objective": "f", "constraints": {"squar": (0, 1)}}),
-        ("low ≤ high", {"objective": "f", "constraints": {"square": (1, 0)}}),
-        ("one of them None at most", {"objective": "f", "constraints": {"square": (None, None)}}),
-        ("must be a real number, got an array", {"objective": "f", "constraints": {"square": (None, [1.0, 2.0])}}),
-        ("low < high", {"objective": "f", "bounds": {"x": (1.0, 0.0)}}),
-        ("not within its bounds", {"objective": "f", "bounds": {"x": (0.0, 2.0)}}),
-        ("Unknown parameter with bounds 'y'", {"objective": "f", "bounds": {"y": (0.0, 2.0)}}),
-        ("must be a pair", {"objective": "f", "bounds": {"x": 2.0}}),
-        ("method must be", {"objective": "f", "method": "newton"}),
-        ("'slsqp' now", {"objective": "f", "method": "bfgs"}),
-        ("need method='slsqp'", {"objective": "f", "method": optax.sgd(0.1), "constraints": {"square": (0, 1)}}),
-        ("starts must be", {"objective": "f", "starts": 0}),
-        ("starts must be", {"objective": "f", "starts": True}),
-        ("tol must be positive", {"objective": "f", "tol": 0.0}),
-        ("strictly within", {"objective": "f", "method": optax.sgd(0.1), "bounds": {"x": (-1.2, 2.0)}}),
-    ],
-)
-def test_bad_input_is_named(message, options):
-    with pytest.raises(ValueError, match=message):
-        mb.optimise(valley, START, **options)
+@pytest.mark.slow
+def test_a_robust_design_is_in_the_wide_minimum():
+    objective = mb.robust(landscape, scattered(), weight=2.0)
+    best = mb.optimise(objective, {"x": -0.9}, objective="f", bounds={"x": (-2.0, 2.0)}, starts=16)
+    assert 0.5 < best.parameters["x"] < 1.5
 
 
-def test_arguments_of_the_last_release():
-    for name, way in (("local", "the best four"), ("derivatives", "the cheaper mode")):
-        with pytest.raises(TypeError, match=f"no argument '{name}' any more: {way}"):
-            mb.optimise(valley, START, **{name: 1})
+REFUSED = [
+    ("Unknown output 'g'; there are 'f', 'square', 'x'", {"objective": "g"}),
+    ("Name the objective", {}),
+    ("must be a number, but 'x' has shape", {"objective": "x"}),
+    ("did you mean 'square'", {"objective": "f", "constraints": {"squar": (0, 1)}}),
+    ("low ≤ high", {"objective": "f", "constraints": {"square": (1, 0)}}),
+    ("one of them None at most", {"objective": "f", "constraints": {"square": (None, None)}}),
+    ("must be a real number, got an array", {"objective": "f", "constraints": {"square": (None, [1.0, 2.0])}}),
+    ("low < high", {"objective": "f", "bounds": {"x": (1.0, 0.0)}}),
+    ("not within its bounds", {"objective": "f", "bounds": {"x": (0.0, 2.0)}}),
+    ("Unknown parameter with bounds 'y'", {"objective": "f", "bounds": {"y": (0.0, 2.0)}}),
+    ("must be a pair", {"objective": "f", "bounds": {"x": 2.0}}),
+    ("method must be", {"objective": "f", "method": "newton"}),
+    ("'slsqp' now", {"objective": "f", "method": "bfgs"}),
+    ("need method='slsqp'", {"objective": "f", "method": optax.sgd(0.1), "constraints": {"square": (0, 1)}}),
+    ("starts must be", {"objective": "f", "starts": 0}),
+    ("starts must be", {"objective": "f", "starts": True}),
+    ("tol must be positive", {"objective": "f", "tol": 0.0}),
+    ("strictly within", {"objective": "f", "method": optax.sgd(0.1), "bounds": {"x": (-1.2, 2.0)}}),
+    ("no argument 'local' any more: the best four", {"local": 1}),
+    ("no argument 'derivatives' any more: the cheaper mode", {"derivatives": 1}),
+]
+# Functions and starts.
+STARTS = [
+    (valley, {}, "empty"),
+    (valley, ["x"], "system="),
+    (valley, {"x": [np.nan, 1.0]}, "NaN"),
+    (valley, {"x": "far"}, "real number"),
+    (lambda v: {"f": None}, START, "must return a number"),
+]
 
 
-def test_bad_starts_are_named():
-    for start, message in (
-        ({}, "empty"),
-        (["x"], "system="),
-        ({"x": [np.nan, 1.0]}, "NaN"),
-        ({"x": "far"}, "real number"),
-    ):
+def test_what_optimise_refuses():
+    for message, options in REFUSED:
+        with pytest.raises((ValueError, TypeError), match=message):
+            mb.optimise(valley, START, **options)
+    for function, start, message in STARTS:
         with pytest.raises(ValueError, match=message):
-            mb.optimise(valley, start, objective="f")
-    with pytest.raises(ValueError, match="must return a number"):
-        mb.optimise(lambda v: {"f": None}, START)
+            mb.optimise(function, start, objective="f")
 
 
 def test_a_number_that_the_function_reads_may_change():
@@ -507,6 +524,7 @@ def test_a_number_that_the_function_reads_may_change():
     np.testing.assert_allclose(best(), 3.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_rows_of_the_log_are_accepted_or_tried():
     """Rosenbrock's valley from a start beyond its bend, where a method with momentum goes up."""
     valley = lambda p: {"f": (1.0 - p["x"]) ** 2 + 100.0 * (p["y"] - p["x"] ** 2) ** 2}

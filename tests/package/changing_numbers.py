@@ -5,7 +5,6 @@ of such a way, a function that builds a system anew and one that computes someth
 """
 
 import functools
-import types
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -43,25 +42,6 @@ def in_attribute(formula):
     return machine.law, functools.partial(setattr, machine, "k")
 
 
-def in_class(formula):
-    class Machine:
-        @classmethod
-        def law(cls, *given):
-            return formula(cls.k, *given)
-
-    return Machine.law, functools.partial(setattr, Machine, "k")
-
-
-def in_module(formula):
-    module = types.ModuleType("numbers_of_mine")
-    return (lambda *given: formula(module.k, *given)), functools.partial(setattr, module, "k")
-
-
-def in_dictionary(formula):
-    numbers = {}
-    return (lambda *given: formula(numbers["k"], *given)), functools.partial(numbers.__setitem__, "k")
-
-
 def in_array(formula):
     table = np.zeros(40)
     return (lambda *given: formula(jnp.asarray(table)[8], *given)), functools.partial(table.__setitem__, 8)
@@ -75,30 +55,6 @@ def in_closure(formula):
         k = value
 
     return (lambda *given: formula(k, *given)), change
-
-
-def in_partial(formula):
-    numbers = [0.0]
-    law = functools.partial(lambda numbers, *given: formula(numbers[0], *given), numbers)
-    return law, functools.partial(numbers.__setitem__, 0)
-
-
-def in_default(formula):
-    numbers = [0.0]
-
-    def law(*given, numbers=numbers):
-        return formula(numbers[0], *given)
-
-    return law, functools.partial(numbers.__setitem__, 0)
-
-
-def in_called_object(formula):
-    class Law:
-        def __call__(self, *given):
-            return formula(self.k, *given)
-
-    law = Law()
-    return law, functools.partial(setattr, law, "k")
 
 
 def in_module_of_arrays(formula):
@@ -127,20 +83,8 @@ def in_rule(formula):
     return (lambda *given: formula(scaled(jnp.ones(())), *given)), functools.partial(numbers.__setitem__, 0)
 
 
-WAYS = [
-    in_global,
-    in_attribute,
-    in_class,
-    in_module,
-    in_dictionary,
-    in_array,
-    in_closure,
-    in_partial,
-    in_default,
-    in_called_object,
-    in_module_of_arrays,
-    in_rule,
-]
+# They are traced, so that it does not matter how a function reaches a number, but for these.
+WAYS = [in_global, in_attribute, in_array, in_closure, in_module_of_arrays, in_rule]
 
 # Places of functions
 
