@@ -105,9 +105,8 @@ def moving(system, seed=0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "size"), [(30, 2), (9, 4)])
-def test_elimination_of_unsymmetric_matrices(n, size):
-    random = np.random.default_rng(n)
+def test_elimination_of_unsymmetric_matrices():
+    n, size, random = 30, 2, np.random.default_rng(0)
     neighbours = [set() for _ in range(n)]
     for i, j in [*zip(range(n - 1), range(1, n), strict=True), (0, n - 1), (2, n // 2)]:
         neighbours[i].add(j)
@@ -122,11 +121,15 @@ def test_elimination_of_unsymmetric_matrices(n, size):
         elif j in neighbours[i]:
             lower[k] = full[i, :, j] = entries()
             upper[k] = full[j, :, i] = entries()
-    factor = eliminate_blocks(jnp.asarray(lower), order, jnp.asarray(upper))
     x = entries()[:1].repeat(n, axis=0) * np.arange(1, n + 1)[:, None]
+
+    @jax.jit
+    def solve(lower, upper):
+        factor = eliminate_blocks(lower, order, upper)
+        return factor.solve(x), factor.transpose().solve(x)
+
     matrix = full.reshape(n * size, n * size)
-    found = factor.solve(jnp.asarray(x)), factor.transpose().solve(jnp.asarray(x))
-    for own, dense in zip(found, (matrix, matrix.T), strict=True):
+    for own, dense in zip(solve(lower, upper), (matrix, matrix.T), strict=True):
         np.testing.assert_allclose(own.ravel(), np.linalg.solve(dense, x.ravel()), rtol=0, atol=1e-13)
 
 
@@ -149,7 +152,7 @@ def dense_resolvent(system, y, x, r):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, n", [(chain, 12), (cable, 6), (ladder, 5), (tower, 4)])
+@pytest.mark.parametrize("build, n", [(chain, 12), (cable, 5), (ladder, 4), (tower, 3)])
 def test_resolvents_are_those_of_dense_matrices(build, n):
     system = build(n)
     y = moving(system)
@@ -170,7 +173,7 @@ def test_resolvents_are_those_of_dense_matrices(build, n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n, damping", [(6, 0.0), (6, 20.0), (2, 20.0)])
+@pytest.mark.parametrize("n, damping", [(6, 0.0), (2, 20.0)])
 def test_the_spectrum_is_that_near_the_step(n, damping):
     """Of the dense Jacobian in independent coordinates, by `linearise` at rest: the eigenvalue nearest to an
     undamped vibration with `|h λ|` of a few, which decides on formulas, is found, and nothing that is none.
@@ -200,7 +203,7 @@ def run(system, state, *, rtol, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "build, n, t1",
-    [(lambda n: chain(n, stiffness=1e5, damping=1.0, curl=0.1), 4, 0.2), (cable, 3, 0.3), (tower, 2, 0.2)],
+    [(lambda n: chain(n, stiffness=1e5, damping=1.0, curl=0.1), 3, 0.1), (cable, 3, 0.1), (tower, 2, 0.2)],
 )
 def test_motions_are_those_of_dense_matrices(build, n, t1):
     system = build(n)
@@ -210,7 +213,7 @@ def test_motions_are_those_of_dense_matrices(build, n, t1):
     of_dense, of_blocks = solve(dense), solve(Projection())
     reference = of_dense(1e-10)[0]
     size = np.max(np.abs(reference))
-    for rtol in (1e-4, 1e-6, 1e-8):
+    for rtol in (1e-4, 1e-7):
         (expected, steps, _), (found, own, violation) = of_dense(rtol), of_blocks(rtol)
         error, wrong = np.max(np.abs(found - reference)), np.max(np.abs(expected - reference))
         assert error <= max(3 * wrong, rtol * size)
@@ -225,7 +228,7 @@ def _ends(sol):
 
 @pytest.mark.slow
 def test_a_long_chain_moves_as_by_other_equations():
-    times, n = np.array([0.1, 0.3]), 20
+    times, n = np.array([0.1, 0.3]), 12
     expected = sprung_chain(times, n=n, stiffness=1e4, damping=20.0)
     system = chain(n)
     state = mb.assemble(system)
@@ -237,7 +240,7 @@ def test_a_long_chain_moves_as_by_other_equations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, sizes", [(chain, (100, 400)), (cable, (50, 200)), (tower, (50, 200))])
+@pytest.mark.parametrize("build, sizes", [(chain, (50, 200)), (cable, (25, 100)), (tower, (25, 100))])
 def test_no_dense_matrix_and_programs_of_one_size(build, sizes):
     lines = []
     for n in sizes:
@@ -293,9 +296,9 @@ def test_a_batch_equals_the_loop():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, n, t1", [(lambda n: chain(n, curl=0.2), 3, 0.2), (cable, 3, 0.1)])
-def test_derivatives_three_ways(build, n, t1):
-    system = build(n)
+@pytest.mark.parametrize("build, t1", [(lambda n: chain(n, curl=0.2), 0.2), (cable, 0.05)])
+def test_derivatives_three_ways(build, t1):
+    system = build(3)
     state = mb.assemble(system)
     force = system.catalogue.force_names()[-1]
     names = ["rod1.mass", f"{force}.stiffness", f"{force}.damping"]
@@ -334,9 +337,9 @@ def test_size_decides():
         assert ("the dense Newton matrix, with Hermite" in str(system)) == (implicit is Projection)
 
 
-@pytest.mark.parametrize("n, most", [(100, 40), (1000, 40)])
-def test_levels_of_a_chain(n, most):
+def test_levels_of_a_chain():
     """Bodies that share a spring and a hinge with the next, by cyclic reduction and not from an end on."""
+    n, most = 1000, 40
     bodies, pairs = tuple((k,) for k in range(n)), tuple((k - 1, k) for k in range(1, n))
     neighbours = [set() for _ in range(2 * n)]
     for joint, own in enumerate([bodies[0], *pairs], n):
