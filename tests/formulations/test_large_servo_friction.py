@@ -22,7 +22,7 @@ def swing(t, p):
 
 
 @functools.cache
-def planar_chain(n=16):
+def planar_chain(n=14):
     """Rods on pins, two of which rub, and a servo that moves the last rod's end; a spring holds the end."""
     angle = np.linspace(-0.3, 0.9, n)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -71,7 +71,7 @@ def dense(system):
     return dataclasses.replace(system, elimination=None)
 
 
-@pytest.mark.parametrize("build", [planar_chain, pytest.param(spatial_chain, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("build", [planar_chain, spatial_chain])
 def test_accelerations_and_multipliers(build):
     system = build()
     assert system.elimination is not None
@@ -97,29 +97,21 @@ def test_accelerations_and_multipliers(build):
     assert np.max(np.abs(system.velocity_residual(0.0, state.q, after))) < 1e-11
 
 
-@pytest.mark.parametrize(
-    ("build", "varied"),
-    [
-        (planar_chain, {"rub.coefficient": 0.3, "turn.amplitude": 0.2, "b3.mass": 1.0}),
-        (spatial_chain, {"rub.coefficient": 0.3, "lift.target": 0.1, "b3.mass": 1.0}),
-    ],
-)
-def test_motion_and_its_derivatives(build, varied):
+def test_motion_and_its_derivatives():
     """As by partitioning, with forward, reverse and central differences."""
-    system = build()
+    system, varied = planar_chain(), {"rub.coefficient": 0.3, "turn.amplitude": 0.2, "b3.mass": 1.0}
     state, start = moving(system), mb.parameters(system)
 
-    def tip(h, manifold, rtol, **options):
+    def tip(h, manifold, rtol):
         own = mb.with_parameters(system, {name: start[name] + h * step for name, step in varied.items()})
-        y = mb.simulate(own, state, t1=0.3, rtol=rtol, atol=rtol, manifold=manifold, throw=False, **options).ys
+        y = mb.simulate(own, state, t1=0.1, rtol=rtol, atol=rtol, manifold=manifold, throw=False).ys
         return jnp.sum(jnp.cos(y.q[-1])) + jnp.sum(y.u[-1]) * 0.1
 
     forward = jax.jit(lambda h, rtol: jax.jvp(lambda h: tip(h, None, rtol), (h,), (1.0,)))
     value, push = forward(0.0, 1e-10)
     np.testing.assert_allclose(value, jax.jit(lambda: tip(0.0, Partition(), 1e-10))(), rtol=0, atol=1e-7)
     np.testing.assert_allclose(jax.jit(jax.grad(lambda h: tip(h, None, 1e-10)))(0.0), push, rtol=1e-8)
-    h = 1e-3
-    at = lambda h: forward(h, 1e-12)[0]
+    h, at = 1e-3, lambda h: forward(h, 1e-12)[0]
     difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
     np.testing.assert_allclose(push, difference, rtol=1e-6)
 
