@@ -37,7 +37,7 @@ def as_it_is(system):
     return system
 
 
-STRUCTURES = [as_it_is, pytest.param(by_blocks, marks=pytest.mark.slow)]
+STRUCTURES = [as_it_is, by_blocks]
 
 
 def in_long_steps(pendulum, structure, dt, **options):
@@ -47,21 +47,15 @@ def in_long_steps(pendulum, structure, dt, **options):
 
 @pytest.mark.parametrize("structure", STRUCTURES, ids=["dense", "sparse"])
 def test_steps_that_are_too_long_fail(pendulum, structure):
-    """Nothing shortens them, and the run ends."""
-    failed = in_long_steps(pendulum, structure, 0.4)
-    assert failed.result == mb.RESULTS.newton_failed and not np.any(np.isfinite(failed.ys.q))
+    """Nothing shortens them, and the run ends, of that member of a batch alone."""
+    run = jax.jit(jax.vmap(lambda dt: in_long_steps(pendulum, structure, dt)))
+    batch = run(jnp.array([0.05, 0.4]))
+    np.testing.assert_array_equal(batch.result == mb.RESULTS.newton_failed, [False, True])
+    assert np.all(np.isfinite(batch.ys.q[0])) and np.all(np.isnan(batch.ys.q[1]))
+    residual = lambda q: pendulum[0].position_residual(0.0, q)
+    np.testing.assert_allclose(jax.vmap(residual)(batch.ys.q[0]), 0.0, atol=1e-12)
     with pytest.raises(RuntimeError, match="no state on the constraints"):
         in_long_steps(pendulum, structure, 0.4, throw=True)
-    fine = in_long_steps(pendulum, structure, 0.05)
-    assert fine.result == mb.RESULTS.successful and np.all(fine.constraint_violation.position < 1e-12)
-
-
-def test_a_step_that_fails_in_a_batch(pendulum):
-    batch = jax.jit(jax.vmap(lambda dt: in_long_steps(pendulum, as_it_is, dt)))(jnp.array([0.05, 0.4]))
-    np.testing.assert_array_equal(batch.result == mb.RESULTS.newton_failed, [False, True])
-    fine = in_long_steps(pendulum, as_it_is, 0.05)
-    np.testing.assert_allclose(batch.ys.q[0], fine.ys.q, rtol=0, atol=1e-10)
-    assert np.all(np.isnan(batch.ys.q[1]))
 
 
 @pytest.mark.parametrize("structure", STRUCTURES, ids=["dense", "sparse"])
@@ -71,7 +65,7 @@ def test_derivatives_of_a_run_whose_first_steps_fail(pendulum, structure):
     def end(x, rtol=1e-7):
         own = mb.with_parameters(system, {"rod.inertia": x[0], "pin.point_a": jnp.stack([0.0 * x[1], x[1]])})
         start = mb.assemble(own, mb.State(pendulum[1].q, x[2] * pendulum[1].u))
-        motion = mb.simulate(own, start, t1=0.45, dt0=0.4, rtol=rtol, **METHOD | {"max_steps": 1024})
+        motion = mb.simulate(own, start, t1=0.41, dt0=0.4, rtol=rtol, **METHOD | {"max_steps": 1024})
         return motion.ys.q[-1, 2], motion.stats["num_rejected_steps"]
 
     x, h = jnp.array([0.1, 0.0, 1.0]), 1e-5
@@ -124,15 +118,12 @@ def gear_past_its_end():
 def test_a_motion_ends_where_constraints_cannot_be_met(case):
     system, rates, when, result, why = case()
     state = mb.assemble(system, rates=rates)
-    found = mb.simulate(system, state, t1=4.0, throw=False, **METHOD)
-    assert found.result == getattr(mb.RESULTS, result)
-    assert np.all(found.constraint_violation.position < 1e-10)
     kept = mb.simulate(system, state, t1=4.0, saveat=diffrax.SaveAt(steps=True), throw=False, **METHOD)
+    assert kept.result == getattr(mb.RESULTS, result)
+    assert np.all(kept.constraint_violation.position < 1e-10)
     np.testing.assert_allclose(kept.ts[-1], when, rtol=0, atol=1e-4)
     with pytest.raises(RuntimeError, match=why):
         mb.simulate(system, state, t1=4.0, **METHOD)
-    fixed = mb.simulate(system, state, t1=4.0, dt0=0.05, throw=False, **FIXED)
-    assert fixed.result == mb.RESULTS.newton_failed
     with pytest.raises(RuntimeError, match="no state on the constraints"):
         mb.simulate(system, state, t1=4.0, dt0=0.05, **FIXED)
 
