@@ -59,22 +59,10 @@ def rod_state(angle, speed, rate):
     return mb.State(q, np.array([speed - A * s * rate, A * c * rate, rate]))
 
 
-def creep(poses, velocities, reactions, t, p):
-    """The law of `Friction` of a rod's end, as a user writes it."""
-    place = A * jnp.stack([-jnp.cos(poses[-1, 2]), -jnp.sin(poses[-1, 2])])
-    slip = velocities[-1, 0] - velocities[-1, 2] * place[1]
-    force = -p["mu"] * jnp.abs(reactions[-1, 1]) * jnp.tanh(slip / V)
-    wrench = jnp.stack([force, jnp.zeros_like(force), -place[1] * force])
-    return jnp.stack([-wrench, wrench])
-
-
-def rod_scene(mu, law):
+def rod_scene(mu):
     body = planar.Body("rod", mass=M, inertia=J, position=(A, 0.0))
     floor = planar.PointOnLine("floor", "ground", "rod", point_a=(0.0, 0.0), point_b=(-A, 0.0), axis_a=(1.0, 0.0))
-    rub = {
-        "Friction": planar.Friction("rub", "floor", coefficient=mu, transition_speed=V),
-        "NonIdeal": mb.NonIdeal("rub", "floor", creep, parameters={"mu": mu}),
-    }[law]
+    rub = planar.Friction("rub", "floor", coefficient=mu, transition_speed=V)
     return mb.Scene([body], joints=[floor], forces=[GRAVITY, rub]).compile()
 
 
@@ -96,14 +84,14 @@ def rod_lagrangian(mu):
 
 @functools.cache
 def rod(law="Friction", mu=0.3):
-    return rod_lagrangian(mu) if law == "Lagrangian" else rod_scene(mu, law)
+    return rod_lagrangian(mu) if law == "Lagrangian" else rod_scene(mu)
 
 
 STATES = [(1.0, 2.0, 0.3), (0.7, -1.5, 8.0), (2.0, 1e-4, -1.0), (1.4, -3.0, -6.5), (0.6, 0.0, 7.0)]
 
 
 @pytest.mark.slow(but=("Lagrangian",))
-@pytest.mark.parametrize("law", ["Friction", "NonIdeal", "Lagrangian"])
+@pytest.mark.parametrize("law", ["Friction", "Lagrangian"])
 def test_friction_is_the_coefficient_times_the_normal_force(law):
     """Of a rod on a floor, pressed on it and held down to it, by every formulation."""
     system = rod(law)
@@ -286,33 +274,6 @@ def test_a_bead_in_a_rough_loop():
     decay = np.exp(-2 * mu * (phi - np.pi / 2))
     expected = particular(phi) + (start**2 - particular(np.pi / 2)) * decay
     np.testing.assert_allclose(np.sum(np.square(run["bead"].velocity[-1])), expected, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_bead_on_a_turning_wire():
-    """Pressed on it by Coriolis' force, `r̈ = ω² r − 2 μ ω ṙ`."""
-    mu, omega, start = 0.4, 3.0, 0.2
-    wire = planar.Body("wire", mass=1.0, inertia=1.0, angular_velocity=omega)
-    bead = planar.PointMass("bead", mass=0.7, position=(0.3, 0.0), velocity=(start, 0.3 * omega))
-    joints = [
-        planar.Revolute("hub", "ground", "wire", point=(0.0, 0.0)),
-        planar.PointOnLine("slot", "wire", "bead", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis_a=(1.0, 0.0)),
-        planar.Driver(
-            "motor",
-            "ground",
-            "wire",
-            quantity="angle",
-            motion=lambda t, p: p["omega"] * t,
-            parameters={"omega": omega},
-        ),
-    ]
-    rub = planar.Friction("rub", "slot", coefficient=mu, point=(0.0, 0.0))
-    system = mb.Scene([wire, bead], joints=joints, forces=[rub]).compile()
-    run = mb.simulate(system, mb.assemble(system), t1=0.6, rtol=1e-11)
-    roots = omega * (-mu + np.array([1, -1]) * np.sqrt(mu**2 + 1))
-    share = np.linalg.solve(np.array([[1.0, 1.0], roots]), [0.3, start])
-    expected = share @ np.exp(0.6 * roots)
-    np.testing.assert_allclose(np.linalg.norm(run["bead"].position[-1]), expected, rtol=1e-9)
 
 
 # Derivatives

@@ -12,7 +12,7 @@ from rough_machines import GRAVITY, SCENES, manipulator, pendulum, sledge
 import jaxmb as mb
 from jaxmb import formulations, planar
 from jaxmb.formulations import accelerations
-from jaxmb.linalg.rotations import rotate, rotate_2d
+from jaxmb.linalg.rotations import rotate
 
 pytestmark = pytest.mark.slow
 
@@ -102,79 +102,48 @@ def test_every_formulation(name):
             np.testing.assert_allclose(own, multipliers, rtol=1e-9, atol=1e-9 * np.max(np.abs(multipliers)))
 
 
-def newton_euler(system, motion):
-    """Mass times acceleration and rate of spin, less all forces and moments about the mass centres, world axes."""
-    names, planar_ = system.body_names, not system.spatial
-    d, parameters = (2 if planar_ else 3), {name: np.asarray(own) for name, own in mb.parameters(system).items()}
+# The bodies of joints, with the field of the point on the second, and those of the friction laws.
+JOINTS = {
+    "rail": ("ground", "carriage", "point_b"),
+    "hinge": ("carriage", "arm", "point_b"),
+    "swing": ("ground", "arm", None),
+}
+LAWS = {"rub": ("ground", "carriage"), "pin": ("carriage", "arm")}
 
-    def turn(name, v):
-        own = motion[name]
-        return np.asarray(jax.vmap(rotate_2d)(own.angle, v) if planar_ else jax.vmap(rotate)(own.orientation, v))
 
-    cross = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0] if planar_ else np.cross(a, b)
+def test_the_laws_of_newton_and_euler_close_for_every_body():
+    """With the applied forces, friction among them, and the reactions."""
+    system = SCENES["carriage"]()
+    states = [random_state(system, seed) for seed in range(2)]
+    ys, road = mb.State(*(jnp.stack(own) for own in zip(*states, strict=True))), formulations.Partitioned()
+    motion = mb.Trajectory(system, road, jnp.full(2, 0.3), ys, {}, mb.RESULTS.successful, None, None)
+    parameters = {name: np.asarray(own) for name, own in mb.parameters(system).items()}
+    turn = lambda name, v: np.asarray(jax.vmap(rotate)(motion[name].orientation, v))
     left = {}
-    for k, name in enumerate(names):
-        udot = np.asarray(motion.accelerations).reshape(len(motion.ts), len(names), -1)[:, k]
+    for k, name in enumerate(system.body_names):
+        udot = np.asarray(motion.accelerations).reshape(2, -1, 6)[:, k]
         mass, inertia = parameters[f"{name}.mass"], parameters[f"{name}.inertia"]
-        if planar_:
-            spin = inertia * udot[:, 2]
-        else:
-            w = np.asarray(motion[name].angular_velocity)
-            spin = turn(name, udot[:, 3:] @ inertia + np.cross(w, w @ inertia))
-        left[name] = [mass * (udot[:, :d] - parameters["gravity.acceleration"]), spin]
+        w = np.asarray(motion[name].angular_velocity)
+        spin = turn(name, udot[:, 3:] @ inertia + np.cross(w, w @ inertia))
+        left[name] = [mass * (udot[:, :3] - parameters["gravity.acceleration"]), spin]
 
     def act(name, force, moment):
         if name != "ground":
-            left[name][0] = left[name][0] - force
-            left[name][1] = left[name][1] - moment
+            left[name] = [left[name][0] - force, left[name][1] - moment]
 
-    for joint, (body_a, body_b, field) in JOINTS_OF[names].items():
-        place = np.zeros(d) if field is None else parameters[f"{joint}.{field}"]
-        point = np.asarray(motion[body_b].position) + turn(body_b, jnp.broadcast_to(place, (len(motion.ts), d)))
+    for joint, (body_a, body_b, field) in JOINTS.items():
+        place = np.zeros(3) if field is None else parameters[f"{joint}.{field}"]
+        point = np.asarray(motion[body_b].position) + turn(body_b, jnp.broadcast_to(place, (2, 3)))
         force, moment, _ = map(np.asarray, motion.reactions[joint])
         for name, sign in ((body_a, -1), (body_b, 1)):
-            arm = 0.0 if name == "ground" else cross(point - np.asarray(motion[name].position), force)
+            arm = 0.0 if name == "ground" else np.cross(point - np.asarray(motion[name].position), force)
             act(name, sign * force, sign * (moment + arm))
-    for law, bodies in LAWS_OF[names].items():
+    for law, bodies in LAWS.items():
         wrenches = np.asarray(motion.forces[law])
-        assert wrenches.shape[1] == len(bodies) and np.max(np.abs(wrenches)) > 1e-3
+        assert wrenches.shape[1] == 2 and np.max(np.abs(wrenches)) > 1e-3
         for j, name in enumerate(bodies):
-            moment = wrenches[:, j, 2] if planar_ else wrenches[:, j, 3:]
-            act(name, wrenches[:, j, :d], moment if planar_ or name == "ground" else turn(name, moment))
-    return left
-
-
-# The bodies of joints, with the field of the point on the second, and those of the friction laws.
-JOINTS_OF = {
-    ("arm",): {"pin": ("ground", "arm", "point_b")},
-    ("upper", "lower"): {
-        "shoulder": ("ground", "upper", "point_b"),
-        "elbow": ("upper", "lower", "point_b"),
-        "tip": ("ground", "lower", None),
-    },
-    ("carriage", "arm"): {
-        "rail": ("ground", "carriage", "point_b"),
-        "hinge": ("carriage", "arm", "point_b"),
-        "swing": ("ground", "arm", None),
-    },
-}
-LAWS_OF = {
-    ("arm",): {"rub": ("ground", "arm")},
-    ("upper", "lower"): {"rub": ("upper", "lower")},
-    ("carriage", "arm"): {"rub": ("ground", "carriage"), "pin": ("carriage", "arm")},
-}
-
-
-@pytest.mark.parametrize("name", ["pendulum", "manipulator", "carriage"])
-def test_the_laws_of_newton_and_euler_close_for_every_body(name):
-    """With the applied forces, friction among them, and the reactions."""
-    system = SCENES[name]()
-    states = [random_state(system, seed) for seed in range(2)]
-    ys = mb.State(*(jnp.stack(own) for own in zip(*states, strict=True)))
-    motion = mb.Trajectory(
-        system, formulations.Partitioned(), jnp.array([0.3, 0.3]), ys, {}, mb.RESULTS.successful, None, None
-    )
-    for force, moment in newton_euler(system, motion).values():
+            act(name, wrenches[:, j, :3], 0.0 if name == "ground" else turn(name, wrenches[:, j, 3:]))
+    for force, moment in left.values():
         np.testing.assert_allclose(force, 0.0, atol=1e-9)
         np.testing.assert_allclose(moment, 0.0, atol=1e-9)
 
