@@ -4,7 +4,7 @@ At such a position the constraints lose rank and other motions branch off; the b
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -34,44 +34,37 @@ def along(angle):
 
 @dataclasses.dataclass(frozen=True)
 class FlatLinkage:
-    """Uniform slender bars on hinges.
+    """Uniform slender bars of 1 kg on hinges.
 
-    **Fields:** `hinges`: name, bodies, and where on them, in numbers along bars and points of the ground, as a function
-    of the `sizes`; `poses(sizes, x)`: centre and angle of each bar by name; `lengths(sizes)` of the bars; sizes and
-    coordinates of the scene; `line`: a bar whose lower end slides along x, or None; `kinds` of hinges in space other
-    than `spatial.Revolute`.
+    **Fields:** `hinges`: name, bodies, and where on them, in numbers along bars and points of the ground; `poses(x)`:
+    centre and angle of each bar by name; `lengths` of the bars; the coordinates of the scene; `line`: a bar whose lower
+    end slides along x, or None; `kinds` of hinges in space other than `spatial.Revolute`.
     """
 
-    hinges: Callable
+    hinges: Sequence[tuple]
     poses: Callable
-    lengths: Callable
-    sizes: dict[str, float]
+    lengths: dict[str, float]
     start: tuple[float, ...]
     line: str | None = None
     kinds: dict[str, type] = dataclasses.field(default_factory=dict)
 
     def system(self, in_space: bool):
-        """The compiled scene, all bars of 1 kg."""
-        poses, lengths = self.poses(self.sizes, jnp.array(self.start)), self.lengths(self.sizes)
+        """The compiled scene."""
         bodies, joints = [], []
-        for name, (centre, angle) in poses.items():
-            inertia = lengths[name] ** 2 / 12
+        for name, (centre, angle) in self.poses(jnp.array(self.start)).items():
+            inertia = self.lengths[name] ** 2 / 12
             if in_space:
                 turn = _product(jnp.asarray(_PLANE), jnp.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]))
-                body = spatial.Body(
-                    name,
-                    mass=1.0,
-                    inertia=np.diag(inertia * np.array([0.1, 1.0, 1.0])),
-                    position=_turned(centre),
-                    orientation=turn,
-                )
+                own = {"inertia": np.diag(inertia * np.array([0.1, 1.0, 1.0])), "orientation": turn}
+                bodies.append(spatial.Body(name, mass=1.0, position=_turned(centre), **own))
             else:
-                body = planar.Body(name, mass=1.0, inertia=inertia, position=centre, angle=float(angle))
-            bodies.append(body)
-        values = self.values(self.sizes, dict.fromkeys(poses, 1.0), in_space)
+                bodies.append(planar.Body(name, mass=1.0, inertia=inertia, position=centre, angle=float(angle)))
+        point = lambda s: jnp.zeros(3 if in_space else 2).at[0].set(s)
         normal = _product(_product(_PLANE, np.array([0.0, 0, 0, 1])), _PLANE * np.array([1.0, -1, -1, -1]))[1:]
-        for name, a, b, *_ in self.hinges(self.sizes):
-            at = {key: values[f"{name}.{key}"] for key in ("point_a", "point_b")}
+        for name, a, b, at_a, at_b in self.hinges:
+            on_ground = jnp.array([at_a, 0.0])
+            place = point(at_a) if a != "ground" else _turned(on_ground) if in_space else on_ground
+            at = {"point_a": place, "point_b": point(at_b)}
             if not in_space:
                 joints.append(planar.Revolute(name, a, b, **at))
                 continue
@@ -82,57 +75,35 @@ class FlatLinkage:
             joints.append(kind(name, a, b, **at, **axes[kind]))
         if self.line is not None:
             part, axis = (spatial, _turned(jnp.array([1.0, 0.0]))) if in_space else (planar, (1.0, 0.0))
-            at = {"point_a": np.zeros(3 if in_space else 2), "point_b": values["line.point_b"]}
+            at = {"point_a": point(0.0), "point_b": point(-self.lengths[self.line] / 2)}
             joints.append(part.PointOnLine("line", "ground", self.line, axis_a=axis, **at))
         return mb.Scene(bodies, joints=joints).compile()
 
-    def values(self, sizes, masses, in_space):
-        """The parameters of the system for sizes and masses."""
-        lengths, out = self.lengths(sizes), {}
-        point = lambda s: jnp.zeros(3 if in_space else 2).at[0].set(s)
-        for name, mass in masses.items():
-            inertia = mass * lengths[name] ** 2 / 12
-            out[f"{name}.mass"] = mass
-            out[f"{name}.inertia"] = inertia * jnp.diag(jnp.array([0.1, 1.0, 1.0])) if in_space else inertia
-        for name, a, _, at_a, at_b in self.hinges(sizes):
-            on_ground = jnp.stack([jnp.asarray(at_a, float), jnp.zeros(())])
-            ground = a == "ground"
-            out[f"{name}.point_a"] = (_turned(on_ground) if in_space else on_ground) if ground else point(at_a)
-            out[f"{name}.point_b"] = point(at_b)
-        if self.line is not None:
-            out["line.point_b"] = point(-lengths[self.line] / 2)
-        return out
-
-    def state(self, sizes, x, rates, in_space):
+    def state(self, x, rates, in_space):
         """The state at coordinates x and their rates."""
-        flat = lambda x: [jnp.concatenate([centre, angle[None]]) for centre, angle in self.poses(sizes, x).values()]
+        flat = lambda x: [jnp.concatenate([centre, angle[None]]) for centre, angle in self.poses(x).values()]
         at, velocity = jax.jvp(flat, (x,), (rates,))
         if not in_space:
             return mb.State(jnp.concatenate(at), jnp.concatenate(velocity))
-        half = [
-            jnp.array([1.0, 0, 0, 0]) * jnp.cos(p[2] / 2) + jnp.array([0, 0, 0, 1.0]) * jnp.sin(p[2] / 2) for p in at
-        ]
+        half = [jnp.stack([jnp.cos(p[2] / 2), 0.0 * p[2], 0.0 * p[2], jnp.sin(p[2] / 2)]) for p in at]
         q = [jnp.concatenate([_turned(p[:2]), _product(jnp.asarray(_PLANE), h)]) for p, h in zip(at, half, strict=True)]
         u = [jnp.concatenate([_turned(v[:2]), jnp.zeros(2), v[2:]]) for v in velocity]
         return mb.State(jnp.concatenate(q), jnp.concatenate(u))
 
-    def path(self, sizes, masses, x, rates, times, substeps=200):
+    def path(self, x, rates, times, substeps=200):
         """The coordinates at times, by Lagrange's equations and steps of Runge and Kutta, shape (times, freedoms)."""
-        lengths = self.lengths(sizes)
+        length = jnp.array([self.lengths[name] for name in self.poses(x)])
 
         def energy(x, rates):
-            flat = lambda x: jnp.stack([jnp.append(c, a) for c, a in self.poses(sizes, x).values()])
+            flat = lambda x: jnp.stack([jnp.append(c, a) for c, a in self.poses(x).values()])
             _, v = jax.jvp(flat, (x,), (rates,))
-            mass = jnp.stack([masses[name] for name in self.poses(sizes, x)])
-            length = jnp.stack([jnp.asarray(lengths[name]) for name in self.poses(sizes, x)])
-            return 0.5 * jnp.sum(mass * (v[:, 0] ** 2 + v[:, 1] ** 2 + length**2 / 12 * v[:, 2] ** 2))
+            return 0.5 * jnp.sum(v[:, 0] ** 2 + v[:, 1] ** 2 + length**2 / 12 * v[:, 2] ** 2)
 
         def field(y):
             x, rates = jnp.split(y, 2)
             _, rise = jax.jvp(lambda x: jax.grad(energy, 1)(x, rates), (x,), (rates,))
-            return jnp.append(
-                rates, jnp.linalg.solve(jax.hessian(energy, 1)(x, rates), jax.grad(energy)(x, rates) - rise)
-            )
+            force = jax.grad(energy)(x, rates) - rise
+            return jnp.append(rates, jnp.linalg.solve(jax.hessian(energy, 1)(x, rates), force))
 
         def step(_, y, h):
             a = field(y)
@@ -147,64 +118,56 @@ class FlatLinkage:
         _, out = jax.lax.scan(interval, jnp.append(x, rates), jnp.diff(times))
         return jnp.concatenate([x[None], out])
 
-    def centres(self, sizes, path, in_space):
+    def centres(self, path, in_space):
         """The centres of the bars along a path, by name."""
         place = _turned if in_space else lambda centre: centre
-        return jax.vmap(lambda x: {name: place(c) for name, (c, _) in self.poses(sizes, x).items()})(path)
+        return jax.vmap(lambda x: {name: place(c) for name, (c, _) in self.poses(x).items()})(path)
 
 
-def _parallel(count, kinds=None):
+def _parallel(count, kinds=None, l=0.4, d=1.0):
     """Parallel cranks that carry level bars in a row."""
+    hinges = [(f"A{k}", "ground", f"crank{k}", k * d, -l / 2) for k in range(count)]
+    for k in range(1, count):
+        hinges.append((f"P{k}", f"crank{k - 1}", f"level{k}", l / 2, -d / 2))
+        hinges.append((f"Q{k}", f"level{k}", f"crank{k}", d / 2, l / 2))
 
-    def hinges(p):
-        out = [(f"A{k}", "ground", f"crank{k}", k * p["d"], -p["l"] / 2) for k in range(count)]
-        for k in range(1, count):
-            out.append((f"P{k}", f"crank{k - 1}", f"level{k}", p["l"] / 2, -p["d"] / 2))
-            out.append((f"Q{k}", f"level{k}", f"crank{k}", p["d"] / 2, p["l"] / 2))
-        return out
-
-    def poses(p, x):
-        right, tip = jnp.array([1.0, 0.0]) * p["d"], p["l"] * along(x[0])
+    def poses(x):
+        right, tip = jnp.array([d, 0.0]), l * along(x[0])
         out = {f"crank{k}": (tip / 2 + k * right, x[0]) for k in range(count)}
         return out | {f"level{k}": (tip + (k - 0.5) * right, 0 * x[0]) for k in range(1, count)}
 
-    def lengths(p):
-        return {f"crank{k}": p["l"] for k in range(count)} | {f"level{k}": p["d"] for k in range(1, count)}
-
-    return FlatLinkage(hinges, poses, lengths, {"l": 0.4, "d": 1.0}, (0.6,), kinds=kinds or {})
+    lengths = {f"crank{k}": l for k in range(count)} | {f"level{k}": d for k in range(1, count)}
+    return FlatLinkage(hinges, poses, lengths, (0.6,), kinds=kinds or {})
 
 
-def _scissors():
+def _scissors(l=1.0):
     """Two crossed bars, their lower ends on a hinge and on the line."""
-    hinges = lambda p: [("foot", "ground", "a", 0.0, -p["l"] / 2), ("middle", "a", "b", 0.0, 0.0)]
-    poses = lambda p, x: {"a": (p["l"] / 2 * along(x[0]), x[0]), "b": (p["l"] / 2 * along(x[0]), jnp.pi - x[0])}
-    return FlatLinkage(hinges, poses, lambda p: {"a": p["l"], "b": p["l"]}, {"l": 1.0}, (0.6,), "b")
+    hinges = [("foot", "ground", "a", 0.0, -l / 2), ("middle", "a", "b", 0.0, 0.0)]
+    poses = lambda x: {"a": (l / 2 * along(x[0]), x[0]), "b": (l / 2 * along(x[0]), jnp.pi - x[0])}
+    return FlatLinkage(hinges, poses, {"a": l, "b": l}, (0.6,), "b")
 
 
-def _pantograph():
+def _pantograph(l=0.7, r=0.25, w=0.8):
     """An arm and a crank on one axis; a rod parallel to the arm keeps the forearm parallel to the crank."""
+    middle = (w - r) / 2
+    hinges = [
+        ("A", "ground", "arm", 0.0, -l / 2),
+        ("C", "ground", "crank", 0.0, -r / 2),
+        ("R", "crank", "rod", r / 2, -l / 2),
+        ("E", "arm", "forearm", l / 2, -middle),
+        ("F", "rod", "forearm", l / 2, r - middle),
+    ]
 
-    def hinges(p):
-        middle = (p["w"] - p["r"]) / 2
-        return [
-            ("A", "ground", "arm", 0.0, -p["l"] / 2),
-            ("C", "ground", "crank", 0.0, -p["r"] / 2),
-            ("R", "crank", "rod", p["r"] / 2, -p["l"] / 2),
-            ("E", "arm", "forearm", p["l"] / 2, -middle),
-            ("F", "rod", "forearm", p["l"] / 2, p["r"] - middle),
-        ]
-
-    def poses(p, x):
+    def poses(x):
         a, b = along(x[0]), along(x[1])
         return {
-            "arm": (p["l"] / 2 * a, x[0]),
-            "crank": (p["r"] / 2 * b, x[1]),
-            "rod": (p["r"] * b + p["l"] / 2 * a, x[0]),
-            "forearm": (p["l"] * a + (p["w"] - p["r"]) / 2 * b, x[1]),
+            "arm": (l / 2 * a, x[0]),
+            "crank": (r / 2 * b, x[1]),
+            "rod": (r * b + l / 2 * a, x[0]),
+            "forearm": (l * a + (w - r) / 2 * b, x[1]),
         }
 
-    lengths = lambda p: {"arm": p["l"], "crank": p["r"], "rod": p["l"], "forearm": p["w"] + p["r"]}
-    return FlatLinkage(hinges, poses, lengths, {"l": 0.7, "r": 0.25, "w": 0.8}, (0.3, 1.5))
+    return FlatLinkage(hinges, poses, {"arm": l, "crank": r, "rod": l, "forearm": w + r}, (0.3, 1.5))
 
 
 LINKAGES = {

@@ -1,17 +1,12 @@
 """Random small programs of one member, for comparison of members side by side with a loop over members.
 
-`python tests/support/random_programs.py --cases 200` compares many of them, also as users compile them, with
-`--compile "for batches"`.
-
 A program is a function of arrays that applies random operations to its arguments and to earlier results: elementwise
 operations, reductions, products, indices, loops, conditions, `vmap` and derivatives, which have random programs inside.
 Results are bounded. Comparisons are of multiples of a step, and neither ties nor steps are likely where rounding
 differs.
 """
 
-import argparse
 import functools
-import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -20,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-import jaxmb
 from jaxmb._compat import cond_of_any_lane, cond_of_lanes, loop_of_lanes, while_loop
 from jaxmb.lanes import in_lanes
 
@@ -527,26 +521,3 @@ def check(seed: int) -> None:
     for k, (expected, found) in enumerate(results(seed)):
         assert (found.shape, found.dtype) == (expected.shape, expected.dtype), (seed, k, found.shape, expected.shape)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9, err_msg=f"program {seed}, result {k}")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Compare random programs side by side with loops over members.")
-    parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--compile", default=None, help='as in jaxmb.setup: "quickly", "for speed" or "for batches"')
-    chosen = parser.parse_args()
-    jaxmb.setup(compile=chosen.compile, keep=False)
-    failed = 0
-    for seed in range(chosen.first, chosen.first + chosen.cases):
-        try:
-            check(seed)
-        except Exception as error:
-            failed += 1
-            print(f"{seed}: {type(error).__name__}: {str(error)[:1500]}", flush=True)
-        jax.clear_caches()
-    print(f"{failed} of {chosen.cases} programs differ")
-    sys.exit(failed > 0)
-
-
-if __name__ == "__main__":
-    main()
