@@ -261,21 +261,6 @@ def test_a_ladder_rubs_on_floor_and_wall():
     np.testing.assert_allclose(np.abs(multipliers), [floor, wall], rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_a_bead_in_a_rough_loop():
-    """With the angle φ from the lowest point, `dv²/dφ = −2 g R sin φ − 2 μ (v² + g R cos φ)` has a closed form."""
-    mu, start = 0.3, 12.0
-    mechanism = mb.mechanisms.rough_ring(friction=mu, speed=start, gravity=G, model="rigid_bodies")
-    run = mb.simulate(mechanism.system, mechanism.state, t1=0.5, rtol=1e-11)
-    x, y = np.asarray(run["bead"].position[-1])
-    # The bead starts at φ = π/2; one particular solution and one that decays.
-    phi = np.pi / 2 + np.mod(np.arctan2(y, x), 2 * np.pi)
-    particular = lambda a: 2 * G * ((1 - 2 * mu**2) * np.cos(a) - 3 * mu * np.sin(a)) / (1 + 4 * mu**2)
-    decay = np.exp(-2 * mu * (phi - np.pi / 2))
-    expected = particular(phi) + (start**2 - particular(np.pi / 2)) * decay
-    np.testing.assert_allclose(np.sum(np.square(run["bead"].velocity[-1])), expected, rtol=1e-9)
-
-
 # Derivatives
 
 
@@ -298,29 +283,6 @@ def test_derivatives_of_accelerations():
     np.testing.assert_allclose(reverse[0], forward[0], rtol=1e-11)
     np.testing.assert_allclose(forward[0], four(values) / h, rtol=1e-8)
     np.testing.assert_allclose(second[0], four(reverse) / h[:, None], rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_motion():
-    system, y = rod(), rod_state(1.2, 2.0, 0.0)
-    names = ["rub.coefficient", "rod.mass"]
-    start = jnp.array([0.3, M])
-
-    def end(x, rtol):
-        changed = mb.with_parameters(system, dict(zip(names, x, strict=True)))
-        run = mb.simulate(changed, y, t1=0.2, rtol=rtol, max_steps=256, throw=False)
-        return run.ys.q[-1, 2] + run.ys.u[-1, 0]
-
-    reverse = jax.jit(jax.grad(lambda x: end(x, 1e-9)))(start)
-    twice = lambda x, rtol: (end(x, rtol),) * 2
-    both = jax.jit(jax.vmap(jax.jacfwd(twice, has_aux=True), in_axes=(0, None)))
-    h = 1e-3 * np.asarray(start)
-    places = np.asarray(start)[None] + np.concatenate([k * np.diag(h) for k in (1, -1, 2, -2)] + [np.zeros((1, 2))])
-    values = np.asarray(both(jnp.asarray(places), 1e-12)[1])
-    central = (8 * (values[0:2] - values[2:4]) - (values[4:6] - values[6:8])) / (12 * h)
-    forward = both(start[None], 1e-9)[0][0]
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    np.testing.assert_allclose(forward, central, rtol=1e-5)
 
 
 # The regularisation

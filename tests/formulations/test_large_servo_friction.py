@@ -114,27 +114,3 @@ def test_motion_and_its_derivatives():
     h, at = 1e-3, lambda h: forward(h, 1e-12)[0]
     difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
     np.testing.assert_allclose(push, difference, rtol=1e-6)
-
-
-def test_friction_without_a_solution_is_named():
-    """A rod slides on a floor beside a chain of many joints, and swings up to Painlevé's angle, where
-    `3 μ sin θ cos θ = 1 + 3 cos² θ`.
-    """
-    links, half, mu, angle, speed, rate = 15, 0.5, 1.5, 0.5, -3.0, 6.0
-    s, c = np.sin(angle), np.cos(angle)
-    bodies = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, position=(3.5 + k, -5.0)) for k in range(links)]
-    moving = {"velocity": (speed - half * s * rate, half * c * rate), "angular_velocity": rate}
-    bodies.append(planar.Body("rod", mass=1.2, inertia=0.1, position=(half * c, half * s), angle=angle, **moving))
-    joints = [
-        planar.Revolute(f"j{k}", f"b{k - 1}" if k else "ground", f"b{k}", point=(3.0 + k, -5.0)) for k in range(links)
-    ]
-    joints.append(planar.PointOnLine("floor", "ground", "rod", point=(0.0, 0.0), axis=(1.0, 0.0)))
-    forces = [mb.Gravity((0.0, -9.81)), planar.Friction("rub", "floor", coefficient=mu, transition_speed=1e-3)]
-    system = mb.Scene(bodies, joints=joints, forces=forces).compile()
-    assert system.elimination is not None
-    run = mb.simulate(system, mb.assemble(system), t1=1.0, throw=False)
-    assert run.result == mb.RESULTS.friction_undetermined
-    last = run["rod"].angle[-1]
-    np.testing.assert_allclose(3 * mu * np.sin(last) * np.cos(last), 1 + 3 * np.cos(last) ** 2, rtol=1e-6)
-    with pytest.raises(RuntimeError, match=r"friction of 'floor' came to a singular configuration.*Painlevé"):
-        mb.simulate(system, mb.assemble(system), t1=1.0)

@@ -55,3 +55,5 @@ def test_laws_applied_forces_and_memory(build, laws):
             system.nonideal_force(0.0, q, u, multipliers) if laws is GivenLaws else applied - system.force(0.0, q, u)
         )
         assert u @ np.asarray(force) < 0
+        if laws is GivenLaws:
+            np.testing.assert_allclose(force, -0.2 * u, rtol=1e-14)

@@ -10,7 +10,6 @@ import pytest
 import jaxmb as mb
 from jaxmb import manifold, planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
-from jaxmb.report import stress_test
 
 pytestmark = pytest.mark.slow
 
@@ -96,28 +95,6 @@ def test_accelerations(name, n):
         np.testing.assert_allclose(solve(own), expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("n", [5, 16])
-def test_derivatives_of_accelerations(n):
-    """Forward, reverse and central differences by a light and a heavy mass, several at once."""
-    system = alternating(planar_chain(n).compile(), 1e-8)
-    state = moving(system)
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=system.nu))
-
-    def total(factor):
-        changed = mb.with_parameters(system, {"rod3.mass": 1e-8 * factor, "rod2.mass": factor})
-        return weights @ accelerations(changed, Multipliers(), 0.0, state.q, state.u)[0]
-
-    h, factors = 1e-4, jnp.array([0.9, 1.0, 1.1])
-
-    def three_ways(x):
-        forward = jax.jvp(total, (x,), (jnp.ones(()),))[1]
-        return forward, jax.grad(total)(x), (total(x + h) - total(x - h)) / (2 * h)
-
-    forward, reverse, differences = jax.jit(jax.vmap(three_ways))(factors)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-11)
-    np.testing.assert_allclose(forward, differences, rtol=1e-6)
-
-
 def test_steps_are_those_of_partitioning():
     """Sparse elimination takes as many steps as partitioning with the same accelerations, but for some at the start,
     where the factor is that of a state before the step. The motion has its derivatives.
@@ -140,11 +117,3 @@ def test_steps_are_those_of_partitioning():
     forward, reverse = jax.jit(jax.jacfwd(end))(one), jax.jit(jax.grad(end))(one)
     np.testing.assert_allclose(forward, reverse, rtol=1e-6)
     np.testing.assert_allclose(reverse, (tight(one + h) - tight(one - h)) / (2 * h), rtol=1e-5)
-
-
-def test_report():
-    """The report has variants whose masses alternate, and each is right."""
-    system = planar_chain(12).compile()
-    report = stress_test(system, mb.assemble(system), t1=0.1, only=["alternating masses"])
-    assert len(report.rows) == 6
-    assert all(error == "small" or error < 1e-6 for error in report["error"]), report

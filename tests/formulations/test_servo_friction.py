@@ -2,12 +2,11 @@
 
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rough_machines import GRAVITY, SCENES, manipulator, pendulum, sledge
+from rough_machines import GRAVITY, SCENES, manipulator
 
 import jaxmb as mb
 from jaxmb import formulations, planar
@@ -22,40 +21,6 @@ def random_state(system, seed):
     guess = system.guess.q + 0.2 * rng.normal(size=system.nq)
     state = mb.assemble(system, guess=mb.State(guess, jnp.asarray(rng.normal(size=system.nu))))
     return state.q, state.u
-
-
-def test_sliding_block():
-    """Uphill it is slowed by weight and friction; N is that of the slope."""
-    system = sledge()
-    start = mb.assemble(system)
-    motion = mb.simulate(system, start, t1=0.3, rtol=1e-10)
-    speed = 3 - 9.81 * (np.sin(0.3) + 0.2 * np.cos(0.3)) * 0.3
-    # The friction is smoothed at 1e-4 of some m/s.
-    np.testing.assert_allclose(np.linalg.norm(motion["block"].velocity[-1]), speed, rtol=1e-8)
-    force = motion.reactions["rail"].force[-1]
-    np.testing.assert_allclose(np.linalg.norm(force), 2 * 9.81 * np.cos(0.3), rtol=1e-9)
-
-
-def test_friction_takes_the_energy():
-    """The energy that a swing loses is the work against the pin's friction, μ N r |ω|."""
-    system = pendulum()
-    start = mb.assemble(system)
-    times = np.linspace(0.0, 0.6, 61)
-    motion = mb.simulate(system, start, t1=0.6, rtol=1e-11, saveat=jnp.asarray(times))
-    # The pin carries the weight and what accelerates the arm.
-    bearing = 1.5 * np.linalg.norm(np.asarray(motion.accelerations)[:, :2] + np.array([0.0, 9.81]), axis=-1)
-    slip = 0.05 * np.asarray(motion["arm"].angular_velocity)
-    power = 0.3 * bearing * slip * np.tanh(slip / 1e-4)
-    # Simpson's rule, away from the start, where the slip grows through the transition.
-    h, p = times[1] - times[0], power[20:]
-    work = h / 3 * (p[0] + 4 * np.sum(p[1:-1:2]) + 2 * np.sum(p[2:-1:2]) + p[-1])
-    energy = np.asarray(motion.energy)
-    np.testing.assert_allclose(energy[20] - energy[-1], work, rtol=1e-7)
-    assert energy[20] - energy[-1] > 0.01
-
-
-def without_friction(system):
-    return eqx.tree_at(lambda s: s.constraints.nonideal, system, ())
 
 
 def test_program_is_reached_as_its_gains_say():
@@ -146,23 +111,6 @@ def test_the_laws_of_newton_and_euler_close_for_every_body():
     for force, moment in left.values():
         np.testing.assert_allclose(force, 0.0, atol=1e-9)
         np.testing.assert_allclose(moment, 0.0, atol=1e-9)
-
-
-def test_control_is_the_least():
-    """Any other force on the velocities that keeps joints and program is larger in the metric of M⁻¹."""
-    system = without_friction(manipulator())
-    q, u = random_state(system, 5)
-    t = jnp.array(0.3)
-    _, multipliers = accelerations(system, formulations.Multipliers(), t, q, u)
-    control = system.constraint_force(t, q, u, multipliers)
-    A = system.jacobian(t, q, u)
-    inverse = lambda f: system.inertia(t, q, u).solve(f)
-    other = np.random.default_rng(0).normal(size=system.nu)
-    along = A @ inverse(jnp.asarray(other))
-    other = other - A.T @ jnp.linalg.solve(A @ jax.vmap(inverse)(A).T, along)
-    np.testing.assert_allclose(A @ inverse(other), 0.0, atol=1e-12)
-    larger = control + other
-    np.testing.assert_allclose(larger @ inverse(larger), control @ inverse(control) + other @ inverse(other))
 
 
 def test_function_of_the_reactions():

@@ -102,23 +102,6 @@ def test_shares_do_not_depend_on_units_and_on_the_order_of_joints(crank):
 
 
 @pytest.mark.slow
-def test_reactions_that_are_determined_stay():
-    """A pendulum on one hinge beside a bar on two, and the same pendulum alone."""
-    body = lambda name, x: spatial.Body(name, mass=1.0, inertia=(0.1, 0.1, 0.1), position=(x, 0.0, 0.0))
-    hinge = lambda name, a, b, x: spatial.Revolute(name, a, b, point=(x, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
-    pin, joints = (
-        hinge("pin", "ground", "bob", 5.0),
-        [hinge("A", "ground", "bar", 0.0), hinge("B", "bar", "ground", 0.0)],
-    )
-    options = {"forces": [mb.Gravity((0.0, -9.81, 0.0))]}
-    both = mb.Scene([body("bar", 0.5), body("bob", 5.5)], joints=[*joints, pin], **options).compile()
-    alone = mb.Scene([body("bob", 5.5)], joints=[pin], **options).compile()
-    ends = [at_start(s, mb.assemble(s, rates={"pin.angle": 2.0})).reactions["pin"] for s in (both, alone)]
-    np.testing.assert_allclose(ends[0].force, ends[1].force, atol=1e-8)
-    np.testing.assert_allclose(ends[0].moment, ends[1].moment, atol=1e-8)
-
-
-@pytest.mark.slow
 def test_derivatives_of_shares(crank):
     """By the mass of the coupler and the speed of the crank."""
 

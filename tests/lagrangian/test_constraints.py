@@ -23,7 +23,6 @@ from jaxmb.lagrangian import (
     QuasiVelocities,
     QuasiVelocityFrame,
     ServoConstraint,
-    Viscous,
     Voronets,
 )
 
@@ -144,19 +143,6 @@ def test_work_of_constraint_forces():
         np.testing.assert_allclose(systems[0].acceleration_residual(ZERO, q, u, udot), 0.0, atol=1e-14)
         # What is normal to the ring has no effect.
         np.testing.assert_allclose(*others, rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_energy_goes_into_friction():
-    """Of both kinds, by their power."""
-    system = ring(CoulombFriction("ring", "mu"), Viscous("ring", "c"))
-    ts = np.linspace(0.0, 2.0, 400)
-    run = mb.simulate(system, system.guess, t1=2.0, rtol=1e-11, saveat=ts)
-    speed = np.linalg.norm(np.asarray(run.ys.u), axis=1)
-    # On a ring of radius one the normal force is the speed's square.
-    power = 0.3 * speed**3 + 0.2 * speed**2
-    lost = np.sum((ts[1] - ts[0]) * (power[1:] + power[:-1]) / 2)
-    np.testing.assert_allclose(run.energy[0] - run.energy[-1], lost, rtol=1e-5)
 
 
 # The spherical four-bar

@@ -208,17 +208,6 @@ def test_systems_of_ones_own():
     assert (square.linear, square.drift_free) == (False, True)
 
 
-@pytest.mark.slow
-def test_motion_of_a_system_of_ones_own():
-    """The drive moves it by sin(2 t), and its other coordinate by 0.3 t; every solver's manifold sees the drift."""
-    crank = Crank(jnp.ones(()), jnp.zeros(()), jnp.ones(()), mb.State(jnp.zeros(2), jnp.array([0.0, 0.3])))
-    moving = mb.with_parameters(crank, {"speed": 2.0})
-    state = mb.assemble(moving)
-    for manifold in (mb.manifold.Partition(), mb.manifold.Projection()):
-        motion = mb.simulate(moving, state, t1=1.0, rtol=1e-9, manifold=manifold)
-        np.testing.assert_allclose(motion.ys.q[-1], [np.sin(2.0), 0.3], atol=1e-7)
-
-
 WRONG = {
     "kinetic": lambda: LagrangianSystem(kinetic=lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[5] ** 2), q=[0.3, 0.2]),
     "potential": lambda: LagrangianSystem(

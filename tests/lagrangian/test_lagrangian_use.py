@@ -1,6 +1,5 @@
 """What is built around systems works for those from a Lagrangian: assembly, descriptions, saved motions, pictures."""
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 import jaxmb as mb
-from jaxmb import mechanisms
 from jaxmb.formulations import Partitioned
 from jaxmb.lagrangian import (
     Holonomic,
@@ -187,19 +185,6 @@ def test_rates_plots_and_files_of_a_motion(framed, motion, tmp_path):
 
 
 # Projection
-
-
-@pytest.mark.slow
-def test_projection_keeps_wheels_from_slipping():
-    """All coordinates of a cart, projected on its constraints, against its quasi-velocities without any."""
-    free, held = (mechanisms.nonholonomic_cart(form=form) for form in ("frame", "constraints"))
-    end = lambda m: mb.simulate(m.system, m.state, t1=1.0, rtol=1e-9, solver=diffrax.Dopri8())
-    expected, projected = end(free), end(held)
-    np.testing.assert_allclose(projected.ys.q, expected.ys.q, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(projected.ys.u, expected.rates, rtol=0, atol=1e-7)
-    assert np.max(projected.constraint_violation.velocity) <= 1e-12
-    for name, own in held.system.quantities().items():
-        assert eqx.filter_eval_shape(mb.Trajectory.quantity, projected, name).shape == (1, *own.shape)
 
 
 @pytest.mark.slow

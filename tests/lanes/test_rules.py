@@ -145,7 +145,8 @@ CASES = {
 }
 
 
-SLOW = ("powers twice", "halved within", "derivatives of a loop", "chosen within", "keys", "no terms", "recomputed")
+SLOW = ("no rows", "large updated", "large mode", "entries at the same places", "long sums", "shared switch")
+SLOW += ("powers twice", "halved within", "derivatives of a loop", "chosen within", "keys", "no terms", "recomputed")
 
 
 def on_last_axis(function, *members):

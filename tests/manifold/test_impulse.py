@@ -85,16 +85,6 @@ def test_times_at_jumps_move_beyond_them_with_derivative_one():
     np.testing.assert_array_equal(slope, np.eye(3))
 
 
-@pytest.mark.slow
-def test_a_force_that_is_switched_on():
-    """Exact in few steps, where a jump that nobody announces is found by steps that are too long."""
-    law = lambda poses, velocities, t, p: jnp.stack([jnp.where(t < 0.3, 0.0, 2.0), 0.0 * t, 0.0 * t])[None]
-    system = mb.Scene([planar.PointMass("body", mass=1.0)], forces=[mb.Force("push", "body", law)]).compile()
-    ends = [mb.simulate(system, mb.assemble(system), t1=1.0, jumps=jumps) for jumps in ([0.3], None)]
-    np.testing.assert_allclose(ends[0]["body"].position[-1, 0], 0.7**2, rtol=0, atol=1e-13)
-    assert ends[0].stats["num_steps"] < 0.5 * ends[1].stats["num_steps"]
-
-
 REFUSED: list[tuple[Any, str]] = [
     ({"jumps": [np.nan]}, "jumps must not be NaN"),
     ({"jumps": [np.inf]}, "jumps must be a vector of finite times"),
@@ -217,36 +207,6 @@ def test_only_the_kink_of_turns_in_space_is_found(turns, kinks):
     ]
     system = mb.Scene([spatial.Body("arm", mass=1.0, inertia=(0.1, 0.2, 0.2))], joints=joints).compile()
     assert sorted({float(jump.t) for jump in find_jumps(system, system.guess.q, 0.0, 1.0, [])}) == kinks
-
-
-@pytest.mark.slow
-def test_a_pendulum_on_a_driven_cart_beside_a_fast_driver():
-    """The cart starts at once beside a shaft that swings fast: unannounced, its impulse on the pendulum is lost."""
-    start = lambda t, p: jnp.where(t < 0.5, 0.2 * t, 0.1 + 1.2 * (t - 0.5))
-    swing = lambda t, p: 0.1 * jnp.tanh(300.0 * (t - 0.7))
-    bodies = [
-        planar.Body("cart", mass=2.0, inertia=0.1),
-        planar.Body("pendulum", mass=1.0, inertia=1 / 12, position=(0.0, -0.5)),
-        planar.Body("shaft", mass=0.1, inertia=0.01, position=(3.0, 0.0)),
-    ]
-    joints = [
-        planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0)),
-        planar.Revolute("pin", "cart", "pendulum", point=(0.0, 0.0)),
-        planar.Revolute("axle", "ground", "shaft", point=(3.0, 0.0)),
-        planar.Driver("drive", "ground", "cart", quantity="x", motion=start),
-        planar.Driver("swing", "ground", "shaft", quantity="angle", motion=swing),
-    ]
-    system = mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -G))]).compile()
-    state = mb.assemble(system, fix={"pendulum.angle": 0.1}, rates={"pendulum.angle": 0.0})
-    with pytest.warns(UserWarning, match=r"'drive' prescribes.* t = 0.5, .*jumps=\[0.5\]"):
-        missed = mb.simulate(system, state, t1=1.0)
-    found = mb.simulate(system, state, t1=1.0, jumps=jnp.array([0.5]))["pendulum"].angle[-1]
-    field = lambda t, y: [y[1], -1.5 * G * np.sin(y[0])]
-    angle, rate = solve_ivp(field, (0.0, 0.5), [0.1, 0.0], rtol=1e-12, atol=1e-13).y[:, -1]
-    # The pin jumps by one metre a second: about it the moment of momentum of the pendulum changes.
-    after = solve_ivp(field, (0.0, 0.5), [angle, rate - 1.5 * np.cos(angle)], rtol=1e-12, atol=1e-13).y[0, -1]
-    np.testing.assert_allclose(found, after, rtol=0, atol=1e-6)
-    assert abs(missed["pendulum"].angle[-1] - after) > 0.1
 
 
 @pytest.mark.slow

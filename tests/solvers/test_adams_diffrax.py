@@ -1,7 +1,6 @@
 """Everything diffrax offers works with the multistep solver: saving, events, jumps, batches, backward time, pytrees."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,57 +116,8 @@ def test_continuation_repeats_the_unbroken_solve():
     assert jumped.solver_state.step_counts[0] == 2
 
 
-@pytest.mark.slow
-def test_single_precision_and_mixed_leaves():
-    for of_v in (jnp.float32, jnp.float64):
-        y0 = {"x": jnp.array([1.0], jnp.float32), "v": jnp.zeros((1, 1), of_v)}
-        field = lambda t, y, args, of_v=of_v: {
-            "x": y["v"][0].astype(jnp.float32),
-            "v": -y["x"][None].astype(of_v),
-        }
-        controller = MultistepController(1e-4, 1e-4)
-        solution = _solve(jnp.float32(0), jnp.float32(4), y0=y0, vector_field=field, controller=controller)
-        assert solution.ys["x"].dtype == jnp.float32 and solution.ys["v"].dtype == of_v
-        np.testing.assert_allclose(solution.ys["x"][0, 0], np.cos(4.0), rtol=0, atol=2e-3)
-
-
 def _pulse(t, y, args):
     return jnp.where(t < 1.0, -y, -y + 3.0 * jnp.cos(t))
-
-
-@pytest.mark.slow
-def test_restart_after_a_jump_repeats_an_opening():
-    saveat = diffrax.SaveAt(steps=True, solver_state=True)
-    # So coarse that rounding errors have no say in the size of steps.
-    controller = MultistepController(1e-4, 1e-4)
-    common = {"vector_field": _pulse, "saveat": saveat, "max_steps": 64}
-    jumping = diffrax.ClipStepSizeController(controller, jump_ts=jnp.array([1.0]))
-    whole = _solve(0.0, 3.0, y0=jnp.array([2.0]), controller=jumping, **common)
-    at_jump = int(np.argmin(np.abs(np.asarray(whole.ts) - 1.0)))
-    assert whole.solver_state.step_counts[0] == 2
-    # The same, started after the jump with the first step that the restart settled for.
-    t0 = np.nextafter(1.0, 2.0)
-    fresh = _solve(t0, 3.0, y0=whole.ys[at_jump], dt0=whole.ts[at_jump + 1] - t0, controller=controller, **common)
-    n = int(fresh.stats["num_accepted_steps"])
-    # The first step is one that was settled for; a later one is too long for both.
-    assert n == whole.stats["num_accepted_steps"] - at_jump - 1 and fresh.stats["num_rejected_steps"] <= 1
-    np.testing.assert_allclose(whole.ts[at_jump + 1 :][:n], fresh.ts[:n], rtol=1e-9)
-    np.testing.assert_allclose(whole.ys[at_jump + 1 :][:n], fresh.ys[:n], rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_jumps_in_a_batch_and_their_cost():
-    def run(when):
-        vector_field = lambda t, y, args: jnp.where(t < when, -y, -y + 3.0)
-        controller = diffrax.ClipStepSizeController(CONTROLLER, jump_ts=when[None])
-        solution = _solve(0.0, 3.0, y0=jnp.array([2.0]), vector_field=vector_field, controller=controller)
-        return solution.ys[-1, 0], solution.stats["num_rejected_steps"]
-
-    whens = jnp.array([0.7, 1.9])
-    exact = 3.0 + (2.0 * jnp.exp(-whens) - 3.0) * jnp.exp(-(3.0 - whens))
-    ys, rejected = jax.jit(jax.vmap(run))(whens)
-    np.testing.assert_allclose(ys, exact, rtol=0, atol=1e-6)
-    assert np.all(rejected < 10)
 
 
 def test_unannounced_jump_is_found():
@@ -197,35 +147,3 @@ def test_stepping_to_times_costs_little():
     assert clipped.stats["num_steps"] < plain.stats["num_steps"] + 12
     n = int(clipped.stats["num_accepted_steps"])
     _assert_close(jax.tree.map(lambda x: x[n - 1], clipped.ys), _exact(4.0))
-
-
-@pytest.mark.slow
-def test_evaluations_are_counted():
-    calls = []
-
-    def vector_field(t, y, args):
-        jax.debug.callback(lambda: calls.append(1))
-        return -y + jnp.sin(t)
-
-    solution = _solve(
-        0.0,
-        3.0,
-        y0=jnp.array([1.0]),
-        vector_field=vector_field,
-        dt0=0.3,
-        saveat=diffrax.SaveAt(t1=True, solver_state=True),
-    )
-    jax.effects_barrier()
-    assert solution.stats["num_rejected_steps"] > 0
-    step_counts = solution.solver_state.step_counts
-    assert step_counts[1:].sum() == solution.stats["num_accepted_steps"]
-    assert len(calls) == 2 * solution.stats["num_steps"]
-
-
-@pytest.mark.slow
-def test_plain_terms_trace_no_manifold():
-    jaxpr = str(jax.make_jaxpr(lambda: _solve().ys)())
-    state = eqx.filter_eval_shape(lambda: _solve(saveat=diffrax.SaveAt(solver_state=True))).solver_state
-    assert state.chart is None
-    # Without jumps, events and charts nothing is left to branch on within a step.
-    assert "cond[" not in jaxpr.split("while[")[1].split("body_jaxpr")[0]

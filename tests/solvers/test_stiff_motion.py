@@ -6,7 +6,6 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 from oracles import linkages
 
@@ -110,15 +109,6 @@ def test_stiff_four_bar_is_accurate_in_extreme_cases():
         np.testing.assert_allclose(bushing()(rtol=rtol)[0], expected, rtol=20 * rtol)
 
 
-@pytest.mark.slow
-def test_flyball_to_the_end():
-    mechanism = library("flyball")
-    times = mechanism.references.times
-    trajectory = mb.simulate(mechanism.system, mechanism.state, t1=10.0, saveat=times, rtol=1e-9, solver=Hermite())
-    assert max(float(np.max(error)) for error in mechanism.errors(trajectory).values()) < 1e-7
-    assert trajectory.stats["num_accepted_steps"] < 1000
-
-
 # A mass on a spring and a damper
 
 
@@ -155,21 +145,6 @@ def test_mass_on_a_spring_moves_by_its_closed_form():
         assert steps < most
         exact = released(stiffness, damping, times)
         np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-12 if damping > 100 else 1e-9)
-
-
-@pytest.mark.slow
-def test_force_that_jumps_is_met_by_an_event():
-    """A spring that becomes ten times as stiff where half the way is gone: to the event, and on from it."""
-    event = diffrax.Event(lambda t, y, args, **kwargs: y.q[0] - 5e-4, optx.Newton(1e-12, 1e-12))
-    options = {"rtol": 1e-9, "atol": 1e-14, "solver": Hermite()}
-    first = mb.simulate(slider(), START, t1=1.0, event=event, **options)
-    assert first.result == mb.RESULTS.event_occurred
-    np.testing.assert_allclose(released(1e8, 1e6, first.ts[-1]), 5e-4, rtol=1e-8)
-    stiffer = mb.with_parameters(slider(), {"spring.stiffness": jnp.array([1e9, 1e9, 1.0])})
-    middle = jax.tree.map(lambda y: y[-1], first.ys)
-    second = mb.simulate(stiffer, middle, t0=first.ts[-1], t1=first.ts[-1] + 1e-3, **options)
-    expected = released(1e9, 1e6, 1e-3, middle.q[0], middle.u[0])
-    np.testing.assert_allclose(second.ys.q[-1, 0], expected[0], rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -263,17 +238,9 @@ def test_switch_sees_every_number():
         start = jax.tree.map(lambda y: y * x, mechanism.state) if traced == "state" else mechanism.state
         return mb.simulate(own, start, t1=1.0, solver="switch", **options).ys
 
-    for traced in ("state", "parameter", "tolerance", "saved time", "jump", "input"):
+    for traced in ("state", "tolerance", "saved time", "jump", "input"):
         with pytest.raises(ValueError, match="under jit"):
             jax.jit(run, static_argnums=1)(1.0, traced)
     for transform, x in ((lambda f: jax.vmap(f, axis_size=2), jnp.ones(2)), (jax.jacfwd, 1.0)):
         with pytest.raises(ValueError, match="under jit"):
             transform(lambda x: run(x, "parameter"))(x)
-
-
-@pytest.mark.slow
-def test_implicit_solvers_of_diffrax():
-    mechanism = library("four_bar")
-    other = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-6, solver=diffrax.Kvaerno5())
-    own = mb.simulate(mechanism.system, mechanism.state, t1=0.1, rtol=1e-10)
-    np.testing.assert_allclose(other.ys.q, own.ys.q, rtol=0, atol=1e-6)

@@ -61,7 +61,7 @@ def test_stiffness_is_found_and_ends_a_solve(name, t1):
         assert result == diffrax.RESULTS.nonlinear_divergence and steps < 400
 
 
-@pytest.mark.slow(but=("kepler 0.9",))
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMOOTH)
 def test_stiffness_is_not_found_in_smooth_motions(name):
     """And to count it changes nothing."""

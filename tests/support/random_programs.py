@@ -148,14 +148,6 @@ def binary(draw):
 
 
 @operation
-def integers(draw):
-    k, n = draw.integer((3,), 5), draw.integer((3,), 5)
-    of_two = (jnp.add, lambda a, b: a // (b + 2), lambda a, b: a % (b + 2), jnp.bitwise_xor, jnp.maximum)
-    of_two += (lambda a, b: a << (b & 3), lambda a, b: a >> (b & 3), lambda a, b: a * b, jnp.equal)
-    return draw.one(*of_two)(k, n)
-
-
-@operation
 def selected(draw):
     x = draw.real()
     shape = draw.one((), x.shape)
@@ -307,12 +299,6 @@ def scattered(draw):
     return draw.one(*ways)(update, **how)
 
 
-@operation
-def random_numbers(draw):
-    key = jax.random.fold_in(jax.random.key(3), draw.integer())
-    return jax.random.uniform(draw.one(key, jax.random.split(key)[1]), (draw.one(*SIZES),))
-
-
 # Operations with programs inside.
 
 
@@ -350,14 +336,6 @@ def mapped(draw):
     share = draw.one(None, 0)
     y = y if share is None else fitted(y, (n, *y.shape))
     return jax.vmap(inside, (axis, share, 0, 0), out)(x, y, z, k)
-
-
-@operation
-def mapped_twice(draw):
-    m, n = draw.one(*SIZES), draw.one(*SIZES)
-    x, y = fitted(draw.real(), (m, 2)), fitted(draw.real(), (n, draw.one(*SIZES)))
-    inside, k = draw.inside(), draw.real()
-    return jax.vmap(lambda x: jax.vmap(lambda y: inside(x, y, k))(y))(x)
 
 
 @operation
@@ -477,7 +455,7 @@ def jacobian(draw):
 
 
 INSIDE = (
-    called, with_reverse_rule, mapped, mapped, mapped_twice, branched, scanned, counted, whiled, whiled, buffered,
+    called, with_reverse_rule, mapped, mapped, branched, scanned, counted, whiled, whiled, buffered,
     of_lanes, forward, backward, jacobian,
 )  # fmt: skip
 PLAIN = [function for function, _ in OPERATIONS.values() if function not in INSIDE]
