@@ -35,19 +35,18 @@ def test_states_of_large_matrices_are_computed_in_blocks(monkeypatch):
 
 @pytest.mark.slow
 def test_saved_states_and_their_derivatives_do_not_depend_on_blocks(monkeypatch):
-    mechanism = mb.mechanisms.get("andrews")
+    mechanism = mb.mechanisms.get("four_bar")
     system, state = mechanism.system, mechanism.state
     key = next(key for key in mb.parameters(system) if key.endswith(".mass"))
-    times = np.linspace(0.0, 5e-3, 19)
+    times = np.linspace(0.0, 0.1, 19)
 
     def sizes(mass):
-        motion = mb.simulate(mb.with_parameters(system, {key: mass}), state, t1=5e-3, saveat=times)
+        motion = mb.simulate(mb.with_parameters(system, {key: mass}), state, t1=0.1, saveat=times)
         return jnp.stack([jnp.sum(motion.ys.q**2), jnp.sum(motion.multipliers**2)]), motion.ys
 
     mass = mb.parameters(system)[key]
-    both = lambda x: (sizes(x), jax.jacfwd(lambda x: sizes(x)[0])(x), jax.jacrev(lambda x: sizes(x)[0])(x))
+    both = lambda x: (sizes(x), jax.jacrev(lambda x: sizes(x)[0])(x))
     together = jax.jit(both)(mass)
     monkeypatch.setattr(members, "_CACHE", 1)
     apart = jax.jit(lambda x: both(x))(mass)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), together, apart)
-    np.testing.assert_allclose(apart[1], apart[2], rtol=1e-9)

@@ -27,38 +27,13 @@ from jaxmb.solvers.stability import (
     stiff_abscissa,
 )
 
-# b, c_0 and the error constant; a = (1, -1, 0, ...).
-E = {
-    1: ("2/3 1/3", "-1/6", "1/72"),
-    2: ("29/48 5/12 -1/48", "-1/8", "7/1440"),
-    3: ("307/540 19/40 -1/20 7/1080", "-19/180", "17/7200"),
-    4: ("3133/5760 47/90 -41/480 1/45 -17/5760", "-3/32", "41/30240"),
+# Of two points: a, b, c, the order and the error constant.
+PUBLISHED = {
+    "E": ("1 -1 0", "29/48 5/12 -1/48", "-1/8 0 0", 4, "7/1440"),
+    "B": ("1 -8/7 1/7", "6/7 0 0", "-2/7 0 0", 3, "1/21"),
+    "H": ("1 -1 0", "101/240 8/15 11/240", "-13/240 1/6 1/80", 6, "1/9450"),
+    "Y": ("1 -16/23 -7/23", "12/23 16/23 2/23", "-2/23 0 0", 5, "1/1035"),
 }
-
-# Denominator and numerators of a, then b_0, c_0 and the error constant.
-B = {
-    1: (1, "1 -1", "1", "-1/2", "1/6"),
-    2: (7, "7 -8 1", "6/7", "-2/7", "1/21"),
-    3: (85, "85 -108 27 -4", "66/85", "-18/85", "9/425"),
-    4: (415, "415 -576 216 -64 9", "60/83", "-72/415", "24/2075"),
-}
-
-# a, b, c and the error constant.
-H = {
-    1: ("1 -1", "1/2 1/2", "-1/12 1/12", "1/720"),
-    2: ("1 -1 0", "101/240 8/15 11/240", "-13/240 1/6 1/80", "1/9450"),
-    3: (
-        "1 -1 0 0",
-        "6893/18144 313/672 89/672 397/18144",
-        "-1283/30240 851/3360 269/3360 163/30240",
-        "313/25401600",
-    ),
-}
-Y = {
-    2: ("1 -16/23 -7/23", "12/23 16/23 2/23", "-2/23 0 0", "1/1035"),
-    3: ("1 0 -81/97 -16/97", "44/97 108/97 54/97 4/97", "-6/97 0 0 0", "3/27160"),
-}
-
 # Of some numbers of points.
 ANGLES = {
     "E": {1: 90, 3: 87.883, 7: 37.608},
@@ -70,21 +45,19 @@ ABSCISSAS = {1: 0, 2: 0, 3: 0.1034, 4: 0.5262}
 GROWTHS = {2: 3.847, 3: 2.148, 5: 1.325}
 
 
-def _rationals(text: str, length: int | None = None) -> tuple[Fraction, ...]:
-    out = tuple(map(Fraction, text.split()))
-    return out + (Fraction(0),) * ((length or len(out)) - len(out))
-
-
 def test_formulas_have_the_published_coefficients():
-    for k, (b, c, C) in E.items():
-        expected = (_rationals("1 -1", k + 1), _rationals(b), _rationals(c, k + 1))
-        assert formula("E", k) == (f"E{k}", *expected, k + 2, Fraction(C))
-    for k, (denominator, a, b, c, C) in B.items():
-        expected = (tuple(x / denominator for x in _rationals(a)), _rationals(b, k + 1), _rationals(c, k + 1))
-        assert formula("B", k) == (f"B{k}", *expected, k + 1, Fraction(C))
-    for family, table, order in (("H", H, lambda k: 2 * k + 2), ("Y", Y, lambda k: 2 * k + 1)):
-        for k, (*expected, C) in table.items():
-            assert formula(family, k) == (f"{family}{k}", *map(_rationals, expected), order(k), Fraction(C))
+    """And as many points and terms as give them their orders, by which they are known."""
+    rationals = lambda text: tuple(map(Fraction, text.split()))
+    for family, (a, b, c, order, C) in PUBLISHED.items():
+        assert formula(family, 2) == (f"{family}2", *map(rationals, (a, b, c)), order, Fraction(C))
+    for k in range(1, 8):
+        E, B, H, Y = (formula(family, k) for family in "EBHY")
+        assert [each.order for each in (E, B, H, Y)] == [k + 2, k + 1, 2 * k + 2, 2 * k + 1]
+        assert all(len(row) == k + 1 for each in (E, B, H, Y) for row in (each.a, each.b, each.c))
+        for each in (E, H):
+            assert each.a == (1, -1, *[0] * (k - 1))
+        assert all(x == 0 for row in (E.c, B.b, B.c, Y.c) for x in row[1:])
+        assert B.a[0] == Y.a[0] == 1
     assert formula("E", 1)[1:] == formula("Y", 1)[1:]
 
 
