@@ -1,13 +1,13 @@
-"""The derivative of an implicit step, against that of the equation solved to rounding."""
+"""Corrections of an implicit step, and its derivative against that of the equation solved to rounding."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmb.solvers._dense import DenseLinearization
+from jaxmb.solvers._dense import DenseLinearization, inverse
 from jaxmb.solvers._field import derivatives
-from jaxmb.solvers._newton import KnownStep, at_end
+from jaxmb.solvers._newton import KnownStep, StepEquation, at_end
 
 
 class Field(eqx.Module):
@@ -35,6 +35,30 @@ def solved(x, a, b, start, turns):
     corrected = lambda y: y - jnp.linalg.solve(jax.jacfwd(residual)(y), residual(y))
     y = corrected(start) if turns == 1 else jax.lax.fori_loop(0, turns, lambda _, y: corrected(y), start)
     return derivatives(field, t, y)[:3]
+
+
+def test_correction_follows_the_derivatives_along_the_motion():
+    """f and g after a correction are those of the corrected state, up to its square."""
+    field, t, h, free = Field(jnp.array(4.0)), jnp.asarray(0.7), 0.1, jnp.arange(2)
+    A, along_A = np.random.default_rng(1).normal(size=(2, 3, 3))
+
+    @jax.jit
+    def run(y, shift):
+        f = field(t, y)[0][1]
+        matrix = DenseLinearization.unknown(y, free).renewed(StepEquation(field, None, t, h, y, h, 0.0, free), y, f)
+        a, b = jnp.asarray(0.15), jnp.asarray(-0.02)
+        _, f, g, _ = derivatives(field, t, y)
+        equation = StepEquation(field, None, t, h, y - a * f - b * g + shift, a, b, free)
+        change, _, corrected, acceleration = matrix.correction(matrix.inverses(a, b, free), equation, y, f, g, f)
+        _, expected, rate, _ = derivatives(field, t, y - matrix.moved(change))
+        turned = jax.jvp(inverse, (jnp.asarray(A),), (jnp.asarray(along_A),))[1]
+        return change, corrected - expected, acceleration - rate, turned
+
+    change, of_f, of_g, turned = run(np.array([0.3, -0.5]), np.array([1e-3, -2e-3]))
+    assert np.max(np.abs(change)) > 5e-4
+    np.testing.assert_allclose(of_f, 0.0, atol=1e-5)
+    np.testing.assert_allclose(of_g, 0.0, atol=1e-4)
+    np.testing.assert_allclose(turned, -np.linalg.inv(A) @ along_A @ np.linalg.inv(A), rtol=1e-10, atol=1e-10)
 
 
 def test_derivative_of_a_step():

@@ -9,6 +9,7 @@ from ode_problems import PROBLEMS as SMOOTH
 from stiff_problems import PROBLEMS
 
 from jaxmb.solvers import Adams, MultistepController
+from jaxmb.solvers._stiffness import none_found, observed
 
 
 def run(vector_field, t1, y0, args, rtol, solver):
@@ -45,6 +46,28 @@ def test_stiffness_is_each_members_own():
     assert shares[1] > 0.5 and np.all(shares[::2] < 0.15)
     with pytest.raises(ValueError, match="'count'"):
         Adams(stiffness="maybe")  # pyright: ignore
+
+
+def test_evidence_of_stiffness_grows_faster_than_it_fades():
+    """By steps near the bound of stability along which the field changes little, until it is found."""
+
+    @jax.jit
+    def run(steps):
+        def step(before, is_stiff):
+            # The changes of y and f by the corrector, and by the step.
+            one = jnp.ones(())
+            after = observed(before, 4, one, (one, 2.0 * one), (10.0 * one, jnp.where(is_stiff, 0.1, 10.0)))
+            after = observed(after, 4, one, (one, 0.0 * one), (10.0 * one, 0.1 * one))
+            return after, (after.steps, after.level, after.found)
+
+        return jax.lax.scan(step, none_found(), steps)[1]
+
+    steps, level, found = run(np.arange(100) % 4 != 3)
+    np.testing.assert_array_equal(steps[:5], [1, 2, 3, 3, 4])
+    np.testing.assert_array_equal(level[:5], [2, 4, 6, 4, 6])
+    assert not found[-1] and steps[-1] == 75
+    # What is found stays so.
+    np.testing.assert_array_equal(run(np.arange(100) < 80)[2], np.arange(100) >= 74)
 
 
 @pytest.mark.slow
