@@ -47,7 +47,9 @@ def run(arm, values=None, **options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", [{}, {"manifold": mb.manifold.Projection()}, {"solver": mb.solvers.Hermite()}], ids=str
+    "options",
+    [{}, {"manifold": mb.manifold.Projection()}, {"solver": mb.solvers.Hermite()}],
+    ids=["chart", "projection", "implicit"],
 )
 def test_jump_of_a_driver_is_an_impulse(arm, options):
     motion = run(arm, **options)
