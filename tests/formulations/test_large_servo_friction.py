@@ -22,7 +22,7 @@ def swing(t, p):
 
 
 @functools.cache
-def planar_chain(n=14):
+def planar_chain(n=16):
     """Rods on pins, two of which rub, and a servo that moves the last rod's end; a spring holds the end."""
     angle = np.linspace(-0.3, 0.9, n)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -155,7 +155,7 @@ def run(system, state, *, rtol, **options):
 
 @pytest.mark.slow
 def test_a_long_chain_moves_as_by_other_equations():
-    times, n = np.array([0.1, 0.3]), 12
+    times, n = np.array([0.1, 0.3]), 16
     expected = sprung_chain(times, n=n, stiffness=1e4, damping=20.0)
     system = chain(n)
     state = mb.assemble(system)
