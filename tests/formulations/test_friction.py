@@ -55,26 +55,14 @@ def to_rod(q, u):
 
 def rod_state(angle, speed, rate):
     s, c = np.sin(angle), np.cos(angle)
-    q = jnp.array([A * c, A * s, angle])
-    return mb.State(q, jnp.array([speed - A * s * rate, A * c * rate, rate]))
+    q = np.array([A * c, A * s, angle])
+    return mb.State(q, np.array([speed - A * s * rate, A * c * rate, rate]))
 
 
-def creep(poses, velocities, reactions, t, p):
-    """The law of `Friction` of a rod's end, as a user writes it."""
-    place = A * jnp.stack([-jnp.cos(poses[-1, 2]), -jnp.sin(poses[-1, 2])])
-    slip = velocities[-1, 0] - velocities[-1, 2] * place[1]
-    force = -p["mu"] * jnp.abs(reactions[-1, 1]) * jnp.tanh(slip / V)
-    wrench = jnp.stack([force, jnp.zeros_like(force), -place[1] * force])
-    return jnp.stack([-wrench, wrench])
-
-
-def rod_scene(mu, law):
+def rod_scene(mu):
     body = planar.Body("rod", mass=M, inertia=J, position=(A, 0.0))
     floor = planar.PointOnLine("floor", "ground", "rod", point_a=(0.0, 0.0), point_b=(-A, 0.0), axis_a=(1.0, 0.0))
-    rub = {
-        "Friction": planar.Friction("rub", "floor", coefficient=mu, transition_speed=V),
-        "NonIdeal": mb.NonIdeal("rub", "floor", creep, parameters={"mu": mu}),
-    }[law]
+    rub = planar.Friction("rub", "floor", coefficient=mu, transition_speed=V)
     return mb.Scene([body], joints=[floor], forces=[GRAVITY, rub]).compile()
 
 
@@ -96,28 +84,29 @@ def rod_lagrangian(mu):
 
 @functools.cache
 def rod(law="Friction", mu=0.3):
-    return rod_lagrangian(mu) if law == "Lagrangian" else rod_scene(mu, law)
+    return rod_lagrangian(mu) if law == "Lagrangian" else rod_scene(mu)
 
 
 STATES = [(1.0, 2.0, 0.3), (0.7, -1.5, 8.0), (2.0, 1e-4, -1.0), (1.4, -3.0, -6.5), (0.6, 0.0, 7.0)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ["Friction", "NonIdeal", "Lagrangian"])
+@pytest.mark.slow(but=("Lagrangian",))
+@pytest.mark.parametrize("law", ["Friction", "Lagrangian"])
 def test_friction_is_the_coefficient_times_the_normal_force(law):
     """Of a rod on a floor, pressed on it and held down to it, by every formulation."""
     system = rod(law)
     roads = [formulations.Partitioned(), formulations.Multipliers(), formulations.NullSpace(), formulations.Poincare()]
+    roads = roads[:1] if law == "Lagrangian" else roads
     every = jax.jit(lambda q, u: [accelerations(system, road, 0.0, q, u) for road in roads])
     signs = set()
     for numbers in STATES:
         y = rod_state(*numbers)
         normal, force = rod_forces(0.3, *numbers)
         signs.add(np.sign(normal))
+        turn = A * (np.sin(numbers[0]) * force - np.cos(numbers[0]) * normal) / J
         for udot, multipliers in every(y.q, y.u):
             np.testing.assert_allclose(multipliers, [normal], rtol=1e-12)
             np.testing.assert_allclose(M * udot[:2], [force, normal - M * G], rtol=1e-11, atol=1e-11 * M * G)
-            turn = A * (np.sin(numbers[0]) * force - np.cos(numbers[0]) * normal) / J
             np.testing.assert_allclose(udot[2], turn, rtol=1e-11)
     assert signs == {-1.0, 1.0}
 
@@ -143,11 +132,6 @@ def test_a_sliding_rod():
 STEEP, SLIDING = 1.5, -3.0
 
 
-def into_the_paradox():
-    """A rod that is held down to the floor, and swings up to the angle of coupling 1."""
-    return rod(mu=STEEP), rod_state(0.5, SLIDING, 6.0)
-
-
 SOLVERS = {
     "Adams": {},
     "Tsit5": {"solver": diffrax.Tsit5(), "max_steps": 500, "rtol": 1e-6},
@@ -156,26 +140,23 @@ SOLVERS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [pytest.param(s, marks=[pytest.mark.slow][: s != "Adams"]) for s in SOLVERS])
-def test_a_motion_ends_where_friction_is_no_longer_unique(solver):
-    system, start = into_the_paradox()
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_motion_ends_where_friction_is_no_longer_unique(solver):
+    """A rod that is held down to the floor, and swings up to the angle of coupling 1; the error names the joint."""
+    system, start = rod(mu=STEEP), rod_state(0.5, SLIDING, 6.0)
     options = {"t1": 1.0, "saveat": diffrax.SaveAt(steps=True), "throw": False} | SOLVERS[solver]
     run = mb.simulate(system, start, **options)
     assert run.result == mb.RESULTS.friction_undetermined
     assert run.ts.size > 10 and np.all(np.isfinite(run.ys.q))
     np.testing.assert_allclose(coupling(STEEP, run["rod"].angle[-1]), 1.0, rtol=1e-6)
     assert run.reactions["floor"].force[-1, 1] < 0
-
-
-@pytest.mark.slow
-def test_the_error_names_the_joint():
-    system, start = into_the_paradox()
-    with pytest.raises(RuntimeError, match=r"friction of 'floor' came to a singular configuration.*Painlevé"):
-        mb.simulate(system, start, t1=1.0)
-    # From a state without a solution as well.
-    assert coupling(STEEP, 1.1) > 1
-    with pytest.raises(RuntimeError, match="'floor'"):
-        mb.simulate(system, rod_state(1.1, 2.0, 0.3), t1=1.0)
+    if solver == "Adams":
+        with pytest.raises(RuntimeError, match=r"friction of 'floor' came to a singular configuration.*Painlevé"):
+            mb.simulate(system, start, t1=1.0)
+        # From a state without a solution as well.
+        assert coupling(STEEP, 1.1) > 1
+        with pytest.raises(RuntimeError, match="'floor'"):
+            mb.simulate(system, rod_state(1.1, 2.0, 0.3), t1=1.0)
 
 
 @pytest.mark.slow
@@ -185,7 +166,7 @@ def test_no_solution_is_nan():
     systems = [rod(mu=critical * (1 + share)) for share in (-1e-6, 1e-6)]
     numbers = [(1.1, 2.0, 0.3), (1.1, -2.0, 0.3), (1.1, 2.0, 7.0), (1.1, -2.0, 7.0), (1.1, 1e-4, 0.3)]
     states = [rod_state(*own) for own in numbers]
-    batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    batch = jax.tree.map(lambda *x: np.stack(x), *states)
     one = lambda system, y: jnp.concatenate(accelerations(system, formulations.Multipliers(), 0.0, y.q, y.u))
     solve = jax.jit(jax.vmap(one, in_axes=(None, 0)))
     # A floor that presses has none then, one that holds two; near rest there is less friction, and one solution.
@@ -194,22 +175,26 @@ def test_no_solution_is_nan():
     np.testing.assert_array_equal(np.isfinite(solve(systems[1], batch)), finite)
 
 
-@pytest.mark.slow
-def test_equation_of_several_multipliers():
-    """Of laws that couple at random: solved wherever their coupling contracts, and refused elsewhere."""
-    rng = np.random.default_rng(0)
-    for k in (1, 2, 5):
-        slopes, starts = rng.normal(size=(40, k, k)), rng.normal(size=(40, k))
-        radii = np.max(np.abs(np.linalg.eigvals(np.abs(slopes))), axis=1)
-        sizes = np.tile([0.4, 0.99, 1.01, 3.0], 10) / radii
-        slopes = jnp.asarray(slopes * sizes[:, None, None])
-        solve = lambda slope, start: find_multipliers(jnp.abs, slope, start, np.zeros(start.size, bool))
-        x, _, failed = jax.vmap(solve)(slopes, jnp.asarray(starts))
-        np.testing.assert_array_equal(failed, sizes * radii > 1)
-        left = x - starts - jnp.einsum("bij,bj->bi", slopes, jnp.abs(x))
-        np.testing.assert_allclose(left[~failed], 0.0, atol=1e-12)
-        np.testing.assert_array_equal(x[failed], starts[failed])
-    assert contracts(jnp.array([[0.0, 0.5], [1.9, 0.0]])) and not contracts(jnp.array([[0.0, 0.5], [2.1, 0.0]]))
+def test_multipliers_of_laws_that_couple_at_random():
+    """Solved wherever their coupling contracts, and refused elsewhere."""
+    rng, k = np.random.default_rng(0), 3
+    slopes, starts = rng.normal(size=(40, k, k)), rng.normal(size=(40, k))
+    radii = np.max(np.abs(np.linalg.eigvals(np.abs(slopes))), axis=1)
+    sizes = np.tile([0.4, 0.99, 1.01, 3.0], 10) / radii
+    slopes = slopes * sizes[:, None, None]
+
+    @jax.jit
+    def run(slopes, starts, matrices):
+        solve = lambda slope, start: find_multipliers(jnp.abs, slope, start, np.zeros(k, bool))
+        return jax.vmap(solve)(slopes, starts), jax.vmap(contracts)(matrices)
+
+    matrices = np.array([[[0.0, 0.5], [1.9, 0.0]], [[0.0, 0.5], [2.1, 0.0]]])
+    (x, _, failed), known = jax.device_get(run(slopes, starts, matrices))
+    np.testing.assert_array_equal(failed, sizes * radii > 1)
+    left = x - starts - np.einsum("bij,bj->bi", slopes, np.abs(x))
+    np.testing.assert_allclose(left[~failed], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(x[failed], starts[failed])
+    assert known.tolist() == [True, False]
 
 
 def test_a_foot_without_load_whose_friction_cancels():
@@ -296,48 +281,6 @@ def test_a_ladder_rubs_on_floor_and_wall():
     np.testing.assert_allclose(np.abs(multipliers), [floor, wall], rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_a_bead_in_a_rough_loop():
-    """With the angle φ from the lowest point, `dv²/dφ = −2 g R sin φ − 2 μ (v² + g R cos φ)` has a closed form."""
-    mu, start = 0.3, 12.0
-    mechanism = mb.mechanisms.rough_ring(friction=mu, speed=start, gravity=G, model="rigid_bodies")
-    run = mb.simulate(mechanism.system, mechanism.state, t1=0.5, rtol=1e-11)
-    x, y = np.asarray(run["bead"].position[-1])
-    # The bead starts at φ = π/2; one particular solution and one that decays.
-    phi = np.pi / 2 + np.mod(np.arctan2(y, x), 2 * np.pi)
-    particular = lambda a: 2 * G * ((1 - 2 * mu**2) * np.cos(a) - 3 * mu * np.sin(a)) / (1 + 4 * mu**2)
-    decay = np.exp(-2 * mu * (phi - np.pi / 2))
-    expected = particular(phi) + (start**2 - particular(np.pi / 2)) * decay
-    np.testing.assert_allclose(np.sum(np.square(run["bead"].velocity[-1])), expected, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_bead_on_a_turning_wire():
-    """Pressed on it by Coriolis' force, `r̈ = ω² r − 2 μ ω ṙ`."""
-    mu, omega, start = 0.4, 3.0, 0.2
-    wire = planar.Body("wire", mass=1.0, inertia=1.0, angular_velocity=omega)
-    bead = planar.PointMass("bead", mass=0.7, position=(0.3, 0.0), velocity=(start, 0.3 * omega))
-    joints = [
-        planar.Revolute("hub", "ground", "wire", point=(0.0, 0.0)),
-        planar.PointOnLine("slot", "wire", "bead", point_a=(0.0, 0.0), point_b=(0.0, 0.0), axis_a=(1.0, 0.0)),
-        planar.Driver(
-            "motor",
-            "ground",
-            "wire",
-            quantity="angle",
-            motion=lambda t, p: p["omega"] * t,
-            parameters={"omega": omega},
-        ),
-    ]
-    rub = planar.Friction("rub", "slot", coefficient=mu, point=(0.0, 0.0))
-    system = mb.Scene([wire, bead], joints=joints, forces=[rub]).compile()
-    run = mb.simulate(system, mb.assemble(system), t1=0.6, rtol=1e-11)
-    roots = omega * (-mu + np.array([1, -1]) * np.sqrt(mu**2 + 1))
-    share = np.linalg.solve(np.array([[1.0, 1.0], roots]), [0.3, start])
-    expected = share @ np.exp(0.6 * roots)
-    np.testing.assert_allclose(np.linalg.norm(run["bead"].position[-1]), expected, rtol=1e-9)
-
-
 # Derivatives
 
 
@@ -346,55 +289,37 @@ def test_derivatives_of_accelerations():
     """Of the implicit equation, to second order: forward, reverse and differences."""
     system, y = rod(), rod_state(0.7, -1.5, 8.0)
     names = ["rub.coefficient", "rod.mass", "rod.inertia"]
-    start = jnp.array([float(mb.parameters(system)[name]) for name in names])
+    start = np.array([float(mb.parameters(system)[name]) for name in names])
 
     def turn(x):
         changed = mb.with_parameters(system, dict(zip(names, x, strict=True)))
         return accelerations(changed, formulations.Partitioned(), 0.0, y.q, y.u)[0][2]
 
-    reverse, forward = jax.jit(jax.grad(turn))(start), jax.jit(jax.jacfwd(turn))(start)
+    run = jax.jit(jax.vmap(lambda x: (turn(x), jax.grad(turn)(x), jax.jacfwd(turn)(x), jax.hessian(turn)(x))))
     h = 1e-3 * start
-    four = lambda f, step: (8 * (f(start + step) - f(start - step)) - f(start + 2 * step) + f(start - 2 * step)) / 12
-    central = jnp.stack([four(jax.jit(turn), step) for step in np.diag(h)]) / h
-    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
-    np.testing.assert_allclose(forward, central, rtol=1e-8)
-    second = jax.jit(jax.hessian(turn))(start)
-    central = jnp.stack([four(jax.jit(jax.grad(turn)), step) for step in np.diag(h)]) / h[:, None]
-    np.testing.assert_allclose(second, central, rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_motion():
-    system, y = rod(), rod_state(1.2, 2.0, 0.0)
-    names = ["rub.coefficient", "rod.mass"]
-    start = jnp.array([0.3, M])
-
-    def end(x, rtol):
-        changed = mb.with_parameters(system, dict(zip(names, x, strict=True)))
-        run = mb.simulate(changed, y, t1=0.2, rtol=rtol, max_steps=256, throw=False)
-        return run.ys.q[-1, 2] + run.ys.u[-1, 0]
-
-    reverse = jax.jit(jax.grad(lambda x: end(x, 1e-9)))(start)
-    twice = lambda x, rtol: (end(x, rtol),) * 2
-    both = jax.jit(jax.vmap(jax.jacfwd(twice, has_aux=True), in_axes=(0, None)))
-    h = 1e-3 * np.asarray(start)
-    places = np.asarray(start)[None] + np.concatenate([k * np.diag(h) for k in (1, -1, 2, -2)] + [np.zeros((1, 2))])
-    values = np.asarray(both(jnp.asarray(places), 1e-12)[1])
-    central = (8 * (values[0:2] - values[2:4]) - (values[4:6] - values[6:8])) / (12 * h)
-    forward = both(start[None], 1e-9)[0][0]
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    np.testing.assert_allclose(forward, central, rtol=1e-5)
+    places = [start + k * step for k in (1, -1, 2, -2) for step in np.diag(h)]
+    values, reverse, forward, second = map(np.asarray, run(np.stack([start, *places])))
+    four = lambda f: (8 * (f[1:4] - f[4:7]) - (f[7:10] - f[10:13])) / 12
+    np.testing.assert_allclose(reverse[0], forward[0], rtol=1e-11)
+    np.testing.assert_allclose(forward[0], four(values) / h, rtol=1e-8)
+    np.testing.assert_allclose(second[0], four(reverse) / h[:, None], rtol=1e-7, atol=1e-8)
 
 
 # The regularisation
 
 
 def test_regularised_friction():
-    v = jnp.array([0.3, -0.4])
-    np.testing.assert_allclose(smooth.dry_friction(jnp.array(2.0), v, 0.2), -2.0 * v / 0.5 * np.tanh(2.5), rtol=1e-15)
-    np.testing.assert_array_equal(smooth.sign(jnp.array([-5.0, 0.0, 5.0]), 0.1), [-1.0, 0.0, 1.0])
-    np.testing.assert_allclose(jax.jacfwd(smooth.dry_friction, 1)(jnp.array(2.0), jnp.zeros(2), 0.2), -10.0 * np.eye(2))
-    # The series near rest joins the formula.
-    for size in (0.0316, 0.0317):
-        force = smooth.dry_friction(jnp.array(1.0), size * v / 0.5, 1.0)
-        np.testing.assert_allclose(force, -v / 0.5 * np.tanh(size), rtol=1e-13)
+    v = np.array([0.3, -0.4])
+
+    @jax.jit
+    def run(sizes):
+        # The series near rest joins the formula.
+        near = jax.vmap(lambda size: smooth.dry_friction(1.0, size * v / 0.5, 1.0))(sizes)
+        slope = jax.jacfwd(lambda v: smooth.dry_friction(2.0, v, 0.2))(jnp.zeros(2))
+        return smooth.dry_friction(2.0, v, 0.2), near, slope, smooth.sign(jnp.array([-5.0, 0.0, 5.0]), 0.1)
+
+    force, near, slope, signs = run(np.array([0.0316, 0.0317]))
+    np.testing.assert_allclose(force, -2.0 * v / 0.5 * np.tanh(2.5), rtol=1e-15)
+    np.testing.assert_allclose(near, -np.outer(np.tanh([0.0316, 0.0317]), v / 0.5), rtol=1e-13)
+    np.testing.assert_allclose(slope, -10.0 * np.eye(2))
+    np.testing.assert_array_equal(signs, [-1.0, 0.0, 1.0])

@@ -31,14 +31,29 @@ def ring(*nonideal):
     ],
     ids=["four-bar", "ring", "viscous", "rough"],
 )
-def test_applied_forces_and_memory(build, laws):
+def test_laws_applied_forces_and_memory(build, laws):
     system = build()
     own = laws_of(system)
     assert type(own) is laws
-    at = Instant(system, jnp.zeros(()), system.guess.q, jnp.ones(system.nu))
-    multipliers = jnp.arange(1.0, system.acceleration_rows + 1)
-    memory = own.remembered(at, multipliers)
-    assert (memory is None) == (laws is not ReactiveLaws)
-    np.testing.assert_array_equal(own.recalled(at, multipliers, memory), multipliers)
-    expected = at.force + system.nonideal_force(at.t, at.q, at.u, multipliers)
-    np.testing.assert_allclose(jax.jit(lambda: own.applied(at, memory))(), expected, rtol=1e-12, atol=1e-12)
+    q, u = np.asarray(system.guess.q), np.ones(system.nu)
+    multipliers = np.arange(1.0, system.acceleration_rows + 1)
+
+    @jax.jit
+    def run(q, u, multipliers):
+        at = Instant(system, jnp.zeros(()), q, u)
+        memory = own.remembered(at, multipliers)
+        assert (memory is None) == (laws is not ReactiveLaws)
+        expected = at.force + system.nonideal_force(at.t, q, u, multipliers)
+        return own.applied(at, memory), expected, own.recalled(at, multipliers, memory)
+
+    applied, expected, recalled = run(q, u, multipliers)
+    np.testing.assert_allclose(applied, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(recalled, multipliers)
+    if laws is not IdealLaws:
+        # Friction works against the motion.
+        force = (
+            system.nonideal_force(0.0, q, u, multipliers) if laws is GivenLaws else applied - system.force(0.0, q, u)
+        )
+        assert u @ np.asarray(force) < 0
+        if laws is GivenLaws:
+            np.testing.assert_allclose(force, -0.2 * u, rtol=1e-14)

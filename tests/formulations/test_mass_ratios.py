@@ -10,7 +10,6 @@ import pytest
 import jaxmb as mb
 from jaxmb import manifold, planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
-from jaxmb.report import stress_test
 
 pytestmark = pytest.mark.slow
 
@@ -83,87 +82,38 @@ def exact(system, state):
 
 
 @pytest.mark.parametrize(
-    "name, n",
-    [
-        ("planar chain", 5),
-        ("planar chain", 16),
-        ("planar loop", 5),
-        pytest.param("planar loop", 17, marks=pytest.mark.slow),
-        pytest.param("spatial chain", 5, marks=pytest.mark.slow),
-        pytest.param("spatial chain", 16, marks=pytest.mark.slow),
-    ],
+    "name, n", [("planar chain", 16), ("planar loop", 5), ("planar loop", 17), ("spatial chain", 5)]
 )
 def test_accelerations(name, n):
     system = SCENES[name](n).compile()
     assert (system.elimination is not None) == (n > 10)
     state = moving(system)
     solve = jax.jit(lambda system: accelerations(system, Multipliers(), 0.0, state.q, state.u)[0])
-    for ratio in (1e-8, 1e-4, 1.0, 1e8):
+    for ratio in (1e-8, 1.0, 1e8):
         own = alternating(system, ratio)
         expected = exact(own, state)
         np.testing.assert_allclose(solve(own), expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("n", [5, pytest.param(16, marks=pytest.mark.slow)])
-def test_derivatives_of_accelerations(n):
-    """Forward, reverse and central differences by a light and a heavy mass, several at once."""
-    system = alternating(planar_chain(n).compile(), 1e-8)
-    state = moving(system)
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=system.nu))
-
-    def total(factor):
-        changed = mb.with_parameters(system, {"rod3.mass": 1e-8 * factor, "rod2.mass": factor})
-        return weights @ accelerations(changed, Multipliers(), 0.0, state.q, state.u)[0]
-
-    h, factors = 1e-4, jnp.array([0.9, 1.0, 1.1])
-
-    def three_ways(x):
-        forward = jax.jvp(total, (x,), (jnp.ones(()),))[1]
-        return forward, jax.grad(total)(x), (total(x + h) - total(x - h)) / (2 * h)
-
-    forward, reverse, differences = jax.jit(jax.vmap(three_ways))(factors)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-11)
-    np.testing.assert_allclose(forward, differences, rtol=1e-6)
-
-
-def run(system, state, policy, rtol, **options):
-    return mb.simulate(system, state, t1=0.3, rtol=rtol, manifold=policy, max_steps=1000, **options)
-
-
-@pytest.mark.parametrize("ratio", [1e-8, 1e8])
-def test_steps_are_those_of_partitioning(ratio):
+def test_steps_are_those_of_partitioning():
     """Sparse elimination takes as many steps as partitioning with the same accelerations, but for some at the start,
-    where the factor is that of a state before the step.
+    where the factor is that of a state before the step. The motion has its derivatives.
     """
-    system = alternating(planar_chain(16).compile(), ratio)
+    system = alternating(planar_chain(16).compile(), 1e8)
     state = mb.assemble(system, rates={f"rod{i}.angle": 1.0 for i in range(16)})
+    options = {"t1": 0.2, "max_steps": 1000}
     for rtol in (1e-6, 1e-10):
-        projected = run(system, state, manifold.Projection(), rtol)
-        partitioned = run(system, state, manifold.Partition(), rtol, formulation=Multipliers())
+        run = lambda policy, rtol=rtol, **own: mb.simulate(system, state, rtol=rtol, manifold=policy, **options, **own)
+        projected, partitioned = run(manifold.Projection()), run(manifold.Partition(), formulation=Multipliers())
         assert projected.stats["num_steps"] <= 1.05 * partitioned.stats["num_steps"] + 8
         np.testing.assert_allclose(projected.ys.q[-1], partitioned.ys.q[-1], rtol=0, atol=100 * rtol)
 
-
-def test_derivatives_of_a_motion():
-    system = alternating(planar_chain(16).compile(), 1e8)
-    state = mb.assemble(system, rates={f"rod{i}.angle": 1.0 for i in range(16)})
-
-    def end(factor, rtol=1e-10, **options):
+    def end(factor, rtol=1e-10):
         changed = mb.with_parameters(system, {"rod3.mass": 1e8 * factor, "rod4.mass": factor})
-        return run(changed, state, manifold.Projection(), rtol, **options)["rod15"].position[-1, 1]
+        motion = mb.simulate(changed, state, rtol=rtol, manifold=manifold.Projection(), **options)
+        return motion["rod15"].position[-1, 1]
 
-    one, h = jnp.ones(()), 1e-3
-    forward = jax.jit(jax.jacfwd(end))(one)
-    reverse = jax.jit(jax.grad(end))(one)
-    tight = jax.jit(lambda x: end(x, 1e-12))
-    differences = (tight(one + h) - tight(one - h)) / (2 * h)
+    one, h, tight = jnp.ones(()), 1e-3, jax.jit(lambda x: end(x, 1e-12))
+    forward, reverse = jax.jit(jax.jacfwd(end))(one), jax.jit(jax.grad(end))(one)
     np.testing.assert_allclose(forward, reverse, rtol=1e-6)
-    np.testing.assert_allclose(reverse, differences, rtol=1e-5)
-
-
-def test_report():
-    """The report has variants whose masses alternate, and each is right."""
-    system = planar_chain(16).compile()
-    report = stress_test(system, mb.assemble(system), t1=0.3, only=["alternating masses"])
-    assert len(report.rows) == 6
-    assert all(error == "small" or error < 1e-6 for error in report["error"]), report
+    np.testing.assert_allclose(reverse, (tight(one + h) - tight(one - h)) / (2 * h), rtol=1e-5)

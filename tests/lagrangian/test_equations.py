@@ -2,7 +2,6 @@
 
 import functools
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,16 +13,12 @@ from jaxmb.formulations import Multipliers, Partitioned, accelerations
 from jaxmb.lagrangian import (
     Connection,
     Hamel,
-    Holonomic,
     LagrangianSystem,
     Nonholonomic,
     QuasiVelocities,
     QuasiVelocityFrame,
     Voronets,
 )
-from jaxmb.linalg import rotations
-
-pytestmark = pytest.mark.slow
 
 ZERO = jnp.zeros(())
 
@@ -47,6 +42,7 @@ PUBLISHED = {"roller_racer": (-0.35211055, 1.39346791), "nonholonomic_cart": (-0
 STATE = jnp.array([0.1, 0.2, 0.3, 0.7]), jnp.array([1.0, 0.5])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_accelerations_and_multipliers(name):
     system = library(name).system
@@ -66,11 +62,6 @@ WRITTEN = {
     "nonholonomic_cart": ("frame", "connection"),
     "three_platform_snake": ("connection",),
 }
-
-
-def columns_of_the_snake(t, q, p):
-    system = library("three_platform_snake").system
-    return jax.jacfwd(system.kinematics.rates, 2)(t, q, jnp.zeros(2), p)
 
 
 def rewritten(name, form, equations):
@@ -93,6 +84,7 @@ def any_variation(t, q, v, dq, p):
     return jnp.einsum("ijk,j,k->i", p["gamma"], v, dq)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, form", [(name, form) for name, forms in WRITTEN.items() for form in forms])
 def test_transpositional_relations_do_not_matter(name, form):
     random = np.random.default_rng(0)
@@ -115,6 +107,7 @@ def test_transpositional_relations_do_not_matter(name, form):
             np.testing.assert_allclose(again, expected, rtol=0, atol=1e-12 * size)
 
 
+@pytest.mark.slow
 def test_derivatives_of_equations_written_in_another_way():
     """Forward and reverse, with respect to state and parameters, are those of the projected equations."""
     forms = {"frame": Hamel("suslov"), "connection": Voronets("holder")}
@@ -134,35 +127,7 @@ def test_derivatives_of_equations_written_in_another_way():
             )
 
 
-def test_the_snake_in_a_frame_as_well():
-    """Hamel-Voronets: the base's frame, moved along by the connection."""
-    system = library("three_platform_snake").system
-    frame = LagrangianSystem(
-        system.lagrangian,
-        kinematics=QuasiVelocityFrame(columns_of_the_snake, 2),
-        equations=Hamel("suslov"),
-        q=system.guess.q,
-        parameters=system.parameters,
-    )
-    q, u = system.guess.q, jnp.array([0.7, -1.1])
-    np.testing.assert_allclose(solved(frame, q, u)[0], solved(system, q, u)[0], rtol=0, atol=1e-12)
-
-
-def test_constraining_the_lagrangian_first_is_another_motion():
-    """Which it would be without the curvature's term, as it is where motions are varied within the constraints."""
-    system = library("roller_racer", form="connection").system
-    lift = lambda r: jnp.concatenate([jnp.zeros(2), r])
-    reduced = LagrangianSystem(
-        lambda t, r, w, p: system.lagrangian(t, lift(r), system.kinematics.rates(t, lift(r), w, p), p),
-        q=STATE[0][2:],
-        parameters=system.parameters,
-    )
-    w = jnp.array([0.5, 0.2])
-    right, other = solved(system, STATE[0], w)[0], solved(reduced, STATE[0][2:], w)[0]
-    assert np.max(np.abs(right - other)) > 1e-2
-
-
-def test_a_drift_and_time_in_the_frame_and_in_the_connection():
+def test_equations_in_a_frame_and_with_a_connection():
     """A sleigh on a plane that turns and is carried along: rheonomic in every term."""
     kinetic = lambda t, q, v, p: 0.5 * (1.3 * v[0] ** 2 + 1.1 * v[1] ** 2 + (0.4 + 0.1 * jnp.sin(q[0] + t)) * v[2] ** 2)
     potential = lambda t, q, p: jnp.sin(q[0]) * q[1] + 0.3 * q[2] ** 2 * jnp.cos(t)
@@ -171,97 +136,30 @@ def test_a_drift_and_time_in_the_frame_and_in_the_connection():
     common = {"kinetic": kinetic, "potential": potential, "q": (0.3, -0.2, 0.5)}
     slip = lambda t, q, v, p: v[1] + A(t, q, p)[0] @ v[jnp.array([0, 2])] + a(t, q, p)[0]
     connection = Connection((0, 2), (1,), A, a)
-    projected = LagrangianSystem(**common, kinematics=connection, u=(0.7, -0.4))
-    t, q, u = jnp.asarray(0.4), projected.guess.q, projected.guess.u
-    expected = accelerations(projected, Partitioned(), t, q, u)[0]
-
     columns = lambda t, q, p: jax.jacfwd(lambda u: connection.rates(t, q, u, p))(jnp.zeros(2))
-    drift = lambda t, q, p: connection.rates(t, q, jnp.zeros(2), p)
-    frame = QuasiVelocityFrame(columns, 2, drift)
-    for kinematics, equations in (
-        (connection, Voronets()),
-        (connection, Voronets("holder")),
-        (frame, None),
-        (frame, Hamel()),
-        (frame, Hamel(0.37)),
-    ):
-        other = LagrangianSystem(**common, kinematics=kinematics, equations=equations)
-        np.testing.assert_allclose(accelerations(other, Partitioned(), t, q, u)[0], expected, rtol=1e-12)
-    constrained = LagrangianSystem(**common, constraints=[Nonholonomic("slip", slip)])
-    v = projected.rates(t, q, u)
-    found, _ = accelerations(constrained, Multipliers(), t, q, v)
-    np.testing.assert_allclose(found[jnp.array([0, 2])], expected, rtol=1e-12)
+    frame = QuasiVelocityFrame(columns, 2, lambda t, q, p: connection.rates(t, q, jnp.zeros(2), p))
+    ways = ((connection, None), (connection, Voronets("holder")), (frame, Hamel(0.37)))
+    systems = [LagrangianSystem(**common, kinematics=k, equations=e) for k, e in ways]
+    held = LagrangianSystem(**common, constraints=[Nonholonomic("slip", slip)])
+    q, u = np.array(common["q"]), np.array([0.7, -0.4])
 
+    @jax.jit
+    def every(t):
+        v = systems[0].rates(t, q, u)
+        return [accelerations(own, Partitioned(), t, q, u)[0] for own in systems], accelerations(
+            held, Multipliers(), t, q, v
+        )[0]
 
-def _body_axes(q):
-    """Rates of Euler angles z, x, z with turning about the body's axes."""
-    _, theta, psi = q
-    s, c = jnp.sin(theta), jnp.cos(theta)
-    zero = jnp.zeros_like(s)
-    return jnp.stack(
-        [
-            jnp.stack([jnp.sin(psi) / s, jnp.cos(psi) / s, zero]),
-            jnp.stack([jnp.cos(psi), -jnp.sin(psi), zero]),
-            jnp.stack([-jnp.sin(psi) * c / s, -jnp.cos(psi) * c / s, zero + 1.0]),
-        ]
-    )
-
-
-# A rigid body in Euler parameters: a mass matrix of rank three in four coordinates, or three quasi-velocities
-
-
-def test_a_body_in_euler_parameters_and_in_angular_velocities():
-    J = np.diag([1.0, 2.0, 3.0])
-    omega_of = lambda p, v: rotations.angular_velocity(p, v)
-    kinetic = lambda t, q, v, p: 0.5 * omega_of(q, v) @ p["inertia"] @ omega_of(q, v)
-    columns = lambda t, q, p: jax.jacfwd(lambda w: rotations.rates(q, w))(jnp.zeros(3))
-    q, w = jnp.array([0.8, 0.0, 0.6, 0.0]), jnp.array([0.3, -1.2, 0.7])
-    expected = np.linalg.solve(J, -np.cross(w, J @ w))
-    for equations in (None, Hamel()):
-        body = LagrangianSystem(
-            kinetic=kinetic,
-            kinematics=QuasiVelocityFrame(columns, 3),
-            equations=equations,
-            q=q,
-            parameters={"inertia": J},
-        )
-        np.testing.assert_allclose(solved(body, q, w)[0], expected, rtol=0, atol=1e-13)
-    unit = Holonomic("unit", lambda t, q, p: q @ q - 1.0)
-    whole = LagrangianSystem(kinetic=kinetic, constraints=[unit], q=q, parameters={"inertia": J})
-    v = rotations.rates(q, w)
-    a = solved(whole, q, v)[0]
-    turned = jax.jvp(omega_of, (q, v), (v, a))[1]
-    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-13)
+    found, expected = every(0.4)
+    for udot in found:
+        np.testing.assert_allclose(udot, np.asarray(expected)[[0, 2]], rtol=1e-12)
 
 
 # Nonlinear quasi-velocities
 
 
-def johnsen_hamel_residual(system, t, q, u, udot):
-    r"""Residuals of the Johnsen-Hamel equations at accelerations u̇, for all ω_k in order: zero for the independent ones
-    of a motion, and Λ_k for the dependent ones, in the equations' own terms:
-
-    $$\frac{d}{dt} \frac{\partial L^*}{\partial \omega_k} - \frac{\partial L^*}{\partial \theta_k}
-      - p_l \left(\frac{d}{dt} \frac{\partial \dot q_l}{\partial \omega_k}
-      - \frac{\partial \dot q_l}{\partial \theta_k} \right) - \Theta_k$$
-
-    with $L^*(t, q, \omega) = L(t, q, \dot q)$ and
-    $\partial / \partial \theta_k = (\partial \dot q_l / \partial \omega_k) \, \partial / \partial q_l$.
-    """
-    kinematics, at = system.kinematics, system.parameters_at
-    omega, along = kinematics.all_of(q.size, u), kinematics.all_of(q.size, udot)
-    rates = lambda t, q, omega: kinematics.rates_of_all(t, q, omega, at(t))
-    star = lambda t, q, omega: system.lagrangian(t, q, rates(t, q, omega), at(t))
-    v = rates(t, q, omega)
-    moving = (t, q, omega), (jnp.ones_like(t), v, along)
-    columns, turned = jax.jvp(jax.jacfwd(rates, 2), *moving)
-    _, first = jax.jvp(jax.grad(star, 2), *moving)
-    second = jax.grad(star, 1)(t, q, omega) @ columns
-    bracket = turned - jax.jacfwd(rates, 1)(t, q, omega) @ columns
-    return first - second - system.momentum(t, q, v) @ bracket - system.applied_force(t, q, v) @ columns
-
-
-def test_johnsen_hamel_equations_of_random_quasi_velocities():
+@pytest.mark.slow
+def test_random_quasi_velocities_move_as_their_constraints():
     n, dependent = 4, (1, 3)
     random = np.random.default_rng(1)
     B, C, D = (random.standard_normal(shape) for shape in ((n, n), (n, n, n), (n, n)))
@@ -283,53 +181,71 @@ def test_johnsen_hamel_equations_of_random_quasi_velocities():
     quasi = LagrangianSystem(**common, kinematics=QuasiVelocities(omega, np.zeros(n), dependent), u=(0.4, -0.3))
     t, q, u = jnp.asarray(0.2), quasi.guess.q, quasi.guess.u
 
-    @jax.jit
-    def everything(system):
-        udot = accelerations(system, Partitioned(), t, q, u)[0]
-        v = system.rates(t, q, u)
-        a = jax.jvp(system.rates, (t, q, u), (jnp.ones(()), v, udot))[1]
-        return v, a, johnsen_hamel_residual(system, t, q, u, udot)
-
-    v, a, left = everything(quasi)
-    np.testing.assert_allclose(omega(t, q, v, {})[jnp.array(dependent)], 0.0, atol=1e-14)
-    independent = np.delete(np.arange(n), dependent)
-    np.testing.assert_allclose(left[independent], 0.0, atol=1e-12)
-    # Chetaev's multipliers give the same motion, and are the forces that hold the dependent quasi-velocities at zero.
+    # Chetaev's multipliers give the same motion.
     rows = Nonholonomic("held", lambda t, q, v, p: omega(t, q, v, p)[jnp.array(dependent)])
     chetaev = LagrangianSystem(**common, constraints=[rows])
-    found, multipliers = accelerations(chetaev, Multipliers(), t, q, v)
-    np.testing.assert_allclose(a, found, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(left[jnp.array(dependent)], multipliers, rtol=1e-10)
-    rate = jax.jvp(lambda t, q, v: omega(t, q, v, {}), (t, q, v), (jnp.ones(()), v, a))[1]
-    np.testing.assert_allclose(rate[jnp.array(dependent)], 0.0, atol=1e-14)
-
-
-def test_quasi_velocities_and_the_constraint_give_one_motion():
-    references = library("constant_speed_particle").references
-    quasi = library("constant_speed_particle", form="quasi")
-    run = mb.simulate(quasi.system, quasi.state, t1=1.0, rtol=1e-12)
-    speed = quasi.system.rates(1.0, run.ys.q[-1], run.ys.u[-1])
-    np.testing.assert_allclose(np.hypot(*speed), 3.0, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(run.ys.q[-1], references.values[-1, :2], rtol=0, atol=1e-10)
-    np.testing.assert_allclose(run.ys.u[-1, 0], -1.319751601680, rtol=0, atol=1e-10)
-
-
-def test_quasi_velocities_of_a_traced_system():
-    """The start of Newton's method is a function, which is not a value of the system."""
-    quasi = library("constant_speed_particle", form="quasi")
-    options = {"t1": 0.1, "solver": diffrax.Dopri8(), "manifold": mb.manifold.Projection(), "throw": False}
 
     @jax.jit
-    def end(speed):
-        return mb.simulate(mb.with_parameters(quasi.system, {"speed": speed}), quasi.state, **options).ys.q[-1]
+    def everything():
+        udot = accelerations(quasi, Partitioned(), t, q, u)[0]
+        v = quasi.rates(t, q, u)
+        a = jax.jvp(quasi.rates, (t, q, u), (jnp.ones(()), v, udot))[1]
+        both = jax.jvp(lambda t, q, v: omega(t, q, v, {}), (t, q, v), (jnp.ones(()), v, a))
+        return a, accelerations(chetaev, Multipliers(), t, q, v)[0], both
 
-    alone = mb.simulate(quasi.system, quasi.state, **options).ys.q[-1]
-    np.testing.assert_allclose(end(3.0), alone, rtol=0, atol=1e-12)
+    found, expected, held = map(np.asarray, everything())
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(held[:, list(dependent)], 0.0, atol=1e-14)
+
+
+def test_quasi_velocities_of_a_speed_that_is_given():
+    """Speed and heading of a particle, whose speed is s(t): the heading turns by `φ̇ = −g cos φ / s`."""
+
+    def omega(t, q, v, p):
+        return jnp.stack([jnp.hypot(v[0], v[1]) - p["speed"] * (1 + 0.1 * t), jnp.arctan2(v[1], v[0])])
+
+    near = lambda t, q, omega, p: p["speed"] * jnp.stack([jnp.cos(omega[1]), jnp.sin(omega[1])])
+    system = LagrangianSystem(
+        kinetic=lambda t, q, v, p: 0.5 * v @ v,
+        potential=lambda t, q, p: 9.81 * q[1],
+        kinematics=QuasiVelocities(omega, near, (0,)),
+        q=(0.0, 0.0),
+        u=(0.3,),
+        parameters={"speed": 3.0},
+    )
+
+    @jax.jit
+    def run(t, q, u):
+        udot, _ = accelerations(system, Partitioned(), t, q, u)
+        v = system.rates(t, q, u)
+        return udot, v, jax.jvp(system.rates, (t, q, u), (jnp.ones(()), v, udot))[1]
+
+    t, heading = 0.5, 0.7
+    udot, v, a = run(t, np.array([1.0, 2.0]), np.array([heading]))
+    along, speed = np.array([np.cos(heading), np.sin(heading)]), 3.0 * (1 + 0.1 * t)
+    turn = -9.81 * along[0] / speed
+    np.testing.assert_allclose(udot, [turn], rtol=1e-12)
+    np.testing.assert_allclose(v, speed * along, rtol=1e-12)
+    np.testing.assert_allclose(a, 0.3 * along + speed * turn * np.array([-along[1], along[0]]), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_motion_in_quasi_velocities():
+    """It is that of the constraint; the start of Newton's method is a function, which is not a value of the system."""
+    references, quasi = library("constant_speed_particle").references, library("constant_speed_particle", form="quasi")
+    run = jax.jit(
+        lambda speed: (
+            mb.simulate(mb.with_parameters(quasi.system, {"speed": speed}), quasi.state, t1=1.0, rtol=1e-12).ys
+        )
+    )(3.0)
+    np.testing.assert_allclose(run.q[-1], references.values[-1, :2], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(run.u[-1, 0], -1.319751601680, rtol=0, atol=1e-10)
 
 
 # Singular states
 
 
+@pytest.mark.slow
 def test_the_end_of_a_cone_is_a_result_and_not_a_number():
     """At rest the constraint has no gradient: there the motion ends."""
     mechanism = library("appell_hamel")

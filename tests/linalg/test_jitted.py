@@ -29,9 +29,9 @@ def test_arrays_are_arguments_and_the_rest_belongs_to_the_program():
 
 
 def test_derivatives_and_batches():
-    function = jitted(lambda x, scale: jnp.sum(x["x"] ** 2) * scale)
-    x = jnp.array([1.0, -2.0])
+    function, x = jitted(lambda x, scale: jnp.sum(x["x"] ** 2) * scale), np.array([1.0, -2.0])
     slope = lambda x: function({"x": x}, 3.0)
-    np.testing.assert_allclose(jax.grad(slope)(x), 6 * x)
-    np.testing.assert_allclose(jax.jacfwd(slope)(x), 6 * x)
-    np.testing.assert_allclose(jax.vmap(slope)(jnp.stack([x, 2 * x])), [15.0, 60.0])
+    several = jax.jit(lambda x, both: (jax.grad(slope)(x), jax.jacfwd(slope)(x), jax.vmap(slope)(both)))
+    reverse, forward, batch = several(x, np.stack([x, 2 * x]))
+    np.testing.assert_allclose([reverse, forward], [6 * x, 6 * x])
+    np.testing.assert_allclose(batch, [15.0, 60.0])

@@ -21,37 +21,45 @@ def square_root(c):
     return root(lambda x: x * x - c, jnp.ones_like(c), solve)
 
 
-@pytest.mark.slow
 def test_root_and_its_derivatives():
-    c = jnp.array([0.5, 2.0, 9.0])
-    np.testing.assert_allclose(square_root(c), np.sqrt(c), rtol=1e-14)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(derivative(square_root)(c), np.diag(0.5 / np.sqrt(c)), rtol=1e-13, atol=1e-15)
-    first = lambda x: jnp.sum(jax.jacfwd(square_root)(x))
-    np.testing.assert_allclose(jax.grad(first)(c), -0.25 * c**-1.5, rtol=1e-12)
+    c = np.array([0.5, 2.0, 9.0])
+
+    @jax.jit
+    def run(c):
+        first = lambda x: jnp.sum(jax.jacfwd(square_root)(x))
+        return square_root(c), jax.jacfwd(square_root)(c), jax.jacrev(square_root)(c), jax.grad(first)(c)
+
+    value, forward, reverse, second = run(c)
+    np.testing.assert_allclose(value, np.sqrt(c), rtol=1e-14)
+    for slope in (forward, reverse):
+        np.testing.assert_allclose(slope, np.diag(0.5 / np.sqrt(c)), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(second, -0.25 * c**-1.5, rtol=1e-12)
 
 
 def test_newton_stops_at_its_bound_and_where_there_is_no_number():
-    count = lambda far, most: int(newton(lambda x: (x + 1, x * 0.0), far, jnp.array(0.0), most=most, dtype=float)[0])
-    assert count(lambda x, size: x < 3, 10) == 3
-    assert count(lambda x, size: x < 30, 10) == 10
-    lost, size = newton(lambda x: (x / 0.0, x / 0.0), lambda _, size: size > 0, jnp.array(0.0), most=9, dtype=float)
-    assert np.isnan(lost) and np.isnan(size)
+    @jax.jit
+    def run(start):
+        count = lambda far: newton(lambda x: (x + 1, x * 0.0), far, start, most=10, dtype=float)[0]
+        lost = newton(lambda x: (x / 0.0, x / 0.0), lambda _, size: size > 0, start, most=9, dtype=float)
+        return count(lambda x, size: x < 3), count(lambda x, size: x < 30), lost
 
-
-@pytest.mark.parametrize(("first", "corrections"), [(1.0, 1), (0.0, 2)])
-def test_chord_with_the_right_matrix(first, corrections):
-    correct = lambda x: (x - (x - 5e-10), jnp.abs(x - 5e-10))
-    x, k, failed = chord(correct, jnp.array(0.0), first=jnp.array(first), tol=1e-12, most=12)
-    assert int(k) == corrections and not failed
-    assert float(x) == pytest.approx(5e-10, abs=1e-20)
+    near, most, lost = run(0.0)
+    assert (near, most) == (3, 10) and np.all(np.isnan(lost))
 
 
 def test_chord_converges_at_the_rate_of_its_matrix_or_fails():
+    run = jax.jit(
+        lambda correct, first: chord(correct, jnp.array(0.0), first=first, tol=1e-12, most=12), static_argnums=0
+    )
+    # With the right matrix one correction suffices, if it is known to be right.
+    right = lambda x: (x - (x - 5e-10), jnp.abs(x - 5e-10))
+    for first, corrections in ((1.0, 1), (0.0, 2)):
+        x, k, failed = run(right, first)
+        assert int(k) == corrections and not failed
+        assert float(x) == pytest.approx(5e-10, abs=1e-20)
     wrong = lambda slope: lambda x: (x - (2 * x - 0.1) / slope, jnp.abs(2 * x - 0.1) / slope)
-    run = lambda slope: chord(wrong(slope), jnp.array(0.0), first=jnp.array(1.0), tol=1e-12, most=12)
-    x, k, failed = run(2.1)
+    x, k, failed = run(wrong(2.1), 1.0)
     # Corrections shrink by a factor of 21; the last one that is made need not be below the tolerance.
     assert not failed and float(x) == pytest.approx(0.05, abs=1e-12) and 8 <= int(k) <= 10
-    _, k, failed = run(0.5)
+    _, k, failed = run(wrong(0.5), 1.0)
     assert failed and int(k) <= 12

@@ -10,54 +10,64 @@ from jaxmb import spatial
 from jaxmb.linalg import rotations as rot
 
 RNG = np.random.default_rng(1)
-UNIT = [jnp.asarray(p / np.linalg.norm(p)) for p in RNG.normal(size=(6, 4))]
+UNIT = RNG.normal(size=(6, 4))
+UNIT /= np.linalg.norm(UNIT, axis=1, keepdims=True)
+V, OMEGA, G = RNG.normal(size=(6, 3)), RNG.normal(size=(6, 3)), RNG.normal(size=(6, 4))
+TWO = {"cross": (V, OMEGA), "rotate": (UNIT, V), "unrotate": (UNIT, V), "multiply": (UNIT, UNIT[::-1])}
+TWO |= {"rates": (UNIT, OMEGA), "pull_back": (UNIT, G)}
+NO_TURN = [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.1, np.pi, 0.2)]
 
 
-@pytest.mark.parametrize("p", UNIT)
-def test_against_scipy(p):
-    other = Rotation.from_quat(np.asarray(rot.to_xyzw(p)))
-    v = jnp.asarray(RNG.normal(size=3))
-    np.testing.assert_allclose(rot.rotation_matrix(p), other.as_matrix(), rtol=0, atol=1e-15)
-    np.testing.assert_allclose(rot.rotate(p, v), other.apply(np.array(v)), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(rot.unrotate(p, rot.rotate(p, v)), v, rtol=0, atol=1e-14)
-    back = rot.from_matrix(other.as_matrix())
-    np.testing.assert_allclose(jnp.abs(jnp.dot(back, p)), 1.0, rtol=0, atol=1e-14)
-    q = UNIT[0]
-    np.testing.assert_allclose(
-        rot.rotation_matrix(rot.multiply(p, q)), rot.rotation_matrix(p) @ rot.rotation_matrix(q), rtol=0, atol=1e-14
-    )
+@pytest.fixture(scope="module")
+def traced():
+    """What the functions give in a program, of all of the numbers."""
+
+    def of_one(p, v, omega, R):
+        pdot = rot.rates(p, omega)
+        turned = jax.jvp(lambda p: rot.rotate(p, v), (p,), (pdot,))[1]
+        back = rot.unrotate(p, rot.rotate(p, v))
+        return rot.rotation_matrix(p), back, rot.from_matrix(R), rot.angular_velocity(p, pdot), pdot, turned
+
+    def every(numbers, two, R, degenerate):
+        two = {name: jax.vmap(getattr(rot, name))(*given) for name, given in two.items()}
+        return jax.vmap(of_one)(*numbers, R), two, jax.vmap(rot.from_matrix)(degenerate)
+
+    others, degenerate = Rotation.from_quat(np.roll(UNIT, -1, axis=1)), Rotation.from_euler("xyz", NO_TURN)
+    given = (UNIT, V, OMEGA), TWO, others.as_matrix(), degenerate.as_matrix()
+    return others, *jax.device_get(jax.jit(every)(*given))
 
 
-@pytest.mark.parametrize("name", ["cross", "rotate", "unrotate", "multiply", "rates", "pull_back"])
-def test_known_numbers_are_left_to_numpy(name):
-    function = getattr(rot, name)
-    sizes = {"cross": (3, 3), "multiply": (4, 4), "pull_back": (4, 4)}.get(name, (4, 3))
-    for _ in range(5):
-        a, b = (RNG.normal(size=size) for size in sizes)
-        known, traced = function(a, b), jax.jit(function)(a, b)
-        assert isinstance(known, np.ndarray)
-        np.testing.assert_allclose(known, traced, rtol=0, atol=1e-14)
+def test_rotations_are_those_of_scipy(traced):
+    others, (matrices, back, parameters, *_), two, degenerate = traced
+    close = lambda a, b, atol=1e-14: np.testing.assert_allclose(a, b, rtol=0, atol=atol)
+    close(matrices, others.as_matrix(), 1e-15)
+    close(two["rotate"], others.apply(V))
+    close(back, V)
+    close(np.abs(np.sum(parameters * UNIT, axis=1)), 1.0)
+    close([rot.rotation_matrix(p) for p in two["multiply"]], matrices @ matrices[::-1])
+    # Where a formula for a rotation matrix degenerates.
+    close([rot.rotation_matrix(p) for p in degenerate], Rotation.from_euler("xyz", NO_TURN).as_matrix())
+    close(np.roll(UNIT[0], -1), rot.to_xyzw(UNIT[0]), 0)
+    close(rot.from_xyzw(rot.to_xyzw(UNIT[0])), UNIT[0], 0)
 
 
-@pytest.mark.parametrize("p", UNIT[:3])
-def test_rates_and_angular_velocity(p):
-    omega = jnp.asarray(RNG.normal(size=3))
-    pdot = rot.rates(p, omega)
-    np.testing.assert_allclose(rot.angular_velocity(p, pdot), omega, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(jnp.dot(p, pdot), 0.0, atol=1e-15)
+def test_rates_and_angular_velocity(traced):
+    _, (*_, omega, rates, turned), two, _ = traced
+    np.testing.assert_allclose(omega, OMEGA, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.sum(UNIT * rates, axis=1), 0.0, atol=1e-15)
     # dR/dt v = R (ω′ × v)
-    v = jnp.asarray(RNG.normal(size=3))
-    _, rate = jax.jvp(lambda p: rot.rotate(p, v), (p,), (pdot,))
-    np.testing.assert_allclose(rate, rot.rotate(p, jnp.cross(omega, v)), rtol=0, atol=1e-14)
+    expected = [rot.rotate(p, np.cross(w, v)) for p, w, v in zip(UNIT, OMEGA, V, strict=True)]
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-14)
     # pull_back is the adjoint of rates.
-    g = jnp.asarray(RNG.normal(size=4))
-    np.testing.assert_allclose(jnp.dot(g, pdot), jnp.dot(rot.pull_back(p, g), omega), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.sum(G * rates, 1), np.sum(two["pull_back"] * OMEGA, 1), rtol=0, atol=1e-14)
 
 
-def test_axis_angle_and_orders():
-    p = rot.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)
-    np.testing.assert_allclose(rot.rotate(p, jnp.array([1.0, 0.0, 0.0])), [0.0, 1.0, 0.0], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(rot.from_xyzw(rot.to_xyzw(p)), p, rtol=0, atol=0)
+def test_known_numbers_are_left_to_numpy(traced):
+    for name, found in traced[2].items():
+        for a, b, expected in zip(*TWO[name], found, strict=True):
+            known = getattr(rot, name)(a, b)
+            assert isinstance(known, np.ndarray), name
+            np.testing.assert_allclose(known, expected, rtol=0, atol=1e-14, err_msg=name)
 
 
 def test_axes_of_any_length():
@@ -68,48 +78,46 @@ def test_axes_of_any_length():
         p = rot.from_axis_angle(length * axis, np.pi / 2)
         np.testing.assert_allclose(rot.rotation_matrix(p), expected, rtol=0, atol=1e-15)
     body = spatial.Body("body", mass=1.0, inertia=(1, 1, 1), orientation=p)
-    np.testing.assert_allclose(rot.rotation_matrix(body.orientation), expected, rtol=0, atol=1e-15)
-    along = jax.jvp(lambda x: rot.from_axis_angle(x, 0.7), (jnp.asarray(axis),), (jnp.asarray(axis),))[1]
+    np.testing.assert_allclose(rot.rotation_matrix(np.asarray(body.orientation)), expected, rtol=0, atol=1e-15)
+    turned = lambda x: rot.from_axis_angle(x, 0.7)
+    along, none = jax.jit(lambda x: (jax.jvp(turned, (x,), (x,))[1], turned(0.0 * x)))(axis)
     np.testing.assert_allclose(along, 0.0, rtol=0, atol=1e-15)
+    assert np.isnan(none[1:]).all()
     with pytest.raises(ValueError, match="zero vector"):
         rot.from_axis_angle((0.0, 0.0, 0.0), 1.0)
-    assert np.isnan(jax.jit(lambda x: rot.from_axis_angle(x, 1.0))(jnp.zeros(3))[1:]).all()
 
 
-@pytest.mark.parametrize("angles", [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.1, np.pi, 0.2)])
-def test_from_matrix_where_a_formula_degenerates(angles):
-    R = Rotation.from_euler("xyz", angles).as_matrix()
-    np.testing.assert_allclose(rot.rotation_matrix(rot.from_matrix(R)), R, rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow("0-from_matrix")
 @pytest.mark.parametrize("function", [rot.from_matrix, lambda x: rot.from_axis_angle(x[0], x[1, 0])])
-@pytest.mark.parametrize("largest", range(4))
-def test_derivatives_of_euler_parameters(function, largest):
+def test_derivatives_of_euler_parameters(function):
     """Forward and reverse mode and central differences, with each formula for a rotation matrix."""
-    p = rot.normalize(jnp.eye(4)[largest] + 0.3 * UNIT[largest])
-    R, along = rot.rotation_matrix(p), jnp.asarray(RNG.normal(size=(3, 3)))
-    assert np.argmax(np.abs(rot.from_matrix(R))) == largest
-    forward = jax.jit(lambda R: jax.jvp(function, (R,), (along,))[1])(R)
-    reverse = jnp.sum(jax.jit(jax.jacrev(function))(R) * along[None], axis=(1, 2))
-    h = 1e-3
-    value = lambda k: np.asarray(function(R + k * h * along))
-    central = (8 * (value(1.0) - value(-1.0)) - (value(2.0) - value(-2.0))) / (12 * h)
+    units = np.eye(4) + 0.3 * UNIT[:4]
+    R = np.stack([rot.rotation_matrix(p / np.linalg.norm(p)) for p in units])
+    assert [np.argmax(np.abs(rot.from_matrix(own))) for own in R] == [0, 1, 2, 3]
+    along, h = RNG.normal(size=(4, 3, 3)), 1e-3
+
+    @jax.jit
+    @jax.vmap
+    def run(R, along):
+        forward = jax.jvp(function, (R,), (along,))[1]
+        reverse = jnp.sum(jax.jacrev(function)(R) * along[None], axis=(1, 2))
+        return forward, reverse, [function(R + k * h * along) for k in (1.0, -1.0, 2.0, -2.0)]
+
+    forward, reverse, values = jax.device_get(run(R, along))
+    central = (8 * (values[0] - values[1]) - (values[2] - values[3])) / (12 * h)
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-14)
     np.testing.assert_allclose(central, forward, rtol=0, atol=1e-9)
-    batch = jax.jit(jax.vmap(function))(jnp.stack([R, R + h * along]))
-    np.testing.assert_allclose(batch, np.stack([value(0.0), value(1.0)]), rtol=0, atol=1e-15)
+    known = np.stack([function(own) for own in R + h * along])
+    np.testing.assert_allclose(values[0], known, rtol=0, atol=1e-15)
 
 
-def test_norm_at_zero():
-    zero = jnp.zeros(3)
-    assert float(rot.norm(zero)) == float(rot.norm(np.zeros(3))) == 0.0
-    assert float(rot.norm(np.array([3.0, 0.0, -4.0]))) == 5.0
-    np.testing.assert_array_equal(jax.grad(rot.norm)(zero), 0.0)
-    np.testing.assert_allclose(jax.grad(rot.norm)(jnp.array([3.0, 0.0, 4.0])), [0.6, 0.0, 0.8], rtol=0, atol=1e-15)
+def test_norm_and_its_derivative_at_zero():
+    value, slope = jax.jit(jax.vmap(jax.value_and_grad(rot.norm)))(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]))
+    np.testing.assert_array_equal(value, [0.0, 5.0])
+    np.testing.assert_allclose(slope, [[0.0, 0.0, 0.0], [0.6, 0.0, 0.8]], rtol=0, atol=1e-15)
+    assert (rot.norm(np.zeros(3)), rot.norm(np.array([3.0, 0.0, -4.0]))) == (0.0, 5.0)
 
 
 def test_single_precision_stays():
     """Of arrays of NumPy as of those of JAX: scenes are checked with the former."""
     p = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
-    assert rot.rotation_matrix(p).dtype == rot.rotation_matrix(jnp.asarray(p)).dtype == np.float32
+    assert rot.rotation_matrix(p).dtype == jax.eval_shape(rot.rotation_matrix, p).dtype == np.float32

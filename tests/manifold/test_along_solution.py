@@ -18,12 +18,6 @@ from jaxmb.solvers.manifold_term import AbstractManifoldTerm
 pytestmark = pytest.mark.slow
 
 
-def total(of, term, t, y, f, kept):
-    """The rate along the field itself, and that along a rate whose derivative is that of the field."""
-    _, own, g = of(term, t, y, f, None, kept, None)
-    return g, of(term, t, y, f, own, kept, None)[2]
-
-
 @pytest.mark.parametrize(
     "manifold, formulation", [(Partition(), Partitioned()), (Projection(), Multipliers())], ids=["chart", "projection"]
 )
@@ -40,7 +34,9 @@ def test_the_rate_of_a_field_has_the_derivatives_of_the_field(manifold, formulat
     def rates(of):
         def at(point, t, y):
             own = eqx.tree_at(lambda term: term.system, term, mb.with_parameters(system, point))
-            return total(of, own, t, y, found.f, kept)
+            # The rate along the field itself, and that along a rate whose derivative is that of the field.
+            _, along, g = of(own, t, y, found.f, None, kept, None)
+            return g, of(own, t, y, found.f, along, kept, None)[2]
 
         at_point = jax.tree.map(jnp.asarray, (point, t, found.y))
         return jax.jvp(at, at_point, along)

@@ -33,52 +33,32 @@ def by_blocks(system):
     return dataclasses.replace(system, elimination=joint_order(system, ()))
 
 
-def as_it_is(system):
-    return system
-
-
-STRUCTURES = [as_it_is, pytest.param(by_blocks, marks=pytest.mark.slow)]
-
-
-def in_long_steps(pendulum, structure, dt, **options):
-    own: Any = {"dt0": dt, "saveat": [0.1, 0.8, 2.0], "throw": False} | FIXED | options
-    return mb.simulate(structure(pendulum[0]), pendulum[1], t1=2.0, **own)
-
-
-@pytest.mark.parametrize("structure", STRUCTURES, ids=["dense", "sparse"])
+@pytest.mark.parametrize("structure", [lambda system: system, by_blocks], ids=["dense", "sparse"])
 def test_steps_that_are_too_long_fail(pendulum, structure):
-    """Nothing shortens them, and the run ends."""
-    failed = in_long_steps(pendulum, structure, 0.4)
-    assert failed.result == mb.RESULTS.newton_failed and not np.any(np.isfinite(failed.ys.q))
-    with pytest.raises(RuntimeError, match="no state on the constraints"):
-        in_long_steps(pendulum, structure, 0.4, throw=True)
-    fine = in_long_steps(pendulum, structure, 0.05)
-    assert fine.result == mb.RESULTS.successful and np.all(fine.constraint_violation.position < 1e-12)
-
-
-def test_a_step_that_fails_in_a_batch(pendulum):
-    batch = jax.jit(jax.vmap(lambda dt: in_long_steps(pendulum, as_it_is, dt)))(jnp.array([0.05, 0.4]))
+    """Nothing shortens them, and the run ends, of that member of a batch alone."""
+    (system, state), options = pendulum, {"t1": 2.0, "saveat": [0.1, 0.8, 2.0], **FIXED}
+    run = lambda dt, throw: mb.simulate(structure(system), state, dt0=dt, throw=throw, **options)
+    batch = jax.jit(jax.vmap(lambda dt: run(dt, False)))(jnp.array([0.05, 0.4]))
     np.testing.assert_array_equal(batch.result == mb.RESULTS.newton_failed, [False, True])
-    fine = in_long_steps(pendulum, as_it_is, 0.05)
-    np.testing.assert_allclose(batch.ys.q[0], fine.ys.q, rtol=0, atol=1e-10)
-    assert np.all(np.isnan(batch.ys.q[1]))
+    assert np.all(np.isfinite(batch.ys.q[0])) and np.all(np.isnan(batch.ys.q[1]))
+    residual = jax.vmap(lambda q: system.position_residual(0.0, q))(batch.ys.q[0])
+    np.testing.assert_allclose(residual, 0.0, atol=1e-12)
+    with pytest.raises(RuntimeError, match="no state on the constraints"):
+        run(0.4, True)
 
 
-@pytest.mark.parametrize("structure", STRUCTURES, ids=["dense", "sparse"])
-def test_derivatives_of_a_run_whose_first_steps_fail(pendulum, structure):
-    system = structure(pendulum[0])
+def test_derivatives_of_a_run_whose_first_steps_fail(pendulum):
+    system, state = pendulum
 
     def end(x, rtol=1e-7):
         own = mb.with_parameters(system, {"rod.inertia": x[0], "pin.point_a": jnp.stack([0.0 * x[1], x[1]])})
-        start = mb.assemble(own, mb.State(pendulum[1].q, x[2] * pendulum[1].u))
-        motion = mb.simulate(own, start, t1=0.45, dt0=0.4, rtol=rtol, **METHOD | {"max_steps": 1024})
+        start = mb.assemble(own, mb.State(state.q, x[2] * state.u))
+        motion = mb.simulate(own, start, t1=0.41, dt0=0.4, rtol=rtol, **METHOD | {"max_steps": 1024})
         return motion.ys.q[-1, 2], motion.stats["num_rejected_steps"]
 
-    x, h = jnp.array([0.1, 0.0, 1.0]), 1e-5
-    value = jax.jit(lambda x: end(x, 1e-10))
+    x, h, value = jnp.array([0.1, 0.0, 1.0]), 1e-5, jax.jit(lambda x: end(x, 1e-10))
     assert value(x)[1] > 0
-    forward = jax.jit(jax.jacfwd(lambda x: end(x)[0]))(x)
-    reverse = jax.jit(jax.grad(lambda x: end(x)[0]))(x)
+    forward, reverse = (jax.jit(way(lambda x: end(x)[0]))(x) for way in (jax.jacfwd, jax.grad))
     central = [(value(x + h * e)[0] - value(x - h * e)[0]) / (2 * h) for e in jnp.eye(3)]
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)
     np.testing.assert_allclose(forward, central, rtol=1e-4, atol=1e-5)
@@ -124,15 +104,12 @@ def gear_past_its_end():
 def test_a_motion_ends_where_constraints_cannot_be_met(case):
     system, rates, when, result, why = case()
     state = mb.assemble(system, rates=rates)
-    found = mb.simulate(system, state, t1=4.0, throw=False, **METHOD)
-    assert found.result == getattr(mb.RESULTS, result)
-    assert np.all(found.constraint_violation.position < 1e-10)
     kept = mb.simulate(system, state, t1=4.0, saveat=diffrax.SaveAt(steps=True), throw=False, **METHOD)
+    assert kept.result == getattr(mb.RESULTS, result)
+    assert np.all(kept.constraint_violation.position < 1e-10)
     np.testing.assert_allclose(kept.ts[-1], when, rtol=0, atol=1e-4)
     with pytest.raises(RuntimeError, match=why):
         mb.simulate(system, state, t1=4.0, **METHOD)
-    fixed = mb.simulate(system, state, t1=4.0, dt0=0.05, throw=False, **FIXED)
-    assert fixed.result == mb.RESULTS.newton_failed
     with pytest.raises(RuntimeError, match="no state on the constraints"):
         mb.simulate(system, state, t1=4.0, dt0=0.05, **FIXED)
 

@@ -8,13 +8,12 @@ import math
 from fractions import Fraction
 
 import diffrax
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
 from jaxmb.solvers import Adams
 from jaxmb.solvers._formulas import FAMILIES, formulas
-from jaxmb.solvers._history import History
 from jaxmb.solvers.stability import (
     Formula,
     boundary_locus,
@@ -28,184 +27,98 @@ from jaxmb.solvers.stability import (
     stiff_abscissa,
 )
 
-# b, c_0 and the error constant; a = (1, -1, 0, ...).
-E = {
-    1: ("2/3 1/3", "-1/6", "1/72"),
-    2: ("29/48 5/12 -1/48", "-1/8", "7/1440"),
-    3: ("307/540 19/40 -1/20 7/1080", "-19/180", "17/7200"),
-    4: ("3133/5760 47/90 -41/480 1/45 -17/5760", "-3/32", "41/30240"),
-    5: ("317731/604800 2837/5040 -1271/10080 373/7560 -529/40320 41/25200", "-863/10080", "731/846720"),
-    6: (
-        "247021/483840 12079/20160 -13823/80640 8131/90720 -5771/161280 179/20160 -731/725760",
-        "-275/3456",
-        "8563/14515200",
-    ),
-    7: (
-        "1758023/3528000 1147051/1814400 -133643/604800 157513/1088640 -2797/36288 86791/3024000 -35453/5443200 "
-        "8563/12700800",
-        "-33953/453600",
-        "27719/65318400",
-    ),
+# Of two points: a, b, c, the order and the error constant.
+PUBLISHED = {
+    "E": ("1 -1 0", "29/48 5/12 -1/48", "-1/8 0 0", 4, "7/1440"),
+    "B": ("1 -8/7 1/7", "6/7 0 0", "-2/7 0 0", 3, "1/21"),
+    "H": ("1 -1 0", "101/240 8/15 11/240", "-13/240 1/6 1/80", 6, "1/9450"),
+    "Y": ("1 -16/23 -7/23", "12/23 16/23 2/23", "-2/23 0 0", 5, "1/1035"),
 }
-
-# Denominator and numerators of a, then b_0, c_0 and the error constant.
-B = {
-    1: (1, "1 -1", "1", "-1/2", "1/6"),
-    2: (7, "7 -8 1", "6/7", "-2/7", "1/21"),
-    3: (85, "85 -108 27 -4", "66/85", "-18/85", "9/425"),
-    4: (415, "415 -576 216 -64 9", "60/83", "-72/415", "24/2075"),
-    5: (12019, "12019 -18000 9000 -4000 1125 -144", "8220/12019", "-1800/12019", "600/84133"),
-    6: (13489, "13489 -21600 13500 -8000 3375 -864 100", "1260/1927", "-1800/13489", "450/94423"),
-    7: (
-        726301,
-        "726301 -1234800 926100 -686000 385875 -148176 34300 -3600",
-        "457380/726301",
-        "-88200/726301",
-        "2450/726301",
-    ),
-    8: (
-        3144919,
-        "3144919 -5644800 4939200 -4390400 3087000 -1580544 548800 -115200 11025",
-        "1917720/3144919",
-        "-352800/3144919",
-        "7840/3144919",
-    ),
-}
-
-# a, b, c and the error constant.
-H = {
-    1: ("1 -1", "1/2 1/2", "-1/12 1/12", "1/720"),
-    2: ("1 -1 0", "101/240 8/15 11/240", "-13/240 1/6 1/80", "1/9450"),
-    3: (
-        "1 -1 0 0",
-        "6893/18144 313/672 89/672 397/18144",
-        "-1283/30240 851/3360 269/3360 163/30240",
-        "313/25401600",
-    ),
-}
-Y = {
-    2: ("1 -16/23 -7/23", "12/23 16/23 2/23", "-2/23 0 0", "1/1035"),
-    3: ("1 0 -81/97 -16/97", "44/97 108/97 54/97 4/97", "-6/97 0 0 0", "3/27160"),
-}
-
+# Of some numbers of points.
 ANGLES = {
-    "E": [90, 90, 87.883, 82.028, 73.097, 59.949, 37.608],
-    "B": [90, 90, 90, 89.363, 86.352, 80.817, 72.531, 60.715, 43.387, 12.341],
-    "H": [90],
-    "Y": [90, 82.767, 46.825],
+    "E": {1: 90, 3: 87.883, 7: 37.608},
+    "B": {3: 90, 4: 89.363, 10: 12.341},
+    "H": {1: 90},
+    "Y": {1: 90, 2: 82.767, 3: 46.825},
 }
-ABSCISSAS = [0, 0, 0.1034, 0.5262, 1.3394, 2.7281, 5.1821]
-# Of B with two points and on.
-GROWTHS = [3.847, 2.148, 1.572, 1.325, 1.195, 1.117, 1.067]
-
-ALL = [formula(family, k) for family in FAMILIES for k in range(1, 8)] + [formula("Adams", k) for k in range(1, 13)]
+ABSCISSAS = {1: 0, 2: 0, 3: 0.1034, 4: 0.5262}
+GROWTHS = {2: 3.847, 3: 2.148, 5: 1.325}
 
 
-def _rationals(text: str, length: int | None = None) -> tuple[Fraction, ...]:
-    out = tuple(map(Fraction, text.split()))
-    return out + (Fraction(0),) * ((length or len(out)) - len(out))
-
-
-@pytest.mark.parametrize("k", E)
-def test_coefficients_of_E(k):
-    b, c, C = E[k]
-    expected = (_rationals("1 -1", k + 1), _rationals(b), _rationals(c, k + 1))
-    assert formula("E", k) == (f"E{k}", *expected, k + 2, Fraction(C))
-
-
-@pytest.mark.parametrize("k", B)
-def test_coefficients_of_B(k):
-    denominator, a, b, c, C = B[k]
-    expected = (tuple(x / denominator for x in _rationals(a)), _rationals(b, k + 1), _rationals(c, k + 1))
-    assert formula("B", k) == (f"B{k}", *expected, k + 1, Fraction(C))
-
-
-@pytest.mark.parametrize("family, k, order", [("H", 1, 4), ("H", 2, 6), ("H", 3, 8), ("Y", 2, 5), ("Y", 3, 7)])
-def test_coefficients_of_H_and_Y(family, k, order):
-    *expected, C = {"H": H, "Y": Y}[family][k]
-    assert formula(family, k) == (f"{family}{k}", *map(_rationals, expected), order, Fraction(C))
-
-
-def test_one_step_formulas_of_E_and_Y_are_the_same():
+def test_formulas_have_the_published_coefficients():
+    """And as many points and terms as give them their orders, by which they are known."""
+    rationals = lambda text: tuple(map(Fraction, text.split()))
+    for family, (a, b, c, order, C) in PUBLISHED.items():
+        assert formula(family, 2) == (f"{family}2", *map(rationals, (a, b, c)), order, Fraction(C))
+    for k in range(1, 8):
+        E, B, H, Y = (formula(family, k) for family in "EBHY")
+        assert [each.order for each in (E, B, H, Y)] == [k + 2, k + 1, 2 * k + 2, 2 * k + 1]
+        assert all(len(row) == k + 1 for each in (E, B, H, Y) for row in (each.a, each.b, each.c))
+        for each in (E, H):
+            assert each.a == (1, -1, *[0] * (k - 1))
+        assert all(x == 0 for row in (E.c, B.b, B.c, Y.c) for x in row[1:])
+        assert B.a[0] == Y.a[0] == 1
     assert formula("E", 1)[1:] == formula("Y", 1)[1:]
 
 
-@pytest.mark.parametrize("each", ALL, ids=lambda each: each.name)
-def test_order_and_error_constant(each):
+def test_formulas_have_their_orders_and_error_constants():
     """On `y = exp(s)` and steps of h the two sides differ by `C h^(p+1)`, to first order."""
 
-    def relative(h):
+    def relative(each, h):
         # The series of the difference, exactly, up to far beyond the order.
         y = lambda j: sum((-j * h) ** n / math.factorial(n) for n in range(each.order + 20))
         terms = zip(each.a, each.b, each.c, strict=True)
         return sum((a - h * b - h**2 * c) * y(j) for j, (a, b, c) in enumerate(terms)) / h ** (each.order + 1)
 
-    errors = [abs(relative(Fraction(1, n)) / each.error_constant - 1) for n in (2000, 4000)]
-    assert errors[0] < 0.02
-    assert 0.45 < errors[1] / errors[0] < 0.55
+    for each in [formula(f, k) for f in FAMILIES for k in range(1, 8)] + [formula("Adams", k) for k in range(1, 13)]:
+        errors = [abs(relative(each, Fraction(1, n)) / each.error_constant - 1) for n in (2000, 4000)]
+        assert errors[0] < 0.02, each.name
+        assert 0.45 < errors[1] / errors[0] < 0.55, each.name
 
 
-@pytest.mark.parametrize("family, k", [(f, k) for f in FAMILIES for k in range(1, FAMILIES[f].highest + 1)])
-def test_coefficients_at_run_time(family, k):
-    """On equal steps the formulas that the solver works with are the rational ones."""
-    exact, properties = formula(family, k), FAMILIES[family]
-    m, multiplicity, h = k * properties.multiplicity, properties.multiplicity, 0.25
+@pytest.mark.parametrize("family", FAMILIES)
+def test_formulas_of_the_solver_are_the_rational_ones_on_equal_steps(family):
+    properties, h = FAMILIES[family], 0.25
+    multiplicity = properties.multiplicity
     mesh = np.repeat(-h * np.arange(properties.length), multiplicity)[: properties.length]
-    history = History(jnp.zeros((properties.length, 1)), jnp.asarray(mesh), jnp.asarray(properties.length))
-    run = formulas(properties, history.mesh, jnp.asarray(h), history.differences.dtype)
-    np.testing.assert_allclose(run.slope[m], float(exact.b[0]), rtol=1e-13)
-    np.testing.assert_allclose(run.curvature[m], float(exact.c[0]), rtol=1e-13)
-
+    run = jax.tree.map(np.asarray, jax.jit(lambda mesh, h: formulas(properties, mesh, h, mesh.dtype))(mesh, h))
     # What the differences are multiplied by, as weights of the values z and of their slopes: Newton's basis at the
     # points takes differences to values.
     spans = mesh[0] - mesh[1:]
     spans = np.where(spans > 0, spans, h)
-    basis = [np.poly1d(mesh[:i], r=True) / np.prod(spans[:i]) for i in range(m)]
-    rows = [[p(t) for p in basis] for t in mesh[:m:multiplicity]]
-    if multiplicity == 2:
-        rows += [[h * p.deriv()(t) for p in basis] for t in mesh[:m:multiplicity]]
-    weights = np.linalg.solve(np.transpose(rows), run.past[m, :m])
-    values, slopes = (exact.b, exact.c) if properties.integrated else (-np.array(exact.a), exact.b)
-    np.testing.assert_allclose(weights[:k], np.array(values[1:], float), rtol=0, atol=1e-13)
-    np.testing.assert_allclose(weights[k:], np.array(slopes[1:], float)[: m - k], rtol=0, atol=1e-13)
+    for k in range(1, properties.highest + 1):
+        exact, m = formula(family, k), k * multiplicity
+        np.testing.assert_allclose(run.slope[m], float(exact.b[0]), rtol=1e-13)
+        np.testing.assert_allclose(run.curvature[m], float(exact.c[0]), rtol=1e-13)
+        basis = [np.poly1d(mesh[:i], r=True) / np.prod(spans[:i]) for i in range(m)]
+        rows = [[p(t) for p in basis] for t in mesh[:m:multiplicity]]
+        if multiplicity == 2:
+            rows += [[h * p.deriv()(t) for p in basis] for t in mesh[:m:multiplicity]]
+        weights = np.linalg.solve(np.transpose(rows), run.past[m, :m])
+        values, slopes = (exact.b, exact.c) if properties.integrated else (-np.array(exact.a), exact.b)
+        np.testing.assert_allclose(weights[:k], np.array(values[1:], float), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(weights[k:], np.array(slopes[1:], float)[: m - k], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("family, k", [(f, k + 1) for f in ANGLES for k in range(len(ANGLES[f]))])
-def test_angles(family, k):
-    assert abs(stability_angle(formula(family, k)) - ANGLES[family][k - 1]) < 0.001
-
-
-@pytest.mark.parametrize("family, k", [("E", 8), ("B", 11), ("H", 2), ("H", 3), ("Y", 4)])
-def test_formulas_without_a_sector(family, k):
-    assert stability_angle(formula(family, k)) == 0
-    assert stability_angle(formula("Adams", k)) == 0
-
-
-@pytest.mark.slow(but=("Y3",))
-@pytest.mark.parametrize("each", [formula("E", 5), formula("B", 7), formula("Y", 3)], ids=lambda each: each.name)
-def test_angle_is_sharp(each):
-    """Beside the ray at the angle there is a point of instability on one side only."""
-    sizes = np.logspace(-2, 3, 20001)
+def test_stability_angle():
+    for family, angles in ANGLES.items():
+        for k, angle in angles.items():
+            assert abs(stability_angle(formula(family, k)) - angle) < 0.001, (family, k)
+    for family, k in (("E", 8), ("H", 2), ("Y", 4), ("Adams", 4)):
+        assert stability_angle(formula(family, k)) == 0
+    # Beside the ray at the angle there is a point of instability on one side only.
+    sizes, each = np.logspace(-2, 3, 20001), formula("Y", 3)
     ray = lambda degrees: np.max(spectral_radius(each, -sizes * np.exp(1j * np.radians(degrees))))
-    angle = stability_angle(each)
-    assert ray(angle - 0.02) < 1 < ray(angle + 0.02)
+    assert ray(stability_angle(each) - 0.02) < 1 < ray(stability_angle(each) + 0.02)
 
 
-@pytest.mark.slow("6", "7")
-@pytest.mark.parametrize("k", range(1, 8))
-def test_stiff_abscissas(k):
-    each = formula("E", k)
-    D = stiff_abscissa(each)
-    assert abs(D - ABSCISSAS[k - 1]) < 1e-4
-    if D > 0:
-        line = lambda x: np.max(spectral_radius(each, x + 1j * np.linspace(0, 20, 20001)))
-        assert line(-D - 0.002) < 1 < line(-D + 0.002)
-
-
-def test_formulas_without_a_half_plane():
+def test_stiff_abscissa():
+    for k, expected in ABSCISSAS.items():
+        assert abs(stiff_abscissa(formula("E", k)) - expected) < 1e-4
+    line = lambda x: np.max(spectral_radius(formula("E", 4), x + 1j * np.linspace(0, 20, 20001)))
+    assert line(-ABSCISSAS[4] - 0.002) < 1 < line(-ABSCISSAS[4] + 0.002)
     assert stiff_abscissa(formula("H", 1)) == 0
-    assert stiff_abscissa(formula("H", 2)) == math.inf
-    assert stiff_abscissa(formula("Adams", 4)) == math.inf
+    assert stiff_abscissa(formula("H", 2)) == stiff_abscissa(formula("Adams", 4)) == math.inf
 
 
 def test_damping_at_infinity():
@@ -217,83 +130,62 @@ def test_damping_at_infinity():
     assert spectral_radius(formula("Adams", 3), -math.inf) == math.inf
 
 
-@pytest.mark.parametrize("mu", [-1.0, 0.3 + 2.0j, -1e3])
-def test_one_step_formulas_are_pade_approximations(mu):
+def test_characteristic_roots():
+    """Those of one step are Padé approximations, or Heun's method; where a coefficient is zero, one is at infinity."""
+    mu = np.array([-1.0, 0.3 + 2.0j, -1e3])
     E1 = (1 + mu / 3) / (1 - 2 * mu / 3 + mu**2 / 6)
     H1 = (1 + mu / 2 + mu**2 / 12) / (1 - mu / 2 + mu**2 / 12)
-    np.testing.assert_allclose(characteristic_roots(formula("E", 1), mu), [E1], rtol=1e-14)
-    np.testing.assert_allclose(characteristic_roots(formula("H", 1), mu), [H1], rtol=1e-14)
-
-
-def test_shapes_and_poles():
-    each = formula("E", 3)
-    mu = np.array([[-1.0, 2.0j, -1.0 + 1.0j]])
+    for each, expected in ((formula("E", 1), E1), (formula("H", 1), H1), (formula("Adams", 1), 1 + mu + mu**2 / 2)):
+        np.testing.assert_allclose(characteristic_roots(each, mu)[:, 0], expected, rtol=1e-14)
+    each, mu = formula("E", 3), np.array([[-1.0, 2.0j, -1.0 + 1.0j]])
     roots = characteristic_roots(each, mu)
     assert roots.shape == (1, 3, 3)
     np.testing.assert_array_equal(spectral_radius(each, mu), np.max(np.abs(roots), axis=-1))
-    # Where the coefficient of the highest power is zero, a root is at infinity.
-    pole = np.roots([-float(each.c[0]), -float(each.b[0]), 1.0])[0]
-    assert spectral_radius(each, pole) > 1e12
+    assert spectral_radius(each, np.roots([-float(each.c[0]), -float(each.b[0]), 1.0])[0]) > 1e12
 
 
-@pytest.mark.parametrize(
-    "each", [formula("E", 4), formula("B", 6), formula("H", 2), formula("Adams", 5)], ids=lambda f: f.name
-)
-def test_locus(each):
+def test_boundary_locus():
     theta = np.linspace(0.1, 3, 7)
-    mu = boundary_locus(each, theta)
-    assert mu.shape == (2, 7)
-    roots = characteristic_roots(each, mu)
-    np.testing.assert_allclose(np.min(np.abs(roots - np.exp(1j * theta)[:, None]), axis=-1), 0, atol=1e-10)
-    assert np.all(np.abs(mu[0]) <= np.abs(mu[1])) and np.all(mu[0] != mu[1])
-
-
-def test_locus_where_a_branch_goes_to_infinity():
+    for each in (formula("E", 4), formula("B", 6), formula("H", 2), formula("Adams", 5)):
+        mu = boundary_locus(each, theta)
+        assert mu.shape == (2, 7)
+        roots = characteristic_roots(each, mu)
+        np.testing.assert_allclose(np.min(np.abs(roots - np.exp(1j * theta)[:, None]), axis=-1), 0, atol=1e-10)
+        assert np.all(np.abs(mu[0]) <= np.abs(mu[1])) and np.all(mu[0] != mu[1])
     np.testing.assert_array_equal(boundary_locus(formula("H", 1), 0.0), [0, np.inf])
 
 
 def test_zero_stability():
-    for family in ("E", "H"):
-        assert all(is_zero_stable(formula(family, k)) for k in range(1, 13))
-    assert [k for k in range(1, 13) if is_zero_stable(formula("B", k))] == list(range(1, 11))
-    # The roots of Y with four points at μ = 0 include 1 and -1, both simple.
-    assert [k for k in range(1, 7) if is_zero_stable(formula("Y", k))] == [1, 2, 3, 4]
-    assert all(is_zero_stable(formula("Adams", k)) for k in range(1, 14))
-
-
-def test_double_roots_on_the_circle_are_not_zero_stable():
+    """A double root on the circle is not stable, as Störmer's; two simple ones are, as those of Y with four points."""
+    for family, points in (("E", 8), ("H", 8), ("B", 10), ("Y", 4), ("Adams", 13)):
+        assert all(is_zero_stable(formula(family, k)) for k in range(1, points + 1, 3)), family
+    assert not is_zero_stable(formula("B", 11)) and not is_zero_stable(formula("Y", 5))
     one, zero = Fraction(1), Fraction(0)
     assert is_zero_stable(Formula("midpoint", (one, zero, -one), (zero, 2 * one, zero), (zero,) * 3, 2, one / 3))
     assert not is_zero_stable(Formula("Störmer", (one, -2 * one, one), (zero,) * 3, (one, zero, zero), 1, one))
 
 
-@pytest.mark.parametrize("k", range(2, 9))
-def test_growth_of_steps(k):
-    limit = largest_growth("B", k)
-    assert abs(limit - GROWTHS[k - 2]) < 0.001
-    assert _growth_of_B(k, limit - 0.001) < 1 < _growth_of_B(k, limit + 0.001)
+def test_largest_growth_of_steps():
+    """Of B against the roots at μ = 0 besides one, from the second derivatives of the Lagrange polynomials."""
 
+    def growth(k, ratio):
+        s = -np.cumsum(ratio ** -np.arange(float(k)))
+        weights = [1 / x**2 * np.prod([y / (y - x) for y in s if y != x]) for x in s]
+        quotient, _ = np.polydiv([-sum(weights), *weights], [1.0, -1.0])
+        return np.max(np.abs(np.roots(quotient)))
 
-def _growth_of_B(k, ratio):
-    """The largest root at μ = 0 besides one, from the second derivatives of the Lagrange polynomials."""
-    s = -np.cumsum(ratio ** -np.arange(float(k)))
-    weights = [1 / x**2 * np.prod([y / (y - x) for y in s if y != x]) for x in s]
-    quotient, _ = np.polydiv([-sum(weights), *weights], [1.0, -1.0])
-    return np.max(np.abs(np.roots(quotient)))
-
-
-def test_steps_may_grow_at_will():
+    for k, expected in GROWTHS.items():
+        limit = largest_growth("B", k)
+        assert abs(limit - expected) < 0.001
+        assert growth(k, limit - 0.001) < 1 < growth(k, limit + 0.001)
+    np.testing.assert_allclose([largest_growth("Y", 2), largest_growth("Y", 3)], [1.5, 1.0629], rtol=0, atol=1e-4)
     for family in ("E", "H"):
-        assert all(largest_growth(family, k) == math.inf for k in range(1, 9))
+        assert all(largest_growth(family, k) == math.inf for k in range(1, 5))
     assert largest_growth("B", 1) == largest_growth("Y", 1) == math.inf
 
 
-def test_growth_of_Y():
-    np.testing.assert_allclose([largest_growth("Y", 2), largest_growth("Y", 3)], [1.5, 1.0629], rtol=0, atol=1e-4)
-
-
 @pytest.mark.slow
-def test_growth_below_one():
+def test_largest_growth_is_below_one_where_equal_steps_are_unstable():
     assert 0.98 < largest_growth("B", 11) < 1
 
 
@@ -319,8 +211,8 @@ def _growth_of_pece(k, mu, steps):
     return np.exp(logarithm / (steps - steps // 2))
 
 
-@pytest.mark.parametrize("k", range(1, 13))
-def test_adams_against_simulation(k):
+@pytest.mark.parametrize("k", [1, 4, 12])
+def test_adams_grows_as_a_simulation(k):
     each = formula("Adams", k)
     assert each.order == k + 1
     # The first point of instability on the negative real axis.
@@ -333,13 +225,9 @@ def test_adams_against_simulation(k):
         np.testing.assert_allclose(_growth_of_pece(k, mu, 2000), spectral_radius(each, mu), rtol=5e-3)
 
 
-def test_adams_of_lowest_order_is_heuns_method():
-    mu = np.array([-2.5, -1.0, 0.5j, 1.0 + 1.0j])
-    np.testing.assert_allclose(characteristic_roots(formula("Adams", 1), mu)[:, 0], 1 + mu + mu**2 / 2, rtol=1e-14)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [1, 4, 9, 12])
-def test_adams_solver_is_the_recurrence(k):
+def test_adams_steps_by_the_recurrence(k):
     """The states of the solver itself, at fixed order and step."""
     each, mu, steps = formula("Adams", k), np.array([-2.1, -1.4, -0.3, 0.2, 1.5]), 25
     ys = diffrax.diffeqsolve(
@@ -348,10 +236,11 @@ def test_adams_solver_is_the_recurrence(k):
         0.0,
         float(steps),
         1.0,
-        jnp.ones(5),
+        np.ones(5),
         stepsize_controller=diffrax.ConstantStepSize(),
         saveat=diffrax.SaveAt(steps=True),
         max_steps=steps,
+        adjoint=diffrax.ForwardMode(),
     ).ys
     a, b, c = (np.array(row, float)[:, None] for row in (each.a, each.b, each.c))
     newest_first = np.asarray(ys)[::-1][: k + 1]
@@ -359,27 +248,23 @@ def test_adams_solver_is_the_recurrence(k):
     np.testing.assert_allclose(residual / np.max(np.abs(newest_first), axis=0), 0, atol=1e-11)
 
 
-@pytest.mark.parametrize("family, k, message", [("Q", 2, "family='Q'"), ("E", 0, "k=0")])
-def test_bad_input(family, k, message):
+def test_refused():
     for function in (formula, largest_growth):
-        with pytest.raises(ValueError, match=message):
-            function(family, k)
-
-
-def test_bad_order():
+        for family, k, message in (("Q", 2, "family='Q'"), ("E", 0, "k=0")):
+            with pytest.raises(ValueError, match=message):
+                function(family, k)
     with pytest.raises(ValueError, match="k=0"):
         formula("Adams", 0)
 
 
-def test_figures():
+def test_plot_of_regions():
     from matplotlib.figure import Figure
 
-    figure = plot_regions([formula("E", 4), formula("H", 1), formula("Adams", 2)])
-    (axes,) = figure.axes
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["E4", "H1", "Adams 2"]
+    (axes,) = plot_regions([formula("H", 1), formula("Adams", 2)]).axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["H1", "Adams 2"]
     # Left of the imaginary axis the boundary of E4 is as far away as its abscissa says.
     axes = Figure().add_subplot()
     assert plot_regions([formula("E", 4)], axes) is axes.figure
     (boundary,) = (c for c in axes.collections if len(c.get_facecolor()) == 0)
     leftmost = min(path.vertices[:, 0].min() for path in boundary.get_paths() if len(path.vertices))
-    assert abs(leftmost + stiff_abscissa(formula("E", 4))) < 0.05
+    assert abs(leftmost + ABSCISSAS[4]) < 0.05

@@ -15,7 +15,6 @@ from oracles.sprung_chain import sprung_chain
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.bodies.field_jacobian import motion_jacobian
-from jaxmb.linalg.block_elimination import eliminate_blocks
 from jaxmb.linalg.elimination_order import order_nodes
 from jaxmb.manifold import Partition, Projection
 from jaxmb.manifold.default import Unconstrained, default_manifold
@@ -64,23 +63,6 @@ def cable(n, *, stiffness=0.5, damping=5e-4):
     return mb.Scene(rods, joints=joints, forces=forces).compile()
 
 
-def ladder(n):
-    """Two chains of rods with rungs between them: loops that share bodies, and implied rows in none of them."""
-    bodies, joints, forces = [], [], [mb.Gravity((0.0, -9.81))]
-    for k in range(n):
-        for side, x in (("l", 0.0), ("r", 1.0)):
-            before = f"{side}{k - 1}" if k else "ground"
-            bodies.append(planar.Body(f"{side}{k}", mass=1.0, inertia=0.1, position=(x, -k - 0.5)))
-            joints.append(planar.Revolute(f"{side}{k}_pin", before, f"{side}{k}", point=(x, -k)))
-            if k:
-                spring = {"stiffness": (0.0, 0.0, 1e3), "damping": (0.0, 0.0, 1.0)}
-                forces.append(planar.Bushing(f"{side}{k}_spring", before, f"{side}{k}", point=(x, -k), **spring))
-        bodies.append(planar.Body(f"rung{k}", mass=0.5, inertia=0.05, position=(0.5, -k - 0.8)))
-        joints.append(planar.Revolute(f"rung{k}_l", f"l{k}", f"rung{k}", point=(0.0, -k - 0.8)))
-        joints.append(planar.Revolute(f"rung{k}_r", f"rung{k}", f"r{k}", point=(1.0, -k - 0.8)))
-    return mb.Scene(bodies, joints=joints, forces=forces).compile()
-
-
 def tower(n):
     """Spatial bodies on bushings alone, from the ground on."""
     bodies = [
@@ -104,32 +86,6 @@ def moving(system, seed=0):
 # Linear algebra
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("n", "size"), [(30, 2), (9, 4)])
-def test_elimination_of_unsymmetric_matrices(n, size):
-    random = np.random.default_rng(n)
-    neighbours = [set() for _ in range(n)]
-    for i, j in [*zip(range(n - 1), range(1, n), strict=True), (0, n - 1), (2, n // 2)]:
-        neighbours[i].add(j)
-        neighbours[j].add(i)
-    order = order_nodes(neighbours, size)
-    entries = lambda: random.normal(size=(size, size)) + 1j * random.normal(size=(size, size))
-    lower, upper = np.zeros((2, order.blocks, size, size), complex)
-    full = np.zeros((n, size, n, size), complex)
-    for k, (i, j) in enumerate(zip(order.row, order.column, strict=True)):
-        if i == j:
-            lower[k] = full[i, :, i] = entries() + 6 * np.eye(size)
-        elif j in neighbours[i]:
-            lower[k] = full[i, :, j] = entries()
-            upper[k] = full[j, :, i] = entries()
-    factor = eliminate_blocks(jnp.asarray(lower), order, jnp.asarray(upper))
-    x = entries()[:1].repeat(n, axis=0) * np.arange(1, n + 1)[:, None]
-    matrix = full.reshape(n * size, n * size)
-    found = factor.solve(jnp.asarray(x)), factor.transpose().solve(jnp.asarray(x))
-    for own, dense in zip(found, (matrix, matrix.T), strict=True):
-        np.testing.assert_allclose(own.ravel(), np.linalg.solve(dense, x.ravel()), rtol=0, atol=1e-13)
-
-
 def dense_resolvent(system, y, x, r):
     """The same equations with dense matrices, from the whole system's functions."""
     t, (q, u) = 0.0, (y.q, y.u)
@@ -149,7 +105,7 @@ def dense_resolvent(system, y, x, r):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, n", [(chain, 12), (cable, 6), (ladder, 5), (tower, 4)])
+@pytest.mark.parametrize("build, n", [(chain, 12), (cable, 5), (tower, 3)])
 def test_resolvents_are_those_of_dense_matrices(build, n):
     system = build(n)
     y = moving(system)
@@ -170,7 +126,7 @@ def test_resolvents_are_those_of_dense_matrices(build, n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n, damping", [(6, 0.0), (6, 20.0), (2, 20.0)])
+@pytest.mark.parametrize("n, damping", [(6, 0.0), (2, 20.0)])
 def test_the_spectrum_is_that_near_the_step(n, damping):
     """Of the dense Jacobian in independent coordinates, by `linearise` at rest: the eigenvalue nearest to an
     undamped vibration with `|h λ|` of a few, which decides on formulas, is found, and nothing that is none.
@@ -198,34 +154,8 @@ def run(system, state, *, rtol, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "build, n, t1",
-    [(lambda n: chain(n, stiffness=1e5, damping=1.0, curl=0.1), 4, 0.2), (cable, 3, 0.3), (tower, 2, 0.2)],
-)
-def test_motions_are_those_of_dense_matrices(build, n, t1):
-    system = build(n)
-    state = mb.assemble(system)
-    dense = Partition() if system.velocity_rows else Unconstrained()
-    solve = lambda manifold: jit_quickly(lambda rtol: _ends(run(system, state, rtol=rtol, t1=t1, manifold=manifold)))
-    of_dense, of_blocks = solve(dense), solve(Projection())
-    reference = of_dense(1e-10)[0]
-    size = np.max(np.abs(reference))
-    for rtol in (1e-4, 1e-6, 1e-8):
-        (expected, steps, _), (found, own, violation) = of_dense(rtol), of_blocks(rtol)
-        error, wrong = np.max(np.abs(found - reference)), np.max(np.abs(expected - reference))
-        assert error <= max(3 * wrong, rtol * size)
-        assert abs(own - steps) <= 0.2 * steps
-        assert violation <= 1e-12
-
-
-def _ends(sol):
-    violation = jnp.max(sol.constraint_violation.position, initial=0.0)
-    return jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]), sol.stats["num_steps"], violation
-
-
-@pytest.mark.slow
 def test_a_long_chain_moves_as_by_other_equations():
-    times, n = np.array([0.1, 0.3]), 20
+    times, n = np.array([0.1, 0.3]), 16
     expected = sprung_chain(times, n=n, stiffness=1e4, damping=20.0)
     system = chain(n)
     state = mb.assemble(system)
@@ -237,7 +167,7 @@ def test_a_long_chain_moves_as_by_other_equations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, sizes", [(chain, (100, 400)), (cable, (50, 200)), (tower, (50, 200))])
+@pytest.mark.parametrize("build, sizes", [(chain, (50, 200)), (cable, (25, 100)), (tower, (25, 100))])
 def test_no_dense_matrix_and_programs_of_one_size(build, sizes):
     lines = []
     for n in sizes:
@@ -274,28 +204,9 @@ def test_events_and_dense_output():
 
 
 @pytest.mark.slow
-def test_a_batch_equals_the_loop():
-    system = chain(2, curl=0.2)
-    state = mb.assemble(system)
-
-    def end(mass, stiffness):
-        moved = mb.with_parameters(system, {"rod1.mass": mass, "spring1.stiffness": jnp.zeros(3).at[2].set(stiffness)})
-        sol = run(moved, state, rtol=1e-8, t1=0.05, manifold=Projection())
-        return jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]), sol.stats["num_steps"]
-
-    cases = jnp.array([0.5, 1.0, 4.0]), jnp.array([1e3, 1e4, 1e5])
-    single = jit_quickly(end)
-    alone, steps = zip(*(single(*case) for case in zip(*cases, strict=True)), strict=True)
-    assert len(set(map(int, steps))) == 3
-    together, of_all = jit_quickly(jax.vmap(end))(*cases)
-    np.testing.assert_array_equal(of_all, steps)
-    np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("build, n, t1", [(lambda n: chain(n, curl=0.2), 3, 0.2), (cable, 3, 0.1)])
-def test_derivatives_three_ways(build, n, t1):
-    system = build(n)
+@pytest.mark.parametrize("build, t1", [(lambda n: chain(n, curl=0.2), 0.2), (cable, 0.05)])
+def test_derivatives_three_ways(build, t1):
+    system = build(3)
     state = mb.assemble(system)
     force = system.catalogue.force_names()[-1]
     names = ["rod1.mass", f"{force}.stiffness", f"{force}.damping"]
@@ -334,9 +245,9 @@ def test_size_decides():
         assert ("the dense Newton matrix, with Hermite" in str(system)) == (implicit is Projection)
 
 
-@pytest.mark.parametrize("n, most", [(100, 40), (1000, 40)])
-def test_levels_of_a_chain(n, most):
+def test_levels_of_a_chain():
     """Bodies that share a spring and a hinge with the next, by cyclic reduction and not from an end on."""
+    n, most = 1000, 40
     bodies, pairs = tuple((k,) for k in range(n)), tuple((k - 1, k) for k in range(1, n))
     neighbours = [set() for _ in range(2 * n)]
     for joint, own in enumerate([bodies[0], *pairs], n):

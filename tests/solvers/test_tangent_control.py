@@ -31,8 +31,8 @@ def at_rest(offset):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.slow)])
-def test_a_fast_mode_at_rest(solver):
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_derivatives_of_a_fast_mode_at_rest(solver):
     system = two_masses()
 
     def end(offset, rtol):
@@ -64,7 +64,7 @@ def test_only_runs_that_are_differentiated_resolve_the_tangent():
 
 
 @pytest.mark.slow
-def test_batches_events_dense_output_and_nested_jit():
+def test_derivatives_in_batches_at_events_between_steps_and_of_second_order():
     system = two_masses()
     crossing = diffrax.Event(lambda t, y, args, **kw: y.q[0], root_finder=None)
 
@@ -77,25 +77,14 @@ def test_batches_events_dense_output_and_nested_jit():
         stop = mb.simulate(system, at_rest(offset), t1=END, rtol=1e-9, event=crossing)
         return stop.ys.q[-1, 1], stop.ts[-1]
 
+    def end(rate):
+        changed = mb.with_parameters(system, {"rate": rate})
+        return mb.simulate(changed, at_rest(jnp.array(0.1)), t1=0.3, rtol=1e-10).ys.q[-1, 1]
+
     gradients = jax.jit(jax.vmap(jax.grad(between)))(jnp.array([0.0, 1e-3]))
     np.testing.assert_allclose(gradients, np.cos(2 * RATE), atol=1e-4)
-    slope, end = jax.jit(jax.grad(until, has_aux=True))(0.0)
-    np.testing.assert_allclose(slope, np.cos(RATE * end), atol=1e-4)
-
-
-@pytest.mark.slow
-def test_second_derivatives():
-    system = two_masses()
-
-    def end(rate):
-        sol = mb.simulate(
-            mb.with_parameters(system, {"rate": rate}),
-            at_rest(jnp.array(0.1)),
-            t1=0.3,
-            rtol=1e-10,
-        )
-        return sol.ys.q[-1, 1]
-
+    slope, time = jax.jit(jax.grad(until, has_aux=True))(0.0)
+    np.testing.assert_allclose(slope, np.cos(RATE * time), atol=1e-4)
     second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(20.0)
     np.testing.assert_allclose(second, -0.1 * 0.3**2 * np.cos(20 * 0.3), rtol=1e-6)
 
@@ -111,7 +100,7 @@ def cart():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_a_force_of_strength_zero_on_a_mass_at_rest(solver):
     """The motion is none, and its derivative is a function of time; also by strengths that nothing is seen of."""
     system = cart()
@@ -132,8 +121,7 @@ def test_a_force_of_strength_zero_on_a_mass_at_rest(solver):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
-def test_a_force_of_strength_zero_beside_constraints(solver):
+def test_a_force_of_strength_zero_beside_constraints():
     """Derivatives of a cart on a rail at rest, by the strength alone and beside those by where it starts."""
     rail = planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0))
 
@@ -147,45 +135,17 @@ def test_a_force_of_strength_zero_beside_constraints(solver):
     def end(strength, offset):
         changed = mb.with_parameters(system, {"push.strength": strength})
         moved = mb.State(start.q.at[0].add(offset), start.u)
-        sol = mb.simulate(changed, moved, t1=1.5, rtol=1e-8, solver=SOLVERS[solver], throw=False)
-        return sol["cart"].position[-1, 0]
+        return mb.simulate(changed, moved, t1=1.5, rtol=1e-8, throw=False)["cart"].position[-1, 0]
 
     exact = 1.5 / 12 - np.sin(18) / 144
-    for derivative in (jax.jit(jax.grad(end)), jax.grad(jax.jit(end))):
-        np.testing.assert_allclose(derivative(0.0, 0.0), exact, rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(jax.jit(end))(0.0, 0.0), exact, rtol=1e-6)
     both = jax.jit(jax.grad(end, argnums=(0, 1)))(0.0, 0.0)
     np.testing.assert_allclose(both, [exact, 1.0], rtol=1e-6)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(end, argnums=(0, 1)))(0.0, 0.0), both, rtol=1e-12)
 
 
 @pytest.mark.slow
-def test_parameters_of_constraints_with_steps_that_are_projected():
-    """Where constraints move with parameters, tangents start on those that have moved: steps need not be short."""
-    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
-    bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
-    system = mb.Scene([bar], joints=[pin], forces=[mb.Gravity((0.0, -9.81))]).compile()
-    nominal, along = mb.parameters(system)["pin.point_b"], jnp.array([0.5, 0.5])
-
-    def end(shift, solver, rtol, direction):
-        changed = mb.with_parameters(system, {"pin.point_b": nominal + shift * along})
-        start = mb.assemble(changed, throw=False)
-        watched = {"pin.point_b": along} if direction else None
-        sol = mb.simulate(changed, start, t1=0.2, rtol=rtol, solver=SOLVERS[solver], direction=watched, throw=False)
-        return jnp.sum(sol.ys.q[-1]), sol.stats["num_steps"]
-
-    derivative = jax.jit(jax.grad(end, has_aux=True), static_argnums=(1, 2, 3))
-    exact, _ = derivative(0.0, "Adams", 1e-11, False)
-    for direction in (False, True):
-        found, steps = derivative(0.0, "Dopri8", 1e-8, direction)
-        np.testing.assert_allclose(found, exact, rtol=1e-6)
-        assert steps < 12
-    whole = jax.jit(end, static_argnums=(1, 2, 3))
-    np.testing.assert_allclose(jax.grad(lambda x: whole(x, "Dopri8", 1e-8, False)[0])(0.0), exact, rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8"])
-def test_a_body_that_is_held(solver):
+def test_a_body_that_is_held():
     """Of its tangents constraints leave nothing but rounding, which steps do not resolve."""
     weld = planar.Fixed("weld", "ground", "plate", point_a=(0.2, 0.1), point_b=(-0.3, 0.1))
     plate = planar.Body("plate", mass=1.0, inertia=0.1, position=(0.5, 0.0))
@@ -194,43 +154,18 @@ def test_a_body_that_is_held(solver):
     def end(angle):
         changed = mb.with_parameters(system, {"weld.angle": angle})
         start = mb.assemble(changed, throw=False)
-        options = {"manifold": mb.manifold.Projection(), "solver": SOLVERS[solver]}
-        sol = mb.simulate(changed, start, t1=0.2, rtol=1e-6, throw=False, **options)
+        sol = mb.simulate(changed, start, t1=0.2, rtol=1e-6, throw=False, manifold=mb.manifold.Projection())
         return sol.ys.q[-1], sol.stats["num_steps"]
 
-    angles = jnp.linspace(-1.0, 1.0, 40)
+    angles = jnp.linspace(-1.0, 1.0, 10)
     derivative = lambda angle: jax.jvp(end, (angle,), (jnp.ones(()),))
     (q, steps), (slope, _) = jit_quickly(jax.vmap(derivative))(angles)
     c, s = jnp.cos(angles), jnp.sin(angles)
     np.testing.assert_allclose(q, jnp.stack([0.2 + 0.3 * c + 0.1 * s, 0.1 + 0.3 * s - 0.1 * c, angles], -1), atol=1e-12)
-    np.testing.assert_allclose(slope, jnp.stack([-0.3 * s + 0.1 * c, 0.3 * c + 0.1 * s, jnp.ones(40)], -1), atol=1e-9)
+    np.testing.assert_allclose(slope, jnp.stack([-0.3 * s + 0.1 * c, 0.3 * c + 0.1 * s, jnp.ones(10)], -1), atol=1e-9)
     assert jnp.max(steps) < 30
     reverse = jit_quickly(jax.vmap(jax.jacrev(lambda angle: end(angle)[0])))(angles)
     np.testing.assert_allclose(reverse, slope, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_controls_that_are_zero():
-    """Their gradient, where an optimisation of controls begins, is that of any others, since the system is linear."""
-    cart = planar.Body("cart", mass=1.0, inertia=0.1)
-    rail = planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0))
-    push = mb.JointForce("push", "rail.displacement", force=0.0)
-    system = mb.Scene([cart], joints=[rail], forces=[push]).compile()
-    start, times = mb.assemble(system), np.linspace(0.0, 1.5, 16)
-
-    @jax.jit
-    @jax.grad
-    def slopes(forces):
-        inputs = {"push.force": mb.Series(times, forces)}
-        return mb.simulate(system, start, t1=1.5, rtol=1e-8, inputs=inputs)["rail"].displacement[-1]
-
-    # Impulses of the forces between the knots times what is left of the motion.
-    step = times[1]
-    exact = step * (1.5 - times)
-    exact[[0, -1]] = step / 2 * (1.5 - step / 3), step**2 / 6
-    # Steps pass over the kinks at the knots.
-    np.testing.assert_allclose(slopes(jnp.zeros(16)), exact, rtol=0, atol=3e-6)
-    np.testing.assert_allclose(slopes(jnp.sin(12.0 * times)), exact, rtol=0, atol=3e-6)
 
 
 @pytest.mark.slow
@@ -260,8 +195,7 @@ def test_a_mode_that_is_kicked_late():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moves_start", [False, True])
-def test_no_direction_leaves_the_steps_of_the_motion(moves_start):
+def test_no_direction_leaves_the_steps_of_the_motion():
     # A slow mode beside a fast one at rest, which a method for stiff systems damps, and so does its derivatives.
     system = LagrangianSystem(
         kinetic=lambda t, q, v, p: 0.5 * jnp.dot(v, v),
@@ -272,7 +206,7 @@ def test_no_direction_leaves_the_steps_of_the_motion(moves_start):
 
     def end(x, direction):
         own = mb.with_parameters(system, {"slow": x**2, "fast": 1e6 * x})
-        start = mb.State(q=jnp.stack([x if moves_start else jnp.ones(()), jnp.zeros(())]), u=jnp.zeros(2))
+        start = mb.State(q=jnp.stack([x, jnp.zeros(())]), u=jnp.zeros(2))
         sol = mb.simulate(own, start, t1=2.0, rtol=1e-8, solver=mb.solvers.Hermite(), direction=direction)
         return sol.ys.q[-1, 0], sol.stats["num_steps"]
 
@@ -282,36 +216,17 @@ def test_no_direction_leaves_the_steps_of_the_motion(moves_start):
     (_, steps), slope = gradient({})
     (_, more), controlled = gradient(None)
     assert steps == end(1.0, None)[1] < more
-    exact = moves_start * np.cos(2.0) - 2.0 * np.sin(2.0)
+    exact = np.cos(2.0) - 2.0 * np.sin(2.0)
     np.testing.assert_allclose([slope, controlled], exact, rtol=2e-7)
     forward = jax.jit(lambda x: jax.jvp(lambda x: end(x, {})[0], (x,), (1.0,))[1])(1.0)
     np.testing.assert_allclose(forward, slope, rtol=1e-11)
 
 
 def test_directions_are_checked():
-    run = lambda direction: mb.simulate(two_masses(), at_rest(jnp.array(0.0)), t1=0.1, direction=direction)
-    with pytest.raises(ValueError, match="rat"):
-        run({"rat": 1.0})
-    with pytest.raises(ValueError, match=r"direction\['rate'\] must"):
-        run({"rate": [1.0, 2.0]})
-    with pytest.raises(ValueError, match="direction must be a dictionary"):
-        run(1.0)
-
-
-@pytest.mark.slow
-def test_a_train():
-    """Hinged cars hardly turn; on the mesh of the motion alone this derivative was wrong by a factor of 2500."""
-    mechanism = mb.mechanisms.get("train")
-    system, mass = mechanism.system, mb.parameters(mechanism.system)["car1.mass"]
-
-    def observed(mass, rtol):
-        changed = mb.with_parameters(system, {"car1.mass": mass})
-        sol = mb.simulate(changed, mechanism.state, t1=2.0, rtol=rtol, max_steps=4096)
-        return jnp.dot(jnp.cos(jnp.arange(system.nq + system.nu)), jnp.concatenate([sol.ys.q[-1], sol.ys.u[-1]]))
-
-    value, slope = jax.jit(observed), jax.jit(jax.grad(observed))
-    central = lambda h: (value(mass + h, 1e-13) - value(mass - h, 1e-13)) / (2 * h)
-    difference = (4 * central(1e-5 * mass) - central(2e-5 * mass)) / 3
-    # The difference itself is right to about 5e-5.
-    for rtol, error in ((1e-4, 2e-2), (1e-6, 1e-3), (1e-8, 1e-4), (1e-10, 1e-4)):
-        np.testing.assert_allclose(slope(mass, rtol), difference, rtol=error)
+    for direction, message in (
+        ({"rat": 1.0}, "rat"),
+        ({"rate": [1.0, 2.0]}, r"direction\['rate'\] must"),
+        (1.0, "direction must be a dictionary"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mb.simulate(two_masses(), at_rest(np.array(0.0)), t1=0.1, direction=direction)

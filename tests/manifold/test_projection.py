@@ -1,4 +1,4 @@
-"""Derivatives of projections in the metric of the mass matrix, with respect to every coordinate."""
+"""Projections in the metric of the mass matrix, and their derivatives with respect to every coordinate."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,34 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxmb as mb
-from jaxmb import spatial
+from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers
 from jaxmb.manifold.projection import ProjectionTerm
 
-pytestmark = pytest.mark.slow
-
 J = np.diag([0.01, 0.018, 0.014])
+
+
+def test_projection_of_a_state_off_a_circle():
+    """The nearest state in the metric of the masses, and the accelerations there; its corrections are counted."""
+    bob = planar.PointMass("bob", mass=2.0, position=(1.0, 0.0))
+    rod = planar.Distance("rod", "ground", "bob", length=1.0)
+    system = mb.Scene([bob], joints=[rod], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    term, q, u = ProjectionTerm(system, Multipliers(), jnp.array(1e-12)), np.array([1.1, 0.2]), np.array([0.3, -0.7])
+
+    @jax.jit
+    def run(q, u):
+        found = term.project_cold(jnp.zeros(()), mb.State(q, u), jnp.array(0), None)
+        near = term.project_near(jnp.zeros(()), mb.State(found.y.q + 1e-6, found.y.u), found, None)
+        return found.y, found.f, found.chart, near.y, near.chart
+
+    y, f, corrections, near, further = run(q, u)
+    along = q / np.linalg.norm(q)
+    across = np.array([-along[1], along[0]])
+    np.testing.assert_allclose(y.q, along, rtol=1e-10)
+    np.testing.assert_allclose(y.u, across * (across @ u), rtol=1e-10)
+    np.testing.assert_allclose(f.u, -9.81 * across[1] * across - along * (across @ u) ** 2, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(near.q), 1.0, rtol=1e-12)
+    assert 1 <= corrections < further
 
 
 def links(inertial):
@@ -29,6 +50,7 @@ def links(inertial):
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inertial", [False, True])
 def test_the_field_changes_as_its_differences_say_in_every_direction(inertial):
     """Also with the norm of a quaternion, which the constraints say nothing of."""
@@ -48,6 +70,7 @@ def test_the_field_changes_as_its_differences_say_in_every_direction(inertial):
         np.testing.assert_allclose(exact[:, :, k], change, rtol=0, atol=1e-6 * np.max(np.abs(exact)))
 
 
+@pytest.mark.slow
 def test_velocities_far_from_constraints_that_are_not_linear_in_them():
     """Three corrections bring them near, the others farther to rounding; derivatives are those of all corrections."""
     system = mb.mechanisms.benenti().system
