@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_as_users_do
-from oracles import linkages, one_freedom, trains
+from oracles import linkages, trains
 from scipy.optimize import curve_fit
 from scipy.special import roots_laguerre
 from trajectories import motion_of
@@ -123,14 +123,13 @@ def train_values(times):
 CARRIED = {
     "train": (train_values, 1e-6),
     **{name: (getattr(linkages, name), 1e-9) for name in ("four_bar", "slider_crank", "n_four_bar", "hanging_chain")},
-    **{name: (getattr(one_freedom, name), 1e-12) for name in LINKAGES},
 }
 
 
 @pytest.mark.slow(but=("slider_crank",))
 @pytest.mark.parametrize("name", CARRIED)
 def test_references_are_the_values_of_an_independent_model(name):
-    """In minimal coordinates, or from where the bodies are."""
+    """In minimal coordinates."""
     (model, bound), references = CARRIED[name], library(name).references
     values = model(references.times)
     np.testing.assert_allclose(values / references.scales, references.values / references.scales, rtol=0, atol=bound)

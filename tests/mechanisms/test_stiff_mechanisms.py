@@ -13,48 +13,10 @@ from jaxmb import mechanisms
 from jaxmb.formulations import Partitioned, accelerations
 from jaxmb.linalg import rotations
 
-extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="needs numbers longer than double")
-
 
 @functools.cache
 def library(name):
     return mechanisms.get(name)
-
-
-def relative(values, expected):
-    """Errors relative to the largest value of each column, as those of a mechanism."""
-    expected = np.asarray(expected, float)
-    return np.max(np.abs(np.asarray(values, float) - expected) / np.max(np.abs(expected), axis=0))
-
-
-# Carried values
-
-
-@pytest.mark.slow
-def test_flyball_references_are_those_of_another_model():
-    references = library("flyball").references
-    values = stiff.implicit_motion(stiff.flyball(number=float), references.times, rtol=1e-11)
-    expected = np.column_stack([np.cos(values[:, 0]), np.sin(values[:, 0]), values[:, 1:]])
-    assert relative(references.values, expected) < 1e-11
-    if np.finfo(np.longdouble).eps < 1e-18:
-        ((psi, *rest),) = stiff.motion(stiff.flyball(), references.times[:1], step=1e-4, columns=8)
-        expected = np.array([np.cos(psi), np.sin(psi), *rest], float)
-        np.testing.assert_allclose(references.values[0], expected, rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
-@extended
-def test_stiff_four_bar_references_are_those_of_an_open_chain():
-    """At a coarser step to the end, at a finer one to 0.1 s, and by an implicit method to 0.01 s."""
-    references = library("stiff_four_bar").references
-    count = len(references.labels)
-    early = references.times[:2]
-    coarse = stiff.motion(stiff.four_bar(), references.times, step=2e-4, columns=7)
-    assert relative(coarse[:, :count], references.values) < 1e-10
-    fine = stiff.motion(stiff.four_bar(), early, step=1e-4, columns=7)
-    assert relative(fine[:, :count], references.values[:2]) < references.tolerance
-    implicit = stiff.implicit_motion(stiff.four_bar(number=float), early[:1], rtol=1e-11)
-    assert relative(implicit[:, :count], references.values[:1]) < 1e-9
 
 
 def test_stiff_four_bar_references_stay_near_the_rigid_one():

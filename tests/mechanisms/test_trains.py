@@ -11,7 +11,7 @@ import pytest
 from oracles import trains as oracle
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import planar
 from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.formulations import Multipliers, Poincare, accelerations
 from jaxmb.manifold import Partition, Projection
@@ -73,7 +73,7 @@ def test_draft_gear_has_finite_derivatives_everywhere():
 
 
 @pytest.mark.slow
-def test_frequencies_of_a_free_chain():
+def test_train_has_the_frequencies_of_a_free_chain():
     n, k, m = 20, 2e7, 8e4
     system = mb.mechanisms.train(n=n, coupler=LINEAR, **BARE).system
     along = np.arange(0, 3 * n, 3)
@@ -83,7 +83,7 @@ def test_frequencies_of_a_free_chain():
 
 
 @pytest.mark.slow
-def test_a_pull_at_the_head_runs_through_the_train_as_a_wave():
+def test_train_takes_a_pull_at_its_head_as_a_wave():
     n, k, m, pull = 100, 2e7, 8e4, 3e5
     mechanism = mb.mechanisms.train(n=n, coupler=LINEAR, pull=pull, **BARE)
     times = np.arange(1, 601) * 0.01
@@ -134,7 +134,7 @@ def test_longitudinal_train_moves_as_a_train_that_stays_straight():
 
 
 @pytest.mark.slow
-def test_slow_and_fast_collisions():
+def test_train_collides_slowly_and_fast():
     """Vehicles that meet at a nanometre or a hundred metres a second, their slack open, shut or in between."""
     system = mb.mechanisms.longitudinal_train(n=4, brake=0.0, resistance=(0, 0, 0)).system
     run = jax.jit(lambda state: mb.simulate(system, state, t1=1.0, rtol=1e-9, throw=False))
@@ -204,7 +204,7 @@ def random_state(system, rng, pitch=0.2):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 50])
-def test_hinge_forces_are_those_of_one_matrix_of_all(n):
+def test_train_on_hinges_has_the_forces_of_one_matrix_of_all(n):
     system = by_blocks(hinged(n).system)
     solve = jax.jit(lambda q, u: (accelerations(system, Multipliers(), 0.1, q, u), system.force(0.1, q, u)))
     rng = np.random.default_rng(n)
@@ -218,78 +218,13 @@ def test_hinge_forces_are_those_of_one_matrix_of_all(n):
         np.testing.assert_allclose(-multipliers.reshape(-1, 2), forces, rtol=0, atol=1e-12 * np.max(np.abs(forces)))
 
 
-def mixed_chains():
-    """Joints of one, two and three rows between the ground and bodies in no order, and a chain of its own."""
-    bodies = [planar.Body(name, mass=1.0 + k, inertia=0.1, position=(k, 0.1 * k)) for k, name in enumerate("abcdef")]
-    bodies.append(planar.PointMass("p", mass=0.5, position=(7.0, 1.0)))
-    joints = [
-        planar.Fixed("weld", "c", "a", point=(1.0, 0.3)),
-        planar.Distance("rod", "b", "a", length=1.0),
-        planar.Revolute("pin", "ground", "b", point=(0.7, 0.1)),
-        planar.PointOnLine("slot", "c", "ground", point=(2.5, 0.3), axis=(1.0, 0.0)),
-        planar.Revolute("own", "e", "d", point=(3.5, 0.2)),
-        planar.Distance("last", "p", "e"),
-        planar.KnifeEdge("blade", "d"),
-    ]
-    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
-
-
-def hanging_spheres():
-    bodies = [
-        spatial.Body(f"b{k}", mass=1.0 + k, inertia=(0.2, 0.3, 0.4 + 0.02 * k), position=(k, 0.0, 0.0))
-        for k in range(4)
-    ]
-    joints = [spatial.Spherical("s0", "ground", "b0", point=(-0.5, 0.0, 0.0))]
-    joints += [spatial.Spherical(f"s{k}", f"b{k - 1}", f"b{k}", point=(k - 0.5, 0.1, 0.0)) for k in range(1, 4)]
-    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("build", [mixed_chains, hanging_spheres])
-def test_any_joints_in_chains(build):
-    system = build()
-    rng = np.random.default_rng(0)
-    structured = by_blocks(system)
-
-    @jax.jit
-    def solve(q, u, v):
-        cases = (structured, Multipliers()), (structured, Poincare()), (system, Multipliers())
-        blocks = structured.structured_jacobian(0.0, q, u)
-        products = [
-            [A.product(v), A.transpose_product(A.product(v)), A.matrix]
-            for A in (blocks.dense(), system.structured_jacobian(0.0, q, u))
-        ]
-        products.append([blocks.product(v), blocks.transpose_product(blocks.product(v)), products[0][2]])
-        return [accelerations(*case, 0.0, q, u) for case in cases], products
-
-    for _ in range(3):
-        q = system.normalize(0.0, system.guess.q + 0.1 * jnp.asarray(rng.normal(size=system.nq)))
-        for found in solve(q, *jnp.asarray(rng.normal(size=(2, system.nu)))):
-            for case in found[:-1]:
-                for a, b in zip(case, found[-1], strict=True):
-                    np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
-
-
-@pytest.mark.slow
-def test_a_chain_in_space_moves_as_by_partitioning():
-    system = hanging_spheres()
-    cases = (system, Partition()), (system, Projection()), (by_blocks(system), Projection())
-    expected, *ends = [
-        mb.simulate(system, system.guess, t1=0.3, rtol=1e-10, manifold=manifold).ys for system, manifold in cases
-    ]
-    for end in ends:
-        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-7)
-        assert np.max(np.abs(system.coordinate_residual(0.3, end.q[-1]))) <= 1e-13
-
-
 def undamped(coupler):
     return mb.mechanisms.train(n=6, coupler=coupler, suspension_damping=0.0, resistance=0.0, brake=0.0, speed=1.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("coupler", "manifold"), [(LINEAR, None), (planar.Revolute, Projection())])
-def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
+def test_train_keeps_its_energy_and_hinges_closed(coupler, manifold):
     system = undamped(coupler).system
     rng = np.random.default_rng(1)
     push = mb.State(system.guess.q, system.guess.u + jnp.asarray(rng.normal(size=18) * np.tile([0.3, 0.3, 0.02], 6)))
@@ -308,7 +243,7 @@ def long_chain():
 
 
 @pytest.mark.slow
-def test_long_chains_need_no_choice(long_chain):
+def test_rod_chain_of_many_needs_no_choice(long_chain):
     """The same motion by both solvers' defaults, by blocks."""
     assert "sparse elimination" in str(long_chain.system)
     ends = []
@@ -322,7 +257,7 @@ def test_long_chains_need_no_choice(long_chain):
 
 
 @pytest.mark.slow
-def test_derivatives_of_the_motion_of_a_long_chain(long_chain):
+def test_rod_chain_of_many_derivatives(long_chain):
     names = ("link3.mass", "link9.inertia", "pin5.point_a", "pin16.point_b")
     numbers = {name: mb.parameters(long_chain.system)[name] for name in names}
     direction = {"link3.mass": 0.05, "link9.inertia": 1e-5, "pin5.point_a": (0.01, 0.02), "pin16.point_b": (0.02, 0.01)}
@@ -403,7 +338,7 @@ LOOP = planar.Distance("back", "b3", "b0", point_a=(0.2, 0.3))
 
 @pytest.mark.slow
 @pytest.mark.parametrize("build", [lambda: ring(LOOP), turning_pendulum, dry_friction])
-def test_other_joint_graphs_are_projected_with_a_dense_matrix(build):
+def test_projection_of_other_joint_graphs_has_a_dense_matrix(build):
     """Loops and systems without joints: the same motion as by partitioning, with its derivatives."""
     system = build()
     assert system.elimination is None
@@ -442,7 +377,7 @@ def largest(jaxpr):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute, planar.Distance])
-def test_program_and_memory_of_long_trains(coupler):
+def test_train_of_many_has_no_longer_program_and_little_memory(coupler):
     """As many instructions for any number of vehicles, and no array that grows faster than it."""
 
     def measure(n):
