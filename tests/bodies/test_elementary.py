@@ -255,20 +255,22 @@ def test_hinge_half_a_turn_away_is_not_consistent():
         consistent(system, 0.0, state)
 
 
-def test_weld_that_is_turned_is_not_consistent():
-    """By half a turn in the plane; in space by a third about diagonals, after which the axes are those of the body in
-    another order.
-    """
-    weld = planar.Fixed("weld", "ground", "bar", point=(0.0, 0.0))
-    system = mb.Scene([planar.Body("bar", mass=1.0, inertia=1.0)], joints=[weld]).compile()
-    for angle, holds in ((0.0, True), (np.pi, False), (2 * np.pi, False)):
-        state = mb.State(np.array([0.0, 0.0, angle]), np.zeros(3))
-        assert bool(is_consistent(system, 0.0, state)) == holds
+def test_weld_that_is_turned_by_a_third_is_not_consistent():
+    """About diagonals, after which the axes are those of the body in another order."""
     weld = spatial.Fixed("weld", "ground", "bar", point=(0.0, 0.0, 0.0))
     system = mb.Scene([spatial.Body("bar", mass=1.0, inertia=(1.0, 1.0, 1.0))], joints=[weld]).compile()
     turns = [(1, 1, 1), (-1, -1, -1), (1, -1, 1), (-1, 1, 1)]
     for p, holds in ([1.0, 0.0, 0.0, 0.0], True), *((0.5 * np.array([1, *signs]), False) for signs in turns):
         assert bool(is_consistent(system, 0.0, mb.State(np.append(np.zeros(3), p), np.zeros(6)))) == holds
+
+
+@pytest.mark.slow
+def test_weld_that_is_turned_by_a_half_is_not_consistent():
+    weld = planar.Fixed("weld", "ground", "bar", point=(0.0, 0.0))
+    system = mb.Scene([planar.Body("bar", mass=1.0, inertia=1.0)], joints=[weld]).compile()
+    for angle, holds in ((0.0, True), (np.pi, False), (2 * np.pi, False)):
+        state = mb.State(np.array([0.0, 0.0, angle]), np.zeros(3))
+        assert bool(is_consistent(system, 0.0, state)) == holds
 
 
 @pytest.mark.slow

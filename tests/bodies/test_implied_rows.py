@@ -463,13 +463,3 @@ for name in ("four_bar", "bricard"):
     mb.simulate(m.system, mb.State(motion.ys.q[-1], motion.ys.u[-1]), t0=0.3, t1=0.4, rtol=1e-4)
 """
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, env=os.environ)
-
-
-def test_row_of_a_part_has_a_number_of_its_own():
-    """A rolling disc is made of a contact and of rolling; its rows are counted together."""
-    wheel = {"mass": 1.0, "inertia": np.diag([0.02, 0.04, 0.02])}
-    bodies = [spatial.Body(name, position=(0.0, y, 0.3), **wheel) for name, y in (("right", -0.5), ("left", 0.5))]
-    rolls = [spatial.RollingDisc(f"{own.name} rolls", own.name, radius=0.3, axis=(0.0, 1.0, 0.0)) for own in bodies]
-    system = mb.Scene(bodies, joints=rolls).compile()
-    assert len(set(system.rows)) == len(system.rows)
-    assert [k for name, k in system.rows if name == "right rolls"] == [0, 1, 2]

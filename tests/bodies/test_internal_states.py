@@ -185,7 +185,7 @@ def test_failure_of_friction_is_named_beside_internal_states():
 @pytest.mark.slow
 def test_rate_of_a_state_that_is_not_finite_is_named():
     bad = lambda t, measured, states, p: (0.0, {"integral": jnp.sqrt(0.5 - t)})
-    system = cart_and_pole_with(bad)
+    system = cart_with(bad)
     state = system.guess
     assert system.with_states(state.z).catalogue.not_finite(0.4, state.q, state.u) == ()
     assert system.with_states(state.z).catalogue.not_finite(0.6, state.q, state.u) == ("the rate of 'pid.integral'",)
@@ -329,6 +329,7 @@ def test_motors_of_many_joints_move_as_with_dense_matrices():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_jump_keeps_internal_states():
     system = chain_of_motors(15)
     assert system.elimination is not None
@@ -432,101 +433,98 @@ class Misshapen(Filter):
         return {"value": jnp.zeros(2)}
 
 
-REFUSED = {
-    "no rate": (lambda: filtered(Forgetful("f", "body")), "Forgetful 'f' has internal states; derive it from"),
-    "another rate": (lambda: filtered(Misnamed("f", "body", lag=1.0)), "a dictionary of the internal states, value"),
-    "shape of a rate": (
-        lambda: filtered(Misshapen("f", "body", lag=1.0)),
-        r"state_rates\['value'\] must return shape \(\), got \(2,\)",
-    ),
-    "not finite": (
-        lambda: filtered(Filter("f", "body", lag=1.0, value=np.nan)),
-        "initial values of the internal states f.value must be finite",
-    ),
-    "unknown state": (
-        lambda: mb.assemble(plain_cart_and_pole(), fix={"pid.integrl": 0.1}),
-        "Unknown coordinate 'pid.integrl'; did you mean 'pid.integral'",
-    ),
-    "two values": (
-        lambda: mb.assemble(plain_cart_and_pole(), fix={"pid.integral": [0.1, 0.2]}),
-        r"Internal state 'pid.integral' has 1 components, got shape \(2,\)",
-    ),
-    "a state without z": (
-        lambda: mb.simulate(system := plain_cart_and_pole(), mb.State(system.guess.q, system.guess.u), t1=1.0),
-        "The system has 1 internal states, but the state has none",
-    ),
-    "a state with z": (
-        lambda: mb.simulate(
-            (own := mechanisms.four_bar()).system, mb.State(own.state.q, own.state.u, np.zeros(2)), t1=1.0
-        ),
-        "The system has no internal states, but the state has some",
-    ),
-    "an output's shape": (
-        lambda: cart_and_pole_with(lambda t, m, s, p: (jnp.zeros(2), {"integral": 0.0})),
-        r"must return a force of shape \(\) on 'slide.displacement', got \(2,\)",
-    ),
-    "no rates": (
-        lambda: cart_and_pole_with(lambda t, m, s, p: 0.0),
-        "the function of Controller 'pid' must return the forces and a dictionary of rates",
-    ),
-    "other rates": (
-        lambda: cart_and_pole_with(lambda t, m, s, p: (0.0, {})),
-        "must return the rates of its states, integral",
-    ),
-    "unknown quantity": (
-        lambda: cart_and_pole(measures={"angle": "hinge.angel"}),
-        "Controller 'pid': Unknown quantity 'hinge.angel'; did you mean 'hinge.angle'",
-    ),
-    "unknown source": (
-        lambda: cart_and_pole(measures={"angle": "hing.angle"}),
-        "Controller 'pid': Unknown joint, body or frame 'hing'; did you mean 'hinge'",
-    ),
-    "acts on a body": (lambda: cart_and_pole(acts_on="cart.position"), "it acts on coordinates of joints"),
-    "acts twice": (
-        lambda: cart_and_pole(acts_on=["slide.displacement", "slide.displacement"]),
-        "Controller 'pid': acts_on names a coordinate twice",
-    ),
-    "a state's name": (
-        lambda: cart_and_pole(states={"integral": 0.0, "a.b": 0.0}),
-        "Controller 'pid': names of states must not be empty or contain a dot, got 'a.b'",
-    ),
-    "gain of a force": (
-        lambda: motor_on_four_bar(mode="force"),
-        "Motor 'motor': gain and damping belong to the modes 'speed' and 'position'",
-    ),
-    "no gain of a speed": (
-        lambda: motor_on_four_bar(gain=None),
-        "Motor 'motor': without a gain the command does nothing in the mode 'speed'; give gain",
-    ),
-    "no gain of a position": (
-        lambda: motor_on_four_bar(mode="position", gain=None, damping=1.0),
-        "Motor 'motor': without a gain the command does nothing in the mode 'position'",
-    ),
-    "shape of a command": (
-        lambda: motor_on_four_bar(command=[1.0, 2.0]),
-        r"command must have the shape of 'A.angle', \(\), got \(2,\)",
-    ),
-    "equilibrium": (
-        lambda: mb.equilibrium(motor_on_four_bar(mode="force", gain=0.0, command=3.0)),
-        "In the equilibrium internal states change: motor.force",
-    ),
-    "floquet": (
-        lambda: mb.floquet(system := plain_cart_and_pole(), system.guess, 1.0),
-        "floquet does not support internal states; the system has pid.integral",
-    ),
-}
-
-
-def cart_and_pole_with(function):
+def cart_with(function):
     cart = planar.Body("cart", mass=2.0, inertia=1.0)
     slide = planar.Prismatic("slide", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0))
     controller = mb.Controller("pid", function, {}, "slide.displacement", states={"integral": 0.0})
     return mb.Scene([cart], joints=[slide], forces=[controller]).compile()
 
 
-@pytest.mark.slow("equilibrium")
-@pytest.mark.parametrize("case", REFUSED)
-def test_internal_states_that_cannot_be_are_refused(case):
-    call, message = REFUSED[case]
-    with pytest.raises(ValueError, match=message):
-        call()
+def run_without_states():
+    system = plain_cart_and_pole()
+    mb.simulate(system, mb.State(system.guess.q, system.guess.u), t1=1.0)
+
+
+def run_with_states():
+    own = mechanisms.four_bar()
+    mb.simulate(own.system, mb.State(own.state.q, own.state.u, np.zeros(2)), t1=1.0)
+
+
+TWICE, DOTTED = ["slide.displacement", "slide.displacement"], {"integral": 0.0, "a.b": 0.0}
+REFUSED = [
+    (lambda: filtered(Forgetful("f", "body")), "Forgetful 'f' has internal states; derive it from"),
+    (lambda: filtered(Misnamed("f", "body", lag=1.0)), "a dictionary of the internal states, value"),
+    (
+        lambda: filtered(Misshapen("f", "body", lag=1.0)),
+        r"state_rates\['value'\] must return shape \(\), got \(2,\)",
+    ),
+    (
+        lambda: filtered(Filter("f", "body", lag=1.0, value=np.nan)),
+        "initial values of the internal states f.value must be finite",
+    ),
+    (
+        lambda: mb.assemble(plain_cart_and_pole(), fix={"pid.integrl": 0.1}),
+        "Unknown coordinate 'pid.integrl'; did you mean 'pid.integral'",
+    ),
+    (
+        lambda: mb.assemble(plain_cart_and_pole(), fix={"pid.integral": [0.1, 0.2]}),
+        r"Internal state 'pid.integral' has 1 components, got shape \(2,\)",
+    ),
+    (run_without_states, "The system has 1 internal states, but the state has none"),
+    (run_with_states, "The system has no internal states, but the state has some"),
+    (
+        lambda: cart_with(lambda t, m, s, p: (jnp.zeros(2), {"integral": 0.0})),
+        r"must return a force of shape \(\) on 'slide.displacement', got \(2,\)",
+    ),
+    (
+        lambda: cart_with(lambda t, m, s, p: 0.0),
+        "the function of Controller 'pid' must return the forces and a dictionary of rates",
+    ),
+    (lambda: cart_with(lambda t, m, s, p: (0.0, {})), "must return the rates of its states, integral"),
+    (
+        lambda: cart_and_pole(measures={"angle": "hinge.angel"}),
+        "Controller 'pid': Unknown quantity 'hinge.angel'; did you mean 'hinge.angle'",
+    ),
+    (
+        lambda: cart_and_pole(measures={"angle": "hing.angle"}),
+        "Controller 'pid': Unknown joint, body or frame 'hing'; did you mean 'hinge'",
+    ),
+    (lambda: cart_and_pole(acts_on="cart.position"), "it acts on coordinates of joints"),
+    (lambda: cart_and_pole(acts_on=TWICE), "Controller 'pid': acts_on names a coordinate twice"),
+    (
+        lambda: cart_and_pole(states=DOTTED),
+        "Controller 'pid': names of states must not be empty or contain a dot, got 'a.b'",
+    ),
+    (
+        lambda: motor_on_four_bar(mode="force"),
+        "Motor 'motor': gain and damping belong to the modes 'speed' and 'position'",
+    ),
+    (
+        lambda: motor_on_four_bar(gain=None),
+        "Motor 'motor': without a gain the command does nothing in the mode 'speed'; give gain",
+    ),
+    (
+        lambda: motor_on_four_bar(mode="position", gain=None, damping=1.0),
+        "Motor 'motor': without a gain the command does nothing in the mode 'position'",
+    ),
+    (
+        lambda: motor_on_four_bar(command=[1.0, 2.0]),
+        r"command must have the shape of 'A.angle', \(\), got \(2,\)",
+    ),
+    (
+        lambda: mb.floquet(plain_cart_and_pole(), plain_cart_and_pole().guess, 1.0),
+        "floquet does not support internal states; the system has pid.integral",
+    ),
+]
+
+
+def test_internal_states_that_cannot_be_are_refused():
+    for call, message in REFUSED:
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+@pytest.mark.slow
+def test_internal_states_that_change_are_no_equilibrium():
+    with pytest.raises(ValueError, match=r"In the equilibrium internal states change: motor.force"):
+        mb.equilibrium(motor_on_four_bar(mode="force", gain=0.0, command=3.0))

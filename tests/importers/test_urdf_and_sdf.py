@@ -67,20 +67,6 @@ def test_urdf_with_a_free_base_and_a_mimic():
     np.testing.assert_array_equal(coupling.coefficients, [0.1, 2.0])
 
 
-@pytest.mark.slow
-def test_urdf_mimic_holds_exactly():
-    text = robot(
-        link("base"),
-        link("left"),
-        link("right"),
-        joint("l", "base", "left", "continuous"),
-        joint("r", "base", "right", "continuous", "<axis xyz='0 1 0'/><mimic joint='l' multiplier='-2' offset='.1'/>"),
-    )
-    system = importers.urdf(text).scene.compile()
-    motion = mb.simulate(system, mb.assemble(system, fix={"l.angle": 0.4}), t1=0.3, saveat=np.linspace(0, 0.3, 4))
-    np.testing.assert_allclose(motion["r"].angle, 0.1 - 2 * motion["l"].angle, rtol=0, atol=1e-12)
-
-
 def test_urdf_joints_between_links_without_mass_are_one():
     text = robot(
         *(link(name, "") for name in ("w1", "w2")),

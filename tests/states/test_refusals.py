@@ -9,7 +9,9 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar
+from jaxmb.simulate.outcome import about_lost_rank
 from jaxmb.states.consistency import not_finite
+from jaxmb.states.refusals import LostRank
 
 CRANK, ROD = 0.3, 0.8
 REACH = CRANK + ROD
@@ -117,6 +119,14 @@ def test_drive_that_leaves_its_reach_is_named():
         found = re.match(r"The motion came to t = (\S+) of ", str(error.value))
         np.testing.assert_allclose(float(found[1]), when, rtol=1e-5)
         assert "friction" not in str(error.value)
+
+
+def test_drive_that_leaves_its_reach_is_told_apart_from_joints_that_lock():
+    """By the joints that lose their rank, and by the drives among them."""
+    said = {n: about_lost_rank(LostRank(["P", "Q"], ["pull", "push"][:n])) for n in (0, 1, 2)}
+    assert "the constraints of P, Q are no longer independent, and the motion beyond is not determined" in said[0]
+    assert "the motion that 'pull' prescribes leaves its reach" in said[1]
+    assert "'pull' and 'push' prescribes leave their reach" in said[2]
 
 
 @pytest.mark.slow

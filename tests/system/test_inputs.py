@@ -325,28 +325,6 @@ def test_inputs_that_move_a_plane_of_rolling(kind):
 
 
 @pytest.mark.slow
-def test_inputs_that_shake_the_base_of_a_spring_and_damper():
-    """Against SciPy, with the derivative by the amplitude, in which the motion is linear."""
-    pair = planar.SpringDamper("pair", "ground", "block", stiffness=50.0, damping=3.0, free_length=0.5)
-    system = sliding([pair])
-
-    def end(amplitude):
-        shaken = {"pair.point_a": lambda t: jnp.stack([amplitude * jnp.sin(5 * t), 0.0 * t])}
-        start = mb.assemble(system, rates={"block.x": 0.3})
-        return mb.simulate(system, start, t1=2.0, inputs=shaken, rtol=1e-10)["block"].position[-1, 0]
-
-    def exact(amplitude):
-        base = lambda t: (amplitude * np.sin(5 * t), 5 * amplitude * np.cos(5 * t))
-        rates = lambda t, y: [y[1], -(50 * (y[0] - base(t)[0] - 0.5) + 3 * (y[1] - base(t)[1])) / 2]
-        return solve_ivp(rates, (0.0, 2.0), [0.7, 0.3], rtol=1e-12, atol=1e-13).y[0, -1]
-
-    slope = (exact(0.1) - exact(0.0)) / 0.1
-    np.testing.assert_allclose(end(0.1), exact(0.1), rtol=1e-8)
-    np.testing.assert_allclose(jax.jit(jax.grad(end))(0.1), slope, rtol=1e-7)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(0.1), slope, rtol=1e-7)
-
-
-@pytest.mark.slow
 def test_inputs_that_move_a_rail_with_dry_friction():
     """It drags the block until that moves as the rail does."""
     rub = mb.DryFriction("rub", "rail", coefficient=0.3)
@@ -627,33 +605,6 @@ def test_inputs_in_place_of_one_of_several(driven):
         mb.simulate(again, again.guess, t1=1.5)
     with pytest.raises(ValueError, match=r"'motor3.torque' is an input of this system"):
         mb.with_parameters(again, {"motor3.torque": 1.0})
-
-
-@pytest.mark.slow
-def test_series_of_many_parameters_of_a_lagrangian_system():
-    names = [f"torque{k}" for k in range(MOTORS)]
-    system = mb.lagrangian.LagrangianSystem(
-        kinetic=lambda t, q, v, p: 0.5 * v @ v,
-        potential=lambda t, q, p: 0.0 * q[0],
-        force=lambda t, q, v, p: jnp.stack([p[name] for name in names]),
-        q=np.zeros(MOTORS),
-        parameters=dict.fromkeys(names, 0.5),
-    )
-
-    def forces(inputs):
-        driven = mb.with_inputs(system, inputs)
-        force = jax.jit(lambda t: driven.force(t, driven.guess.q, driven.guess.u))
-        return force.lower(0.3).as_text().count("\n"), force
-
-    series = {name: mb.Series(TS, values, "cubic") for name, values in zip(names, SERIES, strict=True)}
-    (of_one, _), (of_all, force) = forces({"torque3": series["torque3"]}), forces(series)
-    # Each of them is a slice for the user's function.
-    assert of_all <= 1.4 * of_one
-    np.testing.assert_allclose(force(TS[2]), SERIES[:, 2], rtol=1e-14)
-    _, force = forces(series | {"torque5": lambda t: 2.0 * t, "torque7": mb.Series(TS, TORQUES)})
-    np.testing.assert_allclose(
-        np.asarray(force(TS[3]))[[4, 5, 6, 7]], [SERIES[4, 3], 2.0 * TS[3], SERIES[6, 3], TORQUES[3]]
-    )
 
 
 def test_series_of_a_batch_and_traced_ones(driven):

@@ -10,12 +10,14 @@ import pytest
 from trajectories import bounced, motion_of
 
 import jaxmb as mb
-from jaxmb import planar, spatial, terrain, viz
+from jaxmb import planar, shapes, spatial, terrain, viz
 from jaxmb.linalg.rotations import rotate
 from jaxmb.parts import contact
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
+from jaxmb.viz.meshes import unit_mesh
 from jaxmb.viz.motion_nodes import chosen
+from jaxmb.viz.silhouettes import area
 
 TS = np.linspace(0.0, 1.0, 5)
 
@@ -249,3 +251,17 @@ def test_disc_contact_is_drawn_as_wheels():
     assert [k for k, _ in discs] == [0, 1]
     np.testing.assert_allclose([shape.scale[0] for _, shape in discs], [0.5, 0.2])
     np.testing.assert_allclose([shape.position for _, shape in discs], [(0, 0, 0), (0.3, 0.1, 0.0)])
+
+
+def test_shapes_are_drawn_in_the_plane_as_they_are_turned():
+    turn = np.radians(30.0)
+    place = {"position": (1.0, 0.5, 0.0), "orientation": (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))}
+    corners = area(shapes.Box((2.0, 1.0, 0.5), **place))[:, :2]
+    c, s = np.cos(turn), np.sin(turn)
+    expected = np.array([(x, y) for x in (-1.0, 1.0) for y in (-0.5, 0.5)]) @ np.array([[c, s], [-s, c]]) + (1.0, 0.5)
+    for corner in expected:
+        assert np.min(np.linalg.norm(corners - corner, axis=1)) < 1e-12
+    # A coil has eight turns.
+    wire = unit_mesh("coil").vertices.reshape(-1, 6, 3).mean(axis=1)
+    wound = wire[np.hypot(*wire[:, :2].T) > 0.8]
+    assert np.ptp(np.unwrap(np.arctan2(wound[:, 1], wound[:, 0]))) == pytest.approx(16 * np.pi, abs=0.5)
