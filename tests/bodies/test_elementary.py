@@ -105,7 +105,7 @@ def assert_agree(system, state, acceleration, tol=1e-13):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["bodies", "frame", "ground"])
-def test_rows_of_every_joint_are_those_of_its_residual(where):
+def test_elements_of_every_joint_give_the_rows_of_its_residual(where):
     """Also where the origin of a body's frame is not its mass centre."""
     pairs = [bodies(k, **({"centre": (0.1, 0.2, -0.1)} if where == "ground" else {})) for k in range(len(JOINTS))]
     turned = {"position": (0.1, -0.3, 0.2), "orientation": (0.8, 0.0, 0.6, 0.0)}
@@ -123,7 +123,7 @@ def test_rows_of_every_joint_are_those_of_its_residual(where):
 
 
 @pytest.mark.slow
-def test_rows_of_planar_joints_are_those_of_their_residuals():
+def test_elements_of_planar_joints_give_the_rows_of_their_residuals():
     point, axis = {"point": (0.5, 0.2)}, {"axis": (0.6, 0.8)}
     places = [{"position": (0.3 * k, 0.1 * k * k), "angle": 0.4 * k - 1.0} for k in range(10)]
     own = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, **place) for k, place in enumerate(places)]
@@ -165,7 +165,7 @@ def many():
 
 
 @pytest.mark.slow
-def test_elementary_joints_stand_among_others():
+def test_elements_stand_among_other_joints():
     system = many().compile()
     assert not all(map(is_elementary, system.constraints.position))
     for state, acceleration in states_of(system, 1):
@@ -275,7 +275,7 @@ def test_weld_that_is_turned_by_a_half_is_not_consistent():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name, t1", [("spatial_slider_crank", 0.2), ("slider_crank", 0.05)])
-def test_motions_and_gradients_are_those_of_the_residuals(name, t1, monkeypatch):
+def test_elements_give_the_motions_and_gradients_of_the_residuals(name, t1, monkeypatch):
     built = mb.mechanisms.get(name)
     system, start = built.system, mb.parameters(built.system)
     # Masses, lengths, points and axes of all joints.

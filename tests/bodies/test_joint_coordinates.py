@@ -31,7 +31,7 @@ def turn(axis, angle):
 
 
 @pytest.mark.slow
-def test_attitudes_follow_from_the_angles_that_are_given(arm):
+def test_joint_coordinates_give_attitudes(arm):
     hip, first, second = 0.7, 1.9, -2.4
     state = mb.assemble(arm, fix={"hip.angle": hip, "knee.angle_a": first, "knee.angle_b": second})
     thigh, shank = state.q[3:7], state.q[10:14]
@@ -42,7 +42,7 @@ def test_attitudes_follow_from_the_angles_that_are_given(arm):
 
 
 @pytest.mark.slow
-def test_coordinates_along_a_motion_are_continuous_and_have_their_derivatives(arm):
+def test_joint_coordinates_along_a_motion_are_continuous_and_have_their_derivatives(arm):
     rates = {"hip.angle": 9.0, "knee.angle_a": 0.3, "knee.angle_b": 0.2}
     start = mb.assemble(arm, fix={"hip.angle": 0.1}, rates=rates)
     ts = np.linspace(0.0, 1.6, 1601)
@@ -65,13 +65,13 @@ def test_coordinates_along_a_motion_are_continuous_and_have_their_derivatives(ar
 
 
 @pytest.mark.slow
-def test_angle_and_another_by_two_full_turns_are_one_position(arm):
+def test_joint_angles_two_full_turns_apart_are_one_position(arm):
     for angle in (np.pi + 0.01, 0.01 - np.pi, 0.01):
         one, other = (mb.assemble(arm, fix={"hip.angle": x}) for x in (angle, angle + 4 * np.pi))
         np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-13)
 
 
-def test_planar_angles_count_turns():
+def test_joint_angles_in_the_plane_count_turns():
     rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0))
     system = mb.Scene([rod], joints=[planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))]).compile()
     state = mb.assemble(system, fix={"pin.angle": 4 * np.pi + 0.3}, rates={"pin.angle": 2.0})
@@ -92,7 +92,7 @@ GIVEN = {
 
 @pytest.mark.slow(but=("Spherical",))
 @pytest.mark.parametrize("kind", GIVEN)
-def test_position_of_the_coordinates_of_each_joint(kind):
+def test_joint_coordinates_give_the_position_of_each_joint(kind):
     options, values = GIVEN[kind]
     body = spatial.Body("body", mass=1.0, inertia=J)
     system = mb.Scene([body], joints=[getattr(spatial, kind)("joint", "ground", "body", **options)]).compile()
@@ -117,7 +117,7 @@ def floating(*forces):
     return mb.Scene([spatial.Body("body", mass=1.0, inertia=J)], joints=[joint], forces=forces).compile()
 
 
-def test_a_joint_that_leaves_all_motions_free_has_coordinates_and_no_reaction():
+def test_joint_that_leaves_all_motions_free_has_coordinates_and_no_reaction():
     system = floating()
     assert system.rows == () and system.velocity_rank == 0
     assert {"root.displacement_3", "root.angle_1"} < set(system.joint_coordinates())
@@ -128,7 +128,7 @@ def test_a_joint_that_leaves_all_motions_free_has_coordinates_and_no_reaction():
 
 
 @pytest.mark.slow
-def test_a_state_from_the_coordinates_of_a_joint_that_leaves_all_motions_free():
+def test_joint_that_leaves_all_motions_free_gives_a_state():
     system = floating()
     place = {"root.displacement_2": 0.4, "root.angle_1": 0.3, "root.angle_2": -0.5, "root.angle_3": 2.0}
     state = mb.assemble(system, fix=place, rates={"root.displacement_3": 0.7})
@@ -140,7 +140,7 @@ def test_a_state_from_the_coordinates_of_a_joint_that_leaves_all_motions_free():
 
 
 @pytest.mark.slow
-def test_derivatives_of_a_state_with_respect_to_an_angle_that_is_given(arm):
+def test_joint_angle_derivatives_of_a_state(arm):
     def entries(angle):
         state = mb.assemble(arm, fix={"hip.angle": angle}, rates={"hip.angle": 2.0}, throw=False)
         return jnp.concatenate([state.q, state.u])
@@ -151,7 +151,7 @@ def test_derivatives_of_a_state_with_respect_to_an_angle_that_is_given(arm):
     np.testing.assert_allclose(forward, (both[0] - both[1]) / 2e-4, rtol=0, atol=1e-6)
 
 
-def test_coordinates_of_joints_that_are_not_there(arm):
+def test_joint_coordinates_that_are_not_there_are_refused(arm):
     for options, message in (
         ({"fix": {"hip.angel": 0.3}}, "did you mean 'hip.angle'"),
         ({"fix": {"hip.angle": [0.3, 0.1]}}, "Coordinate 'hip.angle'"),

@@ -100,7 +100,7 @@ def test_robots_from_urdf_move_as_in_mujoco(name):
     check_dynamics(placed_by_mujoco(model, path), scale=0.5)
 
 
-def test_a_urdf_tree_moves_as_in_mujoco():
+def test_urdf_tree_moves_as_in_mujoco():
     """MuJoCo reads the same file."""
     path = path_of("newton", "newton/examples/assets/quadruped.urdf")
     model = importers.urdf(path, ignore=OFF)
@@ -162,7 +162,7 @@ def gripper():
     return importers.mjcf(alone, ignore="collisions")
 
 
-def test_the_robotiq_gripper_closes_and_moves():
+def test_robotiq_gripper_closes_and_moves():
     model = gripper()
     system = model.scene.compile()
     assert {item.name for item in system.implied}

@@ -426,7 +426,7 @@ def test_mjcf_that_is_wrong_is_refused():
             importers.mjcf(text)
 
 
-def test_missing_meshes_of_pictures_are_said():
+def test_meshes_of_pictures_that_are_missing_are_said():
     text = file(
         '<body name="a"><joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
         '<geom type="mesh" mesh="m"/></body>',

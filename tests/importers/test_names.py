@@ -47,7 +47,7 @@ def test_body_of_mjcf_that_is_called_ground_moves():
         np.testing.assert_allclose(place, data.body("ground").xipos, atol=1e-15)
 
 
-def test_all_kinds_of_elements_that_are_called_ground():
+def test_elements_of_all_kinds_that_are_called_ground():
     text = file(
         f'<body name="ground"><freejoint/>{ROD}<site name="ground"/><body name="welded" pos="0 0 1">{ROD}</body>'
         f'<body name="arm"><joint name="ground" axis="0 1 0"/>{ROD}</body></body>',

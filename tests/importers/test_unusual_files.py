@@ -54,7 +54,7 @@ MORE = """<tendon><fixed name="j8" stiffness="2" damping=".1"><joint joint="j8" 
 
 
 @pytest.mark.slow
-def test_unusual_machines_move_as_in_mujoco():
+def test_mjcf_of_unusual_machines_moves_as_in_mujoco():
     """Accelerations, energies and the rates of activations, with a group of actuators that is switched off."""
     head = HEAD.replace("<option ", '<option actuatorgroupdisable="3" ')
     text = f"<mujoco>{head}<worldbody>{''.join(UNUSUAL.values())}</worldbody>{MORE}</mujoco>"
@@ -94,7 +94,7 @@ def test_keyframes_of_free_bodies():
     np.testing.assert_allclose(state.q[3:], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-15)
 
 
-def test_a_machine_on_a_mocap_body():
+def test_mocap_body_that_carries_a_machine():
     inner = rod("a", HINGE)
     found = importers.mjcf(file(f'<body name="hand" mocap="true" pos="0 0 1">{ROD}{inner}</body>'))
     assert [(own.name, own.body_a, own.body_b) for own in found.scene.joints] == [
@@ -132,7 +132,7 @@ def test_actuators_that_are_refused():
             importers.mjcf(file(rod("a", '<joint name="hip" axis="0 1 0" actuatorfrcrange="-1 2"/>'), more))
 
 
-def test_a_limit_of_the_force_at_a_joint_holds_behind_a_gear():
+def test_limit_of_the_force_at_a_joint_holds_behind_a_gear():
     inner = rod("b", '<joint name="knee" axis="0 1 0" actuatorfrcrange="-3 5"/>')
     bar = rod("a", '<joint name="hip" axis="0 1 0" actuatorfrcrange="-1 2"/>', inner)
     motors = '<motor name="m" joint="hip" gear="-4" forcerange="-.4 1"/><motor name="n" joint="knee"/>'
@@ -149,7 +149,7 @@ def test_a_limit_of_the_force_at_a_joint_holds_behind_a_gear():
 
 
 @pytest.mark.slow
-def test_a_mimic_with_an_offset_is_an_equality_of_mujoco():
+def test_urdf_mimic_with_an_offset_is_an_equality_of_mujoco():
     """The same row, for a joint along a negative axis that is not normalised."""
     text = robot(
         link("base"),
@@ -170,7 +170,7 @@ def test_a_mimic_with_an_offset_is_an_equality_of_mujoco():
     assert "Couplings see angles of hinges only up to half a turn from their zeros: 'r mimic'." in found.notes
 
 
-def test_a_range_of_zero_is_none():
+def test_urdf_range_of_zero_is_none():
     text = robot(link("a"), link("b"), joint("j", "a", "b", inside="<axis xyz='0 1 0'/><limit effort='1'/>"))
     found = importers.urdf(text)
     assert "Limits without a range are ignored: 'j'." in found.notes and "j stop" not in kinds(found)
@@ -187,7 +187,7 @@ def test_fixed_joints_are_frames_also_where_a_file_keeps_them():
 # SDF
 
 
-def test_axes_of_sdf_in_other_frames():
+def test_sdf_axes_in_other_frames():
     """In the frame of a model that is turned about x, and in that of another link."""
     for inside, axis in (
         ("<xyz expressed_in='__model__'>0 -1 0</xyz>", (0, 0, -1)),

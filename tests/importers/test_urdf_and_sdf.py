@@ -196,7 +196,7 @@ def test_sdf_that_is_not_read_is_said():
     assert any(re.search("do not act on the motion: <self_collide>", note) for note in found.notes)
 
 
-def test_what_collides_is_shown_where_a_mesh_is_missing():
+def test_meshes_that_are_missing_leave_what_collides_to_be_shown():
     seen = "<visual><geometry><mesh filename='none.stl'/></geometry></visual>"
     box = "<collision><geometry><box size='.2 .4 .6'/></geometry></collision>"
     text = robot(link("a", INERTIAL + seen + box), link("world", ""), joint("j", "world", "a", "continuous"))
@@ -306,7 +306,7 @@ def test_urdf_in_any_encoding(tmp_path):
             importers.urdf(path)
 
 
-def test_names_of_mjcf_in_another_encoding(tmp_path):
+def test_mjcf_in_another_encoding(tmp_path):
     pytest.importorskip("mujoco")
     path = tmp_path / "robot.xml"
     text = '<mujoco><worldbody><body name="Fuß"><joint/><geom size=".1"/></body></worldbody></mujoco>'
@@ -490,7 +490,7 @@ def test_notes_of_one_kind_are_one():
 LIMITED = "<axis xyz='0 1 0'/><limit lower='-1' upper='1'/>"
 
 
-def test_a_ball_of_bullet_and_a_fixed_joint_that_follows():
+def test_urdf_of_bullet_with_a_ball_and_a_fixed_joint_that_follows():
     found = importers.urdf(
         robot(
             *BARE,

@@ -108,7 +108,7 @@ def test_signatures_are_those_of_the_source():
     assert signature(find("Trajectory.energy")) is None
 
 
-def test_text_for_a_terminal():
+def test_shown_text_for_a_terminal():
     text = shown(find("simulate"), width=60)
     assert text.startswith("jaxmb.simulate(\n    system: AbstractSystem,\n    state: State,\n    *,\n    t1: Scalar,\n")
     # Code is not broken into lines; what follows it is.
@@ -118,12 +118,12 @@ def test_text_for_a_terminal():
     assert max(map(len, prose)) <= 60 and "**" not in text and "```" not in text
 
 
-def test_styles():
+def test_shown_text_with_styles():
     text = shown(find("planar.rod"), styled=True)
     assert text.startswith("\x1b[1mjaxmb.planar.rod\x1b[0m(") and "`" not in text and "\x1b[36m" in text
 
 
-def test_a_list_of_all_names():
+def test_listed_names_are_all():
     text = listed(width=200)
     for subject in subjects():
         assert (subject.title in text.splitlines()) == bool(subject.entries)
@@ -131,7 +131,7 @@ def test_a_list_of_all_names():
             assert f"\n  {entry.name}  {entry.summary[:40]}" in text
 
 
-def test_what_a_module_and_a_class_contain():
+def test_shown_contents_of_a_module_and_a_class():
     module = shown(find("spatial"))
     assert "\nJoints\n" in module and "  spatial.Revolute  A hinge" in module
     assert "\nOf other modules\n" in module and "  planar.Contact  Contact of bodies" in module

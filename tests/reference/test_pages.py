@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 
-def test_pages(tmp_path):
+def test_pages_build_with_every_name_once(tmp_path):
     options = ["-q", "-W", "--keep-going", "-E", "-c", "tests/pages"]
     command = [sys.executable, "-m", "sphinx", *options, ".", str(tmp_path)]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

@@ -114,30 +114,6 @@ def test_assembly_from_rough_guesses():
     np.testing.assert_allclose(push, (at(h) - at(-h)) / (2 * h), rtol=0, atol=1e-6 * np.max(np.abs(push)))
 
 
-@pytest.mark.slow
-def test_assembly_holds_coordinates_of_joints():
-    """In a tree as with dense matrices, with derivatives."""
-    system = planar_tree(60)
-    guess = mb.State(system.guess.q, jnp.asarray(np.random.default_rng(0).normal(size=system.nu)))
-
-    def own(angle, system=system):
-        fix, rates = {"pin3.angle": angle, "rod9.x": 0.1}, {"pin3.angle": 0.5}
-        y = mb.assemble(system, guess, fix=fix, rates=rates, throw=False)
-        return jnp.concatenate([y.q, y.u])
-
-    pushed = lambda system: jax.jit(lambda angle: jax.jvp(lambda x: own(x, system), (angle,), (1.0,)))(0.3)
-    expected = pushed(dataclasses.replace(system, elimination=None))
-    found = pushed(system)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-10 * (1 + np.max(np.abs(other))))
-    weights = np.cos(np.arange(found[0].size))
-    reverse = jax.jit(jax.grad(lambda angle: weights @ own(angle)))(0.3)
-    np.testing.assert_allclose(reverse, weights @ found[1], rtol=1e-9)
-    h = 1e-5
-    difference = (own(0.3 + h) - own(0.3 - h)) / (2 * h)
-    np.testing.assert_allclose(found[1], difference, rtol=0, atol=1e-8 * (1 + np.max(np.abs(difference))))
-
-
 def test_assembly_keeps_poses_that_close():
     """The given poses of a machine that closes are its closest configuration; others are not."""
     system = mb.mechanisms.get("tree", n=5).system

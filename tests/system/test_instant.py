@@ -29,13 +29,13 @@ class Angle(eqx.Module, Keeper):
         return jnp.sin(self.x)
 
 
-def test_a_quantity_is_computed_once_in_a_trace():
+def test_instant_computes_a_quantity_once_in_a_trace():
     assert counted(lambda x: (lambda angle: angle.sine + angle.sine)(Angle(x)), 0.3) == 1
     assert counted(lambda x: Angle(x).sine + Angle(x).sine, 0.3) == 2
 
 
 @pytest.mark.slow
-def test_quantities_of_branches_loops_and_derivatives_stay_there():
+def test_instant_leaves_quantities_in_branches_loops_and_derivatives():
     def program(x):
         angle = Angle(x)
         branch = lax.cond(x > 0, lambda: angle.sine, lambda: 2 * angle.sine)
@@ -49,7 +49,7 @@ def test_quantities_of_branches_loops_and_derivatives_stay_there():
     np.testing.assert_allclose(jax.grad(program)(0.3), 7 * np.cos(0.3), rtol=1e-6)
 
 
-def test_a_copy_keeps_nothing():
+def test_instant_whose_copy_keeps_nothing():
     at = four_bar()
     force = at.force
     assert at.force is force
@@ -57,7 +57,7 @@ def test_a_copy_keeps_nothing():
     assert jax.tree.structure(at) == jax.tree.structure(four_bar())
 
 
-def test_what_the_equation_has():
+def test_instant_has_what_the_equation_has():
     at = four_bar()
     system, (t, q, u) = at.system, (at.t, at.q, at.u)
     residual = system.acceleration_residual(t, q, u, u)

@@ -355,7 +355,7 @@ def test_shapes_along_a_direction_and_between_points():
     assert np.allclose(end(bar), (0.0, 2.0, 2.0)) and np.allclose(end(moved), place + rot.rotate(turn, end(bar)))
 
 
-def test_viser_is_named_where_it_is_missing(pendulum, monkeypatch):
+def test_show_names_viser_where_it_is_missing(pendulum, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ImportError, match=r'pip install "jaxmb\[view\]"'):
         viz.show(pendulum[0])
@@ -363,7 +363,7 @@ def test_viser_is_named_where_it_is_missing(pendulum, monkeypatch):
         check_picture(pendulum[0].system)
 
 
-def test_the_command_opens_a_page_where_there_is_a_screen(pendulum, monkeypatch, tmp_path, capsys):
+def test_show_motion_opens_a_page_where_there_is_a_screen(pendulum, monkeypatch, tmp_path, capsys):
     opened = []
     monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or True)
     monkeypatch.setattr(sys, "platform", "linux")

@@ -67,7 +67,7 @@ def check_it_plays(page):
 
 
 @pytest.mark.parametrize("name", ["four_bar", "tracked_vehicle"])
-def test_a_page(name, motions, page, tmp_path):
+def test_page_plays(name, motions, page, tmp_path):
     path = mb.viz.save_html(motions[name], tmp_path / "motion.html", points=[], reactions=[])
     assert path.stat().st_size < 1.2e6
     page.open(path, "?fixedDpr=1")
@@ -75,7 +75,7 @@ def test_a_page(name, motions, page, tmp_path):
     assert {url.split(":")[0] for url in page.requests} <= {"file", "data", "blob"}
 
 
-def test_a_notebook_that_was_exported(page, tmp_path):
+def test_notebook_that_was_exported_plays(page, tmp_path):
     """Run by a kernel and exported by nbconvert, a notebook still plays."""
     nbconvert, nbclient = pytest.importorskip("nbconvert"), pytest.importorskip("nbclient")
     source = """
