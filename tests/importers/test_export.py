@@ -110,7 +110,6 @@ TURN = 2 * np.pi
 
 
 COUNTED = [
-    (3.0, {"a": {"free": 0.5, "middle": 1.0}}, 2.5, ()),
     (3.0, {"a": {"free": -3.0}}, 6.0 - TURN, ("'a'.",)),
     (3.5, {"a": {"free": 3.2, "middle": 4.0}}, 0.3, ()),
     (3.5, {"a": {"free": -7.0, "middle": -8.0}}, 10.5 - 2 * TURN, ()),
@@ -351,8 +350,8 @@ SUCCESSIONS = {
 @pytest.mark.parametrize("name", SUCCESSIONS)
 def test_export_of_joints_in_succession_places_the_body(name):
     """From where all coordinates are zero, turns and shifts about the axes of MuJoCo lead to the given pose."""
-    body = spatial.Body("body", mass=1.0, inertia=(1.0, 1.0, 1.0))
-    system = mb.Scene([body], joints=[SUCCESSIONS[name]]).compile()
+    moments = np.array([[2.0, 0.3, 0.1], [0.3, 1.5, -0.2], [0.1, -0.2, 1.2]])
+    system = mb.Scene([spatial.Body("body", mass=1.0, inertia=moments)], joints=[SUCCESSIONS[name]]).compile()
     random = np.random.default_rng(1)
     near = mb.State(np.asarray(system.guess.q) + 0.3 * random.normal(size=7), np.zeros(6))
     state = mb.assemble(system, near)
@@ -360,6 +359,8 @@ def test_export_of_joints_in_succession_places_the_body(name):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.body("body").xpos, state.q[:3], atol=1e-12)
+    turn = rotation_of(model.body("body").iquat)
+    np.testing.assert_allclose(turn @ np.diag(model.body("body").inertia) @ turn.T, moments, atol=1e-12)
     coordinates = {key.split(".")[1] for key in system.joint_coordinates()}
     free = model.nv
     assert free == 6 - system.velocity_rank and len(coordinates) <= model.njnt

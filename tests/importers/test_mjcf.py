@@ -2,6 +2,7 @@
 
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from model_files import HINGE, ROD, body_accelerations, check_dynamics, file, ki
 
 from jaxmb import importers, shapes
 from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.importers.description import roll_pitch_yaw, rotation_of
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -219,6 +221,45 @@ def test_mjcf_that_is_approximated_is_said():
         model = importers.mjcf(file(rod("a", joints), more))
         assert kinds(model)[name] == kind
         assert any(re.search(note, said) for said in model.notes)
+
+
+def test_stop_has_the_stiffness_and_damping_of_a_limit():
+    """Of the inertia that moves, for a time constant times its ratio."""
+    found = importers.mjcf(file(rod("a", '<joint name="hip" range="-30 40" solreflimit=".1 .5"/>')))
+    own, inertia = part(found, "hip stop"), 1 / found.locate.model.dof_invweight0[0]
+    np.testing.assert_allclose([own.stiffness, own.damping], [inertia / 0.05**2, 2 * inertia / 0.05], rtol=1e-12)
+    np.testing.assert_allclose([own.lower, own.upper], np.radians([-30.0, 40.0]), rtol=1e-12)
+
+
+def test_joints_are_where_mujoco_has_them():
+    """Coordinates are those of the file, with references, and positions and velocities of MuJoCo satisfy the joints."""
+    skew = SUCCESSIONS["three skew hinges apart"]
+    slide = rod("b", joint("reach", "slide", "1 0 .2", 'ref=".1"'), pos=".1 .3 0")
+    bodies = rod("a", joint("hip", axis="0 1 1", more='ref="20" pos=".1 0 .05"'), slide) + rod("c", skew, pos="0 2 0")
+    found = importers.mjcf(file(bodies), ignore="limits")
+    system, model = found.scene.compile(), found.locate.model
+    names = [system.joint_coordinates()[found.coordinates[model.joint(k).name]] for k in range(model.njnt)]
+
+    @jax.jit
+    def evaluate(q, u):
+        values = [system.catalogue.joint_coordinate(own, 0.0, q) for own in names]
+        return values, system.coordinate_residual(0.0, q), system.velocity_residual(0.0, q, u)
+
+    for q, v in random_states(model, 3, scale=0.4):
+        state = found.state(q, v)
+        values, positions, velocities = evaluate(state.q, state.u)
+        np.testing.assert_allclose(values, q, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(positions, 0.0, atol=1e-12)
+        np.testing.assert_allclose(velocities, 0.0, atol=1e-12)
+
+
+def test_weld_of_sites_has_their_relative_attitude():
+    sites = '<site name="o" euler=".3 0 0"/>' + rod("a", HINGE, '<site name="s" euler="0 0 .4"/>', pos="0 0 0")
+    weld = EQUALITY.format('weld name="loop" site1="s" site2="o"')
+    own = part(importers.mjcf(file(sites, weld, '<compiler angle="radian"/>')), "loop")
+    assert (own.body_a, own.body_b) == ("a", "ground")
+    turn = rotation_of(np.asarray(own.orientation))
+    np.testing.assert_allclose(turn, roll_pitch_yaw((0, 0, 0.4)) @ roll_pitch_yaw((0.3, 0, 0)).T, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("ends", ['body1="a" anchor=".1 .2 .3" relpose=".5 .2 .3 1 0 0 0"', 'site1="s" site2="o"'])

@@ -6,6 +6,7 @@ import pytest
 from model_files import HINGE, ROD, body, check_dynamics, file, hinge, joint, kinds, link, model, part, robot, rod
 
 from jaxmb import importers
+from jaxmb.importers.description import roll_pitch_yaw
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -176,12 +177,23 @@ def test_urdf_range_of_zero_is_none():
     assert "Limits without a range are ignored: 'j'." in found.notes and "j stop" not in kinds(found)
 
 
+# Of the joints of these files.
+TURN = roll_pitch_yaw((0, 0, 0.5))
+
+
 def test_fixed_joints_are_frames_also_where_a_file_keeps_them():
     fixed = joint("f", "b", "c", "fixed").replace("type=", "dont_collapse='true' type=")
     found = importers.urdf(robot(link("a"), link("b"), link("c"), joint("j", "a", "b"), fixed))
     (own,) = found.scene.bodies
     assert own.name == "b" and float(own.mass) == 4.0
     assert {frame.name: frame.body for frame in found.scene.frames}["c"] == "b"
+    # Of two equal masses: their moments, and half of one at their distance.
+    places = [np.array([0.1, 0.0, 0.02]), np.array([0.3, 0.0, 0.1]) + TURN @ (0.1, 0.0, 0.02)]
+    moments = roll_pitch_yaw((0, 0.3, 0)) @ np.diag([0.02, 0.05, 0.04]) @ roll_pitch_yaw((0, 0.3, 0)).T
+    apart = places[1] - places[0]
+    expected = moments + TURN @ moments @ TURN.T + apart @ apart * np.eye(3) - np.outer(apart, apart)
+    np.testing.assert_allclose(own.inertia, expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(own.centre, np.mean(places, axis=0), rtol=0, atol=1e-14)
 
 
 # SDF

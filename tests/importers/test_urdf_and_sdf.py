@@ -115,6 +115,12 @@ WRONG = [
 ]
 
 
+def test_urdf_stop_has_the_inertia_that_moves():
+    """About the axis of the joint, y, which is 0.1 m and 0.02 m from the mass centre."""
+    own = part(importers.urdf(pair("<axis xyz='0 1 0'/><limit lower='-1' upper='1'/>")), "j stop")
+    np.testing.assert_allclose(own.damping**2 / (4 * own.stiffness), 0.05 + 2 * (0.1**2 + 0.02**2), rtol=1e-12)
+
+
 def test_urdf_that_is_wrong_is_refused():
     for text, message in WRONG:
         with pytest.raises(ValueError, match=message):
@@ -223,10 +229,11 @@ def test_sdf_axes_by_its_version(kind):
     ):
         second = f"<axis2><xyz>0 0 1</xyz>{inside}</axis2>" if kind == "universal" else ""
         own = hinge("j", "world", "a", kind=kind, axis=f"<xyz>0 1 0</xyz>{inside}")
-        text = model(body("a", "0 0 0 0 0 -1.570796326794896619"), turned, own.replace("</axis>", f"</axis>{second}"))
+        text = model(body("a", "1 2 3 0 0 -1.570796326794896619"), turned, own.replace("</axis>", f"</axis>{second}"))
         # The link's y axis is the model's x axis, which is the world's; the model's y axis is the world's z axis.
-        name = "j 1 j 2" if kind == "universal" else "j"
-        found = part(importers.sdf(text.replace("version='1.6'", f"version='{version}'")), name)
+        read = importers.sdf(text.replace("version='1.6'", f"version='{version}'"))
+        np.testing.assert_allclose(part(read, "a").position, (1, -3, 2), atol=1e-15)
+        found = part(read, "j 1 j 2" if kind == "universal" else "j")
         first = found.axes[0] if kind == "universal" else found.axis_a
         np.testing.assert_allclose(first, axis, atol=1e-15)
         if kind == "universal":
