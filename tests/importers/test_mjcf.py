@@ -2,7 +2,6 @@
 
 import re
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from model_files import HINGE, ROD, body_accelerations, check_dynamics, file, ki
 
 from jaxmb import importers, shapes
 from jaxmb.formulations import Multipliers, accelerations
-from jaxmb.importers.description import roll_pitch_yaw, rotation_of
+from jaxmb.importers.description import roll_pitch_yaw, rotation_of, turn_about
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -232,25 +231,37 @@ def test_stop_has_the_stiffness_and_damping_of_a_limit():
 
 
 def test_joints_are_where_mujoco_has_them():
-    """Coordinates are those of the file, with references, and positions and velocities of MuJoCo satisfy the joints."""
-    skew = SUCCESSIONS["three skew hinges apart"]
-    slide = rod("b", joint("reach", "slide", "1 0 .2", 'ref=".1"'), pos=".1 .3 0")
-    bodies = rod("a", joint("hip", axis="0 1 1", more='ref="20" pos=".1 0 .05"'), slide) + rod("c", skew, pos="0 2 0")
-    found = importers.mjcf(file(bodies), ignore="limits")
-    system, model = found.scene.compile(), found.locate.model
-    names = [system.joint_coordinates()[found.coordinates[model.joint(k).name]] for k in range(model.njnt)]
-
-    @jax.jit
-    def evaluate(q, u):
-        values = [system.catalogue.joint_coordinate(own, 0.0, q) for own in names]
-        return values, system.coordinate_residual(0.0, q), system.velocity_residual(0.0, q, u)
-
-    for q, v in random_states(model, 3, scale=0.4):
+    """Positions and velocities of MuJoCo satisfy them, and their coordinates are those of the file, with references."""
+    slide = rod("b", joint("reach", "slide", "1 0 0", 'ref=".1"'), pos=".1 .3 0")
+    found = importers.mjcf(file(rod("a", joint("hip", axis="0 1 0", more='ref="20" pos=".1 0 .05"'), slide)))
+    host = found.scene.compile().on_host(0.0)
+    for q, v in random_states(found.locate.model, 3, scale=0.4):
         state = found.state(q, v)
-        values, positions, velocities = evaluate(state.q, state.u)
-        np.testing.assert_allclose(values, q, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(positions, 0.0, atol=1e-12)
+        np.testing.assert_allclose(host.coordinate_residual(np.asarray(state.q)), 0.0, atol=1e-12)
+        velocities, _ = host.velocity_rows_at(np.asarray(state.q), np.asarray(state.u))
         np.testing.assert_allclose(velocities, 0.0, atol=1e-12)
+    # No body is turned in the file.
+    hip, reach, a, b = (part(found, name) for name in ("hip", "reach", "a", "b"))
+    assert np.arctan2(np.cross(hip.x_a, hip.x_b)[1], hip.x_a @ hip.x_b) == pytest.approx(np.radians(20.0), abs=1e-14)
+    apart = b.position + reach.point_b - a.position - reach.point_a
+    np.testing.assert_allclose(apart, [0.1, 0.0, 0.0], atol=1e-14)
+
+
+def test_joints_in_succession_are_where_mujoco_has_them():
+    """From zero coordinates the body turns about each axis in turn, the last one first."""
+    found = importers.mjcf(file(rod("c", SUCCESSIONS["three skew hinges apart"], pos="0 2 0")), ignore="limits")
+    own, model = part(found, "k1 k2 k3"), found.locate.model
+    data = mujoco.MjData(model)
+    for q, _ in random_states(model, 3):
+        attitude = rotation_of(own.orientation)
+        position = own.point_a - attitude @ own.point_b
+        for axis, point, angle in zip(own.axes[::-1], own.points[::-1], q[::-1], strict=True):
+            turn = turn_about(axis, angle)
+            attitude, position = turn @ attitude, point + turn @ (position - point)
+        data.qpos = q
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(attitude.ravel(), data.body("c").xmat, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(position, data.body("c").xpos, rtol=0, atol=1e-12)
 
 
 def test_weld_of_sites_has_their_relative_attitude():
