@@ -59,10 +59,22 @@ def test_instant_whose_copy_keeps_nothing():
 
 def test_instant_has_what_the_equation_has():
     at = four_bar()
-    system, (t, q, u) = at.system, (at.t, at.q, at.u)
-    residual = system.acceleration_residual(t, q, u, u)
-    np.testing.assert_allclose(at.jacobian @ u - residual, at.gamma, rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(at.rates, system.rates(t, q, u))
-    udot = jnp.ones_like(u)
+    system, q, u = at.system, np.asarray(at.q), np.asarray(at.u) + 0.1 * np.eye(9)[0]
+
+    @jax.jit
+    def evaluate(q, u):
+        at = Instant.of(system, 0.0, mb.State(q, u))
+        of_rows = at.jacobian @ u - system.acceleration_residual(0.0, q, u, u)
+        sizes = at.row_sizes()
+        return of_rows, at.gamma, at.rates, system.rates(0.0, q, u), sizes, at.velocity_residual, at.violations(sizes)
+
+    of_rows, gamma, rates, expected, sizes, unmet, (positions, velocities) = evaluate(q, u)
+    np.testing.assert_allclose(of_rows, gamma, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(rates, expected)
+    # Corrections of velocities are relative to the largest velocity, which is not one.
+    speed = np.max(np.abs(u) / np.asarray(system.velocity_scale()))
+    np.testing.assert_allclose(velocities, np.abs(unmet) / sizes / speed, rtol=1e-5, atol=1e-9)
+    assert np.max(velocities) > 1e-3 and np.max(positions) < 1e-6 and abs(speed - 1.0) > 0.1
+    udot = jnp.ones_like(at.u)
     assert at.motion(udot).u is udot and at.motion(udot).z is None
     assert at.position_rows.size == at.velocity_rows.size == system.acceleration_rows
