@@ -142,37 +142,6 @@ def test_elements_of_planar_joints_give_the_rows_of_their_residuals():
         check_elements(system, state)
 
 
-def many():
-    """Joints of all types, between bodies in a chain that closes, with two joints that have no elements."""
-    chain = [
-        spatial.Body(
-            f"b{k}",
-            mass=1.0 + k,
-            inertia=spatial.box(1.0 + k, 1.0, 0.4, 0.2),
-            position=(0.5 * k, 0.1 * k**2, 0.2 * k),
-            orientation=mb.rotations.from_axis_angle(np.array([0.6, 0.8, 0.0]), 0.4 * k),
-        )
-        for k in range(7)
-    ]
-    kinds = ["Revolute", "Universal", "Spherical", "Cylindrical", "PointOnLine", "Distance"]
-    joints = [JOINTS[kind][0](kind, f"b{k}", f"b{k + 1}", **JOINTS[kind][1]) for k, kind in enumerate(kinds)]
-    joints += [
-        spatial.Revolute("base", "ground", "b0", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)),
-        mb.JointDriver("drive", "base.angle", value=0.0),
-        spatial.Screw("screw", "ground", "b6", point=(3.0, 3.6, 1.2), axis=(0.0, 0.0, 1.0), pitch=0.1),
-    ]
-    return mb.Scene(chain, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))])
-
-
-@pytest.mark.slow
-def test_elements_stand_among_other_joints():
-    system = many().compile()
-    assert not all(map(is_elementary, system.constraints.position))
-    for state, acceleration in states_of(system, 1):
-        assert_agree(system, state, acceleration, 1e-12)
-        check_elements(system, state)
-
-
 class Loose(spatial.Revolute):
     """A hinge with a residual of its own, and the elements of a hinge."""
 

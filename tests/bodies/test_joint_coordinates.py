@@ -1,6 +1,5 @@
 """The own coordinates of joints: in initial states, along motions, and their derivatives."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -137,18 +136,6 @@ def test_joint_that_leaves_all_motions_free_gives_a_state():
     attitude = rotations.multiply(turns[0], rotations.multiply(turns[1], turns[2]))
     np.testing.assert_allclose(jnp.abs(attitude @ state.q[3:]), 1.0, rtol=0, atol=1e-14)
     np.testing.assert_allclose(state.u[:3], [0.0, 0.0, 0.7], rtol=0, atol=1e-13)
-
-
-@pytest.mark.slow
-def test_joint_angle_derivatives_of_a_state(arm):
-    def entries(angle):
-        state = mb.assemble(arm, fix={"hip.angle": angle}, rates={"hip.angle": 2.0}, throw=False)
-        return jnp.concatenate([state.q, state.u])
-
-    forward, reverse = jax.jit(jax.jacfwd(entries))(0.4), jax.jit(jax.jacrev(entries))(0.4)
-    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-12)
-    both = jax.jit(jax.vmap(entries))(jnp.array([0.4 + 1e-4, 0.4 - 1e-4]))
-    np.testing.assert_allclose(forward, (both[0] - both[1]) / 2e-4, rtol=0, atol=1e-6)
 
 
 def test_joint_coordinates_that_are_not_there_are_refused(arm):

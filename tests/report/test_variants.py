@@ -36,25 +36,6 @@ def test_lengths_in_functions_are_not_scaled():
         scaled_lengths(system, system.guess, 2.0)
 
 
-@pytest.mark.slow
-def test_units_of_numbers_on_a_joint_are_those_of_its_coordinate():
-    """A spring on a slide and a motor on a hinge: the same accelerations in units of the system's size."""
-    cart = planar.Body("cart", mass=5.0, inertia=0.5, position=(0.1, 0.0))
-    rod = planar.Body("rod", mass=1.0, inertia=0.1, position=(0.6, 0.0))
-    joints = [
-        planar.Prismatic("rail", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0)),
-        planar.Revolute("pin", "cart", "rod", point=(0.1, 0.0)),
-    ]
-    forces = [
-        mb.JointSpring("spring", "rail.displacement", stiffness=200.0, damping=1.0, free=0.3),
-        mb.JointForce("motor", "pin.angle", force=2.0),
-    ]
-    system = mb.Scene([cart, rod], joints=joints, forces=forces).compile()
-    scaled, start = scaled_lengths(system, system.guess, 1e3)
-    size = jnp.array([1e3, 1e3, 1.0] * 2)
-    np.testing.assert_allclose(udot(scaled, start), size * udot(system, system.guess), rtol=1e-9, atol=1e-9)
-
-
 def stop(**own):
     return mb.JointStop("s", "a.angle", lower=0.0, upper=1.0, stiffness=1.0, **own)
 

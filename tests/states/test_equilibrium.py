@@ -180,24 +180,6 @@ def test_equilibrium_of_redundant_joints(name):
 
 
 @pytest.mark.slow
-def test_equilibrium_of_a_rigid_body_in_space_on_three_springs():
-    corners = np.array([[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]])
-    plate = spatial.Body("plate", mass=4.0, inertia=(0.5, 0.6, 0.9), position=(0.1, 0.0, -0.5))
-    springs = [
-        spatial.SpringDamper(
-            f"spring{k}", "ground", "plate", stiffness=200.0 + 50.0 * k, free_length=0.3, point_a=c, point_b=0.8 * c
-        )
-        for k, c in enumerate(corners)
-    ]
-    system = mb.Scene([plate], forces=[*springs, mb.Gravity((0.0, 0.0, -G))]).compile()
-    state = mb.equilibrium(system)
-    udot = system.force(0.0, state.q, state.u)
-    np.testing.assert_allclose(udot, 0.0, atol=1e-8)
-    assert np.linalg.norm(state.q[3:]) == pytest.approx(1.0)
-    assert abs(state.q[5]) > 1e-3
-
-
-@pytest.mark.slow
 def test_equilibrium_of_what_cannot_rest_is_refused():
     turn = lambda t, p: p["rate"] * t
     drive = planar.Driver("drive", "ground", "bob", quantity="angle", motion=turn, parameters={"rate": 1.0})

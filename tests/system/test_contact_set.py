@@ -5,7 +5,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import jaxmb as mb
 from jaxmb import spatial
@@ -27,7 +26,6 @@ def scene(contacts=True):
     return mb.Scene([body, cart], joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81)), *forces]).compile()
 
 
-@pytest.mark.slow
 def test_contact_set_has_the_laws_of_contacts_and_friction():
     system = scene()
     contacts, numbers = system.contacts, system.contact_numbers(0.0)

@@ -564,12 +564,13 @@ def lines(function, *arguments):
     return jax.jit(function).lower(*arguments).as_text().count("\n")
 
 
-def test_series_of_one_kind_are_one_part_of_the_program(driven):
+@pytest.mark.slow("cubic")
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_series_of_one_kind_are_one_part_of_the_program(driven, interpolation):
     q, u = driven.guess.q, driven.guess.u
-    for interpolation in ("linear", "cubic"):
-        of = lambda count, own=interpolation: mb.with_inputs(driven, by_motor(count, own))
-        one, all_ = (lines(lambda s, t: s.force(t, q, u), of(count), 0.3) for count in (1, MOTORS))
-        assert one < all_ <= 1.3 * one
+    of = lambda count: mb.with_inputs(driven, by_motor(count, interpolation))
+    one, all_ = (lines(lambda s, t: s.force(t, q, u), of(count), 0.3) for count in (1, MOTORS))
+    assert one < all_ <= 1.3 * one
 
 
 @pytest.mark.slow
