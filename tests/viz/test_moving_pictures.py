@@ -1,5 +1,6 @@
 """Moving pictures show each saved state where it is; what they cannot show is refused by name."""
 
+import base64
 import dataclasses
 import html
 import re
@@ -8,10 +9,11 @@ import sys
 import diffrax
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
+import zstandard
 from every_part import SPACES, compiled as built
-from pages import Page
 from trajectories import bounced, motion_of
 
 import jaxmb as mb
@@ -24,6 +26,41 @@ from jaxmb.viz.one_motion import as_motion
 from jaxmb.viz.solids import solids
 
 G, MASS, INERTIA, ARM = 9.81, 2.0, 0.3, 0.6
+
+
+class Page:
+    """The messages of a page, with their times, that viser plays; `duration` [s] of playing."""
+
+    def __init__(self, html):
+        found = re.search(r'__VISER_EMBED_DATA__="([^"]*)"', html)
+        assert found is not None
+        raw = zstandard.ZstdDecompressor().decompressobj().decompress(base64.b64decode(found.group(1))[8:])
+        start = 8 + int.from_bytes(raw[:8], "little")
+        content = msgspec.msgpack.decode(raw[8:start])
+        self.duration, self.messages = content["durationSeconds"], content["messages"]
+        self._buffers = []
+        for length in content["binaryBufferLengths"]:
+            start += -start % 8
+            self._buffers.append(raw[start : start + length])
+            start += length
+
+    def names(self):
+        """Nodes that the page shows."""
+        return {message["name"] for _, message in self.messages if "props" in message}
+
+    def values(self, name, field):
+        """The times at which a property of a node is given, and its values from then on."""
+        found = [
+            (time, held[field])
+            for time, message in self.messages
+            if message.get("name") == name and field in (held := message.get("props") or message.get("updates") or {})
+        ]
+        return np.array([time for time, _ in found]), [self._read(value) for _, value in found]
+
+    def _read(self, value):
+        if isinstance(value, dict):
+            return np.frombuffer(self._buffers[value["__binary_index"]], value["dtype"])
+        return value
 
 
 def at_rest(system, ts=(0.0, 1.0)):
