@@ -9,8 +9,7 @@ import pytest
 from model_files import OFF, check_dynamics, random_states
 
 import jaxmb as mb
-from jaxmb import contact, importers, spatial, terrain
-from jaxmb.importers.description import rotation_of
+from jaxmb import importers
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +34,6 @@ URDF = {
     "talos": ("example-robot-data", "robots/talos_left_arm.urdf"),
 }
 ROBOTIQ = ("playground", f"{PLAYGROUND}manipulation/franka_emika_panda_robotiq/xmls/panda_updated_robotiq_2f85.xml")
-CASSIE = ("example-robot-data", "cassie_description/robots/cassie_v2.sdf")
 
 
 def path_of(package, end):
@@ -174,53 +172,3 @@ def test_robotiq_gripper_closes_and_moves():
     left, right = (motion.quantity(f"{side}_driver_joint.angle") for side in ("left", "right"))
     np.testing.assert_allclose(left, right, rtol=0, atol=1e-12)
     assert left[-1] > 1e-3 and np.max(motion.constraint_violation) < 1e-12
-
-
-# Cassie
-
-
-def cassie(*parts, joints=()):
-    """The robot with its motors held by springs, and with balls at the ends of its soles."""
-    model = importers.sdf(path_of(*CASSIE), ignore="collisions")
-    motors = [f"{side}-{joint}-op" for side in ("left", "right") for joint in ("roll", "yaw", "pitch", "knee", "foot")]
-    # Feet have little inertia, and would be stiff on springs as strong as the others.
-    gains = lambda own: {"stiffness": 20.0, "damping": 0.2} if "foot" in own else {"stiffness": 400.0, "damping": 10.0}
-    held = [mb.JointSpring(f"{own} hold", f"{own}.angle", **gains(own)) for own in motors]
-    return model, model.scene.extended(joints=joints, forces=[*held, *parts]).compile()
-
-
-def soles(model, system, state):
-    """Contacts at the ends of the feet with a floor that is 2 mm below them."""
-    motions = dict(zip(system.body_names, np.asarray(system.poses(state.q)), strict=True))
-    centres = {body.name: np.asarray(body.centre) for body in model.scene.bodies}
-    balls, lowest = [], np.inf
-    for body in ("left-foot", "right-foot"):
-        (roll,) = model.collision_shapes[body]
-        for way in (-0.5, 0.5):
-            at = roll.position + way * roll.length * rotation_of(roll.orientation)[:, 2]
-            pose = motions[body]
-            lowest = min(lowest, (pose[:3] + rotation_of(pose[3:]) @ (at - centres[body]))[2] - roll.radius)
-            balls.append((body, at, roll.radius))
-    law = {"normal": contact.Linear(4e4), "damping": 400.0, "friction": contact.Coulomb(0.8, transition_speed=0.05)}
-    floor = terrain.Flat(level=lowest - 0.002)
-    return [
-        spatial.Contact(f"sole {k}", body, centres=at, radius=radius, terrain=floor, **law)
-        for k, (body, at, radius) in enumerate(balls)
-    ]
-
-
-def test_cassie_hangs_is_released_and_lands_on_its_springs():
-    """From the equilibrium while its pelvis was held, with the feet above a floor."""
-    hold = spatial.Fixed("hold", "ground", "pelvis", point=(0.0, 0.0, 1.01))
-    model, hanging = cassie(joints=[hold])
-    assert {item.name for item in hanging.implied} == {"left-foot-op", "right-foot-op"}
-    start = mb.equilibrium(hanging)
-    _, system = cassie(*soles(model, hanging, start))
-    assert system.nu - system.velocity_rank == 18
-    motion = mb.simulate(system, start, t1=0.05, rtol=1e-8, saveat=np.linspace(0.0, 0.05, 7))
-    height = motion["pelvis"].position[:, 2]
-    assert height[-1] < height[0] - 5e-3
-    assert np.max(motion.constraint_violation) < 1e-12
-    # The heel springs yield where the feet have touched the floor.
-    spring = motion["left-tarsus-spring-joint"].angle
-    assert spring[-1] - spring[0] > 5e-3
