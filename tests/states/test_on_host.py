@@ -28,29 +28,34 @@ def held_coordinates(system, names):
 
 
 def check(system, t, guess, u, held):
-    """The closest configuration and velocities are those of programs."""
+    """The closest configuration and velocities are those of programs; False if they are left to these."""
     on_host, none = system.on_host(t), np.zeros(system.nu, bool)
     expected, ok = closest_configuration(system, t, guess, tuple(held.tolist()), system.coordinate_rank)
     found = on_host.closest_configuration(guess, held, system.coordinate_rank)
-    assert ok and found is not None
+    assert ok
+    if found is None:
+        return False
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
     expected, ok = closest_velocities(Instant(system, t, found, u), tuple(none.tolist()))
     rates = on_host.closest_velocities(found, u, none, system.velocity_rank)
     assert ok and rates is not None
     np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-11)
+    return True
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MACHINES)
 def test_on_host_closest_states_are_those_of_programs(name):
     built = mb.mechanisms.get(name)
-    system, random = built.system, np.random.default_rng(5)
+    system, random, found = built.system, np.random.default_rng(5), []
     for names in ([], MACHINES[name]):
         held = held_coordinates(system, names)
         for _ in range(3):
             q = np.asarray(built.state.q)
             guess = np.where(held, q, q + 0.03 * random.normal(size=system.nq))
-            check(system, jnp.zeros(()), guess, random.normal(size=system.nu), held)
+            found.append(check(system, jnp.zeros(()), guess, random.normal(size=system.nu), held))
+    # With redundant rows some guesses are left to programs.
+    assert all(found) or (system.implied and any(found))
 
 
 def pinned_bar(**more):
@@ -96,7 +101,7 @@ def test_on_host_states_of_any_constraints_are_those_of_programs(make):
     system, random = make(), np.random.default_rng(7)
     guess = np.array(system.guess.q)
     guess[: 3 if system.contacts else None] += 0.03 * random.normal(size=3 if system.contacts else system.nq)
-    check(system, jnp.asarray(0.3), guess, random.normal(size=system.nu), np.zeros(system.nq, bool))
+    assert check(system, jnp.asarray(0.3), guess, random.normal(size=system.nu), np.zeros(system.nq, bool))
 
 
 @pytest.mark.slow
