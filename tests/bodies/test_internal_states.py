@@ -205,8 +205,9 @@ def test_controller_derivatives_by_gains_and_the_start():
     x = jnp.array([-160.0, 10.0, 0.1, 0.02])
     value, derivative = in_both_modes(lambda x: run(x, 1e-10), x)
     tight = jax.jit(jax.vmap(lambda x: run(x, 1e-12)))
-    step = 1e-4 * np.diag(x)
-    differences = ((tight(x + step) - tight(x - step)) / (2e-4 * x)[:, None]).T
+    at = np.asarray(x)
+    step = 1e-4 * np.diag(at)
+    differences = np.asarray((tight(at + step) - tight(at - step)) / (2e-4 * at)[:, None]).T
     sizes = np.abs(differences).max(axis=1, keepdims=True)
     np.testing.assert_allclose(derivative / sizes, differences / sizes, rtol=0, atol=1e-6)
     np.testing.assert_allclose(value, tight(x[None])[0], atol=1e-8)
