@@ -92,19 +92,19 @@ SINGULAR = {
 
 
 @pytest.mark.parametrize("case", SINGULAR)
-def test_singular_poses_are_refused(case):
+def test_pose_that_is_singular_is_refused(case):
     make, message = SINGULAR[case]
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_a_four_bar_near_its_flat_pose_is_accepted():
+def test_pose_near_a_singular_one_is_accepted():
     lifted = [(0.0, 0.0), (np.cos(0.01), np.sin(0.01)), (2.0 + np.cos(0.01), np.sin(0.01)), (2.0, 0.0)]
     system = chain(lifted, [1.0, 2.0, 1.0]).compile()
     assert system.velocity_rank == 8
 
 
-def test_three_rockers_that_lock_are_refused():
+def test_rockers_that_lock_are_refused():
     """They are parallel but for one pin, which is a millimetre beside its place."""
     bodies = [planar.Body(f"rocker{k}", mass=1.0, inertia=0.1, position=(k, 0.5)) for k in range(3)]
     bodies.append(planar.Body("platform", mass=1.0, inertia=0.1, position=(1.0, 1.0)))
@@ -115,7 +115,7 @@ def test_three_rockers_that_lock_are_refused():
         mb.Scene(bodies, joints=joints).compile()
 
 
-def test_a_long_beam_of_welded_bodies_is_accepted():
+def test_beam_of_many_welded_bodies_is_accepted():
     """Joints that close no loop are not redundant, though the rows of many of them are nearly dependent."""
     bodies = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, position=(k + 0.5, 0.0)) for k in range(40)]
     ends = ["ground", *(body.name for body in bodies)]
@@ -147,8 +147,7 @@ def ladder(n):
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81, 0.0))])
 
 
-@pytest.fixture
-def sparse(monkeypatch):
+def without_dense_matrices(monkeypatch):
     """Let all components count as those of many rows."""
     monkeypatch.setattr(JointBlocks, "subsets", functools.partialmethod(JointBlocks.subsets, dense=-1))
 
@@ -157,7 +156,7 @@ def sparse(monkeypatch):
 def test_implied_rows_are_those_of_dense_matrices(monkeypatch):
     n = 4
     systems = [ladder(n).compile()]
-    monkeypatch.setattr(JointBlocks, "subsets", functools.partialmethod(JointBlocks.subsets, dense=-1))
+    without_dense_matrices(monkeypatch)
     systems.append(ladder(n).compile())
     for system in systems:
         A = np.asarray(system.jacobian(0.0, system.guess.q, system.guess.u))
@@ -175,8 +174,8 @@ def test_implied_rows_are_those_of_dense_matrices(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_long_ladder_has_no_dense_matrix(monkeypatch):
-    n, largest = 300, 0
+def test_ladder_of_many_has_no_dense_matrix(monkeypatch):
+    n, largest = 150, 0
 
     def watched(function):
         def call(matrix, *arguments, **options):
@@ -190,21 +189,15 @@ def test_a_long_ladder_has_no_dense_matrix(monkeypatch):
         monkeypatch.setattr(np.linalg, name, watched(getattr(np.linalg, name)))
     system = ladder(n).compile()
     assert len(system.implied) == 3 * n and system.velocity_rank == system.nu - n
-    assert {own.name for own in system.implied} <= {f"rung{k}_{side}" for k in range(n) for side in "lr"} | {
-        f"{side}{k}_pin" for k in range(n) for side in "lr"
-    }
     assert largest <= 1000
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in SINGULAR if "bar" in case])
-def test_singular_poses_are_refused_without_dense_matrices(sparse, case):
-    with pytest.raises(ValueError, match=r"is singular: row \d of .* implied by .* there, but not near it"):
-        SINGULAR[case][0]()
-
-
-@pytest.mark.slow
-def test_motions_that_contradict_are_refused_without_dense_matrices(sparse):
+def test_pose_that_is_singular_is_refused_without_dense_matrices(monkeypatch):
+    without_dense_matrices(monkeypatch)
+    for make, _ in (own for case, own in SINGULAR.items() if "bar" in case):
+        with pytest.raises(ValueError, match=r"is singular: row \d of .* implied by .* there, but not near it"):
+            make()
     with pytest.raises(ValueError, match=r"row 0 of \w+ is implied by \w+ at t = 0, but no more at t = "):
         crank(driver("first", lambda t: t), driver("second", lambda t: t + t**3)).compile()
     with pytest.raises(ValueError, match="first, second contradict each other"):
@@ -219,46 +212,38 @@ def test_drivers_that_agree_now_only_are_refused():
         crank(driver("first", lambda t: t), driver("second", lambda t: t + t**3)).compile()
 
 
-@pytest.mark.slow
-def test_drivers_that_agree_are_accepted():
-    system = crank(driver("first", jnp.sin), driver("second", lambda t: jnp.sin(t))).compile()
-    (implied,) = system.implied
-    assert (implied.name, implied.by) in (("second", ("first",)), ("first", ("second",)))
-    end = mb.simulate(system, mb.assemble(system), t1=2.0)
-    np.testing.assert_allclose(end["crank"].angle[-1], np.sin(2.0), atol=1e-9)
-
-
-def parting(t):
-    """Equal to t up to half a second."""
-    return t + jnp.maximum(t - 0.5, 0.0) ** 3
+def parting():
+    """Two drivers, the second of which parts from the first after half a second, at a rate."""
+    late = lambda t, p: t + p["rate"] * jnp.maximum(t - 0.5, 0.0) ** 3
+    second = planar.Driver("second", "ground", "crank", quantity="angle", motion=late, parameters={"rate": 0.0})
+    return crank(driver("first", lambda t: t), second).compile()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, diffrax.Tsit5()])
-def test_drivers_that_part_later_end_the_motion(solver):
-    system = crank(driver("first", lambda t: t), driver("second", parting)).compile()
-    state = mb.assemble(system)
+def test_drivers_that_part_end_the_motion(solver):
+    system = parting()
+    (implied,) = system.implied
+    assert (implied.name, implied.by) in (("second", ("first",)), ("first", ("second",)))
+    state, saveat = mb.assemble(system), diffrax.SaveAt(steps=True)
+    run = lambda rate, **options: mb.simulate(
+        mb.with_parameters(system, {"second.rate": rate}), state, t1=2.0, solver=solver, saveat=saveat, **options
+    )
+    together = run(0.0)
+    np.testing.assert_allclose(together["crank"].angle, together.ts, atol=1e-9)
     with pytest.raises(RuntimeError, match=r"At t = [01].* the constraints (first|second) \(.*contradict the others"):
-        mb.simulate(system, state, t1=2.0, solver=solver)
-    motion = mb.simulate(system, state, t1=2.0, solver=solver, throw=False)
+        run(1.0)
+    motion = run(1.0, throw=False)
     assert motion.result == mb.RESULTS.inconsistent_constraints
+    if solver is None:
+        # A violation of 1e-7 rad is allowed.
+        assert 0.5 <= motion.ts[-1] <= 0.5 + 1.2e-7 ** (1 / 3)
+        assert abs(motion["crank"].angle[-1] - motion.ts[-1] - (motion.ts[-1] - 0.5) ** 3) <= 1.2e-7
 
 
 @pytest.mark.slow
-def test_the_motion_that_is_kept_ends_where_the_drivers_part():
-    system = crank(driver("first", lambda t: t), driver("second", parting)).compile()
-    saveat = diffrax.SaveAt(steps=True)
-    motion = mb.simulate(system, mb.assemble(system), t1=2.0, saveat=saveat, throw=False)
-    # A violation of 1e-7 rad is allowed.
-    assert 0.5 <= motion.ts[-1] <= 0.5 + 1.2e-7 ** (1 / 3)
-    assert abs(motion["crank"].angle[-1] - parting(motion.ts[-1])) <= 1.2e-7
-
-
-@pytest.mark.slow
-def test_a_member_of_a_batch_whose_drivers_part_spoils_no_other():
-    late = lambda t, p: t + p["rate"] * jnp.maximum(t - 0.5, 0.0) ** 3
-    second = planar.Driver("second", "ground", "crank", quantity="angle", motion=late, parameters={"rate": 0.0})
-    system = crank(driver("first", lambda t: t), second).compile()
+def test_drivers_that_part_in_a_member_of_a_batch_spoil_no_other():
+    system = parting()
     state = mb.assemble(system)
 
     def run(rate):
@@ -280,8 +265,10 @@ def test_redundancy_at_a_coarse_tolerance_is_no_singularity():
 # Rows between accelerations
 
 
-def servo(name, angle=jnp.sin, **gains):
-    numbers = {"motion": lambda t, p: p["size"] * angle(t), "parameters": {"size": 1.0}}
+def servo(name, angle=lambda t, p: jnp.sin(t), **gains):
+    """By default along sin t; `straight` leads to t."""
+    program = lambda t, p: p["size"] * (angle(t, p) + p["straight"] * (t - angle(t, p)))
+    numbers = {"motion": program, "parameters": {"size": 1.0, "straight": 0.0}}
     return mb.Servo(planar.Driver(name, "ground", "crank", quantity="angle", **numbers), **gains)
 
 
@@ -289,64 +276,62 @@ def servos(*programs, **options):
     return crank(*programs, angular_velocity=1.0, velocity=(0.0, 0.0), **options).compile()
 
 
-def test_a_second_servo_is_followed_or_refused():
+DIFFERENT = r"constraints (first|second) \(.*(first|second).*ask for other accelerations"
+
+
+def test_servo_of_a_driven_coordinate_is_followed_or_refused():
     gains = {"damping": 2.0, "stiffness": 4.0}
     system = servos(servo("first", **gains), servo("second", **gains))
 
-    def run(size, stiffness, rate):
-        changed = mb.with_parameters(system, {"second.size": size, "second.stiffness": stiffness})
-        state = mb.assemble(changed, rates={"crank.angle": rate})
-        motion = mb.simulate(changed, state, t1=1.0, throw=False)
-        return motion.result == mb.RESULTS.inconsistent_constraints, motion["crank"].angle[-1]
+    def run(rate=1.0, **numbers):
+        changed = mb.with_parameters(system, {f"second.{name}": value for name, value in numbers.items()})
+        state = mb.State(system.guess.q, np.array([0.0, 0.0, rate]))
+        return mb.simulate(changed, state, t1=1.0).ys.q[-1, 2]
 
-    # The same programs; one is larger; gains differ on the program, and off it.
-    cases = jnp.array([[1.0, 4.0, 1.0], [1.001, 4.0, 1.0], [1.0, 5.0, 1.0], [1.0, 5.0, 0.5]])
-    wrong, angle = jax.jit(jax.vmap(run))(*cases.T)
-    assert wrong.tolist() == [False, True, False, True]
-    np.testing.assert_allclose(angle[::2], np.sin(1.0), atol=1e-8)
+    # The same programs; gains that differ, on the program.
+    np.testing.assert_allclose([run(), run(stiffness=5.0)], np.sin(1.0), atol=1e-8)
+    # Another program, a larger one, and gains that differ off the program.
+    for numbers in ({"straight": 1.0}, {"size": 1.001}, {"stiffness": 5.0, "rate": 0.5}):
+        with pytest.raises(RuntimeError, match=DIFFERENT):
+            run(**numbers)
 
 
+APART = lambda: servos(servo("first"), servo("second", lambda t, p: t))
 CONTRADICTING = {
-    "two programs": (lambda: servos(servo("first"), servo("second", lambda t: t)), {}),
     "programs that differ from a time on": (
         lambda: servos(
-            servo("first", lambda t: t), servo("second", lambda t: jnp.where(t < 0.5, t, t + (t - 0.5) ** 2))
+            servo("first", lambda t, p: t), servo("second", lambda t, p: jnp.where(t < 0.5, t, t + (t - 0.5) ** 2))
         ),
         {},
     ),
     "a servo beside a driver": (lambda: servos(driver("first", lambda t: t), servo("second")), {}),
-    "Runge and Kutta": (lambda: servos(servo("first"), servo("second", lambda t: t)), {"solver": diffrax.Tsit5()}),
-    "an implicit method": (
-        lambda: servos(servo("first"), servo("second", lambda t: t)),
-        {"solver": mb.solvers.Hermite()},
-    ),
+    "Runge and Kutta": (APART, {"solver": diffrax.Tsit5()}),
+    "an implicit method": (APART, {"solver": mb.solvers.Hermite()}),
 }
 
 
-@pytest.mark.slow(but=("two programs",))
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CONTRADICTING)
-def test_programs_that_begin_to_differ_are_named(case):
+def test_servo_that_contradicts_is_named(case):
     make, options = CONTRADICTING[case]
     system = make()
-    with pytest.raises(
-        RuntimeError, match=r"constraints (first|second) \(.*(first|second).*ask for other accelerations"
-    ):
+    with pytest.raises(RuntimeError, match=DIFFERENT):
         mb.simulate(system, mb.assemble(system, rates={"crank.angle": 1.0}), t1=2.0, **options)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-8, 1e-11])
-def test_servos_with_different_gains_follow_the_same_program(rtol):
+def test_servos_with_different_gains_follow_the_same_program():
     gains = {"damping": 20.0, "stiffness": 100.0}, {"damping": 200.0, "stiffness": 1e4}
     system = servos(servo("first", **gains[0]), servo("second", **gains[1]))
     state = mb.assemble(system, rates={"crank.angle": 1.0})
     for solver in (None, mb.solvers.Hermite(), diffrax.Tsit5()):
-        motion = mb.simulate(system, state, t1=2.0, rtol=rtol, solver=solver)
-        np.testing.assert_allclose(motion["crank"].angle[-1], np.sin(2.0), atol=10 * rtol)
+        for rtol in (1e-3, 1e-11):
+            motion = mb.simulate(system, state, t1=2.0, rtol=rtol, solver=solver)
+            np.testing.assert_allclose(motion["crank"].angle[-1], np.sin(2.0), atol=10 * rtol)
 
 
 @pytest.mark.slow
-def test_constraints_between_accelerations_are_watched():
+def test_rows_between_accelerations_are_watched():
     row = lambda name, right: lagrangian.AccelerationConstraint(
         name, lambda t, q, v, p: jnp.array([[1.0, 0.0]]), lambda t, q, v, p: jnp.array([right(t)])
     )
@@ -359,15 +344,16 @@ def test_constraints_between_accelerations_are_watched():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("manifold", [Baumgarte(), Projection()])
-def test_other_manifolds_do_not_watch_servos(manifold):
+def test_servos_are_not_watched_by_other_manifolds():
     system = servos(servo("first"), servo("second"))
-    with pytest.raises(ValueError, match=r"Of 4 constraint rows only 3 .*does not watch implied rows of servos"):
-        mb.simulate(system, mb.assemble(system, rates={"crank.angle": 1.0}), t1=1.0, manifold=manifold)
+    state = mb.assemble(system, rates={"crank.angle": 1.0})
+    for manifold in (Baumgarte(), Projection()):
+        with pytest.raises(ValueError, match=r"Of 4 constraint rows only 3 .*does not watch implied rows of servos"):
+            mb.simulate(system, state, t1=1.0, manifold=manifold)
 
 
 @pytest.mark.slow
-def test_drivers_that_contradict_each_other_are_refused_with_stabilised_constraints():
+def test_drivers_that_contradict_are_refused_with_stabilised_constraints():
     second = planar.Driver(
         "second", "ground", "crank", quantity="angle", motion=lambda t, p: p["rate"] * t**2, parameters={"rate": 1.0}
     )
@@ -382,17 +368,16 @@ def test_drivers_that_contradict_each_other_are_refused_with_stabilised_constrai
 # Rows that are implied to a higher order
 
 
-@pytest.mark.parametrize("rtol", [1e-3, 1e-8])
-def test_a_row_that_is_implied_to_the_fifth_order(rtol):
+def test_row_that_is_implied_to_the_fifth_order():
     """Together the rows admit no motion. The displacement x that one of them admits violates the other by x⁵, so by
     5e-8 in the end, and by a displacement of x / 5.
     """
     bead = particle(lambda t, q, p: q[1], lambda t, q, p: q[1] - q[0] ** 5)
-    motion = mb.simulate(bead, mb.State(bead.guess.q, jnp.array([1.0, 0.0])), t1=0.035, rtol=rtol, throw=False)
-    assert (motion.result == mb.RESULTS.successful) == (rtol == 1e-3)
+    for rtol, successful in ((1e-3, True), (1e-8, False)):
+        motion = mb.simulate(bead, mb.State(bead.guess.q, jnp.array([1.0, 0.0])), t1=0.035, rtol=rtol, throw=False)
+        assert (motion.result == mb.RESULTS.successful) == successful
 
 
-@functools.cache
 def box_on_ropes():
     corners = [(0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5)]
     box = spatial.Body("box", mass=1.0, inertia=spatial.box(1.0, 1.0, 1.0, 1.0), position=(0.0, 0.0, 2.0))
@@ -404,72 +389,46 @@ def box_on_ropes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-11])
-def test_a_box_that_yaws_and_sways_on_four_ropes(rtol):
-    """At home three rows are independent, and beside it four: the fourth binds the pitch by the third order only."""
+def test_box_on_four_ropes_sways_and_does_not_yaw():
+    """At home three rows are independent, and beside it four: the fourth binds the pitch by the third order only.
+    Where it only sways it is a spherical pendulum, and the ropes stay parallel.
+    """
     system = box_on_ropes()
-    rates = {"box.velocity": (0.3, 0.0, 0.0), "box.angular_velocity": (0.0, 0.0, 0.3)}
-    with pytest.raises(RuntimeError, match=r"rope\d \(.*contradict.*If they agree, the compiled pose is a bifurcation"):
-        mb.simulate(system, mb.assemble(system, rates=rates), t1=5.0, rtol=rtol)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-8, 1e-11])
-def test_a_box_that_sways_on_four_ropes(rtol):
-    """It is a spherical pendulum, and the ropes stay parallel."""
-    system, rates = box_on_ropes(), {"box.velocity": (0.3, 0.1, 0.0)}
-    motion = mb.simulate(system, mb.assemble(system, rates=rates), t1=5.0, rtol=rtol)
-    energy = 0.5 * jnp.sum(motion["box"].velocity[-1] ** 2) + 9.81 * (motion["box"].position[-1, 2] - 2.0)
-    np.testing.assert_allclose(energy, 0.05, atol=max(rtol, 1e-12))
+    yaws = {"box.velocity": (0.3, 0.0, 0.0), "box.angular_velocity": (0.0, 0.0, 0.3)}
+    for rtol in (1e-5, 1e-11):
+        motion = mb.simulate(system, mb.assemble(system, rates={"box.velocity": (0.3, 0.1, 0.0)}), t1=5.0, rtol=rtol)
+        energy = 0.5 * jnp.sum(motion["box"].velocity[-1] ** 2) + 9.81 * (motion["box"].position[-1, 2] - 2.0)
+        np.testing.assert_allclose(energy, 0.05, atol=max(rtol, 1e-12))
+        with pytest.raises(RuntimeError, match=r"rope\d \(.*contradict.*If they agree, the compiled pose is a bifur"):
+            mb.simulate(system, mb.assemble(system, rates=yaws), t1=5.0, rtol=rtol)
 
 
 # States off the constraints
 
 
-@pytest.fixture(scope="module")
-def four_bar():
-    return mechanisms.get("four_bar")
-
-
 @pytest.mark.slow
-def test_a_moved_pin_needs_another_state(four_bar):
-    moved = mb.with_parameters(four_bar.system, {"D.point_a": jnp.array([2.6, 0.0])})
+def test_state_off_the_constraints_is_refused():
+    four_bar = mechanisms.get("four_bar")
+    state, moved = four_bar.state, mb.with_parameters(four_bar.system, {"D.point_a": jnp.array([2.6, 0.0])})
     with pytest.raises(ValueError, match=r"state violates the constraints D \(0\.1\) at t0 = 0\..*jaxmb\.assemble"):
-        mb.simulate(moved, four_bar.state, t1=0.1)
-    mb.simulate(moved, mb.assemble(moved, four_bar.state), t1=0.1)
-
-
-@pytest.mark.slow
-def test_the_state_of_another_system_is_refused(four_bar):
-    other = mechanisms.get("four_bar", base=2.4)
+        mb.simulate(moved, state, t1=0.1)
+    mb.simulate(moved, mb.assemble(moved, state), t1=0.1)
     with pytest.raises(ValueError, match=r"state violates the constraints .*D \("):
-        mb.simulate(four_bar.system, other.state, t1=0.1)
-
-
-@pytest.mark.slow
-def test_wrong_velocities_are_refused(four_bar):
-    state = four_bar.state
+        mb.simulate(four_bar.system, mechanisms.get("four_bar", base=2.4).state, t1=0.1)
+    fast = mb.State(state.q, state.u.at[0].add(0.1))
     with pytest.raises(ValueError, match=r"velocities of the state violate the constraints .*B \("):
-        mb.simulate(four_bar.system, mb.State(state.q, state.u.at[0].add(0.1)), t1=0.1)
+        mb.simulate(four_bar.system, fast, t1=0.1)
     # Motions that drift on purpose may start anywhere.
-    mb.simulate(
-        four_bar.system,
-        mb.State(state.q, state.u.at[0].add(0.1)),
-        t1=0.01,
-        manifold=Baumgarte(),
-        solver=diffrax.Tsit5(),
-    )
-
-
-@pytest.mark.slow
-def test_the_state_of_another_time_is_refused():
+    mb.simulate(four_bar.system, fast, t1=0.01, manifold=Baumgarte(), solver=diffrax.Tsit5())
     system = crank(driver("drive", lambda t: t)).compile()
     with pytest.raises(ValueError, match=r"state violates the constraints drive \(1\) at t0 = 1\."):
         mb.simulate(system, mb.assemble(system), t0=1.0, t1=1.1)
 
 
 @pytest.mark.slow
-def test_traced_parameters_with_an_old_state_fail(four_bar):
+def test_state_off_the_constraints_of_traced_parameters_fails():
+    four_bar = mechanisms.get("four_bar")
+
     def run(x):
         system = mb.with_parameters(four_bar.system, {"D.point_a": jnp.stack([x, jnp.zeros_like(x)])})
         motion = mb.simulate(system, four_bar.state, t1=0.1, throw=False)
@@ -481,38 +440,18 @@ def test_traced_parameters_with_an_old_state_fail(four_bar):
 
 
 @pytest.mark.slow
-def test_derivatives_through_a_state_that_is_assembled_again(four_bar):
-    def end(x, rtol):
-        system = mb.with_parameters(four_bar.system, {"D.point_a": jnp.stack([x, jnp.zeros_like(x)])})
-        state = mb.assemble(system, fix={"crank.angle": 1.6}, rates={"crank.angle": 4.0})
-        return mb.simulate(system, state, t1=0.3, rtol=rtol)["crank"].angle[-1]
-
-    value, slope = jax.jit(jax.value_and_grad(end))(2.6, 1e-10)
-    tight = jax.jit(lambda x: end(x, 1e-13))
-    assert np.isfinite(value)
-    np.testing.assert_allclose(slope, (tight(2.6 + 1e-4) - tight(2.6 - 1e-4)) / 2e-4, rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("four_bar", {}),
-        pytest.param("spatial_slider_crank", {}, marks=pytest.mark.slow),
-        pytest.param("spatial_slider_crank", {"solver": diffrax.Tsit5()}, marks=pytest.mark.slow),
-    ],
-)
-def test_a_motion_at_a_coarse_tolerance_can_be_continued(name, options):
+@pytest.mark.parametrize("name", ["four_bar", "spatial_slider_crank"])
+def test_state_of_a_motion_at_a_coarse_tolerance_continues(name):
     mechanism = mechanisms.get(name)
-    saveat = np.linspace(0.05, 0.4, 8)
-    coarse = mb.simulate(mechanism.system, mechanism.state, t1=0.4, rtol=1e-3, saveat=saveat, **options)
-    for k in range(8):
+    saveat = np.linspace(0.1, 0.4, 4)
+    coarse = mb.simulate(mechanism.system, mechanism.state, t1=0.4, rtol=1e-3, saveat=saveat)
+    for k in range(4):
         state = jax.tree.map(lambda y, k=k: y[k], coarse.ys)
         mb.simulate(mechanism.system, state, t0=saveat[k], t1=saveat[k] + 1e-3)
 
 
 @pytest.mark.slow
-def test_single_precision_states_are_accepted():
+def test_state_in_single_precision_is_accepted():
     """In a program of its own: the precision is chosen before anything else."""
     code = """
 import jaxmb as mb
@@ -524,17 +463,3 @@ for name in ("four_bar", "bricard"):
     mb.simulate(m.system, mb.State(motion.ys.q[-1], motion.ys.u[-1]), t0=0.3, t1=0.4, rtol=1e-4)
 """
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, env=os.environ)
-
-
-def test_each_row_of_a_part_has_a_number_of_its_own():
-    """A rolling disc is made of a contact and of rolling; its rows are counted together."""
-    wheels = {"right": -0.5, "left": 0.5}
-    wheel = {"mass": 1.0, "inertia": np.diag([0.02, 0.04, 0.02])}
-    bodies = [spatial.Body(name, position=(0.0, y, 0.3), **wheel) for name, y in wheels.items()]
-    axle = spatial.Body("axle", mass=1.0, inertia=0.1 * np.eye(3), position=(0.0, 0.0, 0.3))
-    axis = (0.0, 1.0, 0.0)
-    joints = [spatial.Revolute(f"{k} pin", "axle", k, point=(0.0, y, 0.3), axis=axis) for k, y in wheels.items()]
-    rolls = [spatial.RollingDisc(f"{k} rolls", k, radius=0.3, axis=axis) for k in wheels]
-    system = mb.Scene([axle, *bodies], joints=[*joints, *rolls]).compile()
-    assert len(set(system.rows)) == len(system.rows)
-    assert [k for name, k in system.rows if name == "right rolls"] == [0, 1, 2]

@@ -17,7 +17,7 @@ from jaxmb.bodies.layout import Layout
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.formulations.formulation import pivoted_jacobian
 from jaxmb.linalg.graphs import components
-from jaxmb.manifold import Partition, Projection
+from jaxmb.manifold import Partition
 from jaxmb.parts.spatial.kinematics import SPACE
 
 
@@ -48,29 +48,12 @@ def compare(system, q, u, *, atol=1e-10):
         np.testing.assert_allclose(found, expected, rtol=0, atol=atol * (1.0 + np.max(np.abs(expected))))
 
 
-SCENES = [
-    "andrews",
-    "bennett",
-    "bricard",
-    "double_wishbone",
-    "flyball",
-    "four_bar",
-    "heavy_top",
-    "n_four_bar",
-    "parallelogram",
-    "rod_chain",
-    "rolling_disc",
-    "slider_crank",
-    "spatial_loop",
-    "spatial_slider_crank",
-    "swash_plate",
-    "tracked_vehicle",
-]
+SCENES = ["bricard", "double_wishbone", "flyball", "n_four_bar", "rolling_disc", "swash_plate", "tracked_vehicle"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
-def test_mechanisms_of_the_library(name):
+def test_joint_order_of_mechanisms_of_the_library(name):
     mechanism = mb.mechanisms.get(name)
     system, rng = mechanism.system, np.random.default_rng(0)
     start = mechanism.state
@@ -119,15 +102,8 @@ def two_stars():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("build", "hubs"),
-    [
-        (lambda: star(9, 2), 1),
-        (lambda: star(8, 1, ground=True), 1),
-        pytest.param(two_stars, 2, marks=pytest.mark.slow),
-    ],
-)
-def test_bodies_of_many_joints(build, hubs):
+@pytest.mark.parametrize(("build", "hubs"), [(lambda: star(9, 2), 1), (two_stars, 2)])
+def test_joint_order_of_bodies_of_many_joints(build, hubs):
     system = build()
     order = joint_order(system)
     assert order.hubs.size == hubs
@@ -169,7 +145,7 @@ def hanging_cable():
     ],
     ids=["star", "ladder", "cable"],
 )
-def test_motion_and_its_derivatives(build, varied, implied):
+def test_joint_order_in_a_motion_and_its_derivatives(build, varied, implied):
     """A motion as by partitioning, with forward, reverse and central differences."""
     system = build()
     assert system.elimination is not None and system.velocity_rows - system.velocity_rank == implied
@@ -221,12 +197,15 @@ def random_parts(rng, bodies, loops):
     return parts, blocks
 
 
-@pytest.mark.parametrize("seed", range(200))
-def test_ranks_of_random_graphs(seed):
+def test_ranks_of_random_graphs():
     """The sum of the ranks of components is that of the whole; kept rows are independent and imply the others. By
     sparse elimination, and by a dense one.
     """
-    rng = np.random.default_rng(seed)
+    for seed in range(60):
+        check_ranks(np.random.default_rng(seed))
+
+
+def check_ranks(rng):
     bodies, loops = int(rng.integers(1, 12)), int(rng.integers(0, 4))
     parts, blocks = random_parts(rng, bodies, loops)
     layout = Layout(SPACE, (True,) * bodies)
@@ -295,7 +274,9 @@ def random_scene(seed):
     return mb.Scene(bodies, joints=joints, forces=[gravity])
 
 
-def check_random(seed):
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(12))
+def test_joint_order_of_random_scenes(seed):
     system = random_scene(seed).compile()
     rng = np.random.default_rng(seed)
     guess = mb.State(system.guess.q, jnp.asarray(rng.normal(size=system.nu)))
@@ -306,38 +287,3 @@ def check_random(seed):
     y = jax.jit(lambda y: mb.manifold.project(own, 0.0, mb.State(own.normalize(0.0, y.q), y.u)))(y)
     assert np.max(np.abs(system.coordinate_residual(0.0, y.q))) <= 1e-12
     assert np.max(np.abs(system.velocity_residual(0.0, y.q, y.u))) <= 1e-11
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_random_scenes(seed):
-    check_random(seed)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("part", range(20))
-def test_two_hundred_random_scenes(part):
-    for seed in range(10 * part, 10 * part + 10):
-        check_random(seed)
-    # Each scene has programs of its own, and a process has room for some hundreds of them.
-    jax.clear_caches()
-
-
-@pytest.mark.slow
-def test_redundant_loops_of_many_bodies_move_as_by_partitioning():
-    """A row of parallelograms: every third rocker is implied."""
-    bodies, joints = [], []
-    for k in range(20):
-        for j in range(3):
-            bodies.append(planar.Body(f"r{k}{j}", mass=1.0, inertia=0.1, position=(3 * k + j, 0.5), angle=np.pi / 2))
-            joints.append(planar.Revolute(f"f{k}{j}", "ground", f"r{k}{j}", point=(3 * k + j, 0.0)))
-            joints.append(planar.Revolute(f"h{k}{j}", f"r{k}{j}", f"c{k}", point=(3 * k + j, 1.0)))
-        bodies.append(planar.Body(f"c{k}", mass=1.0, inertia=0.1, position=(3 * k + 1.0, 1.0)))
-    system = mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
-    assert len(system.implied) == 20
-    assert system.elimination is not None
-    rates = {f"r{k}0.angle": 0.1 * k for k in range(20)}
-    state = mb.assemble(system, rates=rates)
-    ends = [mb.simulate(system, state, t1=0.5, rtol=1e-9, manifold=m).ys for m in (None, Projection(), Partition())]
-    for end in ends[:2]:
-        np.testing.assert_allclose(end.q, ends[2].q, rtol=0, atol=1e-7)

@@ -77,9 +77,7 @@ RIGID = {
     "in mm": lambda: of_bars(warren(20)[0] * 1e3, warren(20)[1], (0, 2)),
     "in km": lambda: of_rods(warren(20)[0] * 1e-3, warren(20)[1], (0, 2)),
     "a mast of ten storeys": lambda: of_rods(*mast(10), (0, 1, 2)),
-    "a truss of 401 bars": lambda: of_bars(*warren(200), (0, 2)),
     "a shallow arch": lambda: of_bars(np.array([(0.0, 0.0), (1.0, 0.03), (2.0, 0.0)]), [(0, 1), (1, 2)], (0, 2)),
-    "a cantilever of bars": lambda: of_bars(*pratt(10, crossed=()), (0, 11)),
     "with all diagonals": lambda: of_rods(*pratt(10, crossed=range(10)), (0, 11)),
     "bars with all diagonals": lambda: of_bars(*pratt(10, crossed=range(10)), (0, 11)),
 }
@@ -87,7 +85,7 @@ RIGID = {
 
 @pytest.mark.slow(but=("a truss of 41 rods", "a shallow arch", "in mm"))
 @pytest.mark.parametrize("case", RIGID)
-def test_rigid_trusses_are_accepted(case):
+def test_truss_that_is_rigid_is_accepted(case):
     system = RIGID[case]().compile()
     assert system.velocity_rank == system.nu
     assert len(system.implied) == (10 if "all diagonals" in case else 0)
@@ -129,13 +127,13 @@ LOCKED = {
 
 
 @pytest.mark.parametrize("case", LOCKED)
-def test_bodies_that_a_small_disagreement_locks_are_refused_by_name(case):
+def test_body_that_a_small_disagreement_locks_is_refused_by_name(case):
     make, message = LOCKED[case]
     with pytest.raises(ValueError, match=message):
         make().compile()
 
 
-def test_a_platform_that_rods_lock_firmly_is_accepted():
+def test_body_that_rods_lock_firmly_is_accepted():
     system = on_truss(0.2).compile()
     assert system.velocity_rank == system.nu
 
@@ -155,8 +153,7 @@ def grown(rng, count, flat=None):
     return np.array(nodes), edges
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
-def test_random_trusses(seed):
+def check_random(seed):
     rng = np.random.default_rng(seed)
     system = of_rods(*grown(rng, 6), (0, 1)).compile()
     assert system.velocity_rank == system.nu
@@ -164,8 +161,18 @@ def test_random_trusses(seed):
         of_rods(*grown(rng, 6, flat=3), (0, 1)).compile()
 
 
+def test_truss_that_is_random():
+    check_random(0)
+
+
 @pytest.mark.slow
-def test_no_matrix_of_a_long_truss_is_dense(monkeypatch):
+def test_trusses_that_are_random():
+    for seed in range(1, 6):
+        check_random(seed)
+
+
+@pytest.mark.slow
+def test_truss_of_many_has_no_dense_matrix(monkeypatch):
     largest, svd = 0, np.linalg.svd
 
     def watched(matrix, *arguments, **options):

@@ -1,13 +1,19 @@
 """The command line, run in this process."""
 
+import importlib
 import subprocess
 import sys
+import types
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxmb as mb
 from jaxmb.cli import main
 from jaxmb.cli.commands import parser
+
+run = importlib.import_module("jaxmb.cli.run")
 
 
 def test_mechanisms(capsys):
@@ -48,41 +54,44 @@ def test_run_of_a_lagrangian_system(capsys, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png", "work_precision.png"}
 
 
-@pytest.mark.parametrize(
-    "words, message",
-    [
-        (
-            ["report", "work_precision", "pendulum"],
-            "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python",
-        ),
-        (["reference", "site"], "python -m sphinx -c tests/pages . FOLDER"),
-        (["doctor", "--quick"], "is quick without --quick; --measure measures"),
-    ],
-)
-def test_what_went_tells_the_new_way(words, message, capsys):
-    assert main(words) == 2
-    assert message in capsys.readouterr().err
+WRONG = [
+    (["report", "work_precision", "pendulum"], "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python"),
+    (["reference", "site"], "python -m sphinx -c tests/pages . FOLDER"),
+    (["doctor", "--quick"], "is quick without --quick; --measure measures"),
+]
+WRONG_RUNS = [
+    (["pendulm"], "did you mean 'pendulum'"),
+    (["pendulum", "--t1", "-1"], "--t1 must be positive"),
+    (["pendulum", "--rtol", "2"], "rtol must be between"),
+    (["pendulum", "--set", "mas=2.0"], "did you mean 'mass'"),
+    (["pendulum", "--set", "mass=heavy"], "pendulum cannot be built with --set mass='heavy'"),
+    (["pendulum", "--set", "mass=[1, 2]"], "pendulum cannot be built with --set mass=[1, 2]"),
+    (["n_four_bar", "--set", "n=two"], "n_four_bar cannot be built with --set n='two'"),
+    (["train", "--set", "n={}"], "train cannot be built with --set n={}"),
+    # One line, whatever the mechanism did with the value.
+    (["four_bar", "--set", "speed=fast"], "four_bar cannot be built with --set speed='fast'"),
+]
 
 
-@pytest.mark.parametrize(
-    "words, message",
-    [
-        (["run", "pendulm"], "did you mean 'pendulum'"),
-        (["run", "pendulum", "--t1", "-1"], "--t1 must be positive"),
-        (["run", "pendulum", "--rtol", "2"], "rtol must be between"),
-        (["run", "pendulum", "--set", "mas=2.0"], "did you mean 'mass'"),
-        (["run", "pendulum", "--set", "mass=heavy"], "pendulum cannot be built with --set mass='heavy'"),
-        (["run", "pendulum", "--set", "mass=[1, 2]"], "pendulum cannot be built with --set mass=[1, 2]"),
-        (["run", "n_four_bar", "--set", "n=two"], "n_four_bar cannot be built with --set n='two'"),
-        (["run", "train", "--set", "n={}"], "train cannot be built with --set n={}"),
-    ],
-)
-def test_wrong_words(words, message, capsys, tmp_path):
-    assert main([*words, "--out", str(tmp_path)]) == 2
-    assert message in capsys.readouterr().err
+def test_wrong_words_are_told(capsys, tmp_path):
+    for words, message in WRONG:
+        assert main(words) == 2
+        assert message in capsys.readouterr().err
+    for words, message in WRONG_RUNS:
+        assert main(["run", *words, "--out", str(tmp_path)]) == 2
+        assert message in (told := capsys.readouterr().err) and told.count("\n") == 1
 
 
-def test_a_run_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path):
+def test_run_fits_the_parameter_that_moves_most(monkeypatch):
+    """Of the pendulum's mass, which moves it by one length per relative change here, and its length, by minus five."""
+    at = lambda values: jnp.stack([100.0 + values["bob.mass"] - 5.0 * values["bar.length"]])
+    moved = lambda system, state, **options: types.SimpleNamespace(quantity=lambda name: at(mb.parameters(system)))
+    monkeypatch.setattr(run, "simulate", moved)
+    monkeypatch.setattr(run, "assemble", lambda system, state, **options: state)
+    assert run._most_sensitive(mb.mechanisms.get("pendulum"), np.linspace(0.0, 1.0, 3)) == "bar.length"
+
+
+def test_run_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path):
     file = tmp_path / "own.py"
     file.write_text("def scene(mass, length=1.0):\n    raise ValueError('called')\n")
     words = ["run", f"{file}:scene", "--out", str(tmp_path / "out")]
@@ -96,13 +105,7 @@ def test_a_run_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path
         assert message in capsys.readouterr().err
 
 
-def test_no_traceback_of_wrong_values(capsys, tmp_path):
-    """One line, whatever the mechanism did with the value."""
-    assert main(["run", "four_bar", "--set", "speed=fast", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_where_to_write_is_checked_first(capsys, tmp_path, monkeypatch):
+def test_run_checks_first_where_to_write(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(mb.mechanisms, "get", lambda *args, **kwargs: pytest.fail("built before the check"))
     taken = tmp_path / "taken"
     taken.write_text("")
@@ -156,7 +159,7 @@ def test_help_on_an_unknown_name(capsys):
     assert "Stop" in capsys.readouterr().err
 
 
-def test_interrupted(capsys, monkeypatch):
+def test_run_that_is_interrupted(capsys, monkeypatch):
     def interrupt(*args, **kwargs):
         raise KeyboardInterrupt
 
@@ -165,7 +168,7 @@ def test_interrupted(capsys, monkeypatch):
     assert capsys.readouterr().err == "jaxmb: interrupted\n"
 
 
-def test_no_command(capsys):
+def test_command_that_is_missing(capsys):
     with pytest.raises(SystemExit) as ended:
         main([])
     assert ended.value.code == 2
@@ -183,7 +186,7 @@ def test_parameters_of_a_mechanism():
 
 
 @pytest.mark.slow
-def test_as_a_module():
+def test_help_as_a_module():
     """It is no error if the program that reads the output ends before it has read all."""
     command = f"{sys.executable} -m jaxmb help | head -1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)

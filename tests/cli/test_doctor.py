@@ -26,7 +26,7 @@ def said(capsys, *words):
     return {line[:18].strip(): line[18:] for line in joined}, tables
 
 
-def test_quick(capsys):
+def test_doctor_is_quick(capsys):
     facts, tables = said(capsys)
     assert tables == []
     assert facts["jaxmb"] == f"{mb.__version__}, Python {platform.python_version()}"
@@ -37,7 +37,7 @@ def test_quick(capsys):
     assert list(facts)[-2:] == ["double precision", "kept programs"]
 
 
-def test_whether_arrays_are_shifted_rightly(capsys, monkeypatch):
+def test_doctor_says_whether_arrays_are_shifted_rightly(capsys, monkeypatch):
     """As this machine does, and in words for either case."""
     moved = jax.jit(lambda x: (x + 1).at[1:].set((x + 1)[:-1])[None])(np.arange(8.0))[0]
     right = np.array_equal(moved, [1.0, *np.arange(1.0, 8.0)])
@@ -48,7 +48,7 @@ def test_whether_arrays_are_shifted_rightly(capsys, monkeypatch):
     assert said(capsys)[0]["shifted arrays"].endswith(wrong if right else "is right here")
 
 
-def test_lines_are_short_but_for_paths(capsys, monkeypatch, tmp_path):
+def test_doctor_prints_short_lines_but_for_paths(capsys, monkeypatch, tmp_path):
     folder = tmp_path / ("long" * 20)
     folder.mkdir()
     monkeypatch.setattr(doctor, "kept_in", lambda: folder)
@@ -60,7 +60,7 @@ def test_lines_are_short_but_for_paths(capsys, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("bound, of", [(2**27, " of 128"), (-1, "")])
-def test_where_programs_are_kept(bound, of, capsys, monkeypatch, tmp_path):
+def test_doctor_says_where_programs_are_kept(bound, of, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     folder = tmp_path / "cache"
     folder.mkdir()
@@ -75,13 +75,13 @@ def test_where_programs_are_kept(bound, of, capsys, monkeypatch, tmp_path):
     assert facts["kept programs"] == f"2 in ~/cache, 1.0{of} MiB"
 
 
-def test_where_none_are_kept(capsys, monkeypatch):
+def test_doctor_says_where_none_are_kept(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "kept_in", lambda: None)
     monkeypatch.setenv("JAXMB_CACHE", "off")
     assert said(capsys)[0]["kept programs"] == "none, JAXMB_CACHE=off"
 
 
-def test_what_is_missing(capsys, monkeypatch):
+def test_doctor_says_what_is_missing(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_OPTIONAL", {"plot": ("numpy",), "view": ("numpy", "no_such_package")})
     numpy = f"numpy {importlib.metadata.version('numpy')}"
     facts, _ = said(capsys)
@@ -89,14 +89,14 @@ def test_what_is_missing(capsys, monkeypatch):
     assert facts["for view"] == f'{numpy}, no_such_package missing; pip install "jaxmb[view]"'
 
 
-def test_the_extras_are_those_of_the_package():
+def test_doctor_knows_the_extras_of_the_package():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     names = {extra: tuple(re.match(r"[\w-]+", each).group() for each in own) for extra, own in extras.items()}
     assert {extra: names[extra] for extra in ("docs", "plot", "view", "import", "studies")} == doctor._OPTIONAL
 
 
 @pytest.mark.slow
-def test_measurements(capsys, monkeypatch):
+def test_doctor_measures(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_FIRST_CALLS", NUMBERS)
     monkeypatch.setattr(doctor, "_STEPPED", ("pendulum",))
     _, (_, calls, _, steps) = said(capsys, "--measure")
@@ -111,13 +111,13 @@ def test_measurements(capsys, monkeypatch):
     assert "step [µs]" in " ".join(head)
 
 
-def test_a_process_that_fails(capsys, monkeypatch):
+def test_doctor_tells_of_a_process_that_fails(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_FIRST_CALLS", "raise SystemExit('no such thing')")
     assert main(["doctor", "--measure"]) == 1
     assert capsys.readouterr().err == "jaxmb: A new process failed: no such thing\n"
 
 
-def test_a_motion_that_fails(monkeypatch):
+def test_doctor_tells_of_a_motion_that_fails(monkeypatch):
     monkeypatch.setattr(doctor, "_STEPPED", ("pendulum",))
     monkeypatch.setattr(doctor, "interleaved", lambda runs, repeats: [(1.0,)])
     stats, result = {"num_steps": 1}, mb.RESULTS.max_steps_reached
@@ -127,7 +127,7 @@ def test_a_motion_that_fails(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_second_process_waits_less():
+def test_doctor_finds_that_the_second_process_waits_less():
     """Without what this process has told JAX of kept programs."""
     _, *rows = doctor._first_calls()
     assert [row[0] for row in rows] == list(doctor._SHOWN)
@@ -138,7 +138,7 @@ def test_the_second_process_waits_less():
         assert times[name.replace("first", "another")][0] < times[name][1]
 
 
-def test_the_readme_quotes_what_is_printed():
+def test_doctor_prints_what_the_readme_quotes():
     block = re.search(
         r"`jaxmb doctor(?: --measure)?` .*?```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
     ).group(1)
@@ -151,7 +151,7 @@ def test_the_readme_quotes_what_is_printed():
     "given, told",
     [("3", "; computations take 3"), ("auto", ", NPROC=auto, which is not a number: all of them"), ("", "")],
 )
-def test_threads(given, told, monkeypatch):
+def test_doctor_says_how_many_threads(given, told, monkeypatch):
     monkeypatch.delenv("PJRT_NPROC", raising=False)
     monkeypatch.setenv("NPROC", given)
     assert re.fullmatch(rf"\d+ cores?{told}", doctor._cores())

@@ -29,30 +29,25 @@ ON_A_BASE = (
 )
 
 
-@pytest.mark.parametrize(
-    "text, joints",
-    [
+def test_body_of_mjcf_that_is_called_ground_moves():
+    """It has the mass and the place that MuJoCo gives it."""
+    for text, joints in (
         (ON_THE_WORLD, {"hip": ("ground link", "arm")}),
         (ON_A_BASE, {"hip": ("base", "ground link"), "knee": ("ground link", "arm")}),
-    ],
-    ids=["on the world", "on a base"],
-)
-def test_a_body_of_mjcf_that_is_called_ground_moves(text, joints):
-    """It has the mass and the place that MuJoCo gives it."""
-    found = importers.mjcf(file(text))
-    names, connected = ends(found)
-    assert connected == joints and found.notes == (f"{RENAMED}'ground → ground link'.",)
-    there = found.locate.model
-    assert sum(float(own.mass) for own in found.scene.bodies) == pytest.approx(there.body_mass.sum(), rel=1e-15)
-    q = there.qpos0 + 0.1
-    data = mujoco.MjData(there)
-    data.qpos = q
-    mujoco.mj_kinematics(there, data)
-    place = found.state(q).q.reshape(-1, 7)[names.index("ground link"), :3]
-    np.testing.assert_allclose(place, data.body("ground").xipos, atol=1e-15)
+    ):
+        found = importers.mjcf(file(text))
+        names, connected = ends(found)
+        assert connected == joints and found.notes == (f"{RENAMED}'ground → ground link'.",)
+        there = found.locate.model
+        assert sum(float(own.mass) for own in found.scene.bodies) == pytest.approx(there.body_mass.sum(), rel=1e-15)
+        data = mujoco.MjData(there)
+        data.qpos = there.qpos0 + 0.1
+        mujoco.mj_kinematics(there, data)
+        place = np.asarray(found.state(there.qpos0 + 0.1).q).reshape(-1, 7)[names.index("ground link"), :3]
+        np.testing.assert_allclose(place, data.body("ground").xipos, atol=1e-15)
 
 
-def test_all_kinds_of_elements_that_are_called_ground():
+def test_elements_of_all_kinds_that_are_called_ground():
     text = file(
         f'<body name="ground"><freejoint/>{ROD}<site name="ground"/><body name="welded" pos="0 0 1">{ROD}</body>'
         f'<body name="arm"><joint name="ground" axis="0 1 0"/>{ROD}</body></body>',
@@ -82,56 +77,36 @@ ROBOTS = {
 }
 
 
-@pytest.mark.parametrize("base", ["fixed", "free"])
-@pytest.mark.parametrize("robot_of", ROBOTS)
-def test_a_link_of_urdf_that_is_called_ground_is_what_it_is_by_another_name(robot_of, base):
-    text = ROBOTS[robot_of]
-    found, plain = importers.urdf(text, base=base), importers.urdf(text.replace("'ground'", "'tool'"), base=base)
+def test_link_of_urdf_that_is_called_ground_is_what_it_is_by_another_name():
     renamed = lambda name: "ground link" if name == "tool" else name
-    names, joints = ends(plain)
-    assert ends(found) == ([*map(renamed, names)], {own: (*map(renamed, pair),) for own, pair in joints.items()})
-    frames = [(renamed(own.name), renamed(own.body)) for own in plain.scene.frames]
-    assert [(own.name, own.body) for own in found.scene.frames] == frames
-    assert found.notes[0].startswith(f"{RENAMED}'ground → ground link'")
+    for text in ROBOTS.values():
+        for base in ("fixed", "free"):
+            found, plain = (importers.urdf(own, base=base) for own in (text, text.replace("'ground'", "'tool'")))
+            names, joints = ends(plain)
+            moved = {own: (*map(renamed, pair),) for own, pair in joints.items()}
+            assert ends(found) == ([*map(renamed, names)], moved)
+            frames = [(renamed(own.name), renamed(own.body)) for own in plain.scene.frames]
+            assert [(own.name, own.body) for own in found.scene.frames] == frames
+            assert found.notes[0].startswith(f"{RENAMED}'ground → ground link'")
 
 
-@pytest.mark.parametrize("static", ["0", "1"])
-def test_a_link_of_sdf_that_is_called_ground(static):
+def test_link_of_sdf_that_is_called_ground_or_world():
     text = model(
-        f"<static>{static}</static>",
+        "<static>{}</static>",
         *(body("a"), body("ground"), body("c")),
         *(hinge("j", "a", "ground"), hinge("k", "ground", "c"), hinge("l", "world", "c")),
     )
-    if static == "1":
-        with pytest.raises(ValueError, match="There is no moving link"):
-            importers.sdf(text)
-        return
-    found = importers.sdf(text)
-    assert ends(found) == (
-        ["a", "ground link", "c"],
-        {"j": ("a", "ground link"), "k": ("ground link", "c"), "l": ("ground", "c")},
-    )
+    with pytest.raises(ValueError, match="There is no moving link"):
+        importers.sdf(text.format(1))
+    joints = {"j": ("a", "ground link"), "k": ("ground link", "c"), "l": ("ground", "c")}
+    assert ends(importers.sdf(text.format(0))) == (["a", "ground link", "c"], joints)
+    note = "A link called world that has an <inertial> is not the ground, and moves as its joints allow: 'world'."
+    for inside, bodies, parent, notes in (("", ["b"], "ground", ()), (MASS, ["world", "b"], "world", (note,))):
+        found = importers.sdf(model(body("world", inside=inside), body("b"), hinge("j", "world", "b")))
+        assert ends(found) == (bodies, {"j": (parent, "b")}) and found.notes == notes
 
 
-@pytest.mark.parametrize(
-    "inside, bodies, parent, notes",
-    [
-        ("", ["b"], "ground", ()),
-        (
-            MASS,
-            ["world", "b"],
-            "world",
-            ("A link called world that has an <inertial> is not the ground, and moves as its joints allow: 'world'.",),
-        ),
-    ],
-    ids=["without mass", "with mass"],
-)
-def test_a_link_of_sdf_that_is_called_world(inside, bodies, parent, notes):
-    found = importers.sdf(model(body("world", inside=inside), body("b"), hinge("j", "world", "b")))
-    assert ends(found) == (bodies, {"j": (parent, "b")}) and found.notes == notes
-
-
-def test_a_root_of_urdf_that_is_called_world():
+def test_root_of_urdf_that_is_called_world():
     """It is the ground, which is said where its mass is lost."""
     note = "The root link 'world' is the ground, whatever its mass, despite base='free': give it another name."
     for inside, base, notes in (("", "free", ()), (link("x"), "fixed", ()), (link("x"), "free", (note,))):
@@ -143,22 +118,19 @@ def test_a_root_of_urdf_that_is_called_world():
 # Names that others have already
 
 
-@pytest.mark.parametrize(
-    "names, expected",
-    [
+def test_element_has_the_name_of_the_file_before_others_are_given_it():
+    for names, expected in (
         (("ground", "ground link"), ["ground 2", "ground link"]),
         (("ground link", "ground"), ["ground link", "ground 2"]),
         (("b.c", "b_c"), ["b_c link", "b_c"]),
         (("crank.angle", "crank"), ["crank_angle", "crank"]),
         (("a/b", "{}"), ["a/b", "{}"]),
-    ],
-)
-def test_an_element_has_the_name_of_the_file_before_others_are_given_it(names, expected):
-    text = file("".join(rod(name, HINGE.replace("hip", f"joint {k}")) for k, name in enumerate(names)))
-    found = importers.mjcf(text)
-    assert [own.name for own in found.scene.bodies] == expected
-    listed = ", ".join(repr(f"{old} → {new}") for old, new in zip(names, expected, strict=True) if old != new)
-    assert found.notes == ((f"{RENAMED}{listed}.",) if listed else ())
+    ):
+        text = file("".join(rod(name, HINGE.replace("hip", f"joint {k}")) for k, name in enumerate(names)))
+        found = importers.mjcf(text)
+        assert [own.name for own in found.scene.bodies] == expected
+        listed = ", ".join(repr(f"{old} → {new}") for old, new in zip(names, expected, strict=True) if old != new)
+        assert found.notes == ((f"{RENAMED}{listed}.",) if listed else ())
 
 
 def test_elements_of_mjcf_without_a_name_beside_those_that_have_theirs():
@@ -177,7 +149,7 @@ def test_elements_of_mjcf_without_a_name_beside_those_that_have_theirs():
 
 
 @pytest.mark.parametrize("base", ["fixed", "free"])
-def test_a_joint_of_urdf_that_is_called_base(base):
+def test_joint_of_urdf_that_is_called_base(base):
     """It is not the one of the root: the root keeps its joint where this one is left out with the end that it has."""
     found = importers.urdf(robot(link("a"), link("b"), TIP, joint("j", "a", "b"), joint("base", "b", "tip")), base=base)
     assert ends(found) == (["a", "b"], {"j": ("a", "b")}) if base == "free" else (["b"], {"j": ("ground", "b")})
@@ -218,7 +190,7 @@ def test_joints_of_one_name_are_refused(read, text):
 
 
 @pytest.mark.slow
-def test_a_scene_with_names_that_mujoco_has():
+def test_scene_with_names_that_mujoco_has():
     """Of a body that MuJoCo would take for the world, and of elements that the file needs beside those of the scene."""
     balls = [spatial.Spherical(f"ball {k}", "ground", "world", point=(float(k), 0.0, 0.0)) for k in range(2)]
     body = spatial.Body("world", mass=1.0, inertia=(0.1, 0.1, 0.1))
@@ -254,7 +226,7 @@ def test_joints_that_are_called_as_those_that_mujoco_needs_besides():
 
 
 @pytest.mark.slow
-def test_a_link_called_ground_through_a_scene_and_back():
+def test_link_called_ground_through_a_scene_and_back():
     found = importers.urdf(ROBOTS["with a welded link"], base="free")
     back = importers.mjcf(importers.to_mjcf(found.scene.compile()).text)
     assert ends(back) == ends(found) and {own.name: own.body for own in back.scene.frames} == {"welded": "ground link"}

@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-import os
-import time
 
 import diffrax
 import jax
@@ -13,7 +11,7 @@ import pytest
 from oracles import trains as oracle
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import planar
 from jaxmb.bodies.joint_graph import joint_order
 from jaxmb.formulations import Multipliers, Poincare, accelerations
 from jaxmb.manifold import Partition, Projection
@@ -30,79 +28,52 @@ def gear(**numbers):
 
 # The draft gear
 
+GEARS = {
+    "default": ({}, {}),
+    "without preload": (
+        {"stiffness": 1e7, "unloading": 0.4, "slack": 0.02, "preload": 0.0},
+        {"S0": 0.0, "k": 1e7, "eta": 0.4, "slack": 0.02},
+    ),
+    "damped": ({"slack": 0.0, "unloading": 1.0, "damping": 1e4}, {"slack": 0.0, "eta": 1.0, "c": 1e4}),
+    "sharp": ({"smoothing": 1e-6, "slack": 1e-9}, {"width": 1e-6, "slack": 1e-9}),
+}
+
 
 def test_draft_gear_is_that_of_an_independent_model():
     s, rate = np.meshgrid(np.linspace(-0.16, 0.16, 641), [-20.0, -0.01, -1e-5, 0.0, 1e-12, 0.003, 1.0])
-    for numbers, same in (
-        ({}, {}),
-        ({"slack": 0.0, "unloading": 1.0, "damping": 1e4}, {"slack": 0.0, "eta": 1.0, "c": 1e4}),
-        ({"smoothing": 1e-6, "slack": 1e-9}, {"width": 1e-6, "slack": 1e-9}),
-    ):
+    tension = jax.jit(lambda part, s, rate: part.tension(s, rate))
+    for numbers, same in GEARS.values():
         expected = oracle.draft_gear(s, rate, **same)
-        np.testing.assert_allclose(gear(**numbers).tension(s, rate), expected, rtol=1e-12, atol=1e-6)
+        np.testing.assert_allclose(tension(gear(**numbers), s, rate), expected, rtol=1e-12, atol=1e-6)
+    # Without slack and friction it is a spring.
+    spring = LINEAR("c", "a", "b")
+    np.testing.assert_allclose(tension(spring, s, rate), 2e7 * s, rtol=1e-13, atol=1e-8)
 
 
-@pytest.mark.parametrize("preload", [0.0, 5e4])
-def test_area_of_a_cycle_is_what_friction_takes(preload):
-    k, eta, slack, stroke = 1e7, 0.4, 0.02, 0.08
-    part = gear(stiffness=k, unloading=eta, slack=slack, preload=preload)
-    angle = np.linspace(0.0, 2 * np.pi, 200001)
-    for sign in (1, -1):
-        s = sign * (slack + 0.5 * stroke * (1 - np.cos(angle)))
-        rate = sign * 0.5 * stroke * np.sin(angle)
-        area = np.trapezoid(part.tension(s, 1e2 * rate), s)
-        assert area == pytest.approx((1 - eta) * (0.5 * k * stroke**2 + preload * stroke), rel=0.01)
+def test_draft_gear_takes_in_a_cycle_what_its_friction_does():
+    """The area of a cycle; of the independent model, which is the same."""
+    angle, stroke = np.linspace(0.0, 2 * np.pi, 20001), 0.08
+    for preload in (0.0, 5e4):
+        for sign in (1, -1):
+            s = sign * (0.02 + 0.5 * stroke * (1 - np.cos(angle)))
+            rate = sign * 0.5 * stroke * np.sin(angle)
+            area = np.trapezoid(oracle.draft_gear(s, 1e2 * rate, S0=preload), s)
+            assert area == pytest.approx((1 - 0.4) * (0.5 * 1e7 * stroke**2 + preload * stroke), rel=0.01)
 
 
-def test_draft_gear_without_slack_and_friction_is_a_spring():
-    s = np.linspace(-0.1, 0.1, 81)
-    np.testing.assert_allclose(LINEAR("c", "a", "b").tension(s, 3.0), 2e7 * s, rtol=1e-13, atol=1e-8)
-
-
-@pytest.mark.slow("0.0-0.0")
-@pytest.mark.parametrize("rate", [0.0, 1e-300, 1e-12, -1e3, 1e6])
-@pytest.mark.parametrize("extension", [0.0, 0.02, -0.02, 1e-300, 0.13, -1e3])
-def test_derivatives_of_the_tension_are_finite_everywhere(extension, rate):
-    value = lambda part, s, v: part.tension(s, v)
-    out = jax.grad(value, argnums=(0, 1, 2))(gear(), jnp.asarray(extension), jnp.asarray(rate))
+def test_draft_gear_has_finite_derivatives_everywhere():
+    extensions, rates = [0.0, 0.02, -0.02, 1e-300, 0.13, -1e3], [0.0, 1e-300, 1e-12, -1e3, 1e6]
+    s, rate = (x.ravel() for x in np.meshgrid(extensions, rates))
+    of_one = jax.grad(lambda part, s, v: part.tension(s, v), argnums=(0, 1, 2))
+    out = jax.jit(jax.vmap(of_one, (None, 0, 0)))(gear(), s, rate)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(out))
-
-
-@pytest.mark.parametrize(
-    ("numbers", "message"),
-    [
-        ({"slack": -0.01}, "slack must be non-negative"),
-        ({"unloading": 1.5}, "unloading .* at most 1"),
-        ({"transition_speed": 0.0}, "transition_speed must be positive"),
-        ({"smoothing": 0.0}, "smoothing must be positive"),
-        ({"travel": 0.0}, "travel must be positive"),
-    ],
-)
-def test_numbers_of_draft_gears_are_checked(numbers, message):
-    with pytest.raises(ValueError, match=f"'coupler1': {message}"):
-        mb.mechanisms.train(n=2, coupler=functools.partial(planar.DraftGear, **numbers))
-
-
-@pytest.mark.parametrize("make", [mb.mechanisms.train, mb.mechanisms.longitudinal_train])
-@pytest.mark.parametrize(
-    ("numbers", "message"),
-    [
-        ({"n": 0}, "n ≥ 1"),
-        ({"mass": (1.0, 2.0, 3.0)}, r"mass must be a number or one for each of 4 vehicles, got shape \(3,\)"),
-        ({"resistance": 3.0}, "resistance must be"),
-        ({"brake_rise": 0.0}, "brake_rise must be positive"),
-    ],
-)
-def test_numbers_of_trains_are_checked(make, numbers, message):
-    with pytest.raises(ValueError, match=message):
-        make(**numbers)
 
 
 # Trains with draft gears
 
 
 @pytest.mark.slow
-def test_frequencies_of_a_free_chain():
+def test_train_has_the_frequencies_of_a_free_chain():
     n, k, m = 20, 2e7, 8e4
     system = mb.mechanisms.train(n=n, coupler=LINEAR, **BARE).system
     along = np.arange(0, 3 * n, 3)
@@ -112,7 +83,7 @@ def test_frequencies_of_a_free_chain():
 
 
 @pytest.mark.slow
-def test_a_pull_at_the_head_runs_through_the_train_as_a_wave():
+def test_train_takes_a_pull_at_its_head_as_a_wave():
     n, k, m, pull = 100, 2e7, 8e4, 3e5
     mechanism = mb.mechanisms.train(n=n, coupler=LINEAR, pull=pull, **BARE)
     times = np.arange(1, 601) * 0.01
@@ -124,8 +95,31 @@ def test_a_pull_at_the_head_runs_through_the_train_as_a_wave():
     np.testing.assert_allclose(sol.linear_momentum[:, 0], pull * times, rtol=1e-12)
 
 
+def test_longitudinal_train_has_the_accelerations_of_its_vehicles():
+    """Of each by the pull at the head, its own coupler and that before; the coordinates are differences of places."""
+    rng = np.random.default_rng(0)
+    n, mass = 5, 8e4 * (1 + 0.3 * rng.random(5))
+    system = mb.mechanisms.longitudinal_train(n=n, mass=mass, pull=1e5, resistance=(0, 0, 0), brake=0.0).system
+    y, w = 0.05 * rng.normal(size=n), 0.2 * rng.normal(size=n)
+
+    @jax.jit
+    def evaluate(q, u):
+        inertia = system.inertia(0.0, q, u)
+        udot, _ = accelerations(system, Multipliers(), 1.0, q, u)
+        return udot, system.tensions(mb.State(q, u)), inertia.product(udot) - system.force(1.0, q, u)
+
+    udot, tensions, unmet = evaluate(y, w)
+    S = oracle.draft_gear(y[1:], w[1:])
+    np.testing.assert_allclose(tensions, S, rtol=1e-12, atol=1e-6)
+    pulls = np.append(-S, 0.0) + np.insert(S, 0, 1e5)
+    absolute = pulls / mass
+    expected = np.append(absolute[0], absolute[:-1] - absolute[1:])
+    np.testing.assert_allclose(udot, expected, rtol=0, atol=1e-12 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(unmet, 0.0, atol=1e-12 * np.max(np.abs(pulls)) * n)
+
+
 @pytest.mark.slow
-def test_relative_coordinates_are_the_straight_motion_of_the_train():
+def test_longitudinal_train_moves_as_a_train_that_stays_straight():
     rng = np.random.default_rng(0)
     n, mass = 5, 8e4 * (1 + 0.3 * rng.random(5))
     relative = mb.mechanisms.longitudinal_train(n=n, mass=mass, pull=1e5, grade=0.01).system
@@ -137,21 +131,15 @@ def test_relative_coordinates_are_the_straight_motion_of_the_train():
     found, _ = accelerations(relative, Multipliers(), 1.0, jnp.asarray(y), jnp.asarray(w))
     expected, _ = accelerations(plane, Multipliers(), 1.0, still(x), still(v))
     np.testing.assert_allclose(absolute(found[0], np.asarray(found[1:])), expected[::3], rtol=0, atol=1e-11)
-    # Half the tensions of its neighbours, and its own.
-    S = np.concatenate([[0.0], relative.tensions(mb.State(jnp.asarray(y), jnp.asarray(w))), [0.0]])
-    bare = mb.mechanisms.longitudinal_train(n=n, mass=mass, resistance=(0, 0, 0), brake=0.0).system
-    found, _ = accelerations(bare, Multipliers(), 1.0, jnp.asarray(y), jnp.asarray(w))
-    own = -S[1:-1] * (1 / mass[:-1] + 1 / mass[1:]) + S[:-2] / mass[:-1] + S[2:] / mass[1:]
-    np.testing.assert_allclose(found[1:], own, rtol=0, atol=1e-12 * np.max(np.abs(own)))
 
 
 @pytest.mark.slow
-def test_slow_and_fast_collisions():
+def test_train_collides_slowly_and_fast():
     """Vehicles that meet at a nanometre or a hundred metres a second, their slack open, shut or in between."""
     system = mb.mechanisms.longitudinal_train(n=4, brake=0.0, resistance=(0, 0, 0)).system
     run = jax.jit(lambda state: mb.simulate(system, state, t1=1.0, rtol=1e-9, throw=False))
-    for speed in (0.0, 1e-9, 1e-3, 100.0):
-        for y in ((0.0, 0.0, 0.0), (0.02, -0.02, 0.02), (-0.02, 0.0225, -0.0225)):
+    for speed in (0.0, 1e-9, 100.0):
+        for y in ((0.0, 0.0, 0.0), (-0.02, 0.0225, -0.0225)):
             state = mb.State(jnp.array([0.0, *y]), speed * jnp.array([0.0, 0.0, -1.0, 0.0]))
             sol = run(state)
             assert sol.result == mb.RESULTS.successful
@@ -161,44 +149,34 @@ def test_slow_and_fast_collisions():
             np.testing.assert_allclose(np.sum(np.cumsum([end.u[0], *-end.u[1:]])), 2 * speed, rtol=1e-9, atol=1e-12)
 
 
-@pytest.fixture(scope="module")
-def collision():
-    """Largest force of a coupler while two vehicles run into two at rest, from numbers of the first draft gear."""
+@pytest.mark.slow
+def test_draft_gear_derivatives_of_the_largest_force_in_a_collision():
+    """Of two vehicles that run into two at rest, by numbers of the first draft gear."""
     mechanism = mb.mechanisms.longitudinal_train(
         n=4, speed=(0.0, 0.0, 3.0, 3.0), extension=(0.01, -0.02, 0.02), brake=0.0, resistance=(0, 0, 0)
     )
+    names = ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "travel", "transition_speed")
+    numbers = {f"coupler2.{name}": mb.parameters(mechanism.system)[f"coupler2.{name}"] for name in names}
+    times = jnp.linspace(0.0, 0.3, 61)
 
-    def peak(numbers, rtol, **options):
+    def peak(numbers, rtol):
         system = mb.with_parameters(mechanism.system, numbers)
-        sol = mb.simulate(
-            system, mechanism.state, t1=0.3, rtol=rtol, saveat=jnp.linspace(0.0, 0.3, 61), throw=False, **options
-        )
+        sol = mb.simulate(system, mechanism.state, t1=0.3, rtol=rtol, saveat=times, throw=False)
         tensions = jax.vmap(system.tensions)(sol.ys)[:, 1]
         # Not `jnp.min`: XLA may compute a number twice, rounded differently, and its derivative divides by the count
         # of numbers equal to the smallest.
         return -tensions[jnp.argmin(tensions)]
 
-    return peak, {
-        f"coupler2.{name}": mb.parameters(mechanism.system)[f"coupler2.{name}"]
-        for name in ("stiffness", "unloading", "preload", "slack", "stop_stiffness", "travel", "transition_speed")
-    }
-
-
-@pytest.mark.slow
-def test_derivatives_of_the_largest_force_in_a_collision(collision):
-    peak, numbers = collision
-    derivatives = jax.jit(jax.jacfwd(peak))
-    forward, exact = derivatives(numbers, 1e-10), derivatives(numbers, 1e-12)
+    derivatives = jax.jit(jax.jacfwd(lambda numbers, rtol: (peak(numbers, rtol),) * 2, has_aux=True))
+    (forward, _), (exact, _) = derivatives(numbers, 1e-10), derivatives(numbers, 1e-12)
     # Where a step crosses the kink of a draft gear depends on rounding, and so on the program: both agree as far as
     # the tolerance lets them.
     value, reverse = jax.jit(jax.value_and_grad(peak))(numbers, 1e-12)
-    tight = jax.jit(lambda numbers: peak(numbers, 1e-12))
     assert 1e5 < value < 1e7
     for name, number in numbers.items():
         h = 1e-5 * number
-        central = lambda h, name=name, number=number: (
-            (tight(numbers | {name: number + h}) - tight(numbers | {name: number - h})) / (2 * h)
-        )
+        at = lambda x, name=name: derivatives(numbers | {name: x}, 1e-12)[1]
+        central = lambda h, at=at, number=number: (at(number + h) - at(number - h)) / (2 * h)
         # Richardson's extrapolation: the stop bends the force over a millimetre.
         difference = (4 * central(h) - central(2 * h)) / 3
         np.testing.assert_allclose(exact[name], reverse[name], rtol=1e-9, atol=1e-9 * value / number, err_msg=name)
@@ -225,8 +203,8 @@ def random_state(system, rng, pitch=0.2):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n", [2, 3, 10, 50])
-def test_hinge_forces_are_those_of_one_matrix_of_all(n):
+@pytest.mark.parametrize("n", [2, 50])
+def test_train_on_hinges_has_the_forces_of_one_matrix_of_all(n):
     system = by_blocks(hinged(n).system)
     solve = jax.jit(lambda q, u: (accelerations(system, Multipliers(), 0.1, q, u), system.force(0.1, q, u)))
     rng = np.random.default_rng(n)
@@ -240,78 +218,13 @@ def test_hinge_forces_are_those_of_one_matrix_of_all(n):
         np.testing.assert_allclose(-multipliers.reshape(-1, 2), forces, rtol=0, atol=1e-12 * np.max(np.abs(forces)))
 
 
-def mixed_chains():
-    """Joints of one, two and three rows between the ground and bodies in no order, and a chain of its own."""
-    bodies = [planar.Body(name, mass=1.0 + k, inertia=0.1, position=(k, 0.1 * k)) for k, name in enumerate("abcdef")]
-    bodies.append(planar.PointMass("p", mass=0.5, position=(7.0, 1.0)))
-    joints = [
-        planar.Fixed("weld", "c", "a", point=(1.0, 0.3)),
-        planar.Distance("rod", "b", "a", length=1.0),
-        planar.Revolute("pin", "ground", "b", point=(0.7, 0.1)),
-        planar.PointOnLine("slot", "c", "ground", point=(2.5, 0.3), axis=(1.0, 0.0)),
-        planar.Revolute("own", "e", "d", point=(3.5, 0.2)),
-        planar.Distance("last", "p", "e"),
-        planar.KnifeEdge("blade", "d"),
-    ]
-    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81))]).compile()
-
-
-def hanging_spheres():
-    bodies = [
-        spatial.Body(f"b{k}", mass=1.0 + k, inertia=(0.2, 0.3, 0.4 + 0.02 * k), position=(k, 0.0, 0.0))
-        for k in range(4)
-    ]
-    joints = [spatial.Spherical("s0", "ground", "b0", point=(-0.5, 0.0, 0.0))]
-    joints += [spatial.Spherical(f"s{k}", f"b{k - 1}", f"b{k}", point=(k - 0.5, 0.1, 0.0)) for k in range(1, 4)]
-    return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))]).compile()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("build", [mixed_chains, hanging_spheres])
-def test_any_joints_in_chains(build):
-    system = build()
-    rng = np.random.default_rng(0)
-    structured = by_blocks(system)
-
-    @jax.jit
-    def solve(q, u, v):
-        cases = (structured, Multipliers()), (structured, Poincare()), (system, Multipliers())
-        blocks = structured.structured_jacobian(0.0, q, u)
-        products = [
-            [A.product(v), A.transpose_product(A.product(v)), A.matrix]
-            for A in (blocks.dense(), system.structured_jacobian(0.0, q, u))
-        ]
-        products.append([blocks.product(v), blocks.transpose_product(blocks.product(v)), products[0][2]])
-        return [accelerations(*case, 0.0, q, u) for case in cases], products
-
-    for _ in range(3):
-        q = system.normalize(0.0, system.guess.q + 0.1 * jnp.asarray(rng.normal(size=system.nq)))
-        for found in solve(q, *jnp.asarray(rng.normal(size=(2, system.nu)))):
-            for case in found[:-1]:
-                for a, b in zip(case, found[-1], strict=True):
-                    np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.max(np.abs(b)))
-
-
-@pytest.mark.slow
-def test_a_chain_in_space_moves_as_by_partitioning():
-    system = hanging_spheres()
-    cases = (system, Partition()), (system, Projection()), (by_blocks(system), Projection())
-    expected, *ends = [
-        mb.simulate(system, system.guess, t1=0.3, rtol=1e-10, manifold=manifold).ys for system, manifold in cases
-    ]
-    for end in ends:
-        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-7)
-        assert np.max(np.abs(system.coordinate_residual(0.3, end.q[-1]))) <= 1e-13
-
-
 def undamped(coupler):
     return mb.mechanisms.train(n=6, coupler=coupler, suspension_damping=0.0, resistance=0.0, brake=0.0, speed=1.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("coupler", "manifold"), [(LINEAR, None), (planar.Revolute, Projection())])
-def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
+def test_train_keeps_its_energy_and_hinges_closed(coupler, manifold):
     system = undamped(coupler).system
     rng = np.random.default_rng(1)
     push = mb.State(system.guess.q, system.guess.u + jnp.asarray(rng.normal(size=18) * np.tile([0.3, 0.3, 0.02], 6)))
@@ -324,14 +237,10 @@ def test_energy_is_kept_and_hinges_stay_closed(coupler, manifold):
         assert np.max(np.abs(jax.vmap(lambda y: system.velocity_residual(0.0, y.q, y.u))(sol.ys))) <= 1e-13
 
 
-@pytest.fixture(scope="module")
-def long_chain():
-    return mb.mechanisms.get("rod_chain", n=16)
-
-
 @pytest.mark.slow
-def test_long_chains_need_no_choice(long_chain):
+def test_rod_chain_of_many_needs_no_choice():
     """The same motion by both solvers' defaults, by blocks."""
+    long_chain = mb.mechanisms.get("rod_chain", n=16)
     assert "sparse elimination" in str(long_chain.system)
     ends = []
     for solver in (None, diffrax.Tsit5()):
@@ -341,29 +250,6 @@ def test_long_chains_need_no_choice(long_chain):
         ends.append(sol.ys)
     np.testing.assert_allclose(ends[0].q, ends[1].q, rtol=0, atol=1e-8)
     np.testing.assert_allclose(ends[0].u, ends[1].u, rtol=0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_derivatives_of_the_motion_of_a_long_chain(long_chain):
-    names = ("link3.mass", "link9.inertia", "pin5.point_a", "pin16.point_b")
-    numbers = {name: mb.parameters(long_chain.system)[name] for name in names}
-    direction = {"link3.mass": 0.05, "link9.inertia": 1e-5, "pin5.point_a": (0.01, 0.02), "pin16.point_b": (0.02, 0.01)}
-    direction = {name: jnp.asarray(value) for name, value in direction.items()}
-
-    def tip(numbers, rtol, **options):
-        system = mb.with_parameters(long_chain.system, numbers)
-        state = mb.manifold.project(system, 0.0, long_chain.state)
-        sol = mb.simulate(system, state, t1=0.2, rtol=rtol, throw=False, **options)
-        return jnp.sum(sol["link16"].position[-1]) + 0.1 * sol["link16"].angular_velocity[-1]
-
-    along = lambda h, rtol, **options: tip(jax.tree.map(lambda x, dx: x + h * dx, numbers, direction), rtol, **options)
-    forward = jax.jit(lambda h, rtol: jax.jvp(lambda h: along(h, rtol), (h,), (1.0,)))
-    reverse = jax.jit(jax.grad(lambda h: along(h, 1e-10)))
-    _, push = forward(0.0, 1e-10)
-    np.testing.assert_allclose(reverse(0.0), push, rtol=1e-10)
-    value, h = lambda h: forward(h, 1e-12)[0], 1e-3
-    difference = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
-    np.testing.assert_allclose(push, difference, rtol=1e-7)
 
 
 def ring(*more, bodies=4):
@@ -402,47 +288,38 @@ def dry_friction():
     return mb.Scene([body], joints=[pin], forces=[planar.Friction("rub", "pin", coefficient=0.3, radius=0.1)]).compile()
 
 
-def skater():
-    return mb.mechanisms.get("appell_hamel").system
+def check_refused(*cases):
+    for build, options, message in cases:
+        system = build()
+        with pytest.raises(ValueError, match=message):
+            mb.simulate(system, system.guess, t1=1.0, **({"manifold": Projection()} | options))
 
 
-@pytest.mark.slow("dry_friction-options2-Projection with Hermite takes constraints that are ideal")
-@pytest.mark.parametrize(
-    ("build", "options", "message"),
-    [
+def test_projection_with_adams_refuses_redundant_joints_and_other_formulations():
+    check_refused(
         (redundant, {}, r"only 3 are independent.*Partition\(\)"),
-        (pendulum_on_paper, {"solver": mb.solvers.Hermite()}, r"Projection with Hermite needs a scene.*Partition\(\)"),
-        (dry_friction, {"solver": mb.solvers.Hermite()}, "Projection with Hermite takes constraints that are ideal"),
         (ring, {"formulation": Poincare()}, r"Projection with Adams finds accelerations by Multipliers\(\)"),
-        (skater, {}, "linear in velocities"),
-        (lambda: mb.mechanisms.get("spherical_four_bar").system, {}, "inverse of the mass matrix"),
-    ],
-)
-def test_projection_with_adams_refuses(build, options, message):
-    system = build()
-    with pytest.raises(ValueError, match=message):
-        mb.simulate(system, system.guess, t1=1.0, **({"manifold": Projection()} | options))
-
-
-LOOP = planar.Distance("back", "b3", "b0", point_a=(0.2, 0.3))
-TWIN = planar.Distance("twin", "b0", "b1", point_a=(0.0, 1.0))
-FOOT = planar.Revolute("foot", "ground", "b1", point=(1.0, 0.0))
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "build",
-    [
-        lambda: ring(LOOP),
-        lambda: ring(TWIN, bodies=2),
-        lambda: ring(FOOT),
-        pendulum_on_paper,
-        turning_pendulum,
-        dry_friction,
-    ],
-)
-def test_other_joint_graphs_are_projected_with_a_dense_matrix(build):
-    """Loops, branches and systems without joints: the same motion as by partitioning, with its derivatives."""
+def test_projection_refuses_systems_that_are_no_ideal_scenes():
+    hermite = {"solver": mb.solvers.Hermite()}
+    check_refused(
+        (pendulum_on_paper, hermite, r"Projection with Hermite needs a scene.*Partition\(\)"),
+        (dry_friction, hermite, "Projection with Hermite takes constraints that are ideal"),
+        (lambda: mb.mechanisms.get("appell_hamel").system, {}, "linear in velocities"),
+        (lambda: mb.mechanisms.get("spherical_four_bar").system, {}, "inverse of the mass matrix"),
+    )
+
+
+LOOP = planar.Distance("back", "b3", "b0", point_a=(0.2, 0.3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("build", [lambda: ring(LOOP), turning_pendulum, dry_friction])
+def test_projection_of_other_joint_graphs_has_a_dense_matrix(build):
+    """Loops and systems without joints: the same motion as by partitioning, with its derivatives."""
     system = build()
     assert system.elimination is None
     rng = np.random.default_rng(0)
@@ -464,17 +341,6 @@ def test_other_joint_graphs_are_projected_with_a_dense_matrix(build):
     np.testing.assert_allclose(reverse, weights @ dfound, rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_partitioning_of_a_long_chain_still_works(long_chain):
-    """With either formulation when it is asked for."""
-    run = lambda **options: mb.simulate(long_chain.system, long_chain.state, t1=0.02, rtol=1e-9, **options).ys
-    expected = run()
-    for formulation in (None, Multipliers()):
-        end = run(manifold=Partition(), formulation=formulation)
-        np.testing.assert_allclose(end.q, expected.q, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(end.u, expected.u, rtol=0, atol=1e-6)
-
-
 # Cost
 
 
@@ -491,7 +357,7 @@ def largest(jaxpr):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute, planar.Distance])
-def test_program_and_memory_of_long_trains(coupler):
+def test_train_of_many_has_no_longer_program_and_little_memory(coupler):
     """As many instructions for any number of vehicles, and no array that grows faster than it."""
 
     def measure(n):
@@ -504,36 +370,3 @@ def test_program_and_memory_of_long_trains(coupler):
     (few, small), (many, large) = measure(40), measure(160)
     assert few == many
     assert large <= 4.2 * small
-
-
-@pytest.mark.slow
-@pytest.mark.skipif("PYTEST_XDIST_WORKER" in os.environ, reason="needs a machine for itself: no tests beside it")
-@pytest.mark.parametrize("coupler", [planar.DraftGear, planar.Revolute])
-def test_time_of_long_trains(coupler):
-    """Ten times as many vehicles take ten times as long; the bound leaves room for caches that overflow.
-
-    Those are shared with whatever else runs, which makes times of long trains several times as long: the shortest
-    count, of so many that something else has time to pass. The vehicles are moved a little, since of accelerations that
-    are zero in a straight train the solution is refined once or twice more, as rounding has it.
-    """
-    numbers = np.random.default_rng(0)
-    runs = {}
-    for n in (1000, 10000):
-        mechanism = mb.mechanisms.train(n=n, coupler=coupler)
-
-        @jax.jit
-        def several(system, q, u, repeats=100000 // n):
-            again = lambda _, u: u + 1e-9 * accelerations(system, Multipliers(), 0.1, q, u)[0]
-            return jax.lax.fori_loop(0, repeats, again, u)
-
-        q, u = (x + 1e-3 * numbers.normal(size=x.size) for x in (mechanism.state.q, mechanism.state.u))
-        runs[n] = functools.partial(several, mechanism.system, q, u)
-        runs[n]().block_until_ready()
-
-    times = dict.fromkeys(runs, np.inf)
-    for _ in range(500):
-        for n, run in runs.items():
-            start = time.perf_counter()
-            run().block_until_ready()
-            times[n] = min(times[n], (time.perf_counter() - start) * n / 100000)
-    assert times[10000] <= 12 * times[1000]

@@ -16,20 +16,9 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 
-def test_pages(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-q",
-        "-W",
-        "--keep-going",
-        "-E",
-        "-c",
-        "tests/pages",
-        ".",
-        str(tmp_path),
-    ]
+def test_pages_build_with_every_name_once(tmp_path):
+    options = ["-q", "-W", "--keep-going", "-E", "-c", "tests/pages"]
+    command = [sys.executable, "-m", "sphinx", *options, ".", str(tmp_path)]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout + run.stderr
     pages = {path.stem: path.read_text() for path in tmp_path.rglob("*.html")}

@@ -1,6 +1,9 @@
 """Reports of a user's own system and state: their errors are the true ones."""
 
+import functools
+import importlib
 import json
+import types
 
 import diffrax
 import numpy as np
@@ -9,6 +12,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.report import stress_test, work_precision
+
+stress = importlib.import_module("jaxmb.report.stress_test")
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +26,7 @@ def oscillator():
 
 
 @pytest.mark.slow
-def test_the_error_is_the_true_one(oscillator):
+def test_work_precision_has_the_true_error(oscillator):
     """Against the closed form, x = 1 + cos 3t; and an error that the reference cannot tell is no number."""
     system, state, t1 = oscillator
     tolerances = (1e-3, 1e-12)
@@ -40,7 +45,7 @@ def test_the_error_is_the_true_one(oscillator):
     assert tight == "small" and report.notes[-1].startswith("small: below the reference's accuracy")
 
 
-def test_what_is_asked_of_a_report(oscillator):
+def test_reports_that_cannot_be_are_refused(oscillator):
     system, state, _ = oscillator
     with pytest.raises(ValueError, match="needs a state"):
         work_precision(system, state)
@@ -52,8 +57,28 @@ def test_what_is_asked_of_a_report(oscillator):
         stress_test(system, state, t1=1.0, only=["length"])
 
 
+def test_stress_test_judges_the_error_at_the_end(oscillator, monkeypatch):
+    """Relative to the largest value along the motion; no number below ten times the accuracy of the reference."""
+    system, state, t1 = oscillator
+    trial = functools.partial(stress._Trial, "a case", lambda: (system, state, t1), 1e-8)
+    truth = np.array([[0.0], [4.0], [2.0]])
+    ended = lambda motion, result: types.SimpleNamespace(ys=(motion,), stats={"num_steps": 3}, result=result)
+    monkeypatch.setattr(stress, "_natural", lambda system, ys: ys)
+
+    def judged(end, known, result=mb.RESULTS.successful):
+        motion = np.array([[9.0], [9.0], [end]])
+        monkeypatch.setattr(stress, "_run", lambda *arguments: ended(motion, result))
+        case = stress._judge("a kind", trial(truth=(known,)), None)
+        return case.error, case.known_to
+
+    assert judged(2.4, ((truth,), 1e-3)) == (pytest.approx(0.1), pytest.approx(1e-2))
+    assert judged(2.004, ((truth,), 1e-3)) == ("small", pytest.approx(1e-2))
+    assert judged(2.4, None) == ("unknown", None)
+    assert judged(2.4, ((truth,), 1e-3), mb.RESULTS.max_steps_reached) == ("refused", None)
+
+
 @pytest.mark.slow
-def test_stress_of_a_scene(oscillator, tmp_path):
+def test_stress_test_of_a_scene(oscillator, tmp_path):
     """Errors of known motions; a spring too stiff for the steps allowed, and what does not apply."""
     system, state, t1 = oscillator
     report = stress_test(system, state, t1=t1, only=["rtol", "lengths", "initial speed", "doubled joint"])
@@ -72,7 +97,7 @@ def test_stress_of_a_scene(oscillator, tmp_path):
 
 
 @pytest.mark.slow
-def test_stress_of_a_scene_with_internal_states():
+def test_stress_test_of_a_scene_with_internal_states():
     """A rod with a motor that lags: its force counts among the errors, and variants start with it."""
     rod = planar.Body("rod", mass=2.0, inertia=0.3)
     pin = planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0))
@@ -93,7 +118,7 @@ def test_stress_of_a_scene_with_internal_states():
 
 
 @pytest.mark.slow
-def test_stress_of_a_pendulum(pendulum):
+def test_stress_test_of_a_pendulum(pendulum):
     """Every kind of variant of one body; the position below the pin is no singular one, but can be named."""
     system, state = pendulum
     report = stress_test(system, state, t1=1.0, singular={"rod.angle": -np.pi / 2})
@@ -105,20 +130,3 @@ def test_stress_of_a_pendulum(pendulum):
     assert errors["doubled joint", "1e-06 off"] == "refused" and "pin again" in str(report)
     assert all(isinstance(errors["stiffness", f"× 1e+0{k}"], float) for k in (2, 4))
     assert errors["stiffness", "× 1e+14"] == "refused" and "maximum number of solver steps" in str(report)
-
-
-@pytest.mark.slow
-def test_stress_of_a_machine_with_a_rotor_a_mimic_joint_and_a_servo():
-    """Variants whose masses alone change, while numbers of no known unit leave out those of other lengths."""
-    bodies = [planar.Body(name, mass=1.0, inertia=0.1, position=(x, 0.0)) for name, x in (("rod", 0.5), ("tip", 1.5))]
-    joints = [
-        planar.Revolute("pin", "ground", "rod", point=(0.0, 0.0)),
-        planar.Revolute("elbow", "rod", "tip", point=(1.0, 0.0)),
-        mb.JointInertia("rotor", "pin.angle", inertia=0.7),
-        mb.JointCoupling("mimic", "elbow.angle", "pin.angle", coefficients=(0.0, 0.5)),
-    ]
-    servo = mb.Actuator("servo", "pin.angle", control=0.3, gain=(50.0, 0.0, 0.0), bias=(0.0, -50.0, -5.0))
-    system = mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -9.81)), servo]).compile()
-    report = stress_test(system, mb.assemble(system), t1=0.3, only=["mass", "lengths"])
-    assert report.notes[-1].startswith("lengths: left out, the units of mimic.coefficients, servo.control, servo.gain")
-    assert len(report.rows) == 6 and all(error < 1e-8 for error in report["error"])

@@ -1,8 +1,10 @@
 """Work–precision reports: errors, references, and what is written."""
 
 import dataclasses
+import importlib
 import json
 import sys
+import types
 
 import diffrax
 import jax
@@ -15,6 +17,8 @@ from jaxmb import mechanisms
 from jaxmb.report import Table, work_precision
 from jaxmb.report.reference import reference
 from jaxmb.solvers import Adams
+
+work_precision_module = importlib.import_module("jaxmb.report.work_precision")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +37,8 @@ def precision(pendulum):
 
 
 @pytest.mark.slow
-def test_errors_fall_with_the_tolerance(precision):
+def test_work_precision_has_errors_that_fall_with_the_tolerance(precision, tmp_path, monkeypatch):
+    """In a table for a terminal and for a notebook, plain data, and a picture with these."""
     runs = {(run["solver"], run["rtol"]): run for run in precision.to_dict()["rows"]}
     for solver in ("Adams", "Dopri8"):
         loose, tight = runs[solver, 1e-5], runs[solver, 1e-9]
@@ -42,11 +47,6 @@ def test_errors_fall_with_the_tolerance(precision):
         for run in (loose, tight):
             assert 0 < run["run [ms]"] <= run["median"] < 1e3 * run["compile [s]"]
             assert 0 <= run["rejected"] < run["steps"]
-
-
-@pytest.mark.slow
-def test_forms(precision, tmp_path):
-    """A table for a terminal and for a notebook, plain data, and a picture with these."""
     assert len(str(precision).splitlines()) == 1 + 1 + 4 + 1
     assert "elliptic functions" in str(precision)
     assert precision._repr_html_().count("<tr>") == 5 and "elliptic functions" in precision._repr_html_()
@@ -58,9 +58,22 @@ def test_forms(precision, tmp_path):
     precision.figure(tmp_path / "figure.svg")
     assert "&quot;evaluations&quot;" in (text := (tmp_path / "figure.svg").read_text()) or '"evaluations"' in text
     precision.figure(tmp_path / "figure.pdf")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"jaxmb\[plot\]"):
+        precision.figure(tmp_path / "figure.png")
 
 
-def test_a_table_in_words():
+def test_work_precision_counts_the_error_at_the_end(pendulum):
+    """The largest one relative to the scale of its label; no number below the accuracy of the reference."""
+    known = mechanisms.References([0.5, 1.0], ("x", "y"), [[1.0, 4.0], [2.0, 0.0]], "here", 1e-9)
+    for end, expected in ((2e-6, 1e-6), (1e-12, "small")):
+        values = {"x": np.array([1.3, 2.0 + end]), "y": np.array([4.0, 1e-12])}
+        own = dataclasses.replace(pendulum, observe=lambda _, values=values: values)
+        found = work_precision_module._error(own, known, types.SimpleNamespace(ts=known.times))
+        assert found == (pytest.approx(expected, rel=1e-6) if expected != "small" else "small")
+
+
+def test_table_in_words():
     rows = [("one", 0.5, 3), ("other", "small", None)]
     table = Table("a <title>", {"name": "", "x": ".1e", "n": "d"}, rows, ["a note"])
     lines = ["name         x  n", "one    5.0e-01  3", "other    small  –"]
@@ -71,7 +84,7 @@ def test_a_table_in_words():
 
 
 @pytest.mark.slow
-def test_computed_reference(pendulum):
+def test_reference_that_is_computed(pendulum):
     """Without published values: two methods two orders tighter, which agree with each other and with those."""
     known = reference(dataclasses.replace(pendulum, references=None), 1e-9)
     assert "Dopri8" in known.source
@@ -82,20 +95,13 @@ def test_computed_reference(pendulum):
 
 
 @pytest.mark.slow
-def test_failed_run_keeps_its_row(pendulum):
+def test_work_precision_keeps_the_row_of_a_failed_run(pendulum):
     lost = dataclasses.replace(pendulum, state=jax.tree.map(lambda x: x * jnp.nan, pendulum.state))
     failed = work_precision(lost, solvers={"Tsit5": diffrax.Tsit5()}, tolerances=(1e-5,), repeats=1)
     assert failed["error"] == ["failed"] and failed.notes[-1].startswith("Tsit5 at 1e-05: ")
 
 
-def test_no_arguments_to_work_with(pendulum):
+def test_work_precision_without_arguments_to_work_with_is_refused(pendulum):
     for arguments in ({"solvers": {}}, {"tolerances": ()}, {"repeats": 0}):
         with pytest.raises(ValueError, match="at least one"):
             work_precision(pendulum, **arguments)
-
-
-@pytest.mark.slow
-def test_figures_without_matplotlib(precision, monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"jaxmb\[plot\]"):
-        precision.figure(tmp_path / "figure.png")

@@ -9,7 +9,9 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar
+from jaxmb.simulate.outcome import about_lost_rank
 from jaxmb.states.consistency import not_finite
+from jaxmb.states.refusals import LostRank
 
 CRANK, ROD = 0.3, 0.8
 REACH = CRANK + ROD
@@ -36,11 +38,6 @@ def slider_crank(angle, *drivers):
 @pytest.fixture(scope="module")
 def machine():
     return slider_crank(0.6)[0]
-
-
-@pytest.fixture(scope="module")
-def straight():
-    return slider_crank(0.0)[0]
 
 
 @pytest.fixture(scope="module")
@@ -83,17 +80,20 @@ def test_coordinates_beyond_the_reach_of_a_bar_that_is_drawn_at_it(bar):
     np.testing.assert_allclose(mb.assemble(bar, raised, fix={"bar.x": 0.4}).q[2], np.arccos(0.8), rtol=1e-12)
 
 
-@pytest.mark.slow(but=("piston.y",))
-@pytest.mark.parametrize("rate", ["slide.displacement", "piston.x", "piston.y"])
-def test_rates_that_a_position_forbids(straight, rate):
-    """At the dead centre the piston stands still, and across its guide it always does."""
-    with pytest.raises(ValueError, match=f"with the rates {rate} fixed: in this configuration .* determine {rate}"):
-        mb.assemble(straight, rates={rate: 0.1})
-
-
-def test_rates_that_contradict_each_other(machine):
+def test_rates_that_cannot_be_fixed(machine):
+    """Across its guide the piston always stands still, and two rates of one freedom contradict each other."""
+    with pytest.raises(ValueError, match=r"with the rates piston.y fixed: in this configuration .* determine piston.y"):
+        mb.assemble(machine, rates={"piston.y": 0.1})
     with pytest.raises(ValueError, match=r"with the rates .*crank.angle.* fixed: these contradict each other"):
         mb.assemble(machine, rates={"crank.angle": 1.0, "rod.angle": 1.0})
+
+
+@pytest.mark.slow
+def test_rates_that_a_dead_centre_forbids():
+    straight = slider_crank(0.0)[0]
+    for rate in ("slide.displacement", "piston.x"):
+        with pytest.raises(ValueError, match=f"with the rates {rate} fixed: in this configuration .* determine {rate}"):
+            mb.assemble(straight, rates={rate: 0.1})
 
 
 METHODS = {
@@ -103,30 +103,34 @@ METHODS = {
 }
 
 
-@pytest.fixture(scope="module")
-def pulled():
-    """The piston is pulled at 0.05 m/s to its dead centre and beyond."""
+@pytest.mark.slow
+def test_drive_that_leaves_its_reach_is_named():
+    """A piston is pulled at 0.05 m/s to its dead centre and beyond: by one result, with every way to stay on the
+    constraints, at the time at which it does.
+    """
     _, start = slider_crank(0.6)
-    return slider_crank(0.6, mb.JointDriver("pull", "slide.displacement", value=start, rate=0.05))[0], start
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_a_drive_that_leaves_its_reach_is_named(pulled, method):
-    """By one result, with every way to stay on the constraints, at the time at which it does."""
-    system, start = pulled
+    system = slider_crank(0.6, mb.JointDriver("pull", "slide.displacement", value=start, rate=0.05))[0]
     when = (REACH - start) / 0.05
-    run = lambda **given: mb.simulate(system, mb.assemble(system), t1=2 * when, **METHODS[method] | given)
-    assert run(throw=False).result == mb.RESULTS.singular_configuration
-    with pytest.raises(RuntimeError, match=r"'pull' prescribes leaves its reach") as error:
-        run()
-    found = re.match(r"The motion came to t = (\S+) of ", str(error.value))
-    np.testing.assert_allclose(float(found[1]), when, rtol=1e-5)
-    assert "friction" not in str(error.value)
+    for options in METHODS.values():
+        run = lambda options=options, **given: mb.simulate(system, mb.assemble(system), t1=2 * when, **options | given)
+        assert run(throw=False).result == mb.RESULTS.singular_configuration
+        with pytest.raises(RuntimeError, match=r"'pull' prescribes leaves its reach") as error:
+            run()
+        found = re.match(r"The motion came to t = (\S+) of ", str(error.value))
+        np.testing.assert_allclose(float(found[1]), when, rtol=1e-5)
+        assert "friction" not in str(error.value)
+
+
+def test_drive_that_leaves_its_reach_is_told_apart_from_joints_that_lock():
+    """By the joints that lose their rank, and by the drives among them."""
+    said = {n: about_lost_rank(LostRank(["P", "Q"], ["pull", "push"][:n])) for n in (0, 1, 2)}
+    assert "the constraints of P, Q are no longer independent, and the motion beyond is not determined" in said[0]
+    assert "the motion that 'pull' prescribes leaves its reach" in said[1]
+    assert "'pull' and 'push' prescribes leave their reach" in said[2]
 
 
 @pytest.mark.slow
-def test_a_large_mechanism_tells_the_same():
+def test_drive_of_a_large_mechanism_that_leaves_its_reach_is_named():
     """Sparse elimination does not look at ranks: a drive of one of many arms leaves its reach."""
     bodies, joints = [], []
     for k in range(10):
@@ -178,7 +182,7 @@ def two_loops(name, off):
 @pytest.mark.parametrize(
     ("name", "off"), [("F", (4.0, 1.0)), ("B", (5.0, 3.0)), ("G", (0.0, -7.0))], ids=["F", "B", "G"]
 )
-def test_a_point_far_off_is_of_the_joint_that_is_named(name, off):
+def test_joint_whose_point_is_far_off_is_named(name, off):
     with pytest.raises(ValueError, match=f"Without {name} the other joints close, and it then misses by about"):
         two_loops(name, off).compile()
 
@@ -202,7 +206,7 @@ def four_bar(crank, coupler, rocker, base):
 
 @pytest.mark.slow(but=("short",))
 @pytest.mark.parametrize("lengths", [(0.3, 0.5, 0.3, 2.0), (0.2, 3.0, 0.2, 1.0)], ids=["short", "long"])
-def test_what_lengths_of_a_loop_cannot_reach(lengths):
+def test_loop_whose_lengths_cannot_reach_is_told_by_how_much(lengths):
     """The longest side less the sum of the others."""
     with pytest.raises(ValueError, match=r"Without any one of p0, p1, p2, p3 the others close.*miss by about") as error:
         four_bar(*lengths).compile()
@@ -211,31 +215,24 @@ def test_what_lengths_of_a_loop_cannot_reach(lengths):
 
 
 @pytest.mark.slow
-def test_a_joint_that_parameters_move_far_off_is_named():
+def test_joint_that_parameters_move_far_off_is_named():
     system = two_loops("F", (0.0, 0.0)).compile()
     changed = mb.with_parameters(system, {"F.point_b": jnp.array([4.0, 1.5])})
     with pytest.raises(ValueError, match="Without F the other joints close"):
         mb.assemble(changed)
-
-
-def test_entries_of_a_state_that_are_not_finite_are_named():
-    bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
-    system = mb.Scene([bar], joints=[planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))]).compile()
-    q, u = system.guess.q, system.guess.u
-    wrong = mb.State(q.at[1].set(jnp.nan), u)
-    for function in (mb.assemble, mb.equilibrium):
-        with pytest.raises(ValueError, match=rf"{function.__name__}: the guess is not finite: bar\.y \(nan\)"):
-            function(system, wrong)
-    with pytest.raises(ValueError, match=r"the guess is not finite: bar\.angle_rate \(inf\)"):
-        mb.assemble(system, mb.State(q, u.at[2].set(jnp.inf)))
-    with pytest.raises(ValueError, match=r"fixed coordinates are not finite: bar\.angle \(nan\)"):
-        mb.assemble(system, fix={"bar.angle": np.nan})
-    assert not_finite(system, q=np.full(3, np.nan), u=np.zeros(3)) == "bar.x (nan), bar.y (nan), bar.angle (nan)"
-
-
-@pytest.mark.slow
-def test_a_motion_from_a_state_that_is_not_finite_names_the_entry():
-    system = two_loops("F", (0.0, 0.0)).compile()
     wrong = mb.State(system.guess.q.at[2].set(jnp.nan), system.guess.u)
     with pytest.raises(RuntimeError, match=r"assembly_gap.* Not finite: c\.angle \(nan\)\."):
         mb.simulate(system, wrong, t1=0.1)
+
+
+def test_entries_of_a_state_that_are_not_finite_are_named(bar):
+    q, u = np.asarray(bar.guess.q), np.asarray(bar.guess.u)
+    at = lambda values, k, x: np.where(np.arange(3) == k, x, values)
+    for function in (mb.assemble, mb.equilibrium):
+        with pytest.raises(ValueError, match=rf"{function.__name__}: the guess is not finite: bar\.y \(nan\)"):
+            function(bar, mb.State(at(q, 1, np.nan), u))
+    with pytest.raises(ValueError, match=r"the guess is not finite: bar\.angle_rate \(inf\)"):
+        mb.assemble(bar, mb.State(q, at(u, 2, np.inf)))
+    with pytest.raises(ValueError, match=r"fixed coordinates are not finite: bar\.angle \(nan\)"):
+        mb.assemble(bar, fix={"bar.angle": np.nan})
+    assert not_finite(bar, q=np.full(3, np.nan), u=np.zeros(3)) == "bar.x (nan), bar.y (nan), bar.angle (nan)"

@@ -29,13 +29,13 @@ class Angle(eqx.Module, Keeper):
         return jnp.sin(self.x)
 
 
-def test_a_quantity_is_computed_once_in_a_trace():
+def test_instant_computes_a_quantity_once_in_a_trace():
     assert counted(lambda x: (lambda angle: angle.sine + angle.sine)(Angle(x)), 0.3) == 1
     assert counted(lambda x: Angle(x).sine + Angle(x).sine, 0.3) == 2
 
 
 @pytest.mark.slow
-def test_quantities_of_branches_loops_and_derivatives_stay_there():
+def test_instant_leaves_quantities_in_branches_loops_and_derivatives():
     def program(x):
         angle = Angle(x)
         branch = lax.cond(x > 0, lambda: angle.sine, lambda: 2 * angle.sine)
@@ -49,7 +49,7 @@ def test_quantities_of_branches_loops_and_derivatives_stay_there():
     np.testing.assert_allclose(jax.grad(program)(0.3), 7 * np.cos(0.3), rtol=1e-6)
 
 
-def test_a_copy_keeps_nothing():
+def test_instant_whose_copy_keeps_nothing():
     at = four_bar()
     force = at.force
     assert at.force is force
@@ -57,12 +57,24 @@ def test_a_copy_keeps_nothing():
     assert jax.tree.structure(at) == jax.tree.structure(four_bar())
 
 
-def test_what_the_equation_has():
+def test_instant_has_what_the_equation_has():
     at = four_bar()
-    system, (t, q, u) = at.system, (at.t, at.q, at.u)
-    residual = system.acceleration_residual(t, q, u, u)
-    np.testing.assert_allclose(at.jacobian @ u - residual, at.gamma, rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(at.rates, system.rates(t, q, u))
-    udot = jnp.ones_like(u)
+    system, q, u = at.system, np.asarray(at.q), np.asarray(at.u) + 0.1 * np.eye(9)[0]
+
+    @jax.jit
+    def evaluate(q, u):
+        at = Instant.of(system, 0.0, mb.State(q, u))
+        of_rows = at.jacobian @ u - system.acceleration_residual(0.0, q, u, u)
+        sizes = at.row_sizes()
+        return of_rows, at.gamma, at.rates, system.rates(0.0, q, u), sizes, at.velocity_residual, at.violations(sizes)
+
+    of_rows, gamma, rates, expected, sizes, unmet, (positions, velocities) = evaluate(q, u)
+    np.testing.assert_allclose(of_rows, gamma, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(rates, expected)
+    # Corrections of velocities are relative to the largest velocity, which is not one.
+    speed = np.max(np.abs(u) / np.asarray(system.velocity_scale()))
+    np.testing.assert_allclose(velocities, np.abs(unmet) / sizes / speed, rtol=1e-5, atol=1e-9)
+    assert np.max(velocities) > 1e-3 and np.max(positions) < 1e-6 and abs(speed - 1.0) > 0.1
+    udot = jnp.ones_like(at.u)
     assert at.motion(udot).u is udot and at.motion(udot).z is None
     assert at.position_rows.size == at.velocity_rows.size == system.acceleration_rows

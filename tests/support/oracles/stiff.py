@@ -1,4 +1,4 @@
-"""Mechanisms with stiff springs and dampers in minimal coordinates, with equations of their own: NumPy and SciPy only.
+"""Mechanisms with stiff springs and dampers in minimal coordinates, with equations of their own: NumPy only.
 
 Each model gives accelerations `q̈(q, q̇)` and observed values; `motion` integrates it.
 """
@@ -7,7 +7,6 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,24 +185,3 @@ def _extrapolated(right, y, step, columns):
             ratio = (now.dtype.type(k) / (k - j)) ** 2
             row.append(row[-1] + (row[-1] - value) / (ratio - 1))
     return row[-1]
-
-
-def implicit_motion(model, times, *, rtol=1e-12):
-    """Observed values at `times` by the Radau IIA method of order 5 in double precision, for a model in it; Jacobian
-    by complex steps.
-    """
-    n = model.q.size
-    right = lambda y: np.concatenate([y[n:], model.acceleration(y[:n], y[n:])])
-    tiny = 1e-30
-    jacobian = lambda t, y: np.stack([right(y + 1j * tiny * e).imag / tiny for e in np.eye(2 * n)], axis=1)
-    solution = solve_ivp(
-        lambda t, y: right(y),
-        (0.0, times[-1]),
-        np.concatenate([model.q, model.rates]),
-        method="Radau",
-        t_eval=times,
-        jac=jacobian,
-        rtol=rtol,
-        atol=rtol * 1e-3,
-    )
-    return np.array([model.observe(y[:n], y[n:]) for y in solution.y.T])

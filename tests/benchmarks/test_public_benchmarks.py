@@ -16,25 +16,26 @@ import jaxmb as mb
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number, bound", [("A01", 1e-7), ("A02", 1e-7), ("A03", 1e-7), ("A04", 1e-7), ("A05", 1e-8)])
-def test_the_iftomm_library(number, bound):
+@pytest.mark.parametrize("number, bound", [("A01", 1e-7), ("A03", 1e-7)])
+def test_iftomm_problem_is_solved(number, bound):
     case = CASES[number]
-    mechanism, t1 = case.mechanism(), float(case.times[-1])
-    times = np.union1d(case.times[:: len(case.times) // 50], mechanism.references.times)
-    times = times[times <= t1]
+    mechanism, t1 = case.mechanism(), min(float(case.times[-1]), 2.0)
+    times = case.times[:: len(case.times) // 50]
+    times = np.append(times[times < t1], t1)
     motion = mb.simulate(mechanism.system, mechanism.state, t1=t1, saveat=times, rtol=1e-8, solver=case.solver)
     assert case.error(mechanism, motion) < bound
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damping", EIGENVALUES)
-def test_the_eigenvalues_of_a_four_bar_with_a_diagonal_spring(damping):
+def test_iftomm_four_bar_with_a_diagonal_spring_has_its_eigenvalues(damping):
     assert eigenvalue_error(damping)[1] < 2e-10
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, digits", [("andrews", 8.0), ("car_axis", 6.5), ("fekete", 9.0), ("wheelset", 5.0)])
-def test_the_test_set_for_initial_value_problem_solvers(name, digits):
+@pytest.mark.parametrize("name, digits", [("fekete", 9.0), ("wheelset", 5.0)])
+def test_ivp_test_set_is_solved(name, digits):
+    """Its other mechanisms, Andrews's and the car's axis, are those of the library."""
     problem = PROBLEMS[name]()
     system, state = problem.build()
     motion = mb.simulate(system, state, t1=problem.t1, rtol=1e-8)
@@ -43,7 +44,7 @@ def test_the_test_set_for_initial_value_problem_solvers(name, digits):
 
 
 @pytest.mark.slow
-def test_the_wheels_touch_where_the_source_says():
+def test_wheelset_touches_where_the_source_says():
     q = jnp.asarray(np.append(wheelset.COORDINATES, 0.0))
     for side, known in zip(wheelset.SIDES.values(), wheelset.CONTACTS, strict=True):
         found = wheelset.contact(side, q)
@@ -62,7 +63,7 @@ def test_radau5_solves_the_equations_in_the_coordinates_of_the_test_set(name, bo
     assert run.ok and relative(problem.end_of(run), problem.exact) < bound
 
 
-def test_the_time_at_an_error_is_that_of_the_best_runs_about_it():
+def test_seconds_at_an_error_are_those_of_the_best_runs_about_it():
     points = [Point(1e-3, 1e-2, 1.0), Point(1e-4, 3e-2, 5.0), Point(1e-5, 1e-4, 4.0), Point(1e-6, 1e-6, 16.0)]
     assert seconds_at(points, 1e-3) == pytest.approx(2.0)
     assert seconds_at(points, 1e-5) == pytest.approx(8.0)
