@@ -6,9 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 
+from .._compat import custom_vmap
 from .._setup import computes_side_by_side
 from ..linalg.members import in_blocks
 from .evaluate import in_lanes

@@ -62,8 +62,6 @@ PRIVATE_ATTRIBUTES = {
     *("custom_batching", "weak_type", "canonicalize_dtype", "unvmap_any", "scan_kind", "with_stepsize_controller_tols"),
     *("backends_are_initialized", "_enumeration", "_name_to_item", "_index_to_message", "_processes", "LRUCache"),
 }
-# What `_compat` has under the same name.
-ELSEWHERE = {("lanes.members", "jax.custom_batching.custom_vmap")}
 
 
 @functools.cache
@@ -182,9 +180,7 @@ def test_only_compat_uses_private_names_which_exist():
             whole = f"{source}.{name}" if name else source
             if source.startswith("__future__") or not (is_private(source) or whole.startswith(PRIVATE_MODULES)):
                 continue
-            if module != "_compat":
-                about = f"{module} imports {whole}: private names of other packages belong in _compat.py"
-                assert (module, whole) in ELSEWHERE, about
+            assert module == "_compat", f"{module} imports {whole}: private names of other packages belong in _compat.py"
             package = source.split(".")[0]
             about = f"{package} {importlib.metadata.version(package)} has no {whole}, which jaxmb._compat uses"
             try:

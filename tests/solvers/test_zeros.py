@@ -10,7 +10,7 @@ import pytest
 from jaxtyping import Array
 
 from jaxmb.solvers import events
-from jaxmb.solvers.manifold_term import AbstractGuards
+from jaxmb.solvers.manifold_term import AbstractGuards, GuardsSeen
 
 FUNCTIONS = {
     "line": (lambda s: 0.37 - s, 8),
@@ -48,11 +48,9 @@ class Dip(AbstractGuards):
     def near(self):
         return 100 * self.touch
 
-    def values(self, t, y):
-        return ((t - self.first) * (t - self.last))[None]
-
-    def rates(self, t, y):
-        return (2 * t - self.first - self.last)[None]
+    def seen(self, t, y):
+        value, rate = (t - self.first) * (t - self.last), 2 * t - self.first - self.last
+        return GuardsSeen(value[None], rate[None])
 
     def forces(self, y):
         return jnp.array([False])
@@ -82,20 +80,14 @@ class Slip(AbstractGuards):
     near: Array
     is_new: bool = eqx.field(static=True)
 
-    def values(self, t, y):
-        return y
-
-    def rates(self, t, y):
-        return jnp.full_like(y, jnp.inf)
+    def seen(self, t, y):
+        return GuardsSeen(y, jnp.full_like(y, jnp.inf), y <= self.touch if self.is_new else None)
 
     def forces(self, y):
         return jnp.zeros_like(y, bool)
 
     def changed(self, before, after):
         return jnp.any(before != after)
-
-    def begins(self, t, y):
-        return y <= self.touch if self.is_new else None
 
 
 @functools.partial(jax.jit, static_argnums=0)

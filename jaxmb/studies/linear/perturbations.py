@@ -57,7 +57,8 @@ class Perturbations(eqx.Module):
 
 def joined(state: State) -> Float[Array, "n"]:
     """Coordinates, velocities and internal states in one vector."""
-    return jnp.concatenate(jax.tree.leaves(state))
+    # Full turns of joints in space have no perturbations.
+    return jnp.concatenate([x for x in (state.q, state.u, state.z) if x is not None])
 
 
 def parted(system: AbstractSystem, x: Array) -> State:
