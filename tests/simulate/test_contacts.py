@@ -12,12 +12,13 @@ import numpy as np
 import optimistix
 import pytest
 from compiling import jit_quickly
-from scenarios import Scenario
+from scenarios import Derived, Scenario
+from scipy.optimize import brentq
 
 import jaxmb as mb
 from jaxmb import manifold, planar, spatial, terrain
 from jaxmb.manifold import Projection
-from jaxmb.solvers import Hermite
+from jaxmb.solvers import Hermite, restarts
 
 G = 9.81
 DOWN, DOWN_3D = mb.Gravity((0.0, -G)), mb.Gravity((0.0, 0.0, -G))
@@ -343,6 +344,247 @@ def particle_that_leaves_a_sphere():
     at, speed, late = np.arccos(leaves), np.sqrt(G * leaves), 0.2
     flight = np.array([np.sin(at), leaves]) + late * speed * np.array([leaves, -np.sin(at)]) - [0.0, G * 0.02]
     return Scenario(system, time + late, [("sphere", "open", time)], {"p.position": flight})
+
+
+# Derivatives
+
+DERIVED = {}
+
+
+def derived(function):
+    DERIVED[function.__name__] = function
+    return function
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DERIVED)
+def test_derivatives_are_those_of_closed_forms(name):
+    DERIVED[name]().check()
+
+
+@derived
+def bounces():
+    """Height, speed and events by the restitution, the stop, the state at the start and the end; the members of a
+    batch have two to six impacts.
+    """
+
+    def end(x, rtol):
+        options = {"rtol": rtol, "max_steps": 300, "max_events": 16}
+        motion = mb.simulate(changed(x[0], x[1]), dropped(x[2], x[3]), t1=x[4], **options)
+        events = motion.events
+        return jnp.concatenate(
+            [motion.ys.q[-1, 1:2], motion.ys.u[-1, 1:2], events.times[:2], events.impulses[:2, 0],
+             events.kinetic_energy_lost[:2]]
+        )  # fmt: skip
+
+    def exact(x):
+        restitution, lower, start, speed, t1 = x
+        falls = jnp.sqrt(speed**2 + 2 * G * (start - lower))
+        time, found = (speed + falls) / G, []
+        for _ in range(16):
+            found.append((time, 2.0 * (1 + restitution) * falls, falls**2 * (1 - restitution**2)))
+            after, left = restitution * falls, t1 - time
+            y, v = lower + after * left - G / 2 * left**2, after - G * left
+            # It has not yet come down again.
+            falls, time = after, time + 2 * after / G
+            if time > t1:
+                return jnp.concatenate([jnp.stack([y, v]), *(jnp.stack(own) for own in zip(*found[:2], strict=True))])
+
+    many = [[0.8, 0.1, 1.0, -0.4, 1.9], [0.95, -0.5, 1.0, -0.4, 1.9], [0.7, 0.3, 1.0, -0.4, 1.87]]
+    return Derived(end, many[0], exact, many=many)
+
+
+@derived
+def particle_that_falls_on_a_sphere():
+    """It closes the contact, slides down and leaves: the place, and the times of both events."""
+    system = mb.Scene(
+        [planar.PointMass("p", mass=0.7, position=(0.3, 1.3))],
+        joints=[mb.RigidBallContact("sphere", "ground", "p", radius_a=1.0, radius_b=0.0)],
+        forces=[DOWN],
+    ).compile()
+    start = mb.assemble(system)
+
+    def end(x, rtol):
+        own = mb.with_parameters(system, {"sphere.radius_a": x[0]})
+        state = dataclasses.replace(start, q=start.q.at[0].set(x[1]))
+        motion = mb.simulate(own, state, t1=0.9, rtol=rtol, max_steps=400, max_events=16)
+        return jnp.concatenate([motion.ys.q[-1, :2], motion.events.times[:2]])
+
+    return Derived(end, [1.0, 0.3], near=1e-6)
+
+
+@derived
+def particle_that_is_pushed_off_its_floor():
+    """By more and more: it leaves when nothing acts on it altogether."""
+    forces = [mb.Gravity((0.0, -10.0)), planar.PointForce("push", "ball", force=(0.0, 0.0))]
+    floor = mb.RigidContact("floor", "ball", terrain=FLAT)
+    system = mb.Scene([planar.PointMass("ball", mass=1.0)], joints=[floor], forces=forces).compile()
+    state = mb.assemble(system)
+
+    def end(x, rtol):
+        push = {"push.force": lambda t: jnp.stack([0.0 * t, 10.0 * t / x[0]])}
+        motion = mb.simulate(system, state, t1=2.0, inputs=push, rtol=rtol, max_steps=300, max_events=8)
+        return motion.events.times[:1]
+
+    return Derived(end, [1.0], lambda x: x)
+
+
+@derived
+def pull_that_sets_in_and_ends():
+    """While a ball falls onto a stop, and after the impact: by its size, both times and the restitution."""
+    system = mb.with_parameters(BALL, {"gravity.acceleration": (0.0, -10.0)})
+    state = dropped(0.2)
+
+    def end(x, rtol):
+        pull = {"lift.force": lambda t: jnp.where((t < x[1]) | (t >= x[2]), 0.0, x[0])}
+        own, options = mb.with_parameters(system, {"floor.restitution": x[3]}), {"max_steps": 400, "max_events": 8}
+        motion = mb.simulate(own, state, t1=0.4, inputs=pull, jumps=x[1:3], rtol=rtol, **options)
+        own = motion["ball"]
+        return jnp.concatenate([own.position[-1, 1:], own.velocity[-1, 1:], motion.events.times[:1]])
+
+    def exact(x):
+        less = 10.0 - x[0] / 2.0
+        y, v = 0.2 - 5.0 * x[1] ** 2, -10.0 * x[1]
+        falls = (v + jnp.sqrt(v**2 + 2 * less * y)) / less
+        v, back = x[3] * (less * falls - v), x[2] - x[1] - falls
+        y, v, left = v * back - less / 2 * back**2, v - less * back, 0.4 - x[2]
+        return jnp.stack([y + v * left - 5.0 * left**2, v - 10.0 * left, x[1] + falls])
+
+    return Derived(end, [8.0, 0.1, 0.3, 0.5], exact)
+
+
+@derived
+def ball_on_a_floor_that_vibrates():
+    """It lands without a rebound, rides, and lifts off where the floor falls as gravity does."""
+    floor = mb.RigidContact("floor", "ball", terrain=FLAT)
+    ball = planar.PointMass("ball", mass=1.3, position=(0.0, 0.25))
+    system = mb.Scene([ball], joints=[floor], forces=[DOWN]).compile()
+    start = mb.assemble(system)
+
+    def end(x, rtol):
+        amplitude, frequency, gravity = x
+        wave = {"floor.terrain.level": lambda t: amplitude * jnp.sin(frequency * t)}
+        own = mb.with_parameters(system, {"gravity.acceleration": jnp.stack([0.0 * gravity, -gravity])})
+        motion = mb.simulate(own, start, t1=0.5, inputs=wave, rtol=rtol, max_steps=400, max_events=8)
+        events = motion.events
+        return jnp.concatenate([motion.ys.q[-1, 1:2], motion.ys.u[-1, 1:2], events.times[:2], events.impulses[:1, 0]])
+
+    def exact(x):
+        amplitude, frequency, gravity = x
+        gap = lambda t: 0.25 - gravity / 2 * t**2 - amplitude * np.sin(frequency * t)
+        lands = brentq(gap, 0.2, 0.27, xtol=1e-15, rtol=1e-14)
+        leaves = (2 * np.pi + np.arcsin(gravity / (amplitude * frequency**2))) / frequency
+        impulse = 1.3 * (amplitude * frequency * np.cos(frequency * lands) + gravity * lands)
+        v, left = amplitude * frequency * np.cos(frequency * leaves), 0.5 - leaves
+        y = amplitude * np.sin(frequency * leaves) + v * left - gravity / 2 * left**2
+        return np.array([y, v - gravity * left, lands, leaves, impulse])
+
+    return Derived(end, [0.05, 18.0, G], exact, traced=False, values=1e-8, near=1e-6)
+
+
+@derived
+def particle_on_a_slope_that_rises():
+    """Dry friction on it is that under a gravity which is larger by the acceleration of the ground."""
+    gradient = 0.6
+    floor = mb.RigidContact("floor", "p", terrain=terrain.Slope(-gradient))
+    rub = mb.DryFriction("rub", "floor", coefficient=0.3)
+    system = mb.Scene([planar.PointMass("p", mass=1.3)], joints=[floor], forces=[DOWN, rub]).compile()
+    start = mb.assemble(system, fix={"floor.mode": 1})
+
+    def end(x, rtol):
+        wave = {"floor.terrain.level": lambda t: x[0] * (1 - jnp.cos(x[1] * t))}
+        own = mb.with_parameters(system, {"rub.coefficient": x[2]})
+        motion = mb.simulate(own, start, t1=0.5, inputs=wave, rtol=rtol, max_steps=400, max_events=8)
+        return jnp.concatenate([motion.ys.q[-1, :2], motion.ys.u[-1, :2]])
+
+    def exact(x):
+        height, rate = jax.jvp(lambda t: x[0] * (1 - jnp.cos(x[1] * t)), (0.5,), (1.0,))
+        cos, sin = np.array([1.0, gradient]) / np.hypot(1.0, gradient)
+        share = sin - x[2] * cos
+        way, speed = share * (G * 0.5**2 / 2 + height), share * (G * 0.5 + rate)
+        return jnp.stack([way * cos, height - way * sin, speed * cos, rate - speed * sin])
+
+    return Derived(end, [0.02, 9.0, 0.3], exact, values=1e-8)
+
+
+@derived
+def block_between_stops_that_move():
+    """Each impact is with the stop as fast as it moves."""
+    block = planar.Body("block", mass=2.0, inertia=0.1, velocity=(1.5, 0.0))
+    stops = mb.Stop("stops", "rail.displacement", lower=-0.2, upper=0.3, restitution=0.6)
+    system = mb.Scene([block], joints=[rail("block"), stops]).compile()
+    start = mb.assemble(system)
+
+    def end(x, rtol):
+        wave = lambda t: x[0] * jnp.sin(x[1] * t)
+        inputs = {"stops.lower": lambda t: -0.2 + wave(t), "stops.upper": lambda t: 0.3 - 0.5 * wave(t)}
+        own = mb.with_parameters(system, {"stops.restitution": x[2]})
+        motion = mb.simulate(own, start, t1=0.8, inputs=inputs, rtol=rtol, max_steps=400, max_events=8)
+        events = motion.events
+        return jnp.concatenate([motion.ys.q[-1, :1], motion.ys.u[-1, :1], events.times[:2], events.impulses[:2, 0]])
+
+    def exact(x):
+        wave = lambda t: (x[0] * np.sin(x[1] * t), x[0] * x[1] * np.cos(x[1] * t))
+        gap = lambda t, start, speed, middle, share: middle + share * wave(t)[0] - start - speed * t
+        time, place, speed, found = 0.0, 0.0, 1.5, []
+        for middle, share in ((0.3, -0.5), (-0.2, 1.0)):
+            own = place - speed * time, speed, middle, share
+            fine = np.linspace(time + 1e-6, 0.8, 1000)
+            first = np.flatnonzero(np.diff(np.sign(gap(fine, *own))))[0]
+            hit = brentq(gap, fine[first], fine[first + 1], own, xtol=1e-15, rtol=1e-14)
+            rate = share * wave(hit)[1]
+            after = rate - x[2] * (speed - rate)
+            found.append((hit, 2.0 * abs(after - speed)))
+            time, place, speed = hit, middle + share * wave(hit)[0], after
+        (first, one), (second, other) = found
+        return np.array([place + speed * (0.8 - time), speed, first, second, one, other])
+
+    return Derived(end, [0.04, 6.0, 0.6], exact, traced=False, values=1e-8, near=1e-6)
+
+
+@pytest.mark.slow
+def test_derivatives_of_events_are_finite_in_a_member_without_events():
+    """In space, where zeros are no attitude; one member of the batch meets the floor, the other does not."""
+    ball = spatial.Body("ball", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 1.0))
+    floor = mb.RigidContact("floor", "ball", terrain=FLAT, restitution=0.8)
+    system = mb.Scene([ball], joints=[floor], forces=[DOWN_3D]).compile()
+    state = mb.assemble(system)
+
+    def first(height):
+        start = mb.State(state.q.at[2].set(height), state.u)
+        times = mb.simulate(system, start, t1=0.6, rtol=1e-9, max_steps=200, max_events=8).events.times
+        return jnp.where(jnp.isfinite(times[0]), times[0], 0.0)
+
+    times, slopes = jit_quickly(jax.vmap(jax.value_and_grad(first)))(jnp.array([1.0, 5.0]))
+    np.testing.assert_allclose(times, [FALL, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(slopes, [FALL / 2, 0.0], rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_tangents_after_impacts_by_a_matrix_and_one_at_a_time(monkeypatch):
+    def last(gravity):
+        own = mb.with_parameters(BALL, {"gravity.acceleration": gravity})
+        motion = mb.simulate(own, dropped(), t1=0.8, rtol=1e-9, max_steps=300, max_events=8)
+        return jnp.append(motion.ys.q[-1], motion.events.times[0])
+
+    at = mb.parameters(BALL)["gravity.acceleration"]
+    found = {}
+    for most in (256, 0):
+        monkeypatch.setattr(restarts, "_MOST_COLUMNS", most)
+        jax.clear_caches()
+        found[most] = jit_quickly(jax.jacfwd(last))(at), jit_quickly(jax.jacrev(last))(at)
+    (forward, reverse), others = found[256], found[0]
+    assert np.max(np.abs(forward)) > 0.01
+    for other in (reverse, *others):
+        np.testing.assert_allclose(other, forward, rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_events_are_found_once_in_a_program():
+    """Derivatives have them from the motion."""
+    found = lambda function: str(jax.make_jaxpr(function)(jnp.array([0.8, 0.1]))).count("name=find_event")
+    value = lambda at: end(at, 0.6)
+    assert found(value) == found(jax.grad(value)) == found(jax.jacfwd(value)) == 1
 
 
 # Lifts

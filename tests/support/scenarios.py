@@ -1,10 +1,13 @@
 """Motions with contacts and dry friction, beside what closed forms know of them."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
+from compiling import jit_quickly
+from derivative_checks import central_differences, in_both_modes
 
 import jaxmb as mb
 
@@ -45,3 +48,35 @@ class Scenario:
             value = motion.quantity(name)
             near(value[-1] if self.ts is None else value, known, name)
         return motion
+
+
+@dataclasses.dataclass
+class Derived:
+    """Numbers of a motion as a function `end(x, rtol)` of a vector.
+
+    `exact`: their closed form; None where differences of a tighter solution stand for it; not `traced` by JAX if it is
+    of NumPy. `many`: vectors of a batch, of which `at` is the first. Values and derivatives are compared to `values`
+    and `near`.
+    """
+
+    end: Callable[..., Any]
+    at: Any
+    exact: Callable[[Any], Any] | None = None
+    traced: bool = True
+    many: Any = None
+    values: float = 1e-9
+    near: float = 1e-7
+
+    def check(self) -> None:
+        """Forward mode is reverse mode, and both are the derivative of the closed form."""
+        end, many = (lambda x: self.end(x, 1e-10)), None if self.many is None else np.array(self.many)
+        points, found = [np.array(self.at)] if many is None else many, in_both_modes(end, np.array(self.at), many)
+        for k, x in enumerate(points):
+            value, derivative = found if many is None else (found[0][k], found[1][k])
+            if self.exact is not None:
+                np.testing.assert_allclose(value, self.exact(x), rtol=self.values, atol=self.values)
+            known = jax.jacfwd(self.exact)(x) if self.exact and self.traced else self._differences(x)
+            np.testing.assert_allclose(derivative, known, rtol=self.near, atol=self.near)
+
+    def _differences(self, x):
+        return central_differences(self.exact or jit_quickly(lambda x: self.end(x, 1e-12)), x)
