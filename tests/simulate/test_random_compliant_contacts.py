@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 Linear = mb.contact.Linear
 # Random cases of each kind, and the number of steps of a run that misses nothing.
-CASES, STEPS = 20, 4000
+CASES, STEPS = 6, 2000
 
 
 def discs():
