@@ -698,22 +698,6 @@ def test_ball_among_pegs_meets_the_first_on_its_way(solver):
 
 
 @pytest.mark.slow
-def test_table_on_four_legs_has_redundant_contacts():
-    """It falls flat: three of the reactions carry it, or two, and the fourth is implied."""
-    table = spatial.Body("table", mass=2.0, inertia=np.diag([0.1, 0.1, 0.15]), position=(0.0, 0.0, 0.5))
-    legs = [(x, y, -0.4) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
-    contacts = [mb.RigidContact(f"leg{k}", "table", terrain=FLAT, centre=leg) for k, leg in enumerate(legs)]
-    system = mb.Scene([table], joints=contacts, forces=[DOWN_3D]).compile()
-    motion = mb.simulate(system, mb.assemble(system), t1=1.0)
-    assert {event.kind for event in motion.events} == {"close"}
-    np.testing.assert_allclose(motion["table"].position[-1], [0.0, 0.0, 0.4], atol=1e-12)
-    forces = [motion.reactions[f"leg{k}"].force[-1, 2] for k in range(4)]
-    assert np.all(np.array(forces) >= -1e-12)
-    np.testing.assert_allclose(sum(forces), 2 * G, rtol=1e-12)
-    np.testing.assert_allclose(sum(f * leg[0] for f, leg in zip(forces, legs, strict=True)), 0.0, atol=1e-12)
-
-
-@pytest.mark.slow
 def test_block_comes_to_rest_on_its_corners():
     """Its corners strike in turn, infinitely often in a short time; energy is never gained."""
     block = planar.Body("block", mass=2.0, inertia=0.3, position=(0.0, 0.6), angle=0.05)

@@ -159,8 +159,13 @@ def test_hessians_and_batches_need_no_option():
         np.testing.assert_allclose(gradient, slopes[:, 0], rtol=1e-5)
         np.testing.assert_allclose(hessian, slopes[:, 1:], rtol=1e-5, atol=1e-5 * np.max(np.abs(slopes[:, 1:])))
         np.testing.assert_allclose(hessian, hessian.T, rtol=1e-7)
+
+
+def test_second_derivatives_are_in_forward_mode_over_reverse():
+    stone = mb.Scene([planar.PointMass("stone", mass=1.0)], forces=[mb.Gravity((0.0, -9.81))]).compile()
+    end = lambda y: mb.simulate(stone, mb.State(stone.guess.q.at[1].set(y), stone.guess.u), t1=1.0).ys.q[-1, 1]
     with pytest.raises(TypeError, match=r"in forward mode only: take jax\.hessian"):
-        jax.jacrev(jax.grad(energy))(POINT)
+        jax.jacrev(jax.grad(end))(1.0)
 
 
 @pytest.mark.slow
