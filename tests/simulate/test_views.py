@@ -123,18 +123,24 @@ def test_views_are_those_of_the_function_that_a_system_has():
         )
 
 
-@pytest.mark.slow
-def test_events_are_computed_once_and_as_far_as_they_happened():
-    """Of a motion, of a batch, and in functions that are traced."""
+@pytest.fixture(scope="module")
+def bouncing():
+    """A ball on a guide above a stop, and its motion from a height, with room for so many events."""
     ball = planar.Body("ball", mass=1.0, inertia=0.1, position=(0.0, 0.3))
     guide = planar.Prismatic("guide", "ground", "ball", point=(0.0, 0.0), axis=(0.0, 1.0))
     stop = mb.Stop("stop", "guide.displacement", lower=-1.0, restitution=0.7)
     system = mb.Scene([ball], joints=[guide, stop], forces=[mb.Gravity((0.0, -9.81))]).compile()
 
     def run(height, most=1024):
-        return mb.simulate(system, mb.assemble(system, fix={"ball.y": height}), t1=1.5, rtol=1e-6, max_events=most)
+        start = mb.assemble(system, fix={"ball.y": height})
+        return mb.simulate(system, start, t1=1.5, rtol=1e-6, max_events=most)
 
-    few, motion, many = run(0.3), run(-0.6), run(-0.6, 16384)
+    return run
+
+
+@pytest.mark.slow
+def test_events_are_computed_once_and_as_far_as_they_happened(bouncing):
+    few, motion, many = bouncing(0.3), bouncing(-0.6), bouncing(-0.6, 16384)
     assert few.events is few.events
     with compiled() as names:
         assert len(motion.events) > 8 > len(few.events)
@@ -146,7 +152,10 @@ def test_events_are_computed_once_and_as_far_as_they_happened():
     np.testing.assert_allclose(few.events.times[0], fall, rtol=1e-6)
     np.testing.assert_allclose(few.events.impulses[0, 0], 1.7 * 9.81 * fall, rtol=1e-6)
 
-    members = [run(height, 64) for height in (0.3, -0.3, -0.6)]
+
+@pytest.mark.slow
+def test_events_of_a_batch_are_those_of_its_members(bouncing):
+    members = [bouncing(height, 64) for height in (0.3, -0.3, -0.6)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members).events
     assert batch.times.shape == (3, 64) and batch.impulses.shape == (3, 64, 1)
     for k, member in enumerate(members):
@@ -157,6 +166,6 @@ def test_events_are_computed_once_and_as_far_as_they_happened():
     # In a function that is traced: as its argument, and as a number.
     inside = jax.jit(lambda motion: motion.events.times)(members[1])
     np.testing.assert_allclose(inside[np.isfinite(inside)], members[1].events.times, rtol=1e-12)
-    apart = run(-0.3, 64)
+    apart = bouncing(-0.3, 64)
     np.testing.assert_array_equal(jax.jit(lambda x: x + apart.events.times)(0.0), members[1].events.times)
     np.testing.assert_array_equal(apart.events.times, members[1].events.times)
