@@ -1,11 +1,11 @@
 """Which laws of dry friction hold at the limit of stick."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxmb.contacts.problem import Laws
 from jaxmb.parts.modes import FREE, STICK
@@ -30,16 +30,15 @@ def found():
     return answers
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(
-    "mode, load, sticks",
-    [(FREE, 1.0, True), (FREE, 1 + 1e-7, False), (STICK, 1.0, False), (STICK, 1 - 1e-6, True)],
-    ids=["at the limit", "above it", "held at the limit", "held below it"],
-)
-def test_friction_at_its_limit(mode, load, sticks, sign):
+# In which mode, under which load, and whether it sticks.
+CASES = [(FREE, 1.0, True), (FREE, 1 + 1e-7, False), (STICK, 1.0, False), (STICK, 1 - 1e-6, True)]
+
+
+def test_friction_at_its_limit():
     """At its limit friction sticks: the guard of its force tells whether it slips. Friction that has stuck until then
     slips, in the direction of the load.
     """
-    answers = found()(float(mode), sign * load)
-    assert bool(answers.solvable) and bool(answers.sticks[0]) == sticks
-    np.testing.assert_array_equal(answers.slips, [0.0 if sticks else sign])
+    for (mode, load, sticks), sign in itertools.product(CASES, (1.0, -1.0)):
+        answers = found()(float(mode), sign * load)
+        assert bool(answers.solvable) and bool(answers.sticks[0]) == sticks
+        np.testing.assert_array_equal(answers.slips, [0.0 if sticks else sign])

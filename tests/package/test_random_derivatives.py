@@ -184,7 +184,7 @@ INSTANTS = {
 
 
 def pendulum(seen, *, observe=None, scene=double_pendulum, **options):
-    """A scene of `test_gradient_roads`, with its initial rate, and what is seen of its motion."""
+    """A pendulum on a spring, with its initial rate, and what is seen of its motion."""
     system, _, fix, rate = scene()
 
     def outputs(system, extra, rtol):

@@ -5,11 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import jit_quickly
 
 import jaxmb as mb
 from jaxmb import planar
 
-ALONE = {
+VIEWS = {
     "motion": lambda motion: motion["bob"],
     "energies": lambda motion: (motion.kinetic_energy, motion.potential_energy, motion.energy),
     "momenta": lambda motion: (motion.linear_momentum, motion.angular_momentum),
@@ -27,28 +28,33 @@ def batch():
     bob = planar.PointMass("bob", mass=1.0, position=(1.0, 0.0))
     forces = [mb.Gravity((0.0, -9.81)), planar.SpringDamper("spring", "ground", "bob", stiffness=3.0, free_length=0.0)]
     system = mb.Scene([bob], joints=[planar.Distance("bar", "ground", "bob")], forces=forces).compile()
-    start, saveat = mb.assemble(system), diffrax.SaveAt(ts=jnp.linspace(0.0, 0.1, 4), dense=True)
+    saveat = diffrax.SaveAt(ts=jnp.linspace(0.0, 0.1, 4), dense=True)
 
     def run(mass, gravity):
         values = {"bob.mass": mass, "gravity.acceleration": jnp.stack([0.0 * gravity, -gravity])}
-        changed = mb.with_parameters(system, values)
-        return mb.simulate(changed, start, t1=0.1, saveat=saveat, max_steps=64)
+        return mb.simulate(mb.with_parameters(system, values), system.guess, t1=0.1, saveat=saveat, max_steps=64)
 
     both = jax.vmap(jax.vmap(run, in_axes=(None, 0)), in_axes=(0, None))
-    return jax.jit(both)(jnp.array([1.0, 2.0]), jnp.array([3.0, 6.0, 9.0]))
+    return jit_quickly(both)(jnp.array([1.0, 2.0]), jnp.array([3.0, 6.0, 9.0]))
 
 
-@pytest.mark.slow(but=("violation", "quantities"))
-@pytest.mark.parametrize("view", ALONE)
-def test_views_of_a_batch_are_those_of_its_members(batch, view):
-    together = ALONE[view](batch)
-    for i, j in np.ndindex(2, 3):
-        alone = ALONE[view](jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], batch))
+SHORT = ("energies", "violation", "quantities")
+
+
+@pytest.mark.slow("all")
+@pytest.mark.parametrize("names", [SHORT, tuple(VIEWS)], ids=["some", "all"])
+def test_views_of_a_batch_are_those_of_its_members(batch, names):
+    """One program for the views of the batch, and one for those of a member."""
+    views = jit_quickly(lambda motion: [VIEWS[name](motion) for name in names])
+    together = views(batch)
+    for i, j in ((0, 1), (1, 2)):
+        alone = views(jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], batch))
         equal = lambda a, b, i=i, j=j: np.testing.assert_allclose(a[i, j], b, rtol=1e-12, atol=1e-12)
         jax.tree.map(equal, together, alone)
 
 
-def test_a_batch_is_saved_as_its_members_are(batch, tmp_path):
+@pytest.mark.slow
+def test_batch_is_saved_as_its_members_are(batch, tmp_path):
     batch.save(tmp_path / "batch.npz")
     saved = mb.load(tmp_path / "batch.npz")
     member = jax.tree.map(lambda leaf: leaf[1, 2], batch).to_dict()
@@ -76,6 +82,9 @@ def test_coordinates_of_a_batch_by_name():
     np.testing.assert_allclose(motion.quantity("fast_rate"), rate, rtol=0, atol=1e-9)
 
 
+# Members that fail
+
+
 @pytest.fixture(scope="module")
 def mass_until():
     """A unit mass pushed by a force `√(end − t)`, which is not a number after `end`."""
@@ -91,9 +100,16 @@ def pushed(system, end, mass, speed, **options):
     return mb.simulate(changed, state, t1=0.9, throw=False, **options)
 
 
+def test_single_run_that_fails_is_kept_as_far_as_it_came(mass_until):
+    motion = pushed(mass_until, jnp.array(0.5), jnp.array(1.0), jnp.array(1.0), saveat=None)
+    np.testing.assert_allclose(motion.ts, 0.5, rtol=0, atol=1e-8)
+    # The integral of the force.
+    np.testing.assert_allclose(motion.ys.u[-1, 0], 1.0 + 2.0 / 3.0 * 0.5**1.5, rtol=0, atol=1e-5)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("derivative", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
-def test_a_member_that_fails_is_not_a_number_throughout(mass_until, derivative):
+@pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
+def test_member_that_fails_is_not_a_number_throughout(mass_until, derivative):
     """Half way, from a start that is not finite, and from forces that are not: also what it depends on in no step."""
     one, nan = 1.0, np.nan
     members = jnp.array([[1.0, one, one], [0.5, one, one], [1.0, one, nan], [-1.0, one, one]])
@@ -110,45 +126,49 @@ def test_a_member_that_fails_is_not_a_number_throughout(mass_until, derivative):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [None, pytest.param(mb.solvers.Hermite(), marks=pytest.mark.slow), diffrax.Dopri8()])
-def test_a_member_that_cannot_start_takes_no_step(mass_until, solver):
+@pytest.mark.parametrize("solver", [None, mb.solvers.Hermite(), diffrax.Dopri8()])
+def test_member_that_cannot_start_takes_no_step(mass_until, solver):
     run = jax.jit(jax.vmap(lambda speed: pushed(mass_until, jnp.array(1.0), jnp.array(1.0), speed, solver=solver)))
     motion = run(jnp.array([1.0, np.nan, 1.0]))
     steps, ended = np.asarray(motion.stats["num_steps"]), motion.result == mb.RESULTS.assembly_failed
     assert steps[1] == 0 and steps[0] == steps[2] > 0
     np.testing.assert_array_equal(ended, [False, True, False])
     np.testing.assert_array_equal(np.isinf(motion.ts), [[False] * 3, [True] * 3, [False] * 3])
+    # Forces that are not finite at the start end a run at once.
+    motion = pushed(mass_until, jnp.array(-1.0), jnp.array(1.0), jnp.array(1.0), saveat=None, solver=solver)
+    assert motion.stats["num_steps"] <= 1 and motion.result == mb.RESULTS.dt_min_reached
 
 
 @pytest.mark.slow
-def test_forces_that_are_not_finite_at_the_start_end_the_run_at_once(mass_until):
-    motion = pushed(mass_until, jnp.array(-1.0), jnp.array(1.0), jnp.array(1.0), saveat=None)
-    assert motion.stats["num_steps"] == 1 and motion.result == mb.RESULTS.dt_min_reached
-
-
-def test_a_single_run_that_fails_is_kept_as_far_as_it_came(mass_until):
-    motion = pushed(mass_until, jnp.array(0.5), jnp.array(1.0), jnp.array(1.0), saveat=None)
-    np.testing.assert_allclose(motion.ts, 0.5, rtol=0, atol=1e-8)
-    # The integral of the force.
-    np.testing.assert_allclose(motion["body"].velocity[-1, 0], 1.0 + 2.0 / 3.0 * 0.5**1.5, rtol=0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_state_that_was_not_found():
+def test_loops_that_do_not_close_leave_the_others_alone():
+    """A coupler of 40 m closes none; nor does its state have a derivative."""
     mechanism = mb.mechanisms.get("four_bar")
 
-    def angle(length):
+    def assembled(length):
         system = mb.with_parameters(mechanism.system, {"C.point_a": jnp.stack([length / 2, 0.0 * length])})
-        return mb.assemble(system, mechanism.state, rates=mechanism.rates, throw=False).q[2]
+        return system, mb.assemble(system, mechanism.state, rates=mechanism.rates, throw=False)
 
-    # A coupler of 40 m closes no loop.
-    lengths = jnp.array([3.0, 40.0])
+    @jax.jit
+    @jax.vmap
+    def run(length):
+        motion = mb.simulate(*assembled(length), t1=0.1, throw=False)
+        return motion["crank"].angle[-1], motion.result == mb.RESULTS.successful, motion.result._value
+
+    lengths = jnp.array([3.0, 40.0, 3.1])
+    angles, fine, ended = run(lengths)
+    np.testing.assert_array_equal(fine, [True, False, True])
+    assert ended[1] == mb.RESULTS.assembly_failed._value
+    np.testing.assert_allclose(angles[0], run(jnp.full(3, 3.0))[0][0], rtol=1e-9)
     for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_array_equal(np.isnan(jax.jit(jax.vmap(derivative(angle)))(lengths)), [False, True])
+        slopes = jax.jit(jax.vmap(derivative(lambda length: assembled(length)[1].q[2])))(lengths)
+        np.testing.assert_array_equal(np.isnan(slopes), [False, True, False])
+
+
+# Many members
 
 
 @pytest.mark.slow
-def test_the_gradient_of_a_sum_over_a_batch():
+def test_gradient_of_a_sum_over_a_batch():
     """Of what the members share: the sum of theirs."""
     mechanism = mb.mechanisms.get("pendulum")
     system, state = mechanism.system, mechanism.state
@@ -169,7 +189,7 @@ def test_the_gradient_of_a_sum_over_a_batch():
 
 
 @pytest.mark.slow
-def test_vmap_over_lengths_equals_the_loop():
+def test_batch_over_lengths_equals_the_loop():
     mechanism = mb.mechanisms.get("four_bar")
 
     def crank_angle(length):
@@ -179,25 +199,6 @@ def test_vmap_over_lengths_equals_the_loop():
         state = mb.assemble(system, mechanism.state, fix=mechanism.fix, rates=mechanism.rates, throw=False)
         return mb.simulate(system, state, t1=0.5, rtol=1e-12, throw=False)["crank"].angle[-1]
 
-    lengths = jnp.linspace(0.8, 1.1, 256)
-    together = jax.jit(jax.vmap(crank_angle))(lengths)
-    single = jax.jit(crank_angle)
+    lengths = jnp.linspace(0.8, 1.1, 64)
+    together, single = jax.jit(jax.vmap(crank_angle))(lengths), jax.jit(crank_angle)
     np.testing.assert_allclose(together, [single(length) for length in lengths], rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_failed_members_leave_the_others_alone():
-    mechanism = mb.mechanisms.get("four_bar")
-
-    def run(length):
-        half = jnp.stack([length / 2, jnp.zeros_like(length)])
-        system = mb.with_parameters(mechanism.system, {"C.point_a": half})
-        state = mb.assemble(system, mechanism.state, rates=mechanism.rates, throw=False)
-        sol = mb.simulate(system, state, t1=0.1, throw=False)
-        return sol["crank"].angle[-1], sol.result == mb.RESULTS.successful, sol.result == mb.RESULTS.assembly_failed
-
-    # A coupler of 40 m closes no loop.
-    angle, fine, failed = jax.jit(jax.vmap(run))(jnp.array([3.0, 40.0, 3.1]))
-    np.testing.assert_array_equal(fine, [True, False, True])
-    np.testing.assert_array_equal(failed, [False, True, False])
-    np.testing.assert_allclose(angle[0], run(jnp.array(3.0))[0], rtol=1e-9)

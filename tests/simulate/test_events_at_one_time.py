@@ -1,13 +1,10 @@
-"""Machines that share a scene, and the moments of their events, have motions and derivatives of their own."""
-
-import functools
+"""Machines that share a scene, and the moments of their events, have derivatives of their own."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_quickly
-from scipy.integrate import solve_ivp
 
 import jaxmb as mb
 from jaxmb import planar
@@ -17,161 +14,6 @@ pytestmark = pytest.mark.slow
 
 G, FLAT = 9.81, terrain.Flat()
 DOWN = mb.Gravity((0.0, -G))
-
-
-class Ball:
-    """A ball that falls on the floor; with numbers: height and speed at the start, restitution, mass."""
-
-    joints = (mb.RigidContact("floor", "ball", terrain=FLAT, restitution=0.5),)
-    bodies, forces = (planar.PointMass("ball", mass=1.0, position=(0.0, 1.0)),), ()
-    parameters = ("floor.restitution", "ball.mass")
-
-    @staticmethod
-    def drawn(chance, moment):
-        v = chance.uniform(-2.0, 0.0)
-        return [0.5 * G * moment**2 - v * moment, v, chance.uniform(0.0, 1.0), chance.uniform(0.5, 3.0)]
-
-    @staticmethod
-    def start(numbers):
-        return {"ball.y": numbers[0]}, {"ball.y_rate": numbers[1]}
-
-
-class Bar:
-    """A pendulum that meets a stop; with numbers: angle and rate at the start, restitution."""
-
-    bodies = (planar.Body("bar", mass=1.0, inertia=0.05, position=(0.5, 0.0)),)
-    joints = (
-        planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0)),
-        mb.Stop("stop", "pin.angle", lower=-0.9, restitution=0.5),
-    )
-    forces, parameters = (), ("stop.restitution",)
-
-    @staticmethod
-    def drawn(chance, moment):
-        fall = lambda t, y: [y[1], -0.5 * G / 0.3 * np.cos(y[0])]
-        end = [-0.9, -chance.uniform(2.5, 4.0)]
-        back = solve_ivp(fall, (moment, 0.0), end, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
-        return [*back, chance.uniform(0.0, 1.0)]
-
-    @staticmethod
-    def start(numbers):
-        angle, rate = numbers[:2]
-        x, y = 0.5 * jnp.cos(angle), 0.5 * jnp.sin(angle)
-        return {"bar.x": x, "bar.y": y, "bar.angle": angle}, {
-            "bar.x_rate": -y * rate,
-            "bar.y_rate": x * rate,
-            "bar.angle_rate": rate,
-        }
-
-
-class Box:
-    """A box on a rail that friction brings to rest; with numbers: speed at the start, coefficient."""
-
-    bodies = (planar.Body("box", mass=2.0, inertia=0.1),)
-    joints = (planar.Prismatic("rail", "ground", "box", point=(0.0, 0.0), axis=(1.0, 0.0)),)
-    forces, parameters = (mb.DryFriction("rub", "rail", coefficient=0.4),), ("rub.coefficient",)
-
-    @staticmethod
-    def drawn(chance, moment):
-        coefficient = chance.uniform(0.1, 0.6)
-        return [coefficient * G * moment, coefficient]
-
-    @staticmethod
-    def start(numbers):
-        return {}, {"box.x_rate": numbers[0]}
-
-
-def ending(machines, t1):
-    """The places and speeds of the machines at the end, and the energy lost in events, by numbers of each."""
-    parts = lambda kind: [part for machine in machines for part in getattr(machine, kind)]
-    system = mb.Scene(parts("bodies"), joints=parts("joints"), forces=[DOWN, *parts("forces")]).compile()
-    drawn, at, of_rates = mb.assemble(system), system.coordinate_names(), system.rate_names()
-
-    def end(numbers):
-        q, u, values = drawn.q, drawn.u, {}
-        for machine, of_machine in zip(machines, numbers, strict=True):
-            places, rates = machine.start(of_machine)
-            values |= dict(zip(machine.parameters, of_machine[-len(machine.parameters) :], strict=True))
-            for name, value in places.items():
-                q = q.at[at[name][0]].set(value)
-            for name, value in rates.items():
-                u = u.at[of_rates[name][0]].set(value)
-        changed = mb.with_parameters(system, values)
-        motion = mb.simulate(changed, mb.State(q, u), t1=t1, rtol=1e-9, max_steps=400, max_events=24)
-        last = motion.ys
-        bodies = [machine.bodies[0].name for machine in machines]
-        own = [jnp.concatenate([last.q[-1][_of(at, n)], last.u[-1][_of(of_rates, n)]]) for n in bodies]
-        return own, jnp.sum(motion.events.kinetic_energy_lost), jnp.sum(jnp.isfinite(motion.events.times))
-
-    return end
-
-
-def _of(names, body):
-    return np.array([k for name, at in names.items() if name.startswith(f"{body}.") and len(at) == 1 for k in at])
-
-
-def test_machines_beside_each_other_are_those_of_scenes_of_their_own():
-    """Random machines with an impact, a stop and an end of slip at one moment: motions, energies and derivatives."""
-    machines, moment, members = [Ball, Bar, Box], 0.2, 8
-
-    def with_slopes(end):
-        def twice(numbers):
-            out = end(numbers)
-            return out[0], out
-
-        return jit_quickly(jax.jacfwd(twice, has_aux=True))
-
-    together = with_slopes(ending(machines, 0.4))
-    alone = [with_slopes(ending([machine], 0.4)) for machine in machines]
-    chance, shared = np.random.default_rng(0), 0
-    for _ in range(members):
-        numbers = [jnp.array(machine.drawn(chance, moment)) for machine in machines]
-        slopes, (ends, lost, count) = together(numbers)
-        own = [end([of_machine]) for end, of_machine in zip(alone, numbers, strict=True)]
-        shared += int(count) < sum(int(found[1][2]) for found in own)
-        np.testing.assert_allclose(lost, sum(float(found[1][1]) for found in own), rtol=1e-7)
-        for k, ((own_slopes,), ((own_end,), _, _)) in enumerate(own):
-            np.testing.assert_allclose(ends[k], own_end, atol=5e-7)
-            for j, slope in enumerate(slopes[k]):
-                size = 1 + np.max(np.abs(own_slopes[0]))
-                np.testing.assert_allclose(slope, own_slopes[0] if j == k else 0.0 * slope, atol=1e-5 * size)
-    # By rounding, some follow each other instead.
-    assert shared >= members // 2
-
-
-@functools.cache
-def cradles(count):
-    """Rows of three discs that nearly touch; the first of each moves."""
-    bodies = [
-        planar.Body(f"{row}{k}", mass=1.0, inertia=1e-3, position=(x, float(row)), velocity=(float(k == 0), 0.0))
-        for row in range(count)
-        for k, x in enumerate((-0.2, 0.1 + 1e-6, 0.2 + 2e-6))
-    ]
-    contacts = [
-        mb.RigidBallContact(f"c{row}{k}", f"{row}{k}", f"{row}{k + 1}", radius_a=0.05, radius_b=0.05, restitution=1.0)
-        for row in range(count)
-        for k in range(2)
-    ]
-    return mb.Scene(bodies, joints=contacts).compile()
-
-
-def test_cradles_beside_each_other():
-    """The last disc of each takes over the motion of its first one; forward and reverse mode, and times of events."""
-    system, rows = cradles(3), 3
-    start, at = mb.assemble(system), system.coordinate_names()
-    first, last = (np.array([at[f"{row}{k}.x"][0] for row in range(rows)]) for k in (0, 2))
-
-    def end(x):
-        state = mb.State(start.q.at[first].add(x), start.u)
-        motion = mb.simulate(system, state, t1=1.0, rtol=1e-10, max_steps=300, max_events=12)
-        return motion.ys.q[-1][last], motion.events.times[:2]
-
-    at_start = jnp.zeros(rows)
-    (forward, times), (reverse, _) = (jit_quickly(mode(end))(at_start) for mode in (jax.jacfwd, jax.jacrev))
-    np.testing.assert_allclose(forward, np.eye(rows), atol=1e-8)
-    np.testing.assert_allclose(reverse, forward, atol=1e-10)
-    # All strike earlier if all start closer.
-    np.testing.assert_allclose(times @ np.ones(rows), [-1.0, -1.0], atol=1e-8)
 
 
 def test_contacts_that_act_on_each_other_close_together():

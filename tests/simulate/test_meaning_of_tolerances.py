@@ -16,31 +16,22 @@ from jaxmb.manifold.internal_states import counted_components
 from jaxmb.simulate.method import running_scales
 from jaxmb.solvers.tolerances import NormOfCounted
 
-TOLERANCES = 10.0 ** -np.arange(4.0, 11.1, 1.0)
+TOLERANCES = 10.0 ** -np.array([4.0, 6.0, 8.0, 10.0])
 SOLVERS = {"Adams": mb.solvers.Adams(), "Dopri8": diffrax.Dopri8(), "Hermite": mb.solvers.Hermite()}
 
 # Mechanisms, with the end of a short motion [s]; planar, spatial, nonholonomic and from Lagrangians.
 MOTIONS = {
-    "pendulum": 3.0,
     "four_bar": 2.0,
-    "slider_crank": 0.2,
     "andrews": 0.03,
-    "rod_chain": 1.0,
-    "car_axis": 1.0,
     "hanging_chain": 1.0,
     "knife_edge": 3.0,
-    "chaplygin_sleigh": 3.0,
     "heavy_top": 1.0,
-    "free_body": 5.0,
     "rolling_disc": 1.0,
     "roller_racer": 2.0,
-    "nonholonomic_cart": 2.0,
-    "three_platform_snake": 2.0,
-    "spherical_four_bar": 1.0,
     "benenti": 2.0,
     "rough_ring": 2.0,
 }
-IMPLICIT = ("four_bar", "slider_crank", "andrews", "heavy_top", "pendulum", "roller_racer", "benenti")
+IMPLICIT = ("four_bar", "heavy_top", "roller_racer", "benenti")
 
 
 @functools.cache
@@ -72,18 +63,13 @@ def check(ratios):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MOTIONS)
-def test_errors_of_adams_method_are_those_of_a_runge_kutta_method(name):
-    check(errors(name, "Adams") / errors(name, "Dopri8"))
+def test_errors_of_all_methods_are_those_of_a_runge_kutta_method(name):
+    for solver in ("Adams", *["Hermite"] * (name in IMPLICIT)):
+        check(errors(name, solver) / errors(name, "Dopri8"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", IMPLICIT)
-def test_errors_of_hermite_are_those_of_a_runge_kutta_method(name):
-    check(errors(name, "Hermite") / errors(name, "Dopri8"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver, finest", [("Adams", 1e-13), pytest.param("Hermite", 1e-12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solver, finest", [("Adams", 1e-13), ("Hermite", 1e-12)])
 def test_steps_do_not_creep_where_rounding_limits_them(solver, finest):
     system, state = mechanism("four_bar").system, mechanism("four_bar").state
     run = lambda rtol: mb.simulate(system, state, t1=1.0, rtol=rtol, solver=SOLVERS[solver], max_steps=5000)
@@ -108,11 +94,9 @@ PENDULUM, AMONG_STOPS = pendulum(), pendulum(*stops(4))
 
 WAYS = {
     "Adams": {},
-    "atol": {"atol": 1e-7},
     "Projection": {"manifold": mb.manifold.Projection()},
     "MultistepController": {"stepsize_controller": mb.solvers.MultistepController(1e-6, 1e-8)},
     "Hermite": {"solver": mb.solvers.Hermite()},
-    "Tsit5": {"solver": diffrax.Tsit5()},
     "PIDController": {"solver": diffrax.Tsit5(), "stepsize_controller": diffrax.PIDController(1e-6, 1e-8)},
 }
 
@@ -143,8 +127,11 @@ def test_stops_that_are_never_reached_change_no_step(way):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [mb.solvers.Adams(), diffrax.Tsit5()], ids=["Adams", "Tsit5"])
-@pytest.mark.parametrize("name", ["bar.mass", "bar.angle"])
+@pytest.mark.parametrize(
+    "solver, name",
+    [(mb.solvers.Adams(), "bar.mass"), (mb.solvers.Adams(), "bar.angle"), (diffrax.Tsit5(), "bar.mass")],
+    ids=["Adams by a mass", "Adams by the start", "Tsit5 by a mass"],
+)
 def test_stops_that_are_never_reached_change_no_step_of_a_derivative(solver, name):
     """Neither where tangents by parameters are controlled, nor those by the state."""
 

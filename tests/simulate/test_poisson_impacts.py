@@ -83,7 +83,7 @@ def phase(W, b, again, coefficient):
 
 @pytest.mark.slow("both corners")
 @pytest.mark.parametrize("angle, touching", [(0.0, (0, 1)), (0.3, (0,))], ids=["both corners", "one corner"])
-def test_a_block_strikes_the_ground(angle, touching):
+def test_block_strikes_the_ground(angle, touching):
     """At random velocities, with random coefficients."""
     rng, n = np.random.default_rng(3), len(touching)
     c, s = np.cos(angle), np.sin(angle)
@@ -150,26 +150,26 @@ def nearest(W, b, again, coefficient):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("coefficient", [0.1, 0.7])
-def test_a_bar_strikes_the_ground_in_space(coefficient):
+def test_bar_strikes_the_ground_in_space():
     u = np.array([0.6, -0.3, -2.0, 1.0, -0.5, 2.0])
     arm = TURN.apply(END)
     # Velocities of the end by those of the centre and the angular velocity in the axes of the bar.
     J = np.hstack([np.eye(3), np.cross(TURN.as_matrix().T, arm).T])[[2, 0, 1]]
     inverse = np.diag(1 / np.array([MASS] * 3 + [*MOMENTS]))
     W, b = J @ inverse @ J.T, J @ u
-    first = nearest(W, b, 0.0, coefficient)
-    second = nearest(W, b + W @ first, 0.5 * first[0], coefficient)
-    found = jax.jit(struck(bar()))({"rub.coefficient": jnp.asarray(coefficient)}, jnp.asarray(u))
-    np.testing.assert_allclose(found.after.u[:6], u + inverse @ J.T @ (first + second), rtol=1e-9)
-    assert found.energy > 0
+    event = jax.jit(struck(bar()))
+    for coefficient in (0.1, 0.7):
+        first = nearest(W, b, 0.0, coefficient)
+        second = nearest(W, b + W @ first, 0.5 * first[0], coefficient)
+        found = event({"rub.coefficient": jnp.asarray(coefficient)}, jnp.asarray(u))
+        np.testing.assert_allclose(found.after.u[:6], u + inverse @ J.T @ (first + second), rtol=1e-9)
+        assert found.energy > 0
 
 
 def cases():
-    """Scenes with velocities before an impact: that slip to the end, that stick, in space, with a law each,
-    and with less than the whole rebound, which would give energy back.
+    """Scenes with velocities before an impact: that slip to the end with a law each, that stick, in space, and with
+    less than the whole rebound, which would give energy back.
     """
-    yield block((0.5, 0.4), (0.3, 0.2)), (1.0, -1.5, 0.4)
     yield block((0.5, 0.4), (0.05, 0.1), ("poisson", "newton")), (2.0, -1.5, -0.7)
     yield block((0.6, 0.0), (0.6, 0.6), angle=0.3), (0.2, -1.5, 2.0)
     yield bar(), (0.6, -0.3, -2.0, 1.0, -0.5, 2.0)
@@ -177,8 +177,8 @@ def cases():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", range(5))
-def test_derivatives(case):
+@pytest.mark.parametrize("case", range(4))
+def test_impacts_have_derivatives(case):
     """Of the velocities after impacts, the impulses and the energy, by all numbers and the velocities before."""
     system, u = list(cases())[case]
     event, given = struck(system), mb.parameters(system)

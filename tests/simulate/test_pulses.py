@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_quickly
+from scenarios import Derived
 
 import jaxmb as mb
 from jaxmb import planar, terrain
@@ -76,9 +77,10 @@ WAYS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("way", WAYS)
-def test_a_pulse_moves_a_machine_at_rest(way, solver):
+@pytest.mark.parametrize(
+    "way, solver", [*((way, "Adams") for way in WAYS), ("linear series", "Dopri8"), ("function", "Hermite")]
+)
+def test_pulse_moves_a_machine_at_rest(way, solver):
     """As much as with steps that are shorter than the pulse."""
     for width in (0.3, 0.06):
         system, inputs = WAYS[way](width)
@@ -94,35 +96,18 @@ def test_a_pulse_moves_a_machine_at_rest(way, solver):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end", [END, -END])
-def test_a_pulse_under_jit_and_in_a_batch(end):
-    """Also with heights that are traced, and backward in time."""
-
-    def rate(height):
-        inputs = {"motor.torque": lambda t: height * pulse(jnp.abs(t), 0.2)}
-        return mb.simulate(TORQUE, mb.assemble(TORQUE), t1=end, rtol=1e-9, inputs=inputs).ys.u[-1, 2]
-
-    one = jit_quickly(rate)
-    rates = jit_quickly(jax.vmap(rate))(jnp.array([0.0, 0.5, 1.0]))
-    assert rates[0] == 0 and abs(rates[2]) > 1e-2
-    np.testing.assert_allclose(rates, [one(x) for x in (0.0, 0.5, 1.0)], rtol=1e-6)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("signal", ["cubic", "function"])
-def test_gradient_by_the_height_of_a_pulse(signal):
-    def rate(height, rtol):
-        given = lambda t: height * pulse(t, 0.2)
-        inputs = {"motor.torque": given if signal == "function" else mb.Series(TS, given(TS), signal)}
-        return mb.simulate(TORQUE, mb.assemble(TORQUE), t1=END, rtol=rtol, inputs=inputs).ys.u[-1, 2]
+def test_pulse_has_derivatives_by_its_height(signal):
+    """In a batch with a member without any."""
 
-    value = jit_quickly(rate)
-    differences = (value(1 + 1e-4, 1e-12) - value(1 - 1e-4, 1e-12)) / 2e-4
-    forward, reverse = jit_quickly(jax.jacfwd(rate))(1.0, 1e-9), jit_quickly(jax.grad(rate))(1.0, 1e-9)
-    np.testing.assert_allclose(forward, differences, rtol=1e-6)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    batch = jit_quickly(jax.vmap(jax.grad(rate), (0, None)))(jnp.array([1.0, 0.5]), 1e-9)
-    np.testing.assert_allclose(batch[0], forward, rtol=1e-6)
+    def rate(x, rtol):
+        given = lambda t: x[0] * pulse(t, 0.2)
+        inputs = {"motor.torque": given if signal == "function" else mb.Series(TS, given(TS), signal)}
+        return mb.simulate(TORQUE, mb.assemble(TORQUE), t1=END, rtol=rtol, inputs=inputs).ys.u[-1, 2:]
+
+    forward = Derived(rate, [1.0], near=1e-6).check()
+    rates = jit_quickly(jax.vmap(lambda x: rate(x, 1e-9)))(np.array([[0.0], [1.0]]))
+    assert rates[0] == 0 and abs(rates[1]) > 1e-2 and abs(forward) > 1e-2
 
 
 class Thruster(mb.parts.AbstractForce):
@@ -144,7 +129,7 @@ class Silent(Thruster):
 
 
 @pytest.mark.slow
-def test_a_part_of_ones_own():
+def test_part_of_ones_own_is_given_in_time():
     system = pendulum(Thruster("jet", "bob")).compile()
     assert jnp.max(jnp.abs(mb.simulate(system, mb.assemble(system), t1=END).ys.u)) > 1e-2
     with pytest.raises(NotImplementedError, match="Silent says of_time = True, and needs a method given_in_time"):
@@ -181,11 +166,10 @@ BURST = mb.Scene(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["Adams", "Dopri8", pytest.param("Hermite", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("end", [END, -END])
-def test_a_pulse_of_a_force_with_internal_states(solver, end):
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_pulse_of_a_force_with_internal_states(solver):
     """Of the force, whose size is a state, and of the rate of a state, in both directions of time."""
-    for size in (1.0, -40.0):
+    for end, size in itertools.product((END, -END), (1.0, -40.0)):
         start = mb.assemble(BURST, fix={"burst.size": size})
         motion = mb.simulate(BURST, start, t1=end, rtol=1e-8, solver=SOLVERS[solver], max_steps=4000)
         impulse = size * np.sign(end) * 0.02 * np.sqrt(np.pi)
@@ -194,18 +178,15 @@ def test_a_pulse_of_a_force_with_internal_states(solver, end):
 
 
 @pytest.mark.slow
-def test_gradient_by_the_internal_state_of_a_pulse():
+def test_pulse_has_derivatives_by_an_internal_state():
     """The velocity is proportional to the state."""
 
-    def rate(size):
-        start = mb.assemble(BURST, fix={"burst.size": size})
-        return mb.simulate(BURST, start, t1=END, rtol=1e-8).ys.u[-1, 0]
+    def rate(x, rtol):
+        start = mb.assemble(BURST, fix={"burst.size": x[0]}, throw=False)
+        return mb.simulate(BURST, start, t1=END, rtol=1e-8).ys.u[-1, :1]
 
-    slope = 0.01 * np.sqrt(np.pi)
-    sizes = jnp.array([1.0, -40.0])
-    np.testing.assert_allclose(jit_quickly(jax.vmap(rate))(sizes), slope * sizes, rtol=1e-6)
-    for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose(jit_quickly(jax.vmap(derivative(rate)))(sizes), slope, rtol=1e-6)
+    exact = lambda x: 0.01 * np.sqrt(np.pi) * x
+    Derived(rate, [1.0], exact, many=[[1.0], [-40.0]], values=1e-6, near=1e-6).check()
 
 
 @pytest.mark.slow
@@ -224,25 +205,25 @@ def hidden(values):
     return np.sum(np.abs(np.diff(values))) - abs(values[-1] - values[0])
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_no_more_than_a_tenth_is_hidden_between_stops(seed):
-    rng = np.random.default_rng(seed)
-    ts, values = np.sort(rng.uniform(-1.0, 11.0, 60)), np.cumsum(rng.normal(size=60)) * 10.0 ** rng.integers(-6, 6)
-    ts[0], ts[-1] = -1.0, 11.0
-    series = mb.Series(ts, values)
-    system = mb.with_inputs(TORQUE, {"motor.torque": series})
-    stops = np.asarray(turning_times(system, mb.assemble(TORQUE), 0.0, END))
-    stops = stops[np.isfinite(stops)]
-    assert np.all(np.isin(stops, ts)) and np.all((stops > 0) & (stops < END))
-    grid = np.unique(np.concatenate([[0.0, END], ts[(ts > 0) & (ts < END)]]))
-    along = np.interp(grid, ts, values)
-    most, ends = 0.1 * np.ptp(along), np.concatenate([[0.0], stops, [END]])
-    for first, last in itertools.pairwise(ends):
-        inside = (grid >= first) & (grid <= last)
-        assert hidden(along[inside]) <= most * (1 + 1e-12)
-        if last < END:  # No stop is too early: with the next value more is hidden.
-            longer = (grid >= first) & (grid <= grid[np.searchsorted(grid, last) + 1])
-            assert hidden(along[longer]) > most
+def test_no_more_than_a_tenth_is_hidden_between_stops():
+    at = mb.assemble(TORQUE)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        ts, values = np.sort(rng.uniform(-1.0, 11.0, 60)), np.cumsum(rng.normal(size=60)) * 10.0 ** rng.integers(-6, 6)
+        ts[0], ts[-1] = -1.0, 11.0
+        system = mb.with_inputs(TORQUE, {"motor.torque": mb.Series(ts, values)})
+        stops = np.asarray(turning_times(system, at, 0.0, END))
+        stops = stops[np.isfinite(stops)]
+        assert np.all(np.isin(stops, ts)) and np.all((stops > 0) & (stops < END))
+        grid = np.unique(np.concatenate([[0.0, END], ts[(ts > 0) & (ts < END)]]))
+        along = np.interp(grid, ts, values)
+        most, ends = 0.1 * np.ptp(along), np.concatenate([[0.0], stops, [END]])
+        for first, last in itertools.pairwise(ends):
+            inside = (grid >= first) & (grid <= last)
+            assert hidden(along[inside]) <= most * (1 + 1e-12)
+            if last < END:  # No stop is too early: with the next value more is hidden.
+                longer = (grid >= first) & (grid <= grid[np.searchsorted(grid, last) + 1])
+                assert hidden(along[longer]) > most
 
 
 def test_what_does_not_come_and_go_needs_no_stops():
@@ -282,25 +263,20 @@ IMPULSE = 0.3 * np.sqrt(np.pi)
 
 
 @pytest.mark.slow
-def test_derivatives_by_strengths_of_zero():
+def test_strengths_of_zero_have_derivatives():
     """Of the speed at the end, by the size of a pulse and by the damping of a later one, which its speed excites."""
 
-    def speed(strengths):
-        system = mb.with_parameters(BRAKED, {"brake.size": strengths[0], "brake.c": strengths[1]})
-        return mb.simulate(system, mb.assemble(BRAKED), t1=100.0, rtol=1e-9).ys.u[-1, 0]
+    def speed(x, rtol):
+        system = mb.with_parameters(BRAKED, {"brake.size": x[0], "brake.c": x[1]})
+        return mb.simulate(system, mb.assemble(BRAKED), t1=100.0, rtol=1e-9).ys.u[-1, :1]
 
-    closed = lambda size, c: size * IMPULSE * np.exp(-c * IMPULSE)
-    starts = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 2.0], [-3.0, 0.5]])
-    expected = np.array([[IMPULSE * np.exp(-c * IMPULSE), -IMPULSE * closed(s, c)] for s, c in np.asarray(starts)])
-    both = jax.vmap(lambda x: (jax.value_and_grad(speed)(x), jax.jacfwd(speed)(x)))
-    (value, reverse), forward = jit_quickly(both)(starts)
-    np.testing.assert_allclose(value, [closed(*start) for start in np.asarray(starts)], atol=1e-7)
-    np.testing.assert_allclose(forward, expected, atol=1e-6)
-    np.testing.assert_allclose(reverse, forward, atol=1e-9)
+    exact = lambda x: (x[0] * IMPULSE * jnp.exp(-x[1] * IMPULSE))[None]
+    many = [[0.0, 0.0], [1.0, 0.0], [0.0, 2.0], [-3.0, 0.5]]
+    Derived(speed, many[0], exact, many=many, values=1e-7, near=1e-6).check()
 
 
 @pytest.mark.slow
-def test_derivatives_by_the_values_of_a_series_of_zeros():
+def test_series_of_zeros_has_derivatives_by_its_values():
     """The start of an optimisation of a control: each value moves the sled by the area of its hat."""
     ts = np.array([0.0, 30.0, 30.4, 31.0, 60.0, 60.5, 61.0, 100.0])
 
@@ -334,7 +310,7 @@ def test_small_pulses_beside_large_ones(solver):
 
 
 @pytest.mark.slow
-def test_a_small_stroke_strikes_after_a_large_one_away():
+def test_small_stroke_strikes_after_a_large_one_away():
     """The ground moves away by one metre, and later up to a ball at rest, which leaves with twice its speed."""
     gap, height = 0.03, 0.04
     ball = planar.PointMass("ball", mass=1.0, position=(0.0, gap))

@@ -12,7 +12,7 @@ from jaxmb.parts import terrain
 
 pytestmark = pytest.mark.slow
 
-MEMBERS, END = 40, 1.0
+MEMBERS, END = 12, 1.0
 TIMES = np.linspace(0.0, END, 101)
 DOWN = mb.Gravity((0.0, -9.81))
 
@@ -100,4 +100,4 @@ def test_random_motions(name):
         assert np.min(motion.events.kinetic_energy_lost, initial=0.0) >= -1e-9 * size
         gaps = [motion[part].gap for part in own.contacts.contact_names if "stop" not in part]
         assert np.min(gaps) >= -1e-10 * float(system.length)
-    assert failed <= MEMBERS // 20
+    assert failed <= 1

@@ -1,9 +1,9 @@
-"""A ratchet whose teeth and pawl are discs without restitution, against events by hand and steps that know of none."""
+"""A ratchet whose teeth and pawl are discs without restitution, against events by hand."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles.ratchet import Ratchet, moved, stepped
+from oracles.ratchet import Ratchet, moved
 
 import jaxmb as mb
 from jaxmb import planar
@@ -46,7 +46,7 @@ def scene(ratchet):
 
 
 @pytest.mark.slow
-def test_a_ratchet():
+def test_ratchet_turns_and_locks():
     system = scene(LOCKS)
     state = mb.assemble(system, fix=dict(zip(("wheel.angle", "pawl.angle"), START, strict=True)))
     for ratchet, end in ((TURNS, 1.2), (LOCKS, 0.5)):
@@ -63,11 +63,3 @@ def test_a_ratchet():
         np.testing.assert_allclose(motion.events.times[:count], [time for time, _ in events][:count], atol=1e-8)
         for closed, (_, known) in zip(motion.events.after[:count], events, strict=False):
             assert tuple(np.flatnonzero(closed)) == known
-
-
-def test_events_by_hand_are_those_of_small_steps():
-    """Of the ratchet that locks, by a rule of the first order."""
-    q, u, _ = moved(LOCKS, START, (0.0, 0.0), 0.3)
-    near, rates = stepped(LOCKS, START, (0.0, 0.0), 0.3, 1500)
-    np.testing.assert_allclose(near, q, atol=1e-3)
-    np.testing.assert_allclose(rates, u, atol=1e-9)

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.slow
 
 
 # A contact of stiffness k lasts for π √(m / k), in which time a rigid one does not move: the error falls with 1 / √k.
-STIFFNESSES = (1e6, 1e8, 1e10, 1e12)
+STIFFNESSES = (1e8, 1e10, 1e12)
 
 
 def converges_to(rigid, compliant):
@@ -37,7 +37,7 @@ def train(couplings):
     return mb.Scene(cars, joints=rails + stops * rigid, forces=stops * (not rigid)).compile()
 
 
-def test_a_train_with_slack():
+def test_train_with_slack():
     slack = {"lower": -0.5, "upper": 0.05}
 
     def end(system):
@@ -84,7 +84,7 @@ def bearing(k):
     return mb.Force("pin", ["crank", "rod"], law, parameters={"stiffness": k})
 
 
-def test_a_slider_crank_with_clearance():
+def test_slider_crank_with_clearance():
     def run(system):
         return mb.simulate(system, mb.assemble(system), t1=0.0375, saveat=[0.0375], rtol=1e-11, max_steps=100_000)
 
@@ -94,38 +94,7 @@ def test_a_slider_crank_with_clearance():
     converges_to(end(rigid), lambda k: end(run(slider_crank(bearing(k)))))
 
 
-def four_bar(stop):
-    """A four-bar linkage whose rocker swings against a stop."""
-    links = {"crank": ((0.0, 0.5), 1.57, 1.0), "coupler": ((1.0, 1.4), 0.4, 2.0), "rocker": ((2.2, 0.9), 1.8, 1.8)}
-    bodies = [
-        planar.Body(name, mass=1.0, inertia=planar.rod(1.0, length), position=at, angle=angle)
-        for name, (at, angle, length) in links.items()
-    ]
-    joints = [
-        planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
-        planar.Revolute("B", "crank", "coupler", point_a=(0.5, 0.0), point_b=(-1.0, 0.0)),
-        planar.Revolute("C", "coupler", "rocker", point_a=(1.0, 0.0), point_b=(0.9, 0.0)),
-        planar.Revolute("D", "ground", "rocker", point_a=(2.5, 0.0), point_b=(-0.9, 0.0)),
-    ]
-    rigid = isinstance(stop, mb.Stop)
-    forces = [mb.Gravity((0.0, -9.81)), *[stop] * (not rigid)]
-    return mb.Scene(bodies, joints=joints + [stop] * rigid, forces=forces).compile()
-
-
-def test_a_four_bar_whose_rocker_hits_a_stop():
-    def run(system):
-        start = mb.assemble(system, rates={"crank.angle": -4.0})
-        return mb.simulate(system, start, t1=0.5, saveat=[0.5], rtol=1e-11, max_steps=100_000)
-
-    end = lambda motion: np.array([motion[name].angle[0] for name in ("crank", "coupler", "rocker")])
-    rigid = run(four_bar(mb.Stop("stop", "D.angle", upper=2.3, restitution=1.0)))
-    assert len(rigid.events) == 1
-    ends = {"lower": -9.0, "upper": 2.3}
-    compliant = lambda k: mb.JointStop("stop", "D.angle", **ends, stiffness=k, smoothing=1e-2 / np.sqrt(k))
-    converges_to(end(rigid), lambda k: end(run(four_bar(compliant(k)))))
-
-
-def test_ten_thousand_impacts():
+def test_energy_over_a_thousand_impacts():
     """A mass on a spring rattles between two stops: no energy comes in, and what is lost is what impacts take."""
     system = mb.Scene(
         [planar.Body("mass", mass=1.0, inertia=1.0, velocity=(10.0, 0.0))],
@@ -135,12 +104,12 @@ def test_ten_thousand_impacts():
         ],
         forces=[mb.JointSpring("spring", "rail.displacement", stiffness=3.0)],
     ).compile()
-    rtol, times = 1e-10, np.linspace(0.0, 350.0, 1001)
+    rtol, times = 1e-10, np.linspace(0.0, 35.0, 101)
     motion = mb.simulate(
-        system, mb.assemble(system), t1=350.0, saveat=times, rtol=rtol, max_steps=10**6, max_events=20_000
+        system, mb.assemble(system), t1=35.0, saveat=times, rtol=rtol, max_steps=10**5, max_events=2_000
     )
     events, start = motion.events, motion.energy[0]
-    assert len(events.times) >= 10_000
+    assert len(events.times) >= 1_000
     assert np.max(np.diff(motion.energy)) <= rtol * start
     lost = np.cumsum(np.asarray(events.kinetic_energy_lost))[np.searchsorted(np.asarray(events.times), times) - 1]
     np.testing.assert_allclose(motion.energy[1:], start - lost[1:], atol=1e3 * rtol * start)

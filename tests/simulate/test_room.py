@@ -25,23 +25,23 @@ def pendulum():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", ["dense", "steps"])
-def test_a_long_motion_finds_more_room(pendulum, monkeypatch, kept):
+def test_long_motion_finds_more_room(pendulum, monkeypatch, kept):
     system, state = pendulum
     saveat = diffrax.SaveAt(**{kept: True})
+    run = lambda state, **options: mb.simulate(system, state, t1=1.0, saveat=saveat, **options)
     with monkeypatch.context() as patch:
         patch.setattr(room, "_MEMORY", 1.0)
         patch.setattr(room, "_FEWEST_STEPS", 16)
-        found = mb.simulate(system, state, t1=1.0, saveat=saveat)
+        found = run(state)
         steps = int(found.stats["num_steps"])
         assert steps > 16 and found.stats["max_steps"] == 65536 and found.result == mb.RESULTS.successful
         with pytest.raises(RuntimeError, match=f"max_steps = {steps - 1} steps"):
-            mb.simulate(system, state, t1=1.0, saveat=saveat, max_steps=steps - 1)
+            run(state, max_steps=steps - 1)
     # A program that is traced cannot be computed again.
-    whole = jax.jit(lambda state: mb.simulate(system, state, t1=1.0, saveat=saveat, max_steps=256))(state)
+    whole, count = jax.jit(lambda state: run(state, max_steps=256))(state), found.ts.size
     if kept == "dense":
         np.testing.assert_array_equal(found.at(0.7).q, whole.at(0.7).q)
     else:
-        count = found.ts.size
         np.testing.assert_array_equal(found.ys.q, whole.ys.q[:count])
         assert not np.isfinite(whole.ts[count])
 
@@ -74,7 +74,7 @@ def end(system, state, t1, **options):
 
 
 @pytest.mark.slow
-def test_a_derivative_that_takes_more_steps_than_it_keeps_is_computed_again(pendulum, rooms):
+def test_derivative_that_takes_more_steps_than_it_keeps_is_computed_again(pendulum, rooms):
     long = end(*pendulum, 1.0)
     whole = jax.jit(jax.grad(long))(9.81)
     assert rooms == [65536]
@@ -85,37 +85,26 @@ def test_a_derivative_that_takes_more_steps_than_it_keeps_is_computed_again(pend
     rooms.clear()
     np.testing.assert_allclose(jax.jacfwd(long)(9.81), whole, rtol=1e-9)
     assert rooms == [65536]
-    # A number of steps that does not suffice is said as before.
-    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=20))(9.81)) and rooms[1:] == [64]
+    # A number of steps that does not suffice is said as before, and few steps have a small program.
+    for most, used in ((20, 64), (3, 4), (16, 16)):
+        assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=most))(9.81)) and rooms[-1] == used
 
 
 @pytest.mark.slow
-def test_few_steps_have_a_small_program(pendulum, rooms):
-    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=3))(9.81))
-    assert np.isnan(jax.grad(end(*pendulum, 1.0, max_steps=16))(9.81))
-    assert rooms == [4, 16]
-
-
-@pytest.mark.slow
-def test_a_motion_of_many_steps_tells_its_derivative(pendulum, rooms):
-    long = end(*pendulum, 1.0)
-    value = long(9.81)
-    rooms.clear()
-    assert np.isfinite(jax.value_and_grad(long)(9.81)[0] - value)
-    assert rooms == [65536]
-
-
-@pytest.mark.slow
-def test_a_short_motion_has_a_short_program(pendulum, rooms):
-    short = end(*pendulum, 1e-2, rtol=1e-4)
-    both = short(9.81), jax.value_and_grad(short)(9.81)
-    np.testing.assert_allclose(both[0], both[1][0], rtol=1e-6)
-    assert rooms == [65536, 16]
-    more = jax.hessian(short)(9.81)
-    assert rooms == [65536, 16, 16] and np.isfinite(more)
-    # Of a batch it is not known beforehand how many steps its members take.
-    np.testing.assert_allclose(jax.vmap(jax.grad(short))(jnp.array([9.81]))[0], both[1][1], rtol=1e-9)
-    assert rooms[-1] == 65536
+def test_motion_tells_its_derivative_how_many_steps_it_takes(pendulum, rooms):
+    """A long one needs a long program, and a short one a short program."""
+    for t1, rtol, rows in ((1e-2, 1e-4, 16), (1.0, 1e-8, 65536)):
+        run = end(*pendulum, t1, rtol=rtol)
+        value = run(9.81)
+        rooms.clear()
+        other, slope = jax.value_and_grad(run)(9.81)
+        np.testing.assert_allclose(other, value, rtol=1e-6)
+        assert rooms == [rows]
+        # Of a batch it is not known beforehand how many steps its members take.
+        np.testing.assert_allclose(jax.vmap(jax.grad(run))(jnp.array([9.81]))[0], slope, rtol=1e-9)
+        assert rooms[-1] == 65536
+        if rows == 16:
+            assert np.isfinite(jax.hessian(run)(9.81)) and rooms[-1] == 16
 
 
 @pytest.fixture(scope="module")

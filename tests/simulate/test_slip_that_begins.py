@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_quickly
-from oracles.block_on_belt import Belt, moved, smoothly_moved
+from oracles.block_on_belt import Belt, moved
 from scipy.integrate import solve_ivp
 
 import jaxmb as mb
@@ -104,28 +104,18 @@ def run(belt, x, v, end, rtol):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8, 1e-10])
-@pytest.mark.parametrize("name", CASES)
-def test_a_block_on_a_belt(name, rtol):
+def test_block_on_a_belt_slips_when_its_force_grows_through_the_limit():
     """Each slip begins once, at the time found by hand."""
-    belt, x, v = CASES[name]
-    *known, events = moved(belt, x, v, 1.3)
-    end, times, after = run(belt, x, v, 1.3, rtol)
-    np.testing.assert_allclose(end, known, rtol=0, atol=30 * rtol)
-    # A slip that begins at the start is an event just after it.
-    late = times > 1e-6
-    np.testing.assert_allclose(times[late], [time for time, _ in events], rtol=30 * rtol)
-    np.testing.assert_array_equal(after[late] % 2, [abs(mode) for _, mode in events])
-    assert times.size <= len(events) + 1
-
-
-@pytest.mark.slow("spring")
-@pytest.mark.parametrize("name", ["spring", "falling friction", "at the other limit"])
-def test_events_by_hand_are_those_of_a_smooth_law(name):
-    """Friction that grows within a small velocity of slip has no events."""
-    belt, x, v = CASES[name]
-    width = 1e-6
-    np.testing.assert_allclose(smoothly_moved(belt, x, v, 1.3, width), moved(belt, x, v, 1.3)[:2], atol=100 * width)
+    for name, (belt, x, v) in CASES.items():
+        *known, events = moved(belt, x, v, 1.3)
+        for rtol in (1e-4, 1e-7, 1e-10):
+            end, times, after = run(belt, x, v, 1.3, rtol)
+            np.testing.assert_allclose(end, known, rtol=0, atol=30 * rtol, err_msg=name)
+            # A slip that begins at the start is an event just after it.
+            late = times > 1e-6
+            np.testing.assert_allclose(times[late], [time for time, _ in events], rtol=30 * rtol, err_msg=name)
+            np.testing.assert_array_equal(after[late] % 2, [abs(mode) for _, mode in events], err_msg=name)
+            assert times.size <= len(events) + 1, name
 
 
 def _random_case(chance):
@@ -160,7 +150,7 @@ def _random_case(chance):
 def test_random_belts():
     """Many of them, with one program, against events by hand."""
     chance = np.random.default_rng(0)
-    for k in range(200):
+    for k in range(80):
         belt, x, v, rtol = _random_case(chance)
         *known, events = moved(belt, x, v, 2.0)
         end, times, _ = run(belt, x, v, 2.0, rtol)
@@ -197,7 +187,7 @@ def derivatives():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name, end", [("spring", 1.2), ("falling friction", 2.0)])
-def test_derivatives_where_slip_begins(name, end):
+def test_slip_that_begins_has_derivatives(name, end):
     """Forward, in reverse and by differences; its time moves with the numbers. Where friction falls with the velocity,
     the block sticks and slips again.
     """
@@ -242,7 +232,7 @@ def _swings(end, weight, rate, radius=0.05, slip=0.3, mass=2.0, length=0.4, iner
 
 
 @pytest.mark.slow
-def test_a_pin_that_rubs_begins_to_turn():
+def test_pin_that_rubs_begins_to_turn():
     """Its friction depends on the force of the pin, which depends on the motion."""
     mass, length, rate = 2.0, 0.4, 2.0
     moment = lambda x, v, t, p: jnp.stack([0.0 * t, 0.0 * t, p["rate"] * t])[None]
@@ -279,7 +269,7 @@ def _in_space(on):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("on", ["face", "floor"])
-def test_a_block_in_a_plane_in_space(on):
+def test_block_in_a_plane_in_space(on):
     """On a belt, and under a ramp of force, it slips along a line."""
     system = _in_space(on)
     along = np.array([0.6, 0.8])

@@ -1,4 +1,4 @@
-"""A block on a spring and a damper, on a belt, with Coulomb's friction: events by hand, and by a smooth law."""
+"""A block on a spring and a damper, on a belt, with Coulomb's friction: events by hand."""
 
 from typing import NamedTuple
 
@@ -73,16 +73,3 @@ def _begins(belt, t, x):
         grows = np.sign(force) * (belt.rate - belt.stiffness * belt.speed) > 0
         return np.sign(force) if grows else 0.0
     return np.sign(force) if abs(force) > limit else 0.0
-
-
-def smoothly_moved(belt: Belt, x: float, v: float, end: float, width: float):
-    """Displacement and velocity at the time `end` where friction grows with a slip of less than about `width` [m/s];
-    without a larger limit of stick.
-    """
-
-    def field(t, y):
-        slip = y[1] - belt.speed
-        return y[1], (belt.other_force(t, *y) - belt.friction(abs(slip)) * np.tanh(slip / width)) / belt.mass
-
-    run = solve_ivp(field, (0.0, end), (x, v), "Radau", rtol=1e-9, atol=1e-11)
-    return run.y[:, -1]

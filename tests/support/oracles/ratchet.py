@@ -1,5 +1,4 @@
-"""A wheel with teeth that are discs, and a pawl whose tip is one, without restitution or friction: events by hand, and
-by steps in time that know of no events.
+"""A wheel with teeth that are discs, and a pawl whose tip is one, without restitution or friction: events by hand.
 
 The angles of wheel and pawl are the coordinates, so that their inertias are constant. Which contacts push is found by
 trying all combinations of those that touch.
@@ -121,21 +120,3 @@ def moved(ratchet: Ratchet, q, u, end: float, rtol=1e-12):
         u = u - own.T @ np.linalg.solve((own / inertias) @ own.T, own @ u) / inertias if closed else u
         events.append((t, tuple(closed)))
     return q, u, events
-
-
-def stepped(ratchet: Ratchet, q, u, end: float, count: int):
-    """Angles and rates by Moreau's midpoint rule, of the first order, with `count` steps.
-
-    Source: J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", Springer, 1988.
-    """
-    q, u, h, inertias = np.array(q, float), np.array(u, float), end / count, np.array(ratchet.inertias)
-    for n in range(count):
-        middle = q + 0.5 * h * u
-        gap, rows, _ = ratchet.gaps(middle, u)
-        u = u + h * ratchet.moments((n + 0.5) * h, middle, u) / inertias
-        touching = [k for k in range(ratchet.teeth) if gap[k] <= 0]
-        if touching:
-            chosen, impulse = _pushing(rows, rows @ u, inertias, touching)
-            u = u + rows[chosen].T @ impulse / inertias
-        q = middle + 0.5 * h * u
-    return q, u
