@@ -12,7 +12,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# The programs that the short tests of a file may compile, eager operations with them, unless it states its `MOST_PROGRAMS`.
+# The programs that the short tests of a file may compile, eager operations too, unless it states its `MOST_PROGRAMS`.
 MOST_PROGRAMS = 60
 # Where Linux lists the memory maps of this process, and with how many of them compiled programs are given back.
 MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000

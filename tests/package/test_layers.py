@@ -180,7 +180,7 @@ def test_only_compat_uses_private_names_which_exist():
             whole = f"{source}.{name}" if name else source
             if source.startswith("__future__") or not (is_private(source) or whole.startswith(PRIVATE_MODULES)):
                 continue
-            assert module == "_compat", f"{module} imports {whole}: private names of other packages belong in _compat.py"
+            assert module == "_compat", f"{module} imports {whole}: private names belong in _compat.py"
             package = source.split(".")[0]
             about = f"{package} {importlib.metadata.version(package)} has no {whole}, which jaxmb._compat uses"
             try:
