@@ -607,10 +607,10 @@ FAULTS = [
     ),
     Fault(
         "contacts/guards.py",
-        "gap * (1 - 0.5 * gap / system.contact_numbers(t).peaks)",
-        "gap * (1 - gap / system.contact_numbers(t).peaks)",
+        "gaps * (1 - 0.5 * gaps / peaks)",
+        "gaps * (1 - gaps / peaks)",
     ),
-    Fault("contacts/guards.py", "modes.of_friction * rates, system.length)", "rates, system.length)"),
+    Fault("contacts/guards.py", "modes.of_friction * rates[contacts.n :]", "rates[contacts.n :]"),
     Fault("contacts/impact.py", "dlate = dlate + _release(", "dlate = dlate - _release("),
     Fault("contacts/impact.py", "q + event.late * (before - after)", "q + event.late * (after - before)"),
     Fault(
@@ -633,8 +633,8 @@ FAULTS = [
     Fault("contacts/impacting.py", "2 * rate / (falls * (1 - ratio))", "2 * rate / falls"),
     Fault(
         "contacts/impacting.py",
-        "energy=0.5 * (kinetic(when.u) - kinetic(after))",
-        "energy=kinetic(when.u) - kinetic(after)",
+        "0.5 * (kinetic(when.u) - kinetic(after))",
+        "(kinetic(when.u) - kinetic(after))",
     ),
     Fault(
         "contacts/phases.py",
@@ -719,8 +719,8 @@ FAULTS = [
     Fault("linalg/elimination.py", "-(pushed @ factor.null_space)", "pushed @ factor.null_space"),
     Fault(
         "linalg/inertia.py",
-        "matrix_products(_inverse_3x3(self.inertia), n), 1 / self.mass, f)",
-        "matrix_products(_inverse_3x3(self.inertia), n), 1 / self.mass**2, f)",
+        "matrix_products(inverses_3x3(self.inertia), n), 1 / self.mass, f)",
+        "matrix_products(inverses_3x3(self.inertia), n), 1 / self.mass**2, f)",
     ),
     Fault(
         "linalg/jacobian.py", "towards - self.direction(self.multipliers(self.jacobian.product(towards)))", "towards"

@@ -12,6 +12,8 @@ from jaxmb import importers, parts, spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.importers.description import rotation_of
 
+MOST_PROGRAMS = 100
+
 mujoco = pytest.importorskip("mujoco")
 
 

@@ -18,6 +18,8 @@ from trajectories import motion_of
 import jaxmb as mb
 from jaxmb import mechanisms, planar
 
+MOST_PROGRAMS = 120
+
 RTOL = 1e-10
 
 # By a method that is compiled sooner than the default.

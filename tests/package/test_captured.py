@@ -21,6 +21,8 @@ from jaxmb import planar
 from jaxmb._captured import Captured
 from jaxmb.simulate.captured import captured_event
 
+MOST_PROGRAMS = 90
+
 
 def check(place, way, first, second):
     """The law is proportional to its number, or adds to a part without it; a height changes directions as well."""

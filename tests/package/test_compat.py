@@ -19,6 +19,8 @@ from precision import single_precision
 
 from jaxmb.linalg.sums import unchecked_take
 
+MOST_PROGRAMS = 70
+
 
 @pytest.fixture(scope="module")
 def compat():

@@ -37,6 +37,8 @@ from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import AbstractCompound, AbstractConstraint, AbstractVelocityConstraint, fields
 from jaxmb.parts.base import AbstractInertialConstraint
 
+MOST_PROGRAMS = 160
+
 CONSTRAINTS = (AbstractConstraint, AbstractVelocityConstraint, AbstractCompound)
 # Inertias of one coordinate add up.
 CONSTRAINED = [

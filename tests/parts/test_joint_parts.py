@@ -8,6 +8,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar, spatial
 
+MOST_PROGRAMS = 100
+
 J = np.diag([0.02, 0.09, 0.07])
 
 

@@ -22,6 +22,8 @@ from jaxmb.parts.modes import (
     slip_direction,
 )
 
+MOST_PROGRAMS = 70
+
 # Friction in one direction, then one in two directions.
 ALONG = np.array([0.6, -0.8])
 

@@ -16,6 +16,8 @@ from jaxmb import planar, spatial
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
 
+MOST_PROGRAMS = 90
+
 G = 9.81
 GRAVITY = mb.Gravity((0.0, -G))
 # Compiled sooner than the default; any method will do.

@@ -10,6 +10,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 
+MOST_PROGRAMS = 100
+
 PENDULUM = mb.mechanisms.pendulum()
 BAR = mb.Scene(
     [planar.Body("bar", mass=1.0, inertia=planar.rod(1.0, 1.0), position=(0.5, 0.0))],

@@ -20,6 +20,8 @@ from jaxmb.parts import terrain
 from jaxmb.parts.modes import CLOSED, STICK
 from jaxmb.solvers import Adams, Hermite
 
+MOST_PROGRAMS = 70
+
 G = 9.81
 DOWN, DOWN_3D = mb.Gravity((0.0, -G)), mb.Gravity((0.0, 0.0, -G))
 UP, EAST = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)

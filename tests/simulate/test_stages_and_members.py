@@ -17,6 +17,8 @@ import jaxmb as mb
 from jaxmb import planar
 from jaxmb.trajectory import at_rows, picture_of
 
+MOST_PROGRAMS = 160
+
 G, MASS, HEAVY = 10.0, 2.0, 5.0
 FIRST, LATER = np.linspace(0.0, 0.4, 3), np.linspace(0.4, 1.0, 4)
 

@@ -14,6 +14,8 @@ import jaxmb as mb
 from jaxmb import importers, mechanisms, planar, spatial
 from jaxmb.lagrangian import LagrangianSystem
 
+MOST_PROGRAMS = 240
+
 LENGTHS, BASE, MASSES, GRAVITY = (1.0, 3.0, 2.5), 2.5, (1.0, 3.0, 2.5), 9.81
 TS = np.linspace(0.0, 1.0, 5)
 

@@ -15,6 +15,8 @@ import jaxmb as mb
 from jaxmb import mechanisms, planar, spatial
 from jaxmb.studies.loads import _of_body
 
+MOST_PROGRAMS = 140
+
 
 def through(system, count=1):
     """A trajectory through states with random velocities."""

@@ -11,6 +11,8 @@ from jaxmb import spatial
 from jaxmb.parts import terrain
 from jaxmb.parts.modes import CLOSED, STICK
 
+MOST_PROGRAMS = 90
+
 
 @functools.cache
 def scene(contacts=True):

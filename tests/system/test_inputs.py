@@ -15,6 +15,8 @@ import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.system.inputs import turning_times
 
+MOST_PROGRAMS = 110
+
 G, LENGTH, MASS = 9.81, 0.7, 1.3
 INERTIA = MASS * LENGTH**2 / 3
 TS = np.linspace(0.0, 1.0, 6)

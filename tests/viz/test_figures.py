@@ -19,6 +19,8 @@ from jaxmb.viz.meshes import unit_mesh
 from jaxmb.viz.motion_nodes import chosen
 from jaxmb.viz.silhouettes import area
 
+MOST_PROGRAMS = 70
+
 TS = np.linspace(0.0, 1.0, 5)
 
 

@@ -25,6 +25,8 @@ from jaxmb.viz.motion_nodes import chosen
 from jaxmb.viz.one_motion import as_motion
 from jaxmb.viz.solids import solids
 
+MOST_PROGRAMS = 70
+
 G, MASS, INERTIA, ARM = 9.81, 2.0, 0.3, 0.6
 
 

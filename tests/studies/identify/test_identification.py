@@ -25,6 +25,8 @@ from jaxmb.studies.identify.profile import profile
 from jaxmb.studies.identify.sensors import readings_of
 from jaxmb.studies.minimise import Linearised, levenberg_marquardt, minimise_together
 
+MOST_PROGRAMS = 200
+
 TS = np.linspace(0.0, 1.0, 31)[1:]
 # Compiles faster than Adams, where the solver does not matter.
 TSIT5 = diffrax.Tsit5()

@@ -19,6 +19,8 @@ from jaxmb.studies.identify.loss import LOSSES
 from jaxmb.studies.identify.unknowns import unknowns
 from jaxmb.studies.minimise import Linearised, _step, levenberg_marquardt
 
+MOST_PROGRAMS = 90
+
 TS = np.linspace(0.0, 1.0, 31)[1:]
 TRUE = {"spring.stiffness": 6.0, "spring.damping": 0.3}
 SIGMA = {"rod.angle": 1e-3}

@@ -14,6 +14,8 @@ from jaxmb.studies.identify.loss import LOSSES
 from jaxmb.studies.identify.residuals import Bias, Series, outliers
 from jaxmb.studies.ranges import HalfLine, Inertia, Interval, WholeLine
 
+MOST_PROGRAMS = 140
+
 # Compiles faster than Adams, where the solver does not matter.
 TSIT5 = diffrax.Tsit5()
 # All data sets of the swing have the same times and lack some of them: all fits share one compiled program.

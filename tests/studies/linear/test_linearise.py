@@ -18,6 +18,8 @@ from jaxmb.studies.linear.eigen import eigen
 from jaxmb.studies.linear.linearisation import Linearisation
 from jaxmb.studies.linear.steady import _bodies, _Unknowns
 
+MOST_PROGRAMS = 90
+
 G = 9.81
 
 

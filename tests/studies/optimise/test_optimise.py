@@ -13,6 +13,8 @@ import pytest
 import jaxmb as mb
 from jaxmb.studies.optimise.evaluation import Program
 
+MOST_PROGRAMS = 130
+
 START = {"x": [-1.2, 1.0]}
 DISK = {"square": (None, 1.0)}
 METHODS = ["slsqp", "optax"]
