@@ -305,11 +305,13 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
     here = series.takes(k, row)
     if here is not False:
         place, counts = place.at[0].add(-here.astype(place.dtype)), here
+        of_step = place[0]
         if series.events:
+            # A step that begins at a void event may end at the event that takes its place.
             void = row.at_event.void.astype(place.dtype)
-            counts, place = here & (place[1] == 0), jnp.stack([place[0] + void, void])
+            counts, place = here & (place[1] == 0), jnp.stack([of_step + void, void])
         if table is not None:
-            lw = lw + jnp.where(counts, table[place[0]], 0.0)
+            lw = lw + jnp.where(counts, table[of_step], 0.0)
     if series.times is not None:
         times = series.times
 

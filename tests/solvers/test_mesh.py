@@ -9,6 +9,8 @@ import optimistix as optx
 from jaxmb._compat import WrapTerm
 from jaxmb.solvers import Adams, MeshAdjoint, MultistepController
 from jaxmb.solvers.adams_steps import _at_start
+from jaxmb.solvers.mesh import Saved, _saved, _unsaved
+from jaxmb.solvers.segments import AtEvent, Row
 
 
 def decay(rate, start, **options):
@@ -57,3 +59,33 @@ def test_the_first_row_has_the_field_at_the_start():
     step = lambda: solver.step(term, 0.1, 0.2, start, None, solver.init(term, 0.1, 0.2, start, None), False)
     found = jax.jit(lambda: _at_start(term, step()[3])[0])()
     np.testing.assert_allclose(found, [start[1], -np.sin(start[0]) + 0.1], rtol=1e-14)
+
+
+def test_cotangents_of_events_go_to_their_steps():
+    """The transpose of the table of events, in which the next event takes the place of a void one: an event may end the
+    very step that finds the one before it void.
+    """
+    here = np.array([1, 1, 0, 1, 0, 1, 1, 1], bool)
+    void = np.array([0, 1, 0, 0, 1, 0, 1, 0], bool)
+    rows = Row(0.0, 0.0, AtEvent(jnp.asarray(here), jnp.asarray(void)), None)
+    series = Saved(False, None, 0, True, here.size, jnp.zeros(2, int))
+    at_step = lambda k: jax.tree.map(lambda x: x[k], rows.at_event)
+
+    @jax.jit
+    def tables(w, cotangents):
+        table, place = jnp.zeros(here.size), jnp.zeros(2, int)
+        for k in range(here.size):
+            table, place = _saved(series, table, place, k, rows._replace(at_event=at_step(k)), w[k], None, None)
+        back, of_place = [], place
+        for k in reversed(range(here.size)):
+            row = rows._replace(at_event=at_step(k))
+            lw, _, of_place = _unsaved(series, cotangents, of_place, k, row, jnp.zeros(()), None, None)
+            back.append(lw)
+        return table, place, jnp.stack(back[::-1])
+
+    w, cotangents = np.random.default_rng(0).normal(size=(2, here.size))
+    table, place, back = tables(w, cotangents)
+    kept = here & ~np.append(void[1:], False)
+    np.testing.assert_allclose(table[: place[0]], w[kept])
+    np.testing.assert_array_equal(back != 0, kept)
+    np.testing.assert_allclose(back[kept], cotangents[: place[0]])
