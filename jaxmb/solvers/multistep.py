@@ -165,16 +165,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         return y1, estimate, dense_info, state, result
 
     @eqx.filter_jit
-    def step_again(
-        self,
-        terms: PyTree[diffrax.AbstractTerm],
-        t0: Any,
-        t1: Any,
-        y0: Y,
-        args: Args,
-        solver_state: Any,
-        made_jump: Any,
-    ) -> tuple[Y, Any]:
+    def step_again(self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any) -> tuple[Y, Any]:
         """The end of an accepted step, and the solver state there: `step` without a search for events."""
         y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
         y1, _, _, state, _ = self._advanced(terms, t1, y0, args, state)
