@@ -514,6 +514,11 @@ class Hermite(AbstractMultistep):
             order_index = jnp.where(better, candidates[3], order_index)
             estimate = eqx.tree_at(lambda e: e.growth, estimate, jnp.where(better, growth, estimate.growth))
 
+        # No step from a start without a field has an estimate.
+        lost = is_start(state.history) & ~jnp.all(jnp.isfinite(state.slope))
+        retry = jnp.where(lost, jnp.asarray(-1.0, dtype), estimate.retry)
+        estimate = eqx.tree_at(lambda e: e.retry, estimate, retry)
+
         y1 = unravel_like(y0, step.after)
         renewed = next_chart(terms, t1, y1, step.chart, args)
         matrix = newton.matrix

@@ -80,7 +80,7 @@ def test_event_in_a_batch_beside_members_without_one():
     def at_event(start, **options):
         start = jnp.stack([start, 0.0 * start])
         event = diffrax.Event(falling, **EVENT)
-        return solve(MeshAdjoint(64), y0=start, event=event, throw=False, **options)
+        return solve(**{"adjoint": MeshAdjoint(64)} | options, y0=start, event=event, throw=False)
 
     swings = jax.vmap(jax.value_and_grad(lambda start: at_event(start, terms=SWING).ts[0]))
     times, rates = swings(jnp.array([1.0, jnp.nan, 0.5]))
@@ -88,11 +88,15 @@ def test_event_in_a_batch_beside_members_without_one():
     slope = lambda start: -0.2 / start**2 / np.sqrt(1 - (0.4 / start) ** 2)
     np.testing.assert_allclose(times[::2], [exact(1.0), exact(0.5)], rtol=1e-5)
     np.testing.assert_allclose(rates[::2], [slope(1.0), slope(0.5)], rtol=1e-4)
-    at_end = lambda start: (lambda found: (found.ts[0], found.ys[0]))(at_event(start, max_steps=11))
-    both = jax.vmap(at_end)(jnp.array([1.0, 0.3]))
-    for k, start in enumerate((1.0, 0.3)):
-        for one, alone in zip(both, at_end(jnp.asarray(start)), strict=True):
-            np.testing.assert_allclose(one[k], alone, rtol=1e-9)
+    # Some members end with their last step, before an event. Steps of a batch are not quite those of one member.
+
+    def in_steps(adjoint):
+        ends = lambda found: (found.ts[0], found.ys[0])
+        return jax.vmap(lambda start: ends(at_event(start, adjoint=adjoint, max_steps=12)))(jnp.array([1.0, 0.5, 0.3]))
+
+    own, other = in_steps(MeshAdjoint(64)), in_steps(diffrax.RecursiveCheckpointAdjoint())
+    for one, known in zip(own, other, strict=True):
+        np.testing.assert_allclose(one, known, rtol=1e-12)
 
 
 @pytest.mark.slow
