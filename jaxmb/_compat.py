@@ -9,7 +9,8 @@ import functools
 import importlib.util
 import mmap
 import pkgutil
-from collections.abc import Callable, Mapping
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from importlib import metadata
 from pathlib import Path
@@ -101,6 +102,17 @@ def current_trace() -> Any:
     (jax.extend.core.get_opaque_trace_state, 0.9 and 0.10.)
     """
     return core.get_opaque_trace_state()
+
+
+def traces_around() -> Iterator[Any]:
+    """References to the trace that operations go to now, and to those around it, whose values may be used as well.
+
+    (jax._src.core.trace_ctx and Trace.parent_trace, 0.9 and 0.10.)
+    """
+    trace = jax._src.core.trace_ctx.trace  # pyright: ignore[reportAttributeAccessIssue]
+    while trace is not None:
+        yield weakref.ref(trace)
+        trace = getattr(trace, "parent_trace", None)
 
 
 def with_rest_computed(function: Callable[[Array], Array], like: Array) -> Callable[[Array], Array]:

@@ -71,24 +71,38 @@ def _traced(function, arguments, which):
 
 def _reached(program: Any, reached: set[Any]) -> Iterator[Any]:
     """The operations that some values reach; their results are added to these values."""
+    is_reached = lambda v: not isinstance(v, Literal) and v in reached
     for equation in program.eqns:
-        if any(not isinstance(v, Literal) and v in reached for v in equation.invars):
+        if not any(map(is_reached, equation.invars)):
+            continue
+        yield equation
+        if (inner := _inner(equation, is_reached)) is None:
             reached.update(equation.outvars)
-            yield equation
+            continue
+        inside = inner[1]
+        list(_reached(*inner))
+        of_inner = zip(equation.outvars, inner[0].outvars, strict=True)
+        reached.update(v for v, w in of_inner if not isinstance(w, Literal) and w in inside)
+
+
+def _inner(equation: Any, is_reached: Callable[[Any], bool]) -> tuple[Any, set[Any]] | None:
+    """The program that an operation calls, and its arguments that are reached; None for other operations."""
+    if equation.primitive.name not in _CALLS:
+        return None
+    (inner,) = (x for x in equation.params.values() if isinstance(x, ClosedJaxpr | Jaxpr))
+    inner = getattr(inner, "jaxpr", inner)
+    return inner, {w for v, w in zip(equation.invars, inner.invars, strict=True) if is_reached(v)}
 
 
 def _is_analytic(program: Any, reached: set[Any]) -> bool:
+    is_reached = lambda v: not isinstance(v, Literal) and v in reached
     for equation in _reached(program, reached):
-        name, given = equation.primitive.name, equation.invars
-        if name not in _CALLS:
+        name = equation.primitive.name
+        if (inner := _inner(equation, is_reached)) is None:
             # A real number may also be rounded to a whole one.
             whole = name == "convert_element_type" and not jnp.issubdtype(equation.params["new_dtype"], jnp.floating)
             if whole or name not in _ANALYTIC:
                 return False
-            continue
-        (inner,) = (x for x in equation.params.values() if isinstance(x, ClosedJaxpr | Jaxpr))
-        inner = getattr(inner, "jaxpr", inner)
-        of_inner = zip(given, inner.invars, strict=True)
-        if not _is_analytic(inner, {w for v, w in of_inner if not isinstance(v, Literal) and v in reached}):
+        elif not _is_analytic(*inner):
             return False
     return True

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Scalar
 from ..linalg.sums import unchecked_take
 from ..parts.base import AbstractInertialConstraint
+from ..system.contact_set import ContactMotion, ContactPlace
 from .elementary import ElementaryRows, elementary_rows, half_turned, is_elementary
 from .groups import (
     AbstractConstraintGroup,
@@ -21,9 +22,11 @@ from .groups import (
     ConstraintGroup,
     Kinematics,
     NonIdealGroup,
+    Placed,
     VelocityConstraintGroup,
     joined,
 )
+from .law_groups import laws_among, motions_of, places_of
 from .layout import Layout
 
 
@@ -50,9 +53,14 @@ class ConstraintSet(eqx.Module):
         return (*self.position, *self.velocity, *self.servos)
 
     @property
-    def frictions(self) -> tuple[VelocityConstraintGroup, ...]:
+    def contacts(self) -> tuple[Any, ...]:
+        """The groups of contacts."""
+        return tuple(g for g in self.position if g.is_contact)
+
+    @property
+    def frictions(self) -> tuple[Any, ...]:
         """The groups of dry friction."""
-        return tuple(g for g in self.velocity if g.joints)
+        return tuple(g for g in self.velocity if g.is_friction)
 
     @property
     def laws(self) -> tuple[NonIdealGroup, ...]:
@@ -79,6 +87,25 @@ class ConstraintSet(eqx.Module):
         """The same set, with the rows of all elementary joints computed together."""
         elements = elementary_rows(self.position, self.layout.ground)
         return ConstraintSet(self.position, self.velocity, self.servos, self.nonideal, self.layout, elements)
+
+    # The laws of contacts and dry friction at an instant, as if all acted
+
+    def placed(self, t: Scalar, poses: BodyPoses) -> Placed:
+        """The scene at rest, with the rows of the laws."""
+        placed, laws = places_of(self.groups, t, poses), laws_among(self.groups)
+        if not laws:
+            return placed
+        blocks = joined([*(place.rows for place in placed.places), jnp.zeros(1, poses.dtype)], poses.dtype)
+        gaps = [place.gap for g, place in zip(laws, placed.places, strict=True) if g.is_contact]
+        sizes = [jnp.repeat(g.sizes(placed.places), g.rows) for g in self.frictions]
+        gradients = self._assembled(blocks, laws, of_poses=False)
+        return placed._replace(contacts=ContactPlace(joined(gaps, poses.dtype), gradients, joined(sizes, poses.dtype)))
+
+    def moving(self, placed: Placed, velocities: BodyVelocities) -> Kinematics:
+        """The scene in motion, with the rates of the laws."""
+        now = motions_of(self.groups, placed, velocities)
+        rates, biases = ([getattr(law, name) for law in now.motions] for name in ("rate", "bias"))
+        return now._replace(contacts=ContactMotion(joined(rates, velocities.dtype), joined(biases, velocities.dtype)))
 
     # Residuals
 

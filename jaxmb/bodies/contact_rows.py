@@ -1,22 +1,22 @@
 """Places of contacts and dry friction in a scene: their rows of A, and their modes in q."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from ..contacts.shares import Sharing
-from ..parts.unilateral import AbstractUnilateralConstraint
 from ..system.contact_set import ContactSet
 from ..system.sharing import NoSharing
-from .groups import AbstractConstraintGroup, ConstraintGroup, VelocityConstraintGroup
+from .groups import AbstractConstraintGroup, ConstraintGroup
 
 
 def contact_set(
-    constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[VelocityConstraintGroup], shares: bool
+    constraints: Sequence[ConstraintGroup], velocity_constraints: Sequence[Any], shares: bool
 ) -> ContactSet:
     """The contacts among the groups of position constraints, and the dry friction among the velocity constraints;
     `shares`: whether contacts imply each other, see `ContactSet.sharing`.
     """
-    contacts = [g for g in constraints if isinstance(g.group.part, AbstractUnilateralConstraint)]
-    frictions = [g for g in velocity_constraints if g.joints]
+    contacts = [g for g in constraints if g.is_contact]
+    frictions = [g for g in velocity_constraints if g.is_friction]
     if not contacts and not frictions:
         return ContactSet()
     first_row, rows = {}, 0

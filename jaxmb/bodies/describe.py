@@ -21,7 +21,7 @@ def describe_scene(system: Any) -> Description:
         (plain, ""),
         ([g for g in constraints.inertial if not is_contact(g)], ", each with a velocity of its own"),
         (system.free_joints, ", which have coordinates only"),
-        ([g for g in constraints.velocity if not g.joints], ", between velocities"),
+        ([g for g in constraints.velocity if not g.is_friction], ", between velocities"),
         (constraints.servos, ", a program of a Servo"),
     ]
     kind = lambda g: g.group.part.kind

@@ -24,6 +24,7 @@ from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal, of_each, of_one_kind
 from ..parts.servo import Servo
 from ..parts.space import AbstractSpace
+from ..system.contact_set import ContactMotion, ContactPlace
 from .layout import Layout
 
 # Prepared poses, and velocities or accelerations, of all bodies, scalar coordinates and the ground, in this order.
@@ -38,12 +39,28 @@ _MOST_TURNING = 32
 Acting: TypeAlias = tuple[Float[Array, "parts k v"], np.ndarray]
 
 
+class Placed(NamedTuple):
+    """A scene at rest: time `t` [s], prepared `poses` of bodies, scalar coordinates and ground; `places`: what each
+    group of contacts and of dry friction says of them, see `law_groups`, and `contacts`: all together.
+    """
+
+    t: Scalar
+    poses: BodyPoses
+    places: tuple[Any, ...] = ()
+    contacts: ContactPlace | None = None
+
+
 class Kinematics(NamedTuple):
-    """A scene in motion: time `t` [s], prepared `poses` and `velocities` of bodies, scalar coordinates and ground."""
+    """A scene in motion: as `Placed`, with the `velocities`; `motions`: what each group of laws says of these, and
+    `contacts`: all together.
+    """
 
     t: Scalar
     poses: BodyPoses
     velocities: BodyVelocities
+    places: tuple[Any, ...] = ()
+    motions: tuple[Any, ...] = ()
+    contacts: ContactMotion | None = None
 
 
 class Input(eqx.Module):
@@ -369,6 +386,20 @@ class AbstractConstraintGroup(AbstractGroup):
     def acceleration(self, now: Kinematics, accelerations: BodyVelocities) -> Float[Array, "parts rows"]:
         """The time derivative of `velocity`."""
 
+    def jacobian_of(self, member: Any, now: Kinematics) -> Float[Array, "rows k v"]:
+        """`jacobian` of one part, whose index may be traced."""
+        return self.only(member).jacobian(now)[0]
+
+    @property
+    def is_contact(self) -> bool:
+        """Whether the parts are contacts."""
+        return False
+
+    @property
+    def is_friction(self) -> bool:
+        """Whether the parts are dry friction."""
+        return False
+
     @property
     def of_poses(self) -> bool:
         """Whether the rows come from residuals of poses."""
@@ -464,7 +495,7 @@ class ConstraintGroup(AbstractConstraintGroup):
         return self._map(single, now.poses, per_part=(multipliers,))
 
     def acceleration(self, now, accelerations):
-        t, poses, velocities = now
+        t, poses, velocities, *_ = now
         rates = self._rates(poses, velocities)
         _, second = jax.jvp(self._rates, (poses, velocities), (rates, accelerations))
 
@@ -490,17 +521,7 @@ class ConstraintGroup(AbstractConstraintGroup):
 
 
 class VelocityConstraintGroup(AbstractConstraintGroup):
-    """Kernels of stacked velocity constraints, among them dry friction that sticks.
-
-    **Fields:** `joints`: for dry friction the name of each part's joint; otherwise empty.
-    """
-
-    joints: tuple[str, ...] = eqx.field(static=True, default=())
-
-    @property
-    def law(self) -> "NonIdealGroup":
-        """The law of dry friction that slips."""
-        return NonIdealGroup(self.group, self.joints)
+    """Kernels of stacked velocity constraints."""
 
     @property
     def homogeneous(self) -> bool:
@@ -529,7 +550,7 @@ class VelocityConstraintGroup(AbstractConstraintGroup):
         return self._map(single, now.poses, now.velocities, per_part=(multipliers,))
 
     def acceleration(self, now, accelerations):
-        t, poses, velocities = now
+        t, poses, velocities, *_ = now
 
         def single(at, x, xdot, v, a):
             residual = lambda t, x, v: self._residual(at, t, x, v)

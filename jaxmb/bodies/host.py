@@ -17,6 +17,7 @@ from ..parts.elements import on_bodies
 from ..states.on_host import MOST, AbstractHost
 from .elementary import HostRows, Listed, is_elementary, stacked
 from .groups import Kinematics
+from .law_groups import motions_of, places_of
 
 
 class _Rows(NamedTuple):
@@ -33,7 +34,8 @@ class _Rows(NamedTuple):
 
 @on_host
 def _rows(groups: tuple[Any, ...], now: Kinematics, moves: Any) -> list[_Rows]:
-    out, (t, poses, _) = [], now
+    out, t, poses = [], now.t, now.poses
+    now = motions_of(groups, places_of(groups, t, poses), now.velocities)
     for g in groups:
         if not g.of_poses:
             values = g.velocity(now)

@@ -207,9 +207,9 @@ def _reaction(constraints, places, now, multipliers) -> Reaction:
     force, moment, of_joint = 0.0, 0.0, []
     for place in places:
         group, values = of_groups[place.group]
-        alone, values = group.only(place.member), values[place.member]
-        wrenches = jnp.einsum("r,rkv->kv", values, alone.jacobian(now)[0])
-        f, m = _on_last_body(alone.group, place, now.poses, wrenches)
+        values = values[place.member]
+        wrenches = jnp.einsum("r,rkv->kv", values, group.jacobian_of(place.member, now))
+        f, m = _on_last_body(group.group.only(place.member), place, now.poses, wrenches)
         force, moment = force + f, moment + m
         of_joint.append(values)
     return Reaction(jnp.asarray(force), jnp.asarray(moment), jnp.concatenate(of_joint))

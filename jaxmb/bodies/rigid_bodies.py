@@ -18,7 +18,6 @@ from ..linalg.block_jacobian import BlockJacobian, JointOrder, block_jacobian
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import DenseJacobian
 from ..parts.base import AbstractLink
-from ..parts.unilateral import AbstractUnilateralConstraint
 from ..solvers.manifold_term import GapsSeen
 from ..system.contact_set import ContactNumbers, ContactSet
 from ..system.design_variables import DesignVariables
@@ -159,7 +158,18 @@ class RigidBodySystem(AbstractSystem):
 
     def kinematics(self, t: Scalar, q: Coordinates, u: Velocities) -> Kinematics:
         """The arguments of kernels of stacked parts."""
-        return self.bodies.kinematics(t, q, u)
+        return self.moving(self.placed(t, q), u)
+
+    def _moving(self, t, q, u, now):
+        return self.kinematics(t, q, u) if now is None else now
+
+    @eqx.filter_jit
+    def placed(self, t, q):
+        return self.constraints.placed(jnp.asarray(t, q.dtype), self.bodies.prepared_poses(q))
+
+    @eqx.filter_jit
+    def moving(self, placed, u):
+        return self.constraints.moving(placed, self.bodies.all_velocities(u))
 
     @property
     def rates_are_velocities(self) -> bool:
@@ -210,8 +220,8 @@ class RigidBodySystem(AbstractSystem):
     # Forces. Each kernel is jitted, so a program with many uses traces it once.
 
     @eqx.filter_jit
-    def force(self, t, q, u):
-        now = self.kinematics(t, q, u)
+    def force(self, t, q, u, now=None):
+        now = self._moving(t, q, u, now)
         wrenches = [*self.forces.wrenches(now), *self.bodies.wrenches(now, self.forces.gravity)]
         return self.bodies.generalized_force(wrenches, u)
 
@@ -263,30 +273,33 @@ class RigidBodySystem(AbstractSystem):
         return jnp.concatenate([rows, self.bodies.attitude_gradients(q)])
 
     @eqx.filter_jit
-    def velocity_residual(self, t, q, u):
-        return self.constraints.velocity_residual(self.kinematics(t, q, u))
+    def velocity_residual(self, t, q, u, now=None):
+        return self.constraints.velocity_residual(self._moving(t, q, u, now))
 
     @eqx.filter_jit
-    def acceleration_residual(self, t, q, u, udot):
-        return self.constraints.acceleration_residual(self.kinematics(t, q, u), self.bodies.all_velocities(udot))
+    def acceleration_residual(self, t, q, u, udot, now=None):
+        now = self._moving(t, q, u, now)
+        return self.constraints.acceleration_residual(now, self.bodies.all_velocities(udot))
 
     @eqx.filter_jit
-    def jacobian(self, t, q, u):
-        return self.constraints.jacobian(self.kinematics(t, q, u), self.constraints.groups)
+    def jacobian(self, t, q, u, now=None):
+        now = self._moving(t, q, u, now)
+        return self.constraints.jacobian(now, self.constraints.groups)
 
-    def structured_jacobian(self, t, q, u):
+    def structured_jacobian(self, t, q, u, now=None):
         if self.elimination is None:
-            return DenseJacobian(self.jacobian(t, q, u))
-        return self.block_jacobian(t, q, u, self.elimination)
+            return DenseJacobian(self.jacobian(t, q, u, now))
+        return self.block_jacobian(t, q, u, self.elimination, now)
 
-    def block_jacobian(self, t: Scalar, q: Coordinates, u: Velocities, order: JointOrder) -> BlockJacobian:
+    def block_jacobian(self, t: Scalar, q: Coordinates, u: Velocities, order: JointOrder, now=None) -> BlockJacobian:
         """`A` in blocks of joints on bodies."""
-        return block_jacobian(self.constraints.blocks(self.kinematics(t, q, u), self.constraints.groups), order)
+        now = self._moving(t, q, u, now)
+        return block_jacobian(self.constraints.blocks(now, self.constraints.groups), order)
 
     @eqx.filter_jit
-    def constraint_force(self, t, q, u, multipliers):
-        wrenches = self.constraints.wrenches(self.kinematics(t, q, u), multipliers)
-        return self.bodies.generalized_force(wrenches, u)
+    def constraint_force(self, t, q, u, multipliers, now=None):
+        now = self._moving(t, q, u, now)
+        return self.bodies.generalized_force(self.constraints.wrenches(now, multipliers), u)
 
     @property
     def linear(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -311,17 +324,15 @@ class RigidBodySystem(AbstractSystem):
         return np.array([k for k, (name, _) in enumerate(self.rows) if name in parts], int)
 
     @eqx.filter_jit
-    def nonideal_force(self, t, q, u, multipliers):
-        now = self.kinematics(t, q, u)
+    def nonideal_force(self, t, q, u, multipliers, now=None):
+        now = self._moving(t, q, u, now)
         wrenches = self.constraints.nonideal_wrenches(self.constraints.laws, now, multipliers)
         return self.bodies.generalized_force(wrenches, u)
 
     # Contacts and dry friction
 
     def contact_numbers(self, t):
-        contacts = [
-            g.group.at(t) for g in self.constraints.position if isinstance(g.group.part, AbstractUnilateralConstraint)
-        ]
+        contacts = [g.group.at(t) for g in self.constraints.contacts]
         frictions = [(g.group.at(t), g.rows) for g in self.constraints.frictions]
         joined = lambda values: jnp.concatenate([*values, jnp.zeros(0, self.length.dtype)])
         return ContactNumbers(
@@ -358,8 +369,9 @@ class RigidBodySystem(AbstractSystem):
         return jnp.concatenate([g.headings(t, poses) for g in self.with_headings])
 
     @eqx.filter_jit
-    def friction_reactions(self, t, q, u, multipliers):
-        laws, now = [g.law for g in self.constraints.frictions], self.kinematics(t, q, u)
+    def friction_reactions(self, t, q, u, multipliers, now=None):
+        laws = [g.law for g in self.constraints.frictions]
+        now = self._moving(t, q, u, now)
         reactions = self.constraints.reactions(laws, now, multipliers)
         return jnp.concatenate([g.normal_forces(now, x) for g, x in zip(laws, reactions, strict=True)])
 

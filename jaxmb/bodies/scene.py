@@ -53,15 +53,14 @@ from .constraint_set import ConstraintSet
 from .force_set import ForceSet
 from .groups import (
     BodyGroup,
-    ConstraintGroup,
     CoordinateGroup,
     ForceGroup,
     FrameGroup,
     NonIdealGroup,
-    VelocityConstraintGroup,
     servo_group,
     stack,
 )
+from .law_groups import constraint_group, numbered, velocity_group
 from .layout import Layout
 from .rigid_bodies import RigidBodySystem
 from .structure import with_structure
@@ -204,13 +203,13 @@ class Scene(eqx.Module):
         def of_joints(group):
             return tuple(of_joint[name] for name in group.names)
 
-        def between_velocities(group):
-            dry = isinstance(group.part, AbstractStickSlip)
-            return VelocityConstraintGroup(group, of_joints(group) if dry else ())
-
         of_joint = {law.name: law.joint for law, _ in laws}
         of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractStickSlip)}
         constraints = kind(AbstractConstraint)
+        position, velocity = numbered(
+            [constraint_group(group) for group in constraints if group.rows],
+            [velocity_group(group, of_joint) for group in kind(AbstractVelocityConstraint)],
+        )
         forces = ForceSet(
             groups=tuple(map(ForceGroup, kind(AbstractForce))),
             gravity=None if gravity is None else jax.device_put(gravity.acceleration),
@@ -224,8 +223,8 @@ class Scene(eqx.Module):
                 layout=layout,
             ),
             constraints=ConstraintSet(
-                position=tuple(ConstraintGroup(group) for group in constraints if group.rows),
-                velocity=tuple(map(between_velocities, kind(AbstractVelocityConstraint))),
+                position=position,
+                velocity=velocity,
                 servos=tuple(map(servo_group, kind(Servo, _check_program))),
                 nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
                 layout=layout,

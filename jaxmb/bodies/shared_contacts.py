@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..parts.unilateral import AbstractUnilateralConstraint
-
 # Unit rows whose singular values are below this imply each other.
 _INDEPENDENT = 1e-6
 # Gaps below this fraction of the scene's size are closed.
@@ -32,8 +30,7 @@ def imply_each_other(system: Any, q: Float[np.ndarray, "nq"]) -> bool:
 def _pairs(system) -> list[list[int]]:
     """The numbers of the contacts between the same bodies."""
     # The last body of a contact is its mode.
-    groups = [g.group for g in system.constraints.position if isinstance(g.group.part, AbstractUnilateralConstraint)]
-    parts = [frozenset(bodies[:-1]) for group in groups for bodies in group.bodies]
+    parts = [frozenset(bodies[:-1]) for g in system.constraints.contacts for bodies in g.group.bodies]
     of_pairs = {pair: [k for k, other in enumerate(parts) if other == pair] for pair in parts}
     return list(of_pairs.values())
 

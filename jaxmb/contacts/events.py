@@ -337,10 +337,9 @@ def _evaluated(system: AbstractSystem, formulation: AbstractFormulation, record:
 
 def _moves(guards: ContactGuards, at: Instant, event: Any) -> Bool[Array, "parts"]:
     """Where dry friction slips after an event, or begins to, beyond rounding errors."""
-    (system, t, q), contacts = (at.system, at.t, at.q), at.system.contacts
-    gradients = jnp.abs(contacts.gradients(system, t, q, event.u))
-    rates = jnp.abs(contacts.rates(system, t, q, event.u))
-    begins = jnp.abs(contacts.accelerations(system, t, q, event.u, event.after))
+    system, contacts, after = at.system, at.system.contacts, at.with_(u=event.u)
+    gradients, rates = jnp.abs(after.contact_place.gradients), jnp.abs(after.contact_motion.rates)
+    begins = jnp.abs(after.contact_accelerations(event.after))
     sizes = gradients @ jnp.abs(event.u), gradients @ jnp.abs(at.inertia.solve(at.force))
     slowest = guards.tolerance.in_metres(system).slowest
     moves = (rates > REST * sizes[0] + slowest) | (begins > REST * sizes[1] + slowest)

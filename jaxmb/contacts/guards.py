@@ -1,7 +1,5 @@
 """When events of contacts and dry friction happen: gaps, forces and slips that become zero along a motion."""
 
-import dataclasses
-
 import jax.numpy as jnp
 from jax import lax
 
@@ -48,9 +46,10 @@ class ContactGuards(AbstractGuards):
         system, y = lax.stop_gradient((self.system, y))
         contacts, t = system.contacts, jnp.asarray(t, y.q.dtype)
         q = system.normalize(t, y.q)
-        modes, gaps, rates = contacts.modes(q), contacts.gaps(system, t, q), contacts.rates(system, t, q, y.u)
+        at, modes = Instant(system.at(y), t, q, y.u), contacts.modes(q)
+        gaps, rates = at.contact_place.gaps, at.contact_motion.rates
         closing, slips = rates[: contacts.n], modes.of_friction * rates[contacts.n :]
-        at, peaks, touch = Instant(system, t, q, y.u), system.contact_numbers(t).peaks, self.touch * system.length
+        peaks, touch = system.contact_numbers(t).peaks, self.touch * system.length
         free = jnp.where(modes.open, gaps * (1 - 0.5 * gaps / peaks), system.length)
         free = contacts.sharing.guarded(at, gaps, self.tolerance, free)
         begins = modes.open & (gaps <= touch)
@@ -67,17 +66,15 @@ class ContactGuards(AbstractGuards):
         closing = jnp.where(jnp.abs(closing) > least, closing, 0.0)
         closing = jnp.where(modes.open, closing, jnp.inf)
         closing = jnp.pad(closing, (0, contacts.m), constant_values=jnp.inf)
-        return GuardsSeen(self._with_forces(at, y, free / system.length), closing, begins)
+        return GuardsSeen(self._with_forces(at, self.forces(y), free / system.length), closing, begins)
 
-    def _with_forces(self, at, y, free):
-        """The guards, from those of contacts and friction without a force, in a state `y` that `at` normalises."""
-        contacts, acts = at.system.contacts, self.forces(y)
+    def _with_forces(self, at, acts, free):
+        """The guards, from those of contacts and friction without a force; `acts`: the others."""
 
         def forces(_):
-            here = at.system.at(y)
-            _, multipliers = contact_forces(here, at.t, at.q, at.u)
-            largest = largest_force(here, at.t, dataclasses.replace(y, q=at.q), multipliers)
-            return contacts.sharing.reserves(Instant(here, at.t, at.q, at.u), multipliers, reserves) / largest
+            _, multipliers = contact_forces(at)
+            reserve = at.system.contacts.sharing.reserves(at, multipliers, reserves)
+            return reserve / largest_force(at, multipliers)
 
         return jnp.where(acts, cond_of_any_lane(jnp.any(acts), forces, jnp.ones_like, free), free)
 

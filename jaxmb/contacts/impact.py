@@ -36,7 +36,7 @@ from ..system.instant import Instant
 from .forces import contact_forces, largest_force, reserves
 from .groups import HOLDS, least_in_group
 from .impacting import Event, find_event
-from .phases import Phases
+from .phases import Phases, slips_at
 from .tolerance import ContactTolerance
 
 NO_SECOND_DERIVATIVES = (
@@ -179,7 +179,8 @@ def _by_times(phases: Phases, y, acts):
         impulses, change, energy = _struck(own)
         u, modes = u + (own.event.u - event.at), jnp.where(event.group == head, after, modes)
         q = system.contacts.with_modes(y.q, modes)
-        new = Instant(system, t, q, u, y.z).motion(contact_forces(system, t, q, u)[0])
+        at = Instant(system, t, q, u, y.z)
+        new = at.motion(contact_forces(at)[0])
         left = jax.tree.map(lambda old, new: old - new, rates, new)
         row = State(left.q, change - event.before + left.u, left.z), impulses, energy
         return (u, modes), new, jax.tree.map(lambda table, x: table.at[order[k]].set(x), table, row)
@@ -204,10 +205,11 @@ def _struck(phases: Phases):
 def _later(event: Event, at, along):
     """The derivative of the time at which a gap, or a slip, is zero; with groups for each law."""
     (system, t, q, _), contacts = at, at[0].contacts
-    zero, rate = push(contacts.gaps, at[:3], along[:3]), contacts.rates(system, t, q, event.at)
+    at_event = Instant(system, t, q, event.at)
+    zero, rate = push(_gaps, at[:3], along[:3]), at_event.contact_motion.rates
     if contacts.m:
-        slip = push(contacts.rates, at, along)[contacts.n :]
-        slowing = contacts.accelerations(system, t, q, event.at, event.before)[contacts.n :]
+        slip = push(slips_at, at, along)[contacts.n :]
+        slowing = at_event.contact_accelerations(event.before)[contacts.n :]
         both = of_pairs(contacts.pairs)
         if both.size:
             # Slip in two directions ends when it is zero along its modes.
@@ -216,6 +218,10 @@ def _later(event: Event, at, along):
             slowing = with_entries(slowing, both[:, 0], jnp.sum(modes * slowing[both], axis=1))
         zero, rate = jnp.concatenate([zero, slip]), jnp.concatenate([rate[: contacts.n], slowing])
     return jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
+
+
+def _gaps(system, t, q):
+    return Instant(system, t, q, jnp.zeros(system.nu, q.dtype)).gaps
 
 
 def _release(system, tolerance, event, at, along):
@@ -228,9 +234,9 @@ def _release(system, tolerance, event, at, along):
 
     def reserve(system, t, y):
         """The reserves of the forces below their limits, and their size of comparison."""
-        _, multipliers = contact_forces(system, t, y.q, y.u)
         at = Instant(system, t, y.q, y.u)
-        return contacts.sharing.reserves(at, multipliers, reserves), largest_force(system, t, y, multipliers)
+        _, multipliers = contact_forces(at)
+        return contacts.sharing.reserves(at, multipliers, reserves), largest_force(at, multipliers)
 
     reserve_at_event, largest = reserve(system, t, y)
     k, releases = least_in_group(event.group, released, jnp.abs(reserve_at_event))

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import add_up
 from ..linalg.complementarity import independent_components, solved_components
-from ..linalg.inertia import AbstractInertia
 from ..linalg.pairs import for_first, of_pairs
 from ..linalg.rotations import norm
 from ..parts.modes import Modes, modes_of_contacts, modes_of_friction
@@ -22,7 +21,7 @@ from ..system.contact_set import ContactSet
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .dry_laws import Answers
-from .forces import directions, free_accelerations, friction_coefficients
+from .forces import free_accelerations, friction_coefficients, other_rows
 from .groups import group_sums, groups_of, least_in_group, of_contacts
 from .problem import Laws, Problem, is_implied
 from .tolerance import REST, ContactTolerance
@@ -122,7 +121,8 @@ def find_event(system, formulation, tolerance: ContactTolerance, t, y) -> Event:
     """An event at a state, without derivatives; the tolerance is in units of the system's size."""
     touch, t = (jnp.asarray(x, y.q.dtype) for x in (tolerance.touch, t))
     system, touch, t, y = lax.stop_gradient((system, touch, t, y))
-    return Impacting.at(system, formulation, ContactTolerance(touch).in_metres(system), t, y).event()
+    at = Instant(system, t, y.q, y.u)
+    return Impacting.of(at, formulation, ContactTolerance(touch).in_metres(system)).event()
 
 
 class Struck(NamedTuple):
@@ -185,13 +185,13 @@ class Moves(NamedTuple):
     jump: Float[Array, "nu"]
 
     @classmethod
-    def at(cls, system, t, q, u, inertia: AbstractInertia, unmet) -> "Moves":
-        """The moves at a state; `unmet`: the rates of all rows at its velocities."""
-        rows, jacobian = directions(system, t, q, u)
-        projector = jacobian.projector(inertia)
+    def at(cls, at: Instant) -> "Moves":
+        """The moves at an instant."""
+        rows, unmet = at.contact_place.gradients, at.velocity_rows
+        projector = other_rows(at).projector(at.inertia)
         # The last entry has no impulse.
         impulses = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
-        asked = jnp.concatenate([jnp.zeros((len(rows), unmet.size), q.dtype), -unmet[None]])
+        asked = jnp.concatenate([jnp.zeros((len(rows), unmet.size), rows.dtype), -unmet[None]])
         moves, answers = jax.vmap(projector.solve)(impulses, asked)
         return cls(rows, projector, moves[:-1], answers[:-1], moves[-1])
 
@@ -204,38 +204,41 @@ class Impacting:
     In the first round the impulse is zero; its forces are the forces before the event, which determine the event's
     time.
 
-    **Fields:** `tolerance` [m, rad]; t, q and the velocities `u`; the `inertia` and the `modes` there; the `gap`s, and
-    the `rates` of gaps and slips; the `moves`; the `laws`; `slow`: the velocity up to which slip in a plane has ended.
+    **Fields:** the instant `at`; `tolerance` [m, rad]; the `modes`; the `moves`; the `laws`; `slow`: the velocity up to
+    which slip in a plane has ended.
     """
 
-    system: AbstractEquation
+    at: Instant
     formulation: AbstractFormulation
     tolerance: ContactTolerance
-    t: Float[Array, ""]
-    q: Float[Array, "nq"]
-    u: Float[Array, "nu"]
-    inertia: AbstractInertia
     modes: Modes
-    gap: Float[Array, "contacts"]
-    rates: Float[Array, "laws"]
     moves: Moves
     laws: Laws
     slow: Float[Array, ""]
 
     @classmethod
-    def at(cls, system, formulation, tolerance: ContactTolerance, t, y) -> "Impacting":
-        contacts, q, u = system.contacts, y.q, y.u
-        inertia = system.inertia(t, contacts.with_modes(q, 0.0), u)
-        unmet = Instant(system, t, contacts.bound(q), u).velocity_rows
-        moves = Moves.at(system, t, q, u, inertia, unmet)
-        laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(system, t, q, u))
-        gap, rates = contacts.gaps(system, t, q), contacts.at_rows(unmet)
-        at_state = inertia, contacts.modes(q), gap, rates, moves, laws, tolerance.slow(system, u)
-        return cls(system, formulation, tolerance, t, q, u, *at_state)
+    def of(cls, at: Instant, formulation, tolerance: ContactTolerance) -> "Impacting":
+        contacts, moves = at.system.contacts, Moves.at(at)
+        laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(at))
+        return cls(at, formulation, tolerance, contacts.modes(at.q), moves, laws, tolerance.slow(at.system, at.u))
+
+    @property
+    def system(self) -> AbstractEquation:
+        return self.at.system
 
     @property
     def contacts(self) -> ContactSet:
         return self.system.contacts
+
+    @property
+    def gap(self) -> Float[Array, "contacts"]:
+        """The gaps."""
+        return self.at.contact_place.gaps
+
+    @property
+    def rates(self) -> Float[Array, "laws"]:
+        """The rates of gaps and slips."""
+        return self.at.contact_motion.rates
 
     @property
     def influence(self) -> Float[Array, "laws laws"]:
@@ -259,7 +262,7 @@ class Impacting:
 
     def rates_at(self, u):
         """The rates of gaps and slips at other velocities."""
-        return self.rates + self.moves.rows @ (u - self.u)
+        return self.rates + self.moves.rows @ (u - self.at.u)
 
     def sizes_of_rates(self, *velocities):
         """The sizes of the summands of the rates at some velocities. Rates below their resolution are rounding errors:
@@ -271,13 +274,12 @@ class Impacting:
         """Accelerations without contacts and friction, as `u̇` and along the laws' directions. Also the reactions of the
         joints with friction: without forces along the laws, and by a unit force along each.
         """
-        system, t, q = self.system, self.t, self.q
-        udot, multipliers, opening = free_accelerations(system, self.formulation, self.moves.projector, t, q, u)
+        at = self.at.with_(u=u)
+        udot, multipliers, opening = free_accelerations(at, self.formulation, self.moves.projector)
         if not self.contacts.in_joints.any():
             return udot, opening, None
-        q, answers = self.contacts.stuck(q, self.moves.answers)
-        reactions = lambda multipliers: system.friction_reactions(t, q, u, multipliers)
-        of_all = jax.vmap(reactions)(jnp.concatenate([multipliers[None], answers]))
+        at, answers = self.contacts.stuck(at, self.moves.answers)
+        of_all = jax.vmap(at.friction_reactions)(jnp.concatenate([multipliers[None], answers]))
         return udot, opening, self.contacts.by_forces(of_all)
 
     # The time of the event
@@ -287,7 +289,8 @@ class Impacting:
         n, system = self.contacts.n, self.system
         until, about_to = self.zeros(curve)
         # A zero far off in time does not count: its rates are rounding errors.
-        speed = jnp.max(jnp.maximum(jnp.abs(self.u), jnp.abs(before)) / system.velocity_scale()) * system.length
+        largest = jnp.maximum(jnp.abs(self.at.u), jnp.abs(before))
+        speed = jnp.max(largest / system.velocity_scale()) * system.length
         about_to = about_to & (jnp.abs(until) * speed <= self.tolerance.far)
         first = jnp.argmin(jnp.where(about_to, until, jnp.inf))
         hits = about_to[first]
@@ -295,7 +298,7 @@ class Impacting:
         closes = about_to[:n] & (np.arange(n) == first)
         shut = self.contacts.sharing.shut(self.modes, self.gap, self.tolerance.near)
         touching = shut | closes | (self.gap + late * self.rates[:n] <= self.tolerance.touch)
-        at = self.u + late * before
+        at = self.at.u + late * before
         zeros = (until, about_to) if self.in_groups else None
         return When(late, first, hits, before, at, self.rates_at(at), touching, zeros)
 
@@ -336,7 +339,7 @@ class Impacting:
 
     def bounces(self, when: When):
         """The rates at which gaps would open by Newton's law."""
-        return self.system.contact_numbers(self.t).restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
+        return self.system.contact_numbers(self.at.t).restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
 
     def impulse_of(self, when: When, low, share, reactions) -> Problem:
         """The problem of the impulses. Contacts that are `low` do not bounce, others bounce with a share of the whole
@@ -357,7 +360,7 @@ class Impacting:
     def expand(self, k, before: Round, answers, impulses) -> Round:
         """The end of the compression, and the problem of the expansion: impulses beyond the least ones."""
         when = before.when
-        again = self.system.contact_numbers(self.t).restitution * impulses[: self.contacts.n]
+        again = self.system.contact_numbers(self.at.t).restitution * impulses[: self.contacts.n]
         pushes = np.array(self.contacts.by_poisson, bool) & ~before.low
         again = jnp.where(pushes, of_contacts(before.trial.share, self.contacts.n) * again, 0.0)
         u = self.moved(k, when, impulses)
@@ -447,7 +450,7 @@ class Impacting:
 
         **Arguments:** `curve`: the second derivatives of the gaps.
         """
-        when, struck, restitution = before.when, before.struck, self.system.contact_numbers(self.t).restitution
+        when, struck, restitution = before.when, before.struck, self.system.contact_numbers(self.at.t).restitution
         rate, bounce = struck.rate[: self.contacts.n], self.bounces(when)
         falls = jnp.where(curve < 0, -curve, 1.0)
         opens = rate**2 <= 2 * falls * self.tolerance.bounce
@@ -464,24 +467,25 @@ class Impacting:
     def start(self) -> Round:
         """The state before the first round."""
         n, m, in_rounds = self.contacts.n, self.contacts.m, self.contacts.of_reactions
-        none, one, yes = jnp.zeros(n + m, self.q.dtype), jnp.ones((), self.q.dtype), jnp.array(True)
+        dtype, u = self.at.u.dtype, self.at.u
+        none, one, yes = jnp.zeros(n + m, dtype), jnp.ones((), dtype), jnp.array(True)
         each, balance, zeros = one, None, None
         if self.in_groups:
             each, balance, zeros = 1 + none, jnp.zeros(n + m, int), (none, none > 0)
         no, idle = Answers(none[:n] > 0, none[n:] > 0, none[n:], yes, none[n:] > 0), none[:n] > 0
-        reactions = jax.tree.map(jnp.zeros_like, jax.eval_shape(self.accelerated, self.u)[2])
+        reactions = jax.tree.map(jnp.zeros_like, jax.eval_shape(self.accelerated, u)[2])
         return Round(
             problem=self.laws.of_impulses(none, idle, reactions),
-            when=When(0 * one, jnp.argmin(none), ~yes, self.u, self.u, self.rates, idle, zeros),
+            when=When(0 * one, jnp.argmin(none), ~yes, u, u, self.rates, idle, zeros),
             low=idle,
             rest=none[:n],
-            struck=Struck(no, none, self.u, none, self.u, idle, none[n:] > 0, balance, (each, each), each),
+            struck=Struck(no, none, u, none, u, idle, none[n:] > 0, balance, (each, each), each),
             answers=no,
             forces=none,
             solvable=yes,
             rounds=jnp.array(_ROUNDS if in_rounds else 1),
             trial=Trial(each, Bracket(0 * each, each, 0 * each, each, jnp.zeros(each.shape, int)), each < 0),
-            compression=Phase(self.u, none > 0, none[n:], none) if self.phases == 2 else None,
+            compression=Phase(u, none > 0, none[n:], none) if self.phases == 2 else None,
             pushed=none if self.phases == 2 else None,
         )
 
@@ -510,7 +514,7 @@ class Impacting:
         modes, implied = self.new_modes(settled)
         held, lost = self.lost(settled, implied)
         after = struck.u + lost @ self.moves.by_unit
-        kinetic = lambda u: jnp.dot(u, self.inertia.product(u))
+        kinetic = lambda u: jnp.dot(u, self.at.inertia.product(u))
         impulses = self.seen(struck.impulses, self.sizes_of_rates(after, when.u))
         # Without an impulse, the kinetic energy changes by rounding errors.
         energy = jnp.where(jnp.any(impulses != 0), 0.5 * (kinetic(when.u) - kinetic(after)), 0.0)
@@ -566,7 +570,7 @@ class Impacting:
         of_contacts = modes_of_contacts(last.closed, implied)
         begun = struck.ended & self.contacts.in_pairs
         of_friction = modes_of_friction(last.sticks, last.implied, last.slips, begun)
-        return jnp.concatenate([of_contacts, of_friction]).astype(self.q.dtype), implied
+        return jnp.concatenate([of_contacts, of_friction]).astype(self.at.q.dtype), implied
 
     def lost(self, settled: Round, implied):
         """Which laws hold the velocities after the event, and the impulses that remove the rates left by rounding

@@ -19,7 +19,7 @@ from ..linalg.rotations import norm
 from ..linalg.sums import with_entries
 from ..system.contact_set import ContactSet
 from ..system.instant import Instant
-from .forces import directions, friction_coefficients
+from .forces import friction_coefficients, other_rows
 from .groups import HOLDS, group_sums, of_contacts
 from .impacting import Event, Phase
 
@@ -47,11 +47,10 @@ class Phases:
     @classmethod
     def of(cls, event: Event, at, tangents, du) -> "Phases":
         system, t, q = at
-        contacts = system.contacts
-        rows, jacobian = directions(system, t, q, event.u)
-        projector = jacobian.projector(system.inertia(t, contacts.with_modes(q, 0.0), event.u))
+        after = Instant(system, t, q, event.u)
+        rows, projector = after.contact_place.gradients, other_rows(after).projector(after.inertia)
         moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
-        rebound = ~event.low & ~np.array(contacts.by_poisson, bool)
+        rebound = ~event.low & ~np.array(system.contacts.by_poisson, bool)
         coefficients = _coefficients(event, at, tangents)
         return cls(event, at, tangents, du, rows, projector, moves, rebound, coefficients)
 
@@ -94,15 +93,15 @@ class Phases:
         """The derivatives of all impulses, and of the velocities after them."""
         event, contacts, at = self.event, self.contacts, self.at
         # Velocities and impulses also change with the share of the rebounds.
-        rates = contacts.rates(*at, event.at)
+        rates = slips_at(*at, event.at)
         bounce = _restitution(*at[:2]) * jnp.maximum(-rates[: contacts.n], 0.0)
         bounce = jnp.pad(jnp.where(self.rebound, bounce, 0.0), (0, contacts.m))
         impulses, change, by_share = (self.in_one if event.compression is None else self.in_two)(bounce)
 
         # At this share no energy is gained.
-        both = rates + contacts.rates(*at, event.u)
-        changed = push(contacts.rates, (*at, event.at), (*self.tangents, self.du))
-        changed = changed + push(contacts.rates, (*at, event.u), (*self.tangents, change))
+        both = rates + slips_at(*at, event.u)
+        changed = push(slips_at, (*at, event.at), (*self.tangents, self.du))
+        changed = changed + push(slips_at, (*at, event.u), (*self.tangents, change))
         group, one = event.balance, jnp.ones_like(event.share)
         gained = group_sums(group, impulses * both + event.impulses * changed)
         less = by_share(one)
@@ -170,7 +169,7 @@ class Phases:
         def unmet(system, t, q, first, u):
             """The remaining rates, and the unbalanced momentum."""
             rates = Instant(system, t, q, phase.u).velocity_rows
-            bounce = _restitution(system, t) * jnp.maximum(-contacts.rates(system, t, q, first)[:n], 0.0)
+            bounce = _restitution(system, t) * jnp.maximum(-slips_at(system, t, q, first)[:n], 0.0)
             bounce = jnp.where(phase.held[:n] & self.rebound, self.share * bounce, 0.0)
             rates = rates.at[rows[:n]].add(-bounce)
             momentum = system.inertia(t, q, u).product(phase.u - u)
@@ -195,7 +194,7 @@ class Phases:
         right = jnp.concatenate([right[:n], -change * phase.slips * pushed])
         for k in np.flatnonzero(~contacts.in_joints):
             law = law.at[n + k, contact_of[k]].set(coefficient[k] * phase.slips[k])
-        rates = lambda system, t, q: contacts.rates(system, t, q, phase.u)
+        rates = lambda system, t, q: slips_at(system, t, q, phase.u)
         for both in of_pairs(contacts.pairs):
             # The direction of slip changes with the velocity after the impact.
             k, laws, slips = both[0], n + both, phase.slips[both]
@@ -207,12 +206,17 @@ class Phases:
         return law, right
 
 
+def slips_at(system: Any, t: Any, q: Any, u: Any) -> Float[Array, "laws"]:
+    """The rates of gaps, and the velocities of slip."""
+    return Instant(system, t, q, u).contact_motion.rates
+
+
 def _coefficients(event: Event, at, tangents):
     """The coefficients of friction, and their derivatives."""
     system, _, q = at
     if not system.contacts.m:
         return jnp.zeros(0, q.dtype), jnp.zeros(0, q.dtype)
-    coefficients = lambda system, t, q: friction_coefficients(system, t, q, event.u)[0]
+    coefficients = lambda system, t, q: friction_coefficients(Instant(system, t, q, event.u))[0]
     return coefficients(*at), push(coefficients, at, tangents)
 
 

@@ -14,15 +14,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._types import Coordinates, Scalar, State, Velocities
+from .._types import State
 from ..linalg.complementarity import PIVOT, largest_least, least_norm, reduced
 from ..linalg.elimination import solve
 from ..linalg.pairs import sizes_of
 from ..linalg.sums import with_entries
 from ..parts.modes import CLOSED, IMPLIED
-from ..system.equation import AbstractEquation
+from ..system.instant import Instant
 from ..system.sharing import NoSharing
-from .forces import directions, friction_coefficients
+from .forces import friction_coefficients, other_rows
 
 # Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact; along a
 # motion it is seen at the second one.
@@ -43,12 +43,12 @@ class Shares(NamedTuple):
     sharing: Bool[Array, "n"]
 
     @classmethod
-    def at(cls, system: AbstractEquation, t: Scalar, q: Coordinates, u: Velocities) -> "Shares":
-        """The shares at a state."""
-        contacts = system.contacts
-        modes = contacts.modes(q)
+    def at(cls, at: Instant) -> "Shares":
+        """The shares at an instant."""
+        contacts = at.system.contacts
+        modes = contacts.modes(at.q)
         closed, implied = modes.closed, modes.shut & ~modes.closed
-        influence = _influence(system, t, q, u)[: contacts.n, : contacts.n]
+        influence = _influence(at)[: contacts.n, : contacts.n]
         instead = _instead(influence, closed, implied)
         shares = lax.stop_gradient(jnp.any(jnp.abs(instead) > PIVOT, axis=1))
         return cls(implied, instead, implied | (closed & shares))
@@ -81,9 +81,8 @@ class Sharing(NoSharing):
         system, contacts = at.system, at.system.contacts
         n, modes = contacts.n, contacts.modes(at.q)
         implied = modes.shut & ~modes.closed
-        influence = _influence(system, at.t, at.q, at.u)
-        coefficient, _ = friction_coefficients(system, at.t, at.q, at.u)
-        rates, tolerance = contacts.rates(system, at.t, at.q, at.u)[n:], tolerance.in_metres(system)
+        influence, (coefficient, _) = _influence(at), friction_coefficients(at)
+        rates, tolerance = at.contact_motion.rates[n:], tolerance.in_metres(system)
         slips = jnp.where(_is_fast(contacts.pairs, rates, tolerance.slow(system, at.u)), modes.slips(rates), 0.0)
         change = _change(contacts, influence, coefficient, slips, modes.closed, implied)
         # Contacts that others imply at one pose may part, or meet, at another; and slip may come to depend on shares.
@@ -91,13 +90,13 @@ class Sharing(NoSharing):
 
     def reserves(self, at, multipliers, reserves):
         contacts = at.system.contacts
-        shares = Shares.at(at.system, at.t, at.q, at.u)
+        shares = Shares.at(at)
         forces = contacts.at_rows(multipliers)[: contacts.n]
         least = shares.largest_least(forces)
         # Friction is at its limit where the normal forces have their least shares.
         shared = with_entries(multipliers, np.array(contacts.rows[: contacts.n]), shares.least(forces))
-        bearing = self.bearing(contacts, State(at.q, at.u)).q
-        return jnp.concatenate([least, reserves(at.system, at.t, bearing, at.u, shared)[contacts.n :]])
+        bearing = at.with_(q=self.bearing(contacts, State(at.q, at.u)).q)
+        return jnp.concatenate([least, reserves(bearing, shared)[contacts.n :]])
 
     def determined(self, laws, settled, implied, slow):
         last, struck, n = settled.answers, settled.struck, laws.contacts.n
@@ -112,7 +111,7 @@ class Sharing(NoSharing):
     def multipliers(self, at, multipliers):
         contacts = at.system.contacts
         forces = contacts.at_rows(multipliers)[: contacts.n]
-        shares = Shares.at(at.system, at.t, at.q, at.u)
+        shares = Shares.at(at)
         return with_entries(multipliers, np.array(contacts.rows[: contacts.n]), shares.least(forces))
 
     def bearing(self, contacts, ys):
@@ -132,11 +131,10 @@ class Sharing(NoSharing):
         )
 
 
-def _influence(system, t, q, u):
+def _influence(at):
     """The accelerations along the laws by unit forces along them."""
-    rows, others = directions(system, t, q, u)
-    projector = others.projector(system.inertia(t, q, u))
-    none = jnp.zeros(system.acceleration_rows, q.dtype)
+    rows, projector = at.contact_place.gradients, other_rows(at).projector(at.inertia)
+    none = jnp.zeros(at.system.acceleration_rows, rows.dtype)
     return rows @ jax.vmap(lambda row: projector.solve(row, none)[0])(rows).T
 
 

@@ -27,8 +27,10 @@ from .base import (
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
+from .dry_friction import AbstractStickSlip
 from .fields import declarations, entry, internal_states
 from .space import AbstractSpace
+from .unilateral import AbstractUnilateralConstraint
 
 T = TypeVar("T")
 # The kernels in whose values a step must not pass over a pulse.
@@ -184,6 +186,10 @@ def _held(module: eqx.Module) -> dict[str, tuple[Any, bool]]:
 def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str, tuple[int, ...] | None, list[Any]]]:
     """The name of each kernel of a part, the shape that it must return (None for any), and its arguments."""
     poses, velocities, t = _arguments(space, bodies)
+    if isinstance(part, AbstractStickSlip):
+        yield "slips", (part.rows,), [poses, velocities]
+    if isinstance(part, AbstractUnilateralConstraint):
+        yield "gap", (), [poses[: -part.rows]]
     if isinstance(part, AbstractVelocityConstraint):
         yield "residual", (part.rows,), [poses, velocities, t]
     elif hasattr(part, "residual"):

@@ -4,7 +4,6 @@ import abc
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -72,12 +71,20 @@ class AbstractStickSlip(AbstractVelocityConstraint):
 
     def residual(self, space, poses, velocities, t):
         del t
-        slip, modes = self._slip(space, poses, velocities), velocities[-self.rows :, 0]
+        slip, modes = self.slips(space, poses, velocities), velocities[-self.rows :, 0]
         return jnp.where(kind_of(self._modes(poses)) == STICK, slip, modes)
 
     @abc.abstractmethod
-    def _slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, "rows"]:
+    def slips(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, "rows"]:
         """The velocities of slip [m/s], from poses and velocities of all bodies and modes."""
+
+    @abc.abstractmethod
+    def slip_forces(
+        self, space: AbstractSpace, poses: Poses, slips: Float[Array, "rows"], reactions: Any
+    ) -> Float[Array, "rows"]:
+        """The forces [N] of slip along the directions of slip, zero in stick, from the `slips` and from what the law
+        `needs` of its joint.
+        """
 
     def _modes(self, poses):
         return lax.stop_gradient(poses[-self.rows :, 0])
@@ -164,17 +171,12 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
             return jnp.dot(held.outward(space, held.seen_poses(space, poses[: len(held.bodies)])), force)
         return norm(force)
 
-    def wrenches(
-        self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Wrenches, t: float
-    ) -> Wrenches:
-        """The wrench of slip on each of the joint's bodies; `reactions`: the joint's reaction wrenches on them."""
-        del t
-        slip, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
+    def slip_forces(self, space, poses, slips, reactions):
         # The direction does not depend on reactions; an iteration solves for these.
-        (against,) = pull(-slip_direction(self._modes(poses), slip))
+        against = -slip_direction(self._modes(poses), slips)
         return self.coefficient * self.normal_force(space, poses, reactions) * against
 
-    def _slip(self, space, poses, velocities):
+    def slips(self, space, poses, velocities):
         at = np.array(self.places[0])
         return self.slip(space, unchecked_take(poses, at), unchecked_take(velocities, at))
 
@@ -328,7 +330,10 @@ class DryFriction(AbstractDryFriction):
         return multipliers
 
     def slip(self, space, poses, velocities):
-        slip = self._relative_velocity(space, poses, velocities)
+        return self.over_belt(self._relative_velocity(space, poses, velocities))
+
+    def over_belt(self, slip: Float[Array, "rows"]) -> Float[Array, "rows"]:
+        """The velocities of slip against the belt, from those against its body."""
         return slip if self.speed is None else slip - self.speed.reshape(-1)
 
     def _relative_velocity(self, space, poses, velocities):
@@ -442,13 +447,8 @@ class ExactFriction(AbstractScalarPart, AbstractStickSlip):
     def numbers_agree(self):
         return True if self.static_force is None else self.static_force >= self.force
 
-    def _slip(self, space, poses, velocities):
+    def slips(self, space, poses, velocities):
         return self.measured_with_rate(space, poses, velocities)[1]
 
-    def wrenches(
-        self, space: AbstractSpace, poses: Poses, velocities: Velocities, reactions: Any, t: float
-    ) -> Wrenches:
-        """The wrench of slip on each of the joint's bodies."""
-        del reactions, t
-        slip, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
-        return pull(-self.force * slip_direction(self._modes(poses), slip))[0]
+    def slip_forces(self, space, poses, slips, reactions):
+        return -self.force * slip_direction(self._modes(poses), slips)

@@ -523,7 +523,7 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
 
     # Slip and tensions
 
-    def _slip(self, space, poses, velocities):
+    def slips(self, space, poses, velocities):
         return rate_of(space, self, lambda part, x: part._passed_by(space, x), poses, velocities)[1]
 
     def _passed_by(self, space, poses):
@@ -563,12 +563,9 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
         _, _, rise = self._loads(space, poses, multipliers)
         return unchecked_take(multipliers, self._span_of_side) + self._halves.T @ rise
 
-    def wrenches(self, space, poses, velocities, multipliers, t):
-        """The wrenches of slip on the bodies."""
-        del t
-        slips, _, rise = self._loads(space, poses, multipliers)
-        _, pull = jax.vjp(lambda v: self._slip(space, poses, v), velocities)
-        return pull(jnp.where(slips == 0, 0.0, -rise))[0]
+    def slip_forces(self, space, poses, slips, reactions):
+        direction, _, rise = self._loads(space, poses, reactions)
+        return jnp.where(direction == 0, 0.0, -rise)
 
 
 class SlackRope(AbstractRope, AbstractGeometricContact):

@@ -58,6 +58,10 @@ class AbstractSpace(abc.ABC):
         """The angular velocity [rad/s], in world axes; one number in the plane."""
 
     @abc.abstractmethod
+    def swept(self, omega: Float[Array, "r"], arm: Point) -> Point:
+        """`ω × arm` [m/s], in world axes."""
+
+    @abc.abstractmethod
     def moment(self, pose: Pose, moment_W: Float[Array, "r"]) -> Wrench:
         """Wrench of a moment [N m] in world axes, one number in the plane."""
 

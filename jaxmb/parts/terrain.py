@@ -45,6 +45,15 @@ class AbstractTerrain(AbstractLaw):
     def height(self, place: Place) -> Float[Array, ""]:
         """Height [m] above the world's origin at a place [m], continuously differentiable."""
 
+    def facing(self, point: Float[Array, "d"]) -> tuple[Float[Array, "d"], Float[Array, ""] | None]:
+        """The gradient of the `distance` of a point [m], and its length, None if that is one."""
+        gradient = jax.grad(lambda point: distance(self, point))(point)
+        return gradient, norm(gradient)
+
+    def facing_rate(self, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"] | None:
+        """The rate of that gradient as the point moves; None if it is constant."""
+        return jax.jvp(jax.grad(lambda point: distance(self, point)), (point,), (velocity,))[1]
+
     def detail(self, place: Place) -> Float[Array, ""]:
         """Hook: a length [m] within which the ground around a place rises or falls at most once; by default infinite.
         Steps evaluate contacts at least once over this length.
@@ -76,7 +85,17 @@ def _beyond(place: Place, start: Float[Array, ""], end: Float[Array, ""]) -> Flo
     return jnp.maximum(jnp.maximum(start - place[0], place[0] - end), 0.0)
 
 
-class Flat(AbstractTerrain):
+class _EvenTerrain(AbstractTerrain):
+    """Even ground, whose normal is the same everywhere."""
+
+    def facing(self, point):
+        return outward(self, point), None
+
+    def facing_rate(self, point, velocity):
+        return None
+
+
+class Flat(_EvenTerrain):
     """Level ground.
 
     **Arguments:** `level` [m].
@@ -123,7 +142,7 @@ class Sinusoid(AbstractTerrain):
         return _SHARE * self.wavelength
 
 
-class Slope(AbstractTerrain):
+class Slope(_EvenTerrain):
     """A plane that rises along x.
 
     **Arguments:** `gradient` [m/m]; `level` [m], at x = 0.

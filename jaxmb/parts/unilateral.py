@@ -6,14 +6,14 @@ within its steps. Every pair that may touch must be named; no others are searche
 """
 
 import abc
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..linalg.rotations import norm
+from ..linalg.rotations import norm, normalize
 from . import fields
 from .base import (
     AbstractInertialConstraint,
@@ -88,6 +88,7 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
         return jnp.full_like(self.restitution, jnp.inf)
 
     def residual(self, space, poses, t):
+        """`gap = 0` while the contact is closed; otherwise the mode keeps its value."""
         del t
         mode = poses[-1, 0]
         kind = kind_of(mode)
@@ -186,20 +187,10 @@ class AbstractRigidContact(AbstractGeometricContact):
         The normal must not be opposite to it.
         """
         normal = self.outward(space, poses)
-        if not pole:
-            return jnp.stack([normal[1], -normal[0]])[None]
-        first = poses[0] if len(poses) == 2 else None
-        if first is not None:
-            normal = space.body_direction(first, normal)
-        axes = jnp.eye(3, dtype=normal.dtype)
-        k = abs(pole) - 1
-        upwards = axes[k] if pole > 0 else -axes[k]
-        # The smallest turn from the pole to the normal.
-        turned = [
-            axis - jnp.dot(normal, axis) / (1 + jnp.dot(normal, upwards)) * (upwards + normal)
-            for axis in (axes[(k + 1) % 3], axes[(k + 2) % 3])
-        ]
-        return jnp.stack([v if first is None else space.direction(first, v) for v in turned])
+        if len(poses) == 1:
+            return tangents_of(normal, pole)
+        tangents = tangents_of(space.body_direction(poses[0], normal), pole)
+        return jax.vmap(lambda v: space.direction(poses[0], v))(tangents)
 
     def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities, pole: int = 0) -> Float[Array, "n"]:
         """The velocity [m/s] of the last body relative to the other body or the world, at the point of contact, along
@@ -221,7 +212,65 @@ class AbstractRigidContact(AbstractGeometricContact):
         return velocity
 
 
-class RigidContact(AbstractRigidContact):
+def tangents_of(normal: Float[Array, "d"], pole: int) -> Float[Array, "n d"]:
+    """Unit tangents of a surface from its normal, see `AbstractRigidContact.tangents`."""
+    if not pole:
+        return jnp.stack([normal[1], -normal[0]])[None]
+    axes, upwards = map(jnp.asarray, axes_of(pole, normal.dtype))
+    # The smallest turn from the pole to the normal.
+    return axes - ((axes @ normal) / (1 + upwards @ normal))[:, None] * (upwards + normal)[None]
+
+
+def axes_of(pole: int, dtype: Any) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "3"]]:
+    """The axes beside a pole, and the pole."""
+    k, one = abs(pole) - 1, np.eye(3, dtype=dtype)
+    return one[[(k + 1) % 3, (k + 2) % 3]], np.sign(pole) * one[k]
+
+
+class AbstractSurfaceContact(AbstractRigidContact):
+    """A rigid contact of a ball (in the plane a disc), fixed in the last body, with a surface, fixed in the first of
+    two bodies or in the world.
+
+    Subclasses say what the ball is, and how far a place of its centre is from touching the surface. The gap, the point
+    of contact, the normal and their rates follow. Places, gradients and rates are in the axes of the surface's body.
+    """
+
+    @property
+    @abc.abstractmethod
+    def ball(self) -> tuple[Float[Array, "d"], Float[Array, ""]]:
+        """The centre [m] of the ball, fixed in the last body, and its radius [m]."""
+
+    @abc.abstractmethod
+    def clearance(self, place: Float[Array, "d"]) -> Float[Array, ""]:
+        """The gap [m] of a ball whose centre is at this place [m]."""
+
+    def facing(self, place: Float[Array, "d"]) -> tuple[Float[Array, "d"], Float[Array, ""] | None]:
+        """The gradient of `clearance`, and its length, None if that is one."""
+        gradient = jax.grad(self.clearance)(place)
+        return gradient, norm(gradient)
+
+    def facing_rate(self, place: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, "d"] | None:
+        """The rate of the gradient as the centre moves; None for a plane, where it is constant."""
+        return jax.jvp(jax.grad(self.clearance), (place,), (velocity,))[1]
+
+    def gap(self, space, poses):
+        return self.clearance(self._place(space, poses))
+
+    def touching(self, space, poses):
+        centre, radius = self.ball
+        return space.point(poses[-1], centre) - radius * self.outward(space, poses)
+
+    def outward(self, space, poses):
+        gradient, size = self.facing(self._place(space, poses))
+        normal = gradient if size is None else gradient / size
+        return space.direction(poses[0], normal) if len(poses) == 2 else normal
+
+    def _place(self, space, poses):
+        centre = space.point(poses[-1], self.ball[0])
+        return space.body_point(poses[0], centre) if len(poses) == 2 else centre
+
+
+class RigidContact(AbstractSurfaceContact):
     """Rigid contact of a body with a terrain, as a disc (in the plane), a sphere (in space), or a point; frictionless
     without a `DryFriction`.
 
@@ -247,11 +296,18 @@ class RigidContact(AbstractRigidContact):
     radius: fields.Number = fields.length(sign="non-negative", default=0.0)
     centre: fields.Number = fields.point(body=0, default="origin")
 
-    def gap(self, space, poses):
-        return distance(self.terrain, space.point(poses[0], self.centre)) - self.radius
+    @property
+    def ball(self):
+        return self.centre, self.radius
 
-    def touching(self, space, poses):
-        return space.point(poses[0], self.centre) - self.radius * self.outward(space, poses)
+    def clearance(self, place):
+        return distance(self.terrain, place) - self.radius
+
+    def facing(self, place):
+        return self.terrain.facing(place)
+
+    def facing_rate(self, place, velocity):
+        return self.terrain.facing_rate(place, velocity)
 
     def over_ground(self, point, velocity):
         return over_ground(self, point, velocity)
@@ -260,7 +316,7 @@ class RigidContact(AbstractRigidContact):
         return (None, Ground(height=self.terrain.height)), *round_shapes(space, 0, self.radius, self.centre)
 
 
-class RigidBallContact(AbstractRigidContact, AbstractPointPair):
+class RigidBallContact(AbstractSurfaceContact, AbstractPointPair):
     """Rigid contact of two discs (in the plane) or balls (in space) of different bodies; frictionless without a
     `DryFriction`.
 
@@ -286,18 +342,25 @@ class RigidBallContact(AbstractRigidContact, AbstractPointPair):
     def numbers_agree(self):
         return super().numbers_agree() & (self.radius_a + self.radius_b > 0)
 
-    def gap(self, space, poses):
-        return norm(separation(space, self, poses)) - self.radius_a - self.radius_b
+    @property
+    def ball(self):
+        return self.point_b, self.radius_b
 
-    def touching(self, space, poses):
-        return space.point(poses[1], self.point_b) - self.radius_b * self.outward(space, poses)
+    def clearance(self, place):
+        return norm(place - self.point_a) - self.radius_a - self.radius_b
+
+    def facing(self, place):
+        return normalize(place - self.point_a), None
+
+    def facing_rate(self, place, velocity):
+        return _turning_of_normal(place - self.point_a, velocity)
 
     def shapes(self, space, size):
         first = round_shapes(space, 0, self.radius_a, self.point_a)
         return first + round_shapes(space, 1, self.radius_b, self.point_b)
 
 
-class RigidPlaneContact(AbstractRigidContact, AbstractPointPair):
+class RigidPlaneContact(AbstractSurfaceContact, AbstractPointPair):
     """Rigid contact of a disc or ball of `body_b`, or of a point, with a plane (a line in planar scenes) of `body_a`;
     frictionless without a `DryFriction`.
 
@@ -317,15 +380,21 @@ class RigidPlaneContact(AbstractRigidContact, AbstractPointPair):
     normal: fields.Number = fields.axis(body=None, gives=("normal_a",))
     radius: fields.Number = fields.length(sign="non-negative", default=0.0)
 
-    def gap(self, space, poses):
-        normal = space.direction(poses[0], self.normal_a)
-        return jnp.dot(normal, separation(space, self, poses)) - self.radius
+    @property
+    def ball(self):
+        return self.point_b, self.radius
 
-    def touching(self, space, poses):
-        return space.point(poses[1], self.point_b) - self.radius * self.outward(space, poses)
+    def clearance(self, place):
+        return jnp.dot(self.normal_a, place - self.point_a) - self.radius
+
+    def facing(self, place):
+        return self.normal_a, None
+
+    def facing_rate(self, place, velocity):
+        return None
 
 
-class RigidBoxContact(AbstractRigidContact, AbstractPointPair):
+class RigidBoxContact(AbstractSurfaceContact, AbstractPointPair):
     """Rigid contact of a disc or ball of `body_b` with a rectangle (in the plane) or a box of `body_a`, at its faces,
     edges and corners; frictionless without a `DryFriction`.
 
@@ -344,15 +413,23 @@ class RigidBoxContact(AbstractRigidContact, AbstractPointPair):
     size: fields.Number = fields.parameter(shape=("d",), unit="m", sign="positive")
     radius: fields.Number = fields.length(sign="positive")
 
-    def gap(self, space, poses):
-        return norm(self._outside(space, poses)) - self.radius
+    @property
+    def ball(self):
+        return self.point_b, self.radius
 
-    def touching(self, space, poses):
-        return space.point(poses[1], self.point_b) - self.radius * self.outward(space, poses)
+    def clearance(self, place):
+        return norm(self._outside(place)) - self.radius
 
-    def _outside(self, space, poses):
-        """From the nearest point of the box to the centre of the ball, in the axes of the box."""
-        centre = space.body_point(poses[0], space.point(poses[1], self.point_b)) - self.point_a
+    def facing(self, place):
+        return normalize(self._outside(place)), None
+
+    def facing_rate(self, place, velocity):
+        out = self._outside(place)
+        return _turning_of_normal(out, jnp.where(out == 0, 0.0, velocity))
+
+    def _outside(self, place):
+        """From the nearest point of the box to a place, in the axes of the box."""
+        centre = place - self.point_a
         return centre - clipped(centre, -0.5 * self.size, 0.5 * self.size)
 
     def shapes(self, space, size):
@@ -361,6 +438,13 @@ class RigidBoxContact(AbstractRigidContact, AbstractPointPair):
         extent = np.where(np.arange(3) < space.dimension, extent, self.radius / 3)
         box = Box(extent, position=space.in_space(self.point_a))
         return (0, box), *round_shapes(space, 1, self.radius, self.point_b)
+
+
+def _turning_of_normal(out, rate):
+    """The rate of the unit vector along a vector."""
+    size = norm(out)
+    normal = out / size
+    return (rate - normal * jnp.dot(normal, rate)) / size
 
 
 class Slack(AbstractGeometricContact, AbstractPointPair):

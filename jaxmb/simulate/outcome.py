@@ -19,6 +19,7 @@ from ..solvers import AbstractMultistep, Adams
 from ..states.consistency import contradiction, not_finite
 from ..states.headings import about_headings, are_short
 from ..states.refusals import LostRank, lost_rank, violated_joints
+from ..system.instant import Instant
 from .span import Span
 
 # A message about contacts without solution names gaps below this fraction of the system's size.
@@ -87,9 +88,9 @@ def about_friction(system, coupling) -> str:
 
 def about_contacts(system, outcome: Outcome) -> str:
     """The message about touching bodies for which no forces of contacts and friction are possible."""
-    q = system.normalize(outcome.t, outcome.y.q)
     contacts = system.contacts
-    touch = np.asarray(contacts.gaps(system, outcome.t, q)) <= _TOUCH * float(system.length)
+    gaps = Instant.of(system, outcome.t, outcome.y).normalized().gaps
+    touch = np.asarray(gaps) <= _TOUCH * float(system.length)
     touch = np.append(touch, [True] * contacts.m)
     names = ", ".join(dict.fromkeys(repr(name) for name, at in zip(contacts.names, touch, strict=True) if at))
     at = f"These are {names}, at t = {float(outcome.t):.6g}."

@@ -46,7 +46,7 @@ def consistent(system: AbstractSystem, t: Any, state: State) -> State:
     positions, velocities, overlaps = map(np.asarray, rows)
     if np.any(overlaps):
         names = [name for name, off in zip(system.contacts.contact_names, overlaps, strict=True) if off]
-        depths = -np.asarray(system.contacts.gaps(system, t, state.q))[overlaps]
+        depths = -np.asarray(Instant.of(system, t, state).gaps)[overlaps]
         listing = ", ".join(f"{name} by {depth:.3g}" for name, depth in zip(names, depths, strict=True))
         raise ValueError(
             "The state is beyond contacts, with bodies inside each other, joints beyond their stops or ropes too long, "
@@ -121,7 +121,7 @@ def _violated(system, t, y) -> Any:
     at = Instant.of(near, t, y).normalized()
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
     positions, velocities = at.violations(at.row_sizes())
-    depths = -system.contacts.gaps(system, t, at.q) / system.length
+    depths = -at.gaps / system.length
     return (positions > tol) | near.half_turned(at.q), velocities > tol, depths > tol
 
 

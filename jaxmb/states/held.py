@@ -22,7 +22,7 @@ def contacts_against(
         return is_open, is_open
     tol = tolerance(at.q.dtype) ** 0.5
     largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(at.force))
-    overlaps = is_open & (contacts.gaps(at.system, at.t, at.q) < -tol * at.system.length)
+    overlaps = is_open & (at.gaps < -tol * at.system.length)
     pulls = ~is_open & alone & (contacts.at_rows(multipliers)[: contacts.n] < -tol * largest)
     return overlaps, pulls
 

@@ -4,12 +4,11 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._types import Coordinates, Scalar, Velocities
+from .._types import Coordinates, Scalar
 from ..linalg.pairs import of_pairs
 from ..linalg.sums import unchecked_take, with_entries
 from ..parts.modes import CLOSED, STICK, Modes
@@ -28,6 +27,29 @@ class ContactNumbers(NamedTuple):
     peaks: Float[Array, "contacts"]
     coefficient: Float[Array, "frictions"]
     limit: Float[Array, "frictions"]
+
+
+class ContactPlace(NamedTuple):
+    """Contacts and dry friction at a place, as if all contacts were closed and all friction stuck.
+
+    **Fields:** the `gaps` [m, rad], negative where bodies are inside each other; `gradients`: the derivatives by
+    velocities of the rates of gaps and of the velocities of slip, rows of A; `sizes`: for each direction of friction
+    the normal force of its contact by a unit multiplier, 1 in joints.
+    """
+
+    gaps: Float[Array, "contacts"]
+    gradients: Float[Array, "laws nu"]
+    sizes: Float[Array, "frictions"]
+
+
+class ContactMotion(NamedTuple):
+    """Contacts and dry friction in motion, as if all contacts were closed and all friction stuck.
+
+    **Fields:** the `rates` of gaps and the velocities of slip; their derivatives without accelerations, `biases`.
+    """
+
+    rates: Float[Array, "laws"]
+    biases: Float[Array, "laws"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,16 +178,14 @@ class ContactSet:
         """The coordinates with all contacts closed and all friction sticking."""
         return self.with_modes(q, np.repeat([CLOSED, STICK], [self.n, self.m]).astype(float))
 
-    def stuck(
-        self, q: Coordinates, multipliers: Float[Array, "laws m"]
-    ) -> tuple[Float[Array, "nq"], Float[Array, "laws m"]]:
-        """Coordinates and multipliers of each law from which its reactions follow. Of coupled friction these are those
-        of stick, whose force is the multiplier of its row.
+    def stuck(self, at: Any, multipliers: Float[Array, "laws m"]) -> tuple[Any, Float[Array, "laws m"]]:
+        """The instant and the multipliers of each law from which its reactions follow. Of coupled friction these are
+        those of stick, whose force is the multiplier of its row.
         """
         if not self.coupled:
-            return q, multipliers
+            return at, multipliers
         own = np.eye(multipliers.shape[1])[np.array(self.rows)]
-        return self.bound(q), multipliers + jnp.asarray(own, multipliers.dtype)
+        return at.with_(q=self.bound(at.q)), multipliers + jnp.asarray(own, multipliers.dtype)
 
     # Friction of constant size, whose normal force is one
 
@@ -180,33 +200,3 @@ class ContactSet:
         if not any(self.constant):
             return size
         return size + jnp.max(system.contact_numbers(t).limit[np.flatnonzero(self.constant)])
-
-    # Gaps and slips of the `system` with these contacts, as if all contacts were closed and all friction stuck
-
-    def gaps(self, system: Any, t: Scalar, q: Coordinates) -> Float[Array, "contacts"]:
-        """The gaps [m, rad], negative where bodies are inside each other."""
-        if not self.n:
-            return jnp.zeros(0, q.dtype)
-        return _of_rows(system.position_residual(t, self.bound(q)), self.rows[: self.n])
-
-    def rates(self, system: Any, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "laws"]:
-        """The rates of the gaps, and the velocities of slip."""
-        return _of_rows(system.velocity_residual(t, self.bound(q), u), self.rows)
-
-    def accelerations(
-        self, system: Any, t: Scalar, q: Coordinates, u: Velocities, udot: Float[Array, "nu"]
-    ) -> Float[Array, "laws"]:
-        """The second derivatives of the gaps, and the derivatives of the velocities of slip."""
-        return _of_rows(system.acceleration_residual(t, self.bound(q), u, udot), self.rows)
-
-    def gradients(self, system: Any, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "laws nu"]:
-        """Derivatives of the rates by velocities: the rows of A with contacts closed and friction sticking."""
-        rates, pull = jax.vjp(lambda u: self.rates(system, t, q, u), u)
-        return jax.vmap(lambda row: pull(row)[0])(jnp.eye(rates.size, dtype=rates.dtype))
-
-
-def _of_rows(values, numbers):
-    # Slices of consecutive rows, so that the compiler can leave out rows of other parts.
-    rows = np.array(numbers, int)
-    runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) != 1)) if rows.size else []
-    return jnp.concatenate([*(values[run[0] : run[-1] + 1] for run in runs), values[:0]])

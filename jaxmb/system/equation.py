@@ -60,7 +60,8 @@ class AbstractEquation(eqx.Module):
     - `linear`: whether ψ is linear in u up to a constant term; `drift_free`: whether that term is zero. By default they
         are found from ψ, and hold for all numbers of the system.
     - `elimination`: the order of elimination of the blocks of A; None for one dense matrix. Static.
-    - `contacts`: the unilateral constraints and dry friction. Static.
+    - `contacts`: the unilateral constraints and dry friction. Static. A system with dry friction has
+        `friction_reactions` as well.
     """
 
     nq: AbstractVar[int]
@@ -113,6 +114,18 @@ class AbstractEquation(eqx.Module):
         return self.ranks.acceleration
 
     # Kinematics and inertia
+
+    def placed(self, t: Scalar, q: Coordinates) -> Any:
+        """What several functions of (t, q) share, computed once at an instant; None if they share nothing. With
+        `contacts` it has a `ContactPlace` of this name.
+        """
+        del t, q
+
+    def moving(self, placed: Any, u: Velocities) -> Any:
+        """What several functions of (t, q, u) share. Such functions take it as `now`, if it is known. With `contacts`
+        it has a `ContactMotion` of this name.
+        """
+        del placed, u
 
     @property
     def rates_are_velocities(self) -> bool:
@@ -204,10 +217,6 @@ class AbstractEquation(eqx.Module):
         # Residuals are linear in accelerations, so their derivative is the same at all accelerations.
         return jax.jacfwd(self.acceleration_residual, 3)(t, q, u, jnp.zeros_like(u))
 
-    def velocity_jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "velocity_rows nu"]:
-        """`∂ψ/∂u`, the first rows of A."""
-        return self.jacobian(t, q, u)[: self.velocity_rows]
-
     def structured_jacobian(self, t: Scalar, q: Coordinates, u: Velocities) -> AbstractJacobian:
         """`A` in blocks if the system has an order of `elimination`, else a dense matrix without a factor."""
         return DenseJacobian(self.jacobian(t, q, u))
@@ -277,13 +286,6 @@ class AbstractEquation(eqx.Module):
         """The numbers of `contacts` at a time; they are parameters, and some may be inputs."""
         del t
         return ContactNumbers(*[jnp.zeros(0)] * 4)
-
-    def friction_reactions(
-        self, t: Scalar, q: Coordinates, u: Velocities, multipliers: Float[Array, "acceleration_rows"]
-    ) -> Float[Array, "frictions d"]:
-        """For each row of dry friction a vector [N] as long as its normal force is large."""
-        del t, q, multipliers
-        return jnp.zeros((0, 0), u.dtype)
 
     # Implicit methods
 

@@ -12,19 +12,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._compat import current_trace
+from .._compat import traces_around
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.jacobian import AbstractJacobian
 from ..linalg.sums import placed_sums
+from .contact_set import ContactMotion, ContactPlace
 from .equation import AbstractEquation
 
 T = TypeVar("T")
 
 
 class kept(Generic[T]):
-    """A property that is computed once in each trace.
+    """A property that is computed once in a trace, for the traces within it as well.
 
-    A value from another trace is never used: it may be a tracer of a finished branch or loop.
+    A value from a trace that is not around is never used: it may be a tracer of a finished branch or loop.
     """
 
     def __init__(self, compute: Callable[[Any], T]):
@@ -37,14 +38,20 @@ class kept(Generic[T]):
     def __get__(self, instant, owner=None):
         if instant is None:
             return self
-        values, trace = getattr(instant, "_kept", None), current_trace()
+        values = getattr(instant, "_kept", None)
         if values is None:
             values = {}
             object.__setattr__(instant, "_kept", values)
         entry = values.get(self)
-        if entry is None or entry[0] != trace:
-            entry = values[self] = trace, self._compute(instant)
+        if entry is None or entry[0] not in traces_around():
+            entry = values[self] = next(traces_around()), self._compute(instant)
         return entry[1]
+
+
+def hand_on(instant: Any, other: Any, *properties: kept) -> None:
+    """Let another object have what a keeper has kept of some properties."""
+    values = getattr(instant, "_kept", None) or {}
+    object.__setattr__(other, "_kept", {key: values[key] for key in properties if key in values})
 
 
 class Keeper:
@@ -57,6 +64,12 @@ def _of_state(method: Callable[..., T]) -> kept[T]:
     """The value of the equation's function of (t, q, u)."""
     name = method.__name__
     return kept(lambda at: getattr(at.system, name)(at.t, at.q, at.u))
+
+
+def _of_motion(method: Callable[..., T]) -> kept[T]:
+    """The value of the equation's function of (t, q, u), from the kinematics of the instant."""
+    name = method.__name__
+    return kept(lambda at: at._by_motion(name))
 
 
 def _of_configuration(method: Callable[..., T]) -> kept[T]:
@@ -89,7 +102,10 @@ class Instant(eqx.Module, Keeper):
 
     def with_(self, *, q: Coordinates | None = None, u: Velocities | None = None) -> Self:
         """The same instant with other coordinates or velocities."""
-        return type(self)(self.system, self.t, self.q if q is None else q, self.u if u is None else u, self.z)
+        out = type(self)(self.system, self.t, self.q if q is None else q, self.u if u is None else u, self.z)
+        if q is None:
+            hand_on(self, out, Instant.placed)
+        return out
 
     def normalized(self) -> Self:
         """The same instant with the coordinates' invariants satisfied."""
@@ -107,18 +123,38 @@ class Instant(eqx.Module, Keeper):
         """The rate of the state with accelerations `udot`."""
         return State(self.rates, udot, None if self.z is None else self.state_rates)
 
+    # The kinematics from which the functions follow
+
+    @kept
+    def placed(self) -> Any:
+        """`AbstractEquation.placed`."""
+        return self.system.placed(self.t, self.q)
+
+    @kept
+    def now(self) -> Any:
+        """`AbstractEquation.moving`."""
+        return None if self.placed is None else self.system.moving(self.placed, self.u)
+
+    def _by_motion(self, name: str, *arguments: Array) -> Any:
+        known = {} if self.now is None else {"now": self.now}
+        return getattr(self.system, name)(self.t, self.q, self.u, *arguments, **known)
+
     # Functions of the equation, see `AbstractEquation`.
     rates = _of_state(AbstractEquation.rates)
     state_rates = _of_state(AbstractEquation.state_rates)
     inertia = _of_state(AbstractEquation.inertia)
-    force = _of_state(AbstractEquation.force)
-    jacobian = _of_state(AbstractEquation.jacobian)
-    velocity_jacobian = _of_state(AbstractEquation.velocity_jacobian)
-    structured_jacobian = _of_state(AbstractEquation.structured_jacobian)
-    velocity_residual = _of_state(AbstractEquation.velocity_residual)
+    force = _of_motion(AbstractEquation.force)
+    jacobian = _of_motion(AbstractEquation.jacobian)
+    structured_jacobian = _of_motion(AbstractEquation.structured_jacobian)
+    velocity_residual = _of_motion(AbstractEquation.velocity_residual)
     position_residual = _of_configuration(AbstractEquation.position_residual)
     coordinate_residual = _of_configuration(AbstractEquation.coordinate_residual)
     coordinate_jacobian = _of_configuration(AbstractEquation.coordinate_jacobian)
+
+    @property
+    def velocity_jacobian(self) -> Float[Array, "velocity_rows nu"]:
+        """`∂ψ/∂u`, the first rows of A."""
+        return self.jacobian[: self.system.velocity_rows]
 
     @kept
     def gamma(self) -> Float[Array, "m"]:
@@ -127,16 +163,41 @@ class Instant(eqx.Module, Keeper):
 
     def acceleration_residual(self, udot: Float[Array, "nu"]) -> Float[Array, "m"]:
         """`A u̇ − γ`."""
-        return self.system.acceleration_residual(self.t, self.q, self.u, udot)
+        return self._by_motion("acceleration_residual", udot)
 
     def constraint_force(self, multipliers: Float[Array, "m"]) -> Float[Array, "nu"]:
         """`Aᵀ λ`."""
-        return self.system.constraint_force(self.t, self.q, self.u, multipliers)
+        return self._by_motion("constraint_force", multipliers)
 
     def friction_force(self, multipliers: Float[Array, "k"]) -> Float[Array, "nu"]:
         """C, from the multipliers of the `friction_rows`."""
         of_rows = placed_sums(self.system.friction_rows, self.system.acceleration_rows)
-        return self.system.nonideal_force(self.t, self.q, self.u, of_rows(multipliers))
+        return self._by_motion("nonideal_force", of_rows(multipliers))
+
+    def friction_reactions(self, multipliers: Float[Array, "m"]) -> Float[Array, "frictions d"]:
+        """For each direction of dry friction a vector [N] as long as its normal force is large."""
+        return self._by_motion("friction_reactions", multipliers)
+
+    # Contacts and dry friction, as if all contacts were closed and all friction stuck
+
+    @property
+    def contact_place(self) -> ContactPlace:
+        """Their gaps and gradients."""
+        return self.placed.contacts
+
+    @property
+    def contact_motion(self) -> ContactMotion:
+        """Their rates."""
+        return self.now.contacts
+
+    @property
+    def gaps(self) -> Float[Array, "contacts"]:
+        """The gaps [m, rad] of contacts, open or closed."""
+        return self.contact_place.gaps if self.system.contacts.n else jnp.zeros(0, self.q.dtype)
+
+    def contact_accelerations(self, udot: Float[Array, "nu"]) -> Float[Array, "laws"]:
+        """The second derivatives of the gaps, and the derivatives of the velocities of slip."""
+        return self.contact_place.gradients @ udot + self.contact_motion.biases
 
     # Residuals as rows of A, and their sizes.
 

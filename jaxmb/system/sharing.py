@@ -32,7 +32,7 @@ class NoSharing:
 
         **Arguments:** `reserves`: these as a function of the system, time, coordinates, velocities and multipliers.
         """
-        return reserves(at.system, at.t, at.q, at.u, multipliers)
+        return reserves(at, multipliers)
 
     def determined(self, laws: Any, settled: Any, implied: Bool[Array, "n"], slow: Float[Array, ""]) -> Any:
         """Whether slip after an event is the same for all shares of the forces of contacts; `slow`: see `Impacting`."""

@@ -206,8 +206,8 @@ FAULTS = [
     Fault("parts/dry_friction.py", "else slip - self.speed", "else slip + self.speed"),
     Fault(
         "parts/dry_friction.py",
-        "(against,) = pull(-slip_direction(self._modes(poses), slip))",
-        "(against,) = pull(slip_direction(self._modes(poses), slip))",
+        "against = -slip_direction(self._modes(poses), slips)",
+        "against = slip_direction(self._modes(poses), slips)",
     ),
     Fault(
         "parts/dry_friction.py",
@@ -300,13 +300,13 @@ FAULTS = [
     ),
     Fault(
         "parts/unilateral.py",
-        "norm(separation(space, self, poses)) - self.radius_a - self.radius_b",
-        "norm(separation(space, self, poses)) - self.radius_a + self.radius_b",
+        "return norm(place - self.point_a) - self.radius_a - self.radius_b",
+        "return norm(place - self.point_a) - self.radius_a + self.radius_b",
     ),
     Fault(
         "parts/unilateral.py",
-        "jnp.dot(normal, separation(space, self, poses)) - self.radius",
-        "jnp.dot(normal, separation(space, self, poses)) + self.radius",
+        "return jnp.dot(self.normal_a, place - self.point_a) - self.radius",
+        "return jnp.dot(self.normal_a, place - self.point_a) + self.radius",
     ),
     Fault(
         "parts/unilateral.py",
@@ -316,8 +316,19 @@ FAULTS = [
     Fault("parts/unilateral.py", "velocity(-1) - velocity(0) if len(poses) == 2", "velocity(-1) if len(poses) == 2"),
     Fault(
         "parts/unilateral.py",
-        "distance(self.terrain, space.point(poses[0], self.centre)) - self.radius",
-        "distance(self.terrain, space.point(poses[0], self.centre)) + self.radius",
+        "return distance(self.terrain, place) - self.radius",
+        "return distance(self.terrain, place) + self.radius",
+    ),
+    Fault(
+        "parts/unilateral.py",
+        "return (rate - normal * jnp.dot(normal, rate)) / size",
+        "return rate / size",
+    ),
+    Fault("parts/unilateral.py", "jnp.where(out == 0, 0.0, velocity)", "velocity"),
+    Fault(
+        "parts/unilateral.py",
+        "return axes - ((axes @ normal) / (1 + upwards @ normal))",
+        "return axes - ((axes @ normal) / (2 + upwards @ normal))",
     ),
     # Parts of the plane
     Fault("parts/planar/bodies.py", "return mass * radius**2 / 2", "return mass * radius**2 / 4"),
@@ -507,6 +518,42 @@ FAULTS = [
         "gap, rate = jax.jvp(gaps, (t, x), (jnp.ones_like(t), ",
         "gap, rate = jax.jvp(gaps, (t, x), (jnp.zeros_like(t), ",
     ),
+    Fault("bodies/touch.py", "outward, c - radius * outward)", "outward, c + radius * outward)"),
+    Fault(
+        "bodies/touch.py",
+        "[-space.point_force(x[0], at.seen, force), last]",
+        "[space.point_force(x[0], at.seen, force), last]",
+    ),
+    Fault("bodies/touch.py", "carried + 2 * relative", "carried + relative"),
+    Fault("bodies/touch.py", "bias = bias + jnp.dot(gradient, along)", "bias = bias - jnp.dot(gradient, along)"),
+    Fault("bodies/touch.py", "velocity - radius * outward)", "velocity + radius * outward)"),
+    Fault(
+        "bodies/touch.py",
+        "normal = gradient - at.normal * jnp.dot(at.normal, gradient)",
+        "normal = gradient",
+    ),
+    Fault("bodies/touch.py", "bias + turn @ relative", "bias - turn @ relative"),
+    Fault("bodies/touch.py", "turn = carried if turn is None else turn + carried", "turn = carried"),
+    Fault(
+        "bodies/touch.py",
+        "slope = (axes @ rate - along * (upwards @ rate)) / size",
+        "slope = (axes @ rate + along * (upwards @ rate)) / size",
+    ),
+    Fault(
+        "bodies/law_groups.py",
+        "return jax.jvp(gap, (t, x), (jnp.ones_like(t), xdot))[1]",
+        "return jax.jvp(gap, (t, x), (jnp.zeros_like(t), xdot))[1]",
+    ),
+    Fault(
+        "bodies/law_groups.py",
+        "along = jnp.ones_like(t), jax.vmap(space.rates)(x, v)",
+        "along = jnp.zeros_like(t), jax.vmap(space.rates)(x, v)",
+    ),
+    Fault(
+        "bodies/law_groups.py",
+        "return unchecked_take(norm(forces), np.array(members))",
+        "return jnp.ones(len(members))",
+    ),
     Fault(
         "bodies/motion.py",
         "felt = linear if gravity is None else linear - gravity",
@@ -592,8 +639,8 @@ FAULTS = [
     Fault("contacts/events.py", "Event(time + float(rest), name", "Event(time - float(rest), name"),
     Fault(
         "contacts/forces.py",
-        "system.contact_numbers(t).limit * normal - sizes_of",
-        "system.contact_numbers(t).coefficient * normal - sizes_of",
+        "limit = at.system.contact_numbers(at.t).limit",
+        "limit = at.system.contact_numbers(at.t).coefficient",
     ),
     Fault(
         "contacts/friction.py",
@@ -627,8 +674,8 @@ FAULTS = [
     Fault("contacts/impacting.py", "closing**2 - 2 * curve[:n] * gap", "closing**2 + 2 * curve[:n] * gap"),
     Fault(
         "contacts/impacting.py",
-        "again = self.system.contact_numbers(self.t).restitution * impulses[: self.contacts.n]",
-        "again = self.system.contact_numbers(self.t).restitution**2 * impulses[: self.contacts.n]",
+        "again = self.system.contact_numbers(self.at.t).restitution * impulses[: self.contacts.n]",
+        "again = self.system.contact_numbers(self.at.t).restitution**2 * impulses[: self.contacts.n]",
     ),
     Fault("contacts/impacting.py", "2 * rate / (falls * (1 - ratio))", "2 * rate / falls"),
     Fault(

@@ -13,6 +13,7 @@ from jaxmb.contacts.impacting import Impacting, Trial, next_trial
 from jaxmb.contacts.tolerance import ContactTolerance
 from jaxmb.parts import terrain
 from jaxmb.solvers.events import Bracket
+from jaxmb.system.instant import Instant
 
 G, TOUCH = 10.0, 1e-6
 
@@ -30,7 +31,7 @@ def impacting(system, height, rise, along=0.0, modes=0.0):
     q = system.contacts.with_modes(system.guess.q, modes).at[1].set(height)
     u = jnp.zeros(system.nu).at[:2].set(jnp.array([along, rise]))
     tolerance = ContactTolerance(jnp.asarray(TOUCH))
-    return Impacting.at(system, mb.formulations.Multipliers(), tolerance, jnp.zeros(()), mb.State(q, u))
+    return Impacting.of(Instant(system, jnp.zeros(()), q, u), mb.formulations.Multipliers(), tolerance)
 
 
 @functools.cache
@@ -44,7 +45,7 @@ def pieces():
     @jax.jit
     def found(height, rise):
         event = impacting(system, height, rise)
-        udot, curve, _ = event.accelerated(event.u)
+        udot, curve, _ = event.accelerated(event.at.u)
         start = event.start()
         struck = start.struck._replace(rate=jnp.array([-0.5]) * rise)
         at = start._replace(when=start.when._replace(touching=jnp.array([True])), struck=struck)
@@ -78,7 +79,7 @@ def test_low_bounces_and_how_long_they_take():
 def test_an_impact_opens_the_gap_at_its_share_of_the_rebound():
     event = impacting(ball(), 0.0, -2.0)
     start = event.start()
-    begun = event.begin(1, start._replace(struck=start.struck._replace(udot=event.u)), None, jnp.zeros(1))
+    begun = event.begin(1, start._replace(struck=start.struck._replace(udot=event.at.u)), None, jnp.zeros(1))
     assert begun.when.touching
     for share in (1.0, 0.4):
         problem = event.impulse_of(begun.when, start.low, share, None)

@@ -10,6 +10,7 @@ from at_instants import instants, point
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.system.instant import Instant
 
 G, R = 9.81, 0.1
 GRAVITY = mb.Gravity((0.0, -G))
@@ -292,7 +293,7 @@ def test_a_length_that_is_an_input():
     np.testing.assert_allclose(state.u[:2], [0.0, 0.5], atol=1e-12)
     tensions = instants(system, state)("rope.tension")[0]
     np.testing.assert_allclose(tensions, 2.0 * G * np.array([np.exp(0.2 * np.pi), 1.0]), rtol=1e-10)
-    slip = system.contacts.rates(system, jnp.zeros(()), state.q, state.u)
+    slip = Instant(system, jnp.zeros(()), state.q, state.u).contact_motion.rates
     np.testing.assert_allclose(slip, -0.5, rtol=1e-12)
 
 

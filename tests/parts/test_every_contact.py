@@ -11,6 +11,7 @@ from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import terrain
 from jaxmb.parts.modes import CLOSED, OPEN
 from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.system.instant import Instant
 
 A, B, R, S = np.array([0.4, 0.9]), np.array([1.5, 2.0]), 0.1, 0.25
 # On a body at A that is turned by 0.2, and on one at B that is turned by −0.4.
@@ -68,11 +69,11 @@ def test_gap_and_its_derivatives(name):
 
     @jax.jit
     def seen(q):
-        gap = lambda q: of.gaps(system, t, q)
+        at, gap = Instant(system, t, q, u), lambda q: Instant(system, t, q, u).gaps
         ahead = lambda q: jax.jvp(gap, (q,), (system.rates(t, q, u),))[1]
         gap_rate, bend = jax.jvp(ahead, (q,), (system.rates(t, q, u),))
-        own = of.rates(system, t, q, u), of.accelerations(system, t, q, u, jnp.zeros_like(u))
-        gradients = of.gradients(system, t, q, u), system.jacobian(t, of.with_modes(q, CLOSED), u)[rows]
+        own = at.contact_motion.rates, at.contact_accelerations(jnp.zeros_like(u))
+        gradients = at.contact_place.gradients, system.jacobian(t, of.with_modes(q, CLOSED), u)[rows]
         return gap(q), own, (gap_rate, bend), gradients
 
     gap, own, along, (gradient, closed) = jax.tree.map(np.asarray, seen(system.guess.q))
@@ -99,7 +100,7 @@ def test_contact_that_is_open_does_nothing_and_one_that_is_closed_pushes(name):
     (free, none), (held, forces) = at(OPEN), at(CLOSED)
     (row,) = of.rows
     assert none[row] == 0
-    left = of.accelerations(system, t, state.q, u, held)
+    left = Instant(system, t, state.q, u).contact_accelerations(held)
     np.testing.assert_allclose(left, 0.0, atol=1e-12)
     assert abs(forces[row]) > 1e-3
     assert (forces[row] > 0) == (of.accelerations(system, t, state.q, u, free)[0] < 0)

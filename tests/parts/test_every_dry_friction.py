@@ -11,6 +11,7 @@ from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import terrain
 from jaxmb.parts.modes import FREE, STICK
+from jaxmb.system.instant import Instant
 
 # The velocities of the bodies are any: those in the closest state are used.
 pytestmark = pytest.mark.filterwarnings("ignore:The velocities given with the bodies")
@@ -23,8 +24,9 @@ def state_of(system):
 
 def test_slip_counts_from_the_belt():
     system = friction_scene("disc on a belt")
-    of, t = system.contacts, jnp.zeros(())
-    both = jax.jit(lambda q, u: (of.rates(system, t, q, u)[-1], of.gradients(system, t, q, u)[-1] @ u))
+    t = jnp.zeros(())
+    at = lambda q, u: Instant(system, t, q, u)
+    both = jax.jit(lambda q, u: (at(q, u).contact_motion.rates[-1], at(q, u).contact_place.gradients[-1] @ u))
     slip, moves = both(system.guess.q, system.guess.u)
     np.testing.assert_allclose(slip, moves - FRICTIONS["disc on a belt"][2].speed, rtol=1e-12)
 
@@ -37,15 +39,15 @@ def test_stick_is_a_constraint_and_slip_a_force(name):
     t, q, u = jnp.zeros(()), state.q, state.u
     of, directions = system.contacts, system.contacts.m
     at = lambda mode: of.with_modes(q, of.modes(q).numbers.at[-directions:].set(mode))
-    slip = np.asarray(of.rates(system, t, q, u)[-directions:])
+    slip = np.asarray(Instant(system, t, q, u).contact_motion.rates[-directions:])
     speed = np.linalg.norm(slip)
     assert directions == (2 if "ball" in name or name in ("sleeve", "face") else 1) and speed > 1e-3
 
     # Where it sticks, its rows are those of the slip.
     udot, multipliers = accelerations(system, Multipliers(), t, at(STICK), u)
-    np.testing.assert_allclose(of.accelerations(system, t, q, u, udot)[-directions:], 0.0, atol=1e-11)
+    np.testing.assert_allclose(Instant(system, t, q, u).contact_accelerations(udot)[-directions:], 0.0, atol=1e-11)
     rows = np.array(of.rows)[of.n :]
-    moves = of.gradients(system, t, q, u)[-directions:] @ u
+    moves = Instant(system, t, q, u).contact_place.gradients[-directions:] @ u
     friction = FRICTIONS[name][2]
     constant = isinstance(friction, mb.JointFriction)
     belt = None if constant else friction.speed
@@ -91,9 +93,9 @@ def test_the_direction_of_slip_has_a_sense_at_rest_and_beyond():
     system = friction_scene("ball on an edge")
     state = state_of(system)
     t, q, u, of = jnp.zeros(()), state.q, state.u, system.contacts
-    slip = np.asarray(of.rates(system, t, q, u)[-2:])
+    slip = np.asarray(Instant(system, t, q, u).contact_motion.rates[-2:])
     at = lambda mode: of.with_modes(q, of.modes(q).numbers.at[-2:].set(mode))
-    rows = of.gradients(system, t, q, u)[-2:]
+    rows = Instant(system, t, q, u).contact_place.gradients[-2:]
 
     def direction(mode):
         _, multipliers = accelerations(system, Multipliers(), t, at(mode), u)

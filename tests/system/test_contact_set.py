@@ -10,6 +10,7 @@ import jaxmb as mb
 from jaxmb import spatial
 from jaxmb.parts import terrain
 from jaxmb.parts.modes import CLOSED, STICK
+from jaxmb.system.instant import Instant
 
 MOST_PROGRAMS = 90
 
@@ -59,7 +60,7 @@ def test_contact_set_binds_all_that_is_closed():
     def evaluate(system, q):
         bound = contacts.bound(q)
         # The gap is that of the poses, whatever the modes are.
-        gaps = [contacts.gaps(system, jnp.zeros(()), x) for x in (q, bound)]
+        gaps = [Instant(system, jnp.zeros(()), x, jnp.zeros(system.nu)).gaps for x in (q, bound)]
         return bound, contacts.modes(bound).numbers, gaps
 
     bound, modes, gaps = evaluate(system, q)
@@ -81,6 +82,6 @@ def test_contact_set_of_a_system_without_contacts():
     system = scene(contacts=False)
     contacts, q = system.contacts, np.asarray(system.guess.q)
     assert not contacts and (contacts.n, contacts.m) == (0, 0)
-    assert contacts.gaps(system, 0.0, q).size == contacts.modes(q).open.size == 0
+    assert Instant(system, 0.0, q, np.zeros(system.nu)).gaps.size == contacts.modes(q).open.size == 0
     np.testing.assert_array_equal(contacts.bound(q), q)
     assert all(x.size == 0 for x in system.contact_numbers(0.0))

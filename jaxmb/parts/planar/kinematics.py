@@ -32,6 +32,9 @@ class PlanarSpace(AbstractSpace):
     def turning(self, pose, velocity):
         return velocity[2:]
 
+    def swept(self, omega, arm):
+        return omega * _quarter_turn(arm)
+
     def moment(self, pose, moment_W):
         return jnp.concatenate([jnp.zeros(2, moment_W.dtype), moment_W])
 

@@ -74,6 +74,9 @@ class SpatialSpace(AbstractSpace):
     def turning(self, pose, velocity):
         return _turned(pose, velocity[3:])
 
+    def swept(self, omega, arm):
+        return rot.cross(omega, arm)
+
     def moment(self, pose, moment_W):
         return jnp.concatenate([jnp.zeros_like(moment_W), _turned_back(pose, moment_W)])
 

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from ..._types import State
 from ...states.assembly import assemble
+from ...system.instant import Instant
 from ..batch import batch
 from ..minimise import Linearised
 from .experiment import ExperimentModel
@@ -216,7 +217,7 @@ def _kernel(matrix: np.ndarray, rank: int) -> np.ndarray:
 def _constraint_jacobians(system, trial, flat, ts, states):
     changed = trial.changed_system(system, trial.named(flat))
     position = lambda t, state: changed.coordinate_jacobian(t, state.q)
-    velocity = lambda t, state: changed.velocity_jacobian(t, state.q, state.u)
+    velocity = lambda t, state: Instant.of(changed, t, state).velocity_jacobian
     return jax.vmap(position)(ts, states), jax.vmap(velocity)(ts, states)
 
 

@@ -20,6 +20,7 @@ from ...states.assembly import configuration
 from ...states.consistency import listed
 from ...system import AbstractSystem
 from ...system.description import counted
+from ...system.instant import Instant
 from ...system.quantities import Reaction, Solved
 from ...trajectory import Trajectory
 from .balance import Drives, Found, balanced, searched
@@ -262,8 +263,8 @@ def _refusal(given, found: Found, k: int, tolerance: float) -> str:
             )
     beyond = here.gaps < -tolerance
     if beyond.any():
-        q = path.ys.q[k]
-        gaps = np.asarray(rest.contacts.gaps(rest, path.ts[k], rest.normalize(path.ts[k], q)))
+        at = Instant(rest, path.ts[k], path.ys.q[k], path.ys.u[k])
+        gaps = np.asarray(at.normalized().gaps)
         named = zip(rest.contacts.contact_names, gaps, beyond, strict=True)
         through = ", ".join(f"{name} by {-gap:.3g}" for name, gap, bad in named if bad)
         return f"{lead} the motion passes through {through} [m, rad]. Correct the motion, or raise tolerance."

@@ -21,6 +21,7 @@ from ..._types import Scalar, State
 from ...linalg.elimination import PivotSearch, eliminate, full_pivot
 from ...parts.names import unknown
 from ...system import AbstractSystem
+from ...system.instant import Instant
 from ...system.quantities import directions, rates_of
 from .quantities import checked_names, components, measured
 
@@ -157,7 +158,7 @@ def tangent_basis(system: AbstractSystem, t: Scalar, state: State) -> tuple[Arra
         rows, scale, rank = system.coordinate_jacobian(t, q), system.coordinate_scale(), system.coordinate_rank
     positions = full_pivot(rows, scale=scale)
     along = moves @ eliminate(rows, positions.order, rank).null_space
-    jacobian = system.velocity_jacobian(t, q, u)
+    jacobian = Instant(system, t, q, u).velocity_jacobian
     velocities = full_pivot(jacobian, scale=system.velocity_scale())
     solved = eliminate(jacobian, velocities.order, system.velocity_rank)
     change = lambda dq: jax.jvp(lambda q: system.velocity_residual(t, q, u), (q,), (dq,))[1]
