@@ -97,7 +97,7 @@ class ConstraintSet(eqx.Module):
             return placed
         blocks = joined([*(place.rows for place in placed.places), jnp.zeros(1, poses.dtype)], poses.dtype)
         gaps = [place.gap for g, place in zip(laws, placed.places, strict=True) if g.is_contact]
-        sizes = [jnp.repeat(g.sizes(placed.places), g.rows) for g in self.frictions]
+        sizes = [jnp.repeat(g.law.sizes(placed.places), g.rows) for g in self.frictions]
         gradients = self._assembled(blocks, laws, of_poses=False)
         return placed._replace(contacts=ContactPlace(joined(gaps, poses.dtype), gradients, joined(sizes, poses.dtype)))
 
@@ -207,8 +207,9 @@ class ConstraintSet(eqx.Module):
         def of_law(g):
             if g.needs == "nothing":
                 return jnp.zeros((*g.group.body_index.shape, now.velocities.shape[1]), now.velocities.dtype)
-            if g.needs == "multipliers":
-                return unchecked_take(multipliers, self._rows_of(g.joints))
+            if g.needs in ("multipliers", "normal"):
+                own = unchecked_take(multipliers, self._rows_of(g.joints))
+                return own if g.needs == "multipliers" else own * g.sizes(now.places)[:, None]
             # A joint may be made of several constraints, all between the same bodies.
             of_joint = jnp.sum(unchecked_take(reactions, self.layout.reaction_source(bodies, g.joints)), axis=1)
             # A law may have more scalar coordinates than its joint; these take no reaction.

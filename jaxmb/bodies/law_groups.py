@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._types import Scalar
+from ..linalg.blocks import vector_products
 from ..linalg.rotations import norm
 from ..linalg.sums import unchecked_take
 from ..parts.dry_friction import AbstractStickSlip
@@ -34,7 +35,7 @@ from .groups import (
     Placed,
     VelocityConstraintGroup,
 )
-from .touch import gap_motion, gap_rows, slip_motion, slip_rows, touch_at
+from .touch import gap_gradient, gap_motion, gap_rows, slip_motion, slip_rows, touch_at
 
 
 class LawPlace(NamedTuple):
@@ -87,11 +88,14 @@ class AbstractLawGroup(AbstractConstraintGroup):
         return self.group.gather(of_bodies)[:, -self.rows :, 0]
 
     def jacobian(self, now):
-        rows = now.places[self.number].rows
+        return self._with_modes(now.poses, now.places[self.number].rows)
+
+    def _with_modes(self, poses, rows):
+        """Rows of laws that act, and of the modes of others."""
         *_, k, size = rows.shape
         of_modes = np.zeros((self.rows, k, size), rows.dtype)
         of_modes[np.arange(self.rows), k - self.rows + np.arange(self.rows), 0] = 1.0
-        return jnp.where(self.acts(now.poses)[..., None, None], rows, of_modes)
+        return jnp.where(self.acts(poses)[..., None, None], rows, of_modes)
 
     def velocity(self, now):
         return jnp.where(self.acts(now.poses), now.motions[self.number].rate, self._of_modes(now.velocities))
@@ -104,7 +108,7 @@ class AbstractLawGroup(AbstractConstraintGroup):
         along = along + now.motions[self.number].bias
         return jnp.where(self.acts(now.poses), along, self._of_modes(accelerations))
 
-    def _with_modes(self, rows):
+    def _padded(self, rows):
         """The rows with zeros for the modes, which are the last of the bodies."""
         return jnp.pad(rows, ((0, 0), (0, 0), (0, self.group.body_index.shape[1] - rows.shape[2]), (0, 0)))
 
@@ -146,7 +150,19 @@ class ContactGroup(AbstractLawGroup, ConstraintGroup):
             return jax.vmap(space.pull_back)(x, *pull(jnp.ones_like(value)))[None], value[0], None
 
         rows, *others = self._map(of_surface if self.of_surfaces else by_gap, poses)
-        return LawPlace(self._with_modes(rows), *others)
+        return LawPlace(self._padded(rows), *others)
+
+    def along(self, t, poses, moves):
+        space, n = self._space, self.rows
+
+        def single(at, x, moves):
+            if self.of_surfaces:
+                gradient = gap_gradient(space, at(t), x[:-n])
+            else:
+                gradient = jax.grad(lambda x: self._gap(at, t, x)[0])(x[:-n])
+            return vector_products(moves[:-n], gradient)
+
+        return self._with_modes(poses, self._padded(self._map(single, poses, moves)[:, None]))
 
     def motion(self, now, before):
         space, n, t, touch = self._space, self.rows, now.t, now.places[self.number].touch
@@ -192,22 +208,11 @@ class FrictionGroup(AbstractLawGroup, VelocityConstraintGroup):
     @property
     def law(self) -> "SlipLaws":
         """The laws of friction that slips."""
-        return SlipLaws(self.group, self.joints, self.number)
+        return SlipLaws(self.group, self.joints, self.number, self.against)
 
     def _slips(self, at, t, x, v):
         part = at(t)
         return self.group.kernel("slips")(part, *part.seen(self._space, x, v))
-
-    def sizes(self, places: Sequence[LawPlace]) -> Float[Array, "parts"]:
-        """The normal forces of contacts by unit multipliers of their gaps; 1 in joints."""
-        if self.against is None:
-            return jnp.ones(len(self.group.names), self.group.part.coefficient.dtype)
-        number, members = self.against
-        rows, _, touch = places[number]
-        if touch is not None and touch.size is None:
-            return jnp.ones(len(members), rows.dtype)
-        forces = rows[:, 0, self.group.part.last, : self._space.dimension]
-        return unchecked_take(norm(forces), np.array(members))
 
     def place(self, t, poses, before):
         space, touch = self._space, touch_of(self.against, before)
@@ -216,7 +221,7 @@ class FrictionGroup(AbstractLawGroup, VelocityConstraintGroup):
             return LawPlace(self._map(single, poses), None, None)
         n, pole = self._bodies, self.group.part.pole
         rows = self._map(lambda at, x, touch: slip_rows(space, pole, x[:n], touch), poses, per_part=(touch,))
-        return LawPlace(self._with_modes(rows), None, touch)
+        return LawPlace(self._padded(rows), None, touch)
 
     def motion(self, now, before):
         space, t, touch = self._space, now.t, now.places[self.number].touch
@@ -249,6 +254,18 @@ class SlipLaws(NonIdealGroup):
     """Kernels of the laws of stacked dry friction that slips."""
 
     number: int = eqx.field(static=True, default=-1)
+    against: tuple[int, tuple[int, ...]] | None = eqx.field(static=True, default=None)
+
+    def sizes(self, places: Sequence[LawPlace]) -> Float[Array, "parts"]:
+        """The normal forces of contacts by unit multipliers of their gaps; 1 in joints."""
+        if self.against is None:
+            return jnp.ones(len(self.group.names), self.group.part.coefficient.dtype)
+        number, members = self.against
+        rows, _, touch = places[number]
+        if touch is not None and touch.size is None:
+            return jnp.ones(len(members), rows.dtype)
+        forces = rows[:, 0, self.group.part.last, : self._space.dimension]
+        return unchecked_take(norm(forces), np.array(members))
 
     def wrenches(self, now, reactions):
         space = self._space

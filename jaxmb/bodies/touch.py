@@ -59,6 +59,18 @@ def gap_rows(space: AbstractSpace, part: AbstractSurfaceContact, x: Float[Array,
     return jnp.stack(rows)[None]
 
 
+def gap_gradient(space: AbstractSpace, part: AbstractSurfaceContact, x: Float[Array, "k p"]) -> Float[Array, "k p"]:
+    """The derivative of the gap by the prepared poses of the bodies."""
+    at = touch_at(space, part, x)
+    force = at.outward if at.size is None else at.size * at.outward
+    last = space.point_gradient(part.ball[0], force)
+    if len(x) == 1:
+        return last[None]
+    d = space.dimension
+    turned = space.point_gradient(at.gradient, at.centre - x[0, :d])[d:]
+    return jnp.stack([jnp.concatenate([-force, turned]), last])
+
+
 def gap_motion(space: AbstractSpace, part: AbstractSurfaceContact, x, v, at: Touch) -> tuple[Any, Any, TouchRates]:
     """The rate of the gap, its second derivative without accelerations, and the rates of the touch."""
     d, (_, radius) = space.dimension, part.ball

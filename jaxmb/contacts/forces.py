@@ -2,7 +2,8 @@
 
 import jax.numpy as jnp
 
-from ..formulations import Multipliers, accelerations_at
+from ..formulations import Multipliers
+from ..formulations.laws import accelerations_at
 from ..linalg.elimination import solve
 from ..linalg.pairs import sizes_of
 from ..linalg.rotations import norm

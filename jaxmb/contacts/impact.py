@@ -36,7 +36,7 @@ from ..system.instant import Instant
 from .forces import contact_forces, largest_force, reserves
 from .groups import HOLDS, least_in_group
 from .impacting import Event, find_event
-from .phases import Phases, slips_at
+from .phases import MovingFrame, Phases
 from .tolerance import ContactTolerance
 
 NO_SECOND_DERIVATIVES = (
@@ -118,36 +118,44 @@ def _impact_jvp(primals, tangents):
     dq, du, dt = dense(dy.q, y.q), dense(dy.u, y.u), dense(dt, t)
 
     # The time of the event changes, and with it the time and the state there, by the equations before it.
-    dlate = _later(event, (system, t, y.q, y.u), (dsystem, dt, dq, du))
+    frame = MovingFrame.of((system, t, y.q), (dsystem, dt, dq))
+    dlate = _later(event, Instant(system, t, y.q, event.at), frame, (y.u, du))
     if dated or any(contacts.releases):
         dlate = dlate + _release(system, tolerance, event, (t, y), (dsystem, dt, dy))
     dz = None if y.z is None else dense(dy.z, y.z)
     change = _together if event.group is None else _apart
-    dafter, late, impulses, energy = change(system, t, y, event, dlate, (dsystem, dt, dq, du, dz))
+    dafter, late, impulses, energy = change(system, t, y, event, dlate, frame, (dsystem, dt, dq, du, dz))
     dq = jnp.where(np.isin(np.arange(system.nq), contacts.places), 0.0, dafter.q)
     devent = jax.tree.map(lambda _: None, event)._replace(late=late, impulses=impulses, energy=energy)
     return (after, event), (State(dq, dafter.u, dafter.z), devent)
 
 
-def _together(system, t, y, event: Event, dlate, along):
+def _together(system, t, y, event: Event, dlate, frame: MovingFrame, along):
     """The tangents of the state after the event, of its time, of its impulses and of the energy lost, if all laws are
     in one group, with one time.
     """
     dsystem, dt, dq, du, dz = along
     q = system.contacts.with_modes(y.q, event.modes[1])
     rates = system.rates(t, y.q, event.at), system.rates(t, q, event.u)
+    frame = frame.later(_in_time(system, t, y.q, rates[0])[1], dlate)
     dq, du, dt = dq + dlate * rates[0], du + dlate * event.before, dt + dlate
-    impulses, change, energy = _struck(Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du))
+    impulses, change, energy = _struck(Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du, frame))
     if dz is not None:
         dz = dz + dlate * (system.state_rates(t, y.q, event.at) - system.state_rates(t, q, event.u))
     return State(dq - dlate * rates[1], change - dlate * event.after, dz), dlate, impulses, energy
 
 
-def _apart(system, t, y, event: Event, dlate, along):
+def _in_time(system, t, q, rates):
+    """The tangents of system, t and q in time, and the frame with its tangent along these."""
+    onwards = jax.tree.map(lambda _: None, system), jnp.ones_like(t), rates
+    return onwards, MovingFrame.of((system, t, q), onwards)
+
+
+def _apart(system, t, y, event: Event, dlate, frame: MovingFrame, along):
     """The same for several groups, each with its own time."""
     dsystem, dt, dq, du, dz = along
     heads = system.contacts.heads
-    phases = Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du)
+    phases = Phases.of(event, (system, t, y.q), (dsystem, dt, dq), du, frame)
     impulses, change, energy = _struck(phases)
     # A group with a zero comes before a group whose modes change.
     before, after = (system.contacts.as_modes(numbers).kinds for numbers in event.modes)
@@ -168,14 +176,13 @@ def _by_times(phases: Phases, y, acts):
     assert event.group is not None
     heads, leads = jnp.asarray(system.contacts.heads), acts & (event.group == jnp.arange(acts.size))
     order, count = jnp.argsort(~leads[heads], stable=True), jnp.sum(leads)
-    still = jax.tree.map(lambda _: None, system)
     rates = Instant(system, t, y.q, event.at, y.z).motion(event.before)
-    onwards = still, jnp.ones_like(t), rates.q
+    onwards, in_time = _in_time(system, t, y.q, rates.q)
 
     def advance(k, carry):
         (u, modes), rates, table = carry
         head = heads[order[k]]
-        own = phases.of_group(event.group == head, onwards, event.before)
+        own = phases.of_group(event.group == head, onwards, event.before, in_time)
         impulses, change, energy = _struck(own)
         u, modes = u + (own.event.u - event.at), jnp.where(event.group == head, after, modes)
         q = system.contacts.with_modes(y.q, modes)
@@ -202,26 +209,23 @@ def _struck(phases: Phases):
     return impulses, change, energy
 
 
-def _later(event: Event, at, along):
-    """The derivative of the time at which a gap, or a slip, is zero; with groups for each law."""
-    (system, t, q, _), contacts = at, at[0].contacts
-    at_event = Instant(system, t, q, event.at)
-    zero, rate = push(_gaps, at[:3], along[:3]), at_event.contact_motion.rates
+def _later(event: Event, at: Instant, frame: MovingFrame, velocities):
+    """The derivative of the time at which a gap, or a slip, is zero; with groups for each law.
+
+    **Arguments:** `at`: the instant before the event; the `velocities` at the time, and their tangent.
+    """
+    contacts, n = at.system.contacts, at.system.contacts.n
+    zero, rate = frame.change.gaps, frame.here.rates(at.u)[:n]
     if contacts.m:
-        slip = push(slips_at, at, along)[contacts.n :]
-        slowing = at_event.contact_accelerations(event.before)[contacts.n :]
+        slip, slowing = frame.change_of_rates(*velocities)[n:], at.contact_accelerations(event.before)[n:]
         both = of_pairs(contacts.pairs)
         if both.size:
             # Slip in two directions ends when it is zero along its modes.
             modes = contacts.as_modes(event.modes[0]).of_friction[both]
             slip = with_entries(slip, both[:, 0], jnp.sum(modes * slip[both], axis=1))
             slowing = with_entries(slowing, both[:, 0], jnp.sum(modes * slowing[both], axis=1))
-        zero, rate = jnp.concatenate([zero, slip]), jnp.concatenate([rate[: contacts.n], slowing])
+        zero, rate = jnp.concatenate([zero, slip]), jnp.concatenate([rate, slowing])
     return jnp.where(event.hits, -zero[event.first] / jnp.where(event.hits, rate[event.first], 1.0), 0.0)
-
-
-def _gaps(system, t, q):
-    return Instant(system, t, q, jnp.zeros(system.nu, q.dtype)).gaps
 
 
 def _release(system, tolerance, event, at, along):

@@ -4,7 +4,7 @@ Each phase has one linear system: `M (u⁺ − u⁻) = Aᵀ Λ`, with the rates 
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,6 @@ from ..linalg.elimination import solve
 from ..linalg.pairs import of_pairs
 from ..linalg.pushed import push
 from ..linalg.rotations import norm
-from ..linalg.sums import with_entries
 from ..system.contact_set import ContactSet
 from ..system.instant import Instant
 from .forces import friction_coefficients, other_rows
@@ -24,35 +23,81 @@ from .groups import HOLDS, group_sums, of_contacts
 from .impacting import Event, Phase
 
 
+class Frame(NamedTuple):
+    """Gaps and slips at a place, and at the same place in motion.
+
+    **Fields:** the `gaps`; `rows`, the derivatives of the rates of gaps and slips by velocities; the rates of a system
+    at rest, `drift`; the `coefficient` of friction as a multiple of the force along the gap, and of `restitution`.
+    """
+
+    gaps: Float[Array, "contacts"]
+    rows: Float[Array, "laws nu"]
+    drift: Float[Array, "laws"]
+    coefficient: Float[Array, "frictions"]
+    restitution: Float[Array, "contacts"]
+
+    @classmethod
+    def of(cls, system: Any, t: Float[Array, ""], q: Float[Array, "nq"]) -> "Frame":
+        at = Instant(system, t, q, jnp.zeros(system.nu, q.dtype))
+        place, drift, (coefficient, _) = at.contact_place, at.contact_motion.rates, friction_coefficients(at)
+        return cls(place.gaps, place.gradients, drift, coefficient, system.contact_numbers(t).restitution)
+
+    def rates(self, u: Float[Array, "nu"]) -> Float[Array, "laws"]:
+        """The rates of gaps and the velocities of slip."""
+        return self.rows @ u + self.drift
+
+
+class MovingFrame(NamedTuple):
+    """A frame with its tangent."""
+
+    here: Frame
+    change: Frame
+
+    @classmethod
+    def of(cls, at: tuple[Any, ...], along: tuple[Any, ...]) -> "MovingFrame":
+        """The frame at a system, t and q, with the tangent along theirs."""
+        return cls(Frame.of(*at), Frame(*push(Frame.of, at, along)))
+
+    def later(self, by: "MovingFrame", time: Float[Array, ""]) -> "MovingFrame":
+        """With the tangent of another in addition, so many times."""
+        return self._replace(change=jax.tree.map(lambda a, b: a + time * b, self.change, by.change))
+
+    def change_of_rates(self, u: Float[Array, "nu"], du: Float[Array, "nu"]) -> Float[Array, "laws"]:
+        """The tangent of the rates, with the tangent of the velocities."""
+        return self.change.rates(u) + self.here.rows @ du
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Phases:
     """The linear equations of the phases of an impact.
 
     **Fields:** `at`: system, t and q at the `event`; their `tangents`, and `du`, the tangent of the velocities before
-    it; the `rows` of A of contacts and friction; the `projector` on the other constraints; `moves`: the changes of
-    velocities by unit impulses; contacts that `rebound` by Newton's law; the `coefficients` of friction and their
-    derivatives.
+    it; the `frame` there; the `projector` on the other constraints; `moves`: the changes of velocities by unit
+    impulses; contacts that `rebound` by Newton's law.
     """
 
     event: Event
     at: tuple[Any, Float[Array, ""], Float[Array, "nq"]]
     tangents: tuple[Any, ...]
     du: Float[Array, "nu"]
-    rows: Float[Array, "laws nu"]
+    frame: MovingFrame
     projector: Any
     moves: Float[Array, "laws nu"]
     rebound: Bool[Array, "contacts"]
-    coefficients: tuple[Float[Array, "frictions"], Float[Array, "frictions"]]
 
     @classmethod
-    def of(cls, event: Event, at, tangents, du) -> "Phases":
+    def of(cls, event: Event, at, tangents, du, frame: MovingFrame) -> "Phases":
         system, t, q = at
         after = Instant(system, t, q, event.u)
-        rows, projector = after.contact_place.gradients, other_rows(after).projector(after.inertia)
-        moves = jax.vmap(lambda force: projector.solve(force, jnp.zeros(system.acceleration_rows, q.dtype))[0])(rows)
+        projector, none = other_rows(after).projector(after.inertia), jnp.zeros(system.acceleration_rows, q.dtype)
+        moves = jax.vmap(lambda force: projector.solve(force, none)[0])(frame.here.rows)
         rebound = ~event.low & ~np.array(system.contacts.by_poisson, bool)
-        coefficients = _coefficients(event, at, tangents)
-        return cls(event, at, tangents, du, rows, projector, moves, rebound, coefficients)
+        return cls(event, at, tangents, du, frame, projector, moves, rebound)
+
+    @property
+    def rows(self) -> Float[Array, "laws nu"]:
+        """The rows of A of contacts and friction."""
+        return self.frame.here.rows
 
     @property
     def contacts(self) -> ContactSet:
@@ -63,8 +108,8 @@ class Phases:
         alone, influence = jnp.where(own, impulses, 0.0), self.rows @ self.moves.T
         return alone + solved_components(influence, influence @ alone, held & (self.event.group == HOLDS))
 
-    def of_group(self, own: Bool[Array, "laws"], tangents, du) -> "Phases":
-        """The phases of an impact of one group alone, its `own` laws, with tangents of its own."""
+    def of_group(self, own: Bool[Array, "laws"], tangents, du, frame: MovingFrame) -> "Phases":
+        """The phases of an impact of one group alone, its `own` laws, with tangents and a frame of its own."""
         event, compression = self.event, self.event.compression
         acts = own | (event.group == HOLDS)
         slips = lambda slips: jnp.where(own[self.contacts.n :], slips, 0.0)
@@ -81,8 +126,7 @@ class Phases:
             share=jnp.where(own, event.share, 1.0),
             compression=compression,
         )
-        coefficients = _coefficients(event, self.at, tangents)
-        return dataclasses.replace(self, event=event, tangents=tangents, du=du, coefficients=coefficients)
+        return dataclasses.replace(self, event=event, tangents=tangents, du=du, frame=frame)
 
     @property
     def share(self) -> Float[Array, "*contacts"]:
@@ -91,17 +135,16 @@ class Phases:
 
     def changes(self) -> tuple[Float[Array, "laws"], Float[Array, "nu"]]:
         """The derivatives of all impulses, and of the velocities after them."""
-        event, contacts, at = self.event, self.contacts, self.at
+        event, contacts, frame = self.event, self.contacts, self.frame
         # Velocities and impulses also change with the share of the rebounds.
-        rates = slips_at(*at, event.at)
-        bounce = _restitution(*at[:2]) * jnp.maximum(-rates[: contacts.n], 0.0)
+        rates = frame.here.rates(event.at)
+        bounce = frame.here.restitution * jnp.maximum(-rates[: contacts.n], 0.0)
         bounce = jnp.pad(jnp.where(self.rebound, bounce, 0.0), (0, contacts.m))
         impulses, change, by_share = (self.in_one if event.compression is None else self.in_two)(bounce)
 
         # At this share no energy is gained.
-        both = rates + slips_at(*at, event.u)
-        changed = push(slips_at, (*at, event.at), (*self.tangents, self.du))
-        changed = changed + push(slips_at, (*at, event.u), (*self.tangents, change))
+        both = rates + frame.here.rates(event.u)
+        changed = frame.change_of_rates(event.at, self.du) + frame.change_of_rates(event.u, change)
         group, one = event.balance, jnp.ones_like(event.share)
         gained = group_sums(group, impulses * both + event.impulses * changed)
         less = by_share(one)
@@ -124,22 +167,22 @@ class Phases:
 
     def in_two(self, bounce):
         """The same for an impact by Poisson's law."""
-        event, compression, (system, t, _) = self.event, self.event.compression, self.at
+        event, compression, (here, moved) = self.event, self.event.compression, self.frame
         assert compression is not None
         n, m = self.contacts.n, self.contacts.m
         none = jnp.zeros(n, event.u.dtype)
         first, between, matrix = self.solved(event.at, self.du, compression, none)
         first_by_share = lambda dshare: solve(matrix, jnp.where(compression.held, dshare * bounce, 0.0))
         pushes = ~event.low & np.array(self.contacts.by_poisson, bool)
-        again = lambda system, impulses: jnp.where(pushes, self.share * _restitution(system, t) * impulses[:n], 0.0)
-        normal = push(again, (system, compression.impulses), (self.tangents[0], first))
+        again = here.restitution * first[:n] + moved.restitution * compression.impulses[:n]
+        normal = jnp.where(pushes, self.share * again, 0.0)
         last = Phase(event.u, event.held, event.slips, event.impulses - compression.impulses)
         second, change, last_matrix = self.solved(compression.u, between, last, normal)
 
         def by_share(dshare):
             first = first_by_share(dshare)
             normal = dshare * compression.impulses + event.share * first
-            normal = jnp.where(pushes, _restitution(system, t) * normal[:n], 0.0)
+            normal = jnp.where(pushes, here.restitution * normal[:n], 0.0)
             closing = dshare * bounce - self.rows @ (first @ self.moves)
             return first + solve(last_matrix, jnp.where(event.held, closing, jnp.pad(normal, (0, m))))
 
@@ -160,65 +203,50 @@ class Phases:
         **Arguments:** the velocities `before` the phase, and their derivative; `normal`: the changes of the normal
         impulses of contacts that are not held.
         """
-        (system, t, q), contacts = self.at, self.contacts
+        contacts, (here, moved) = self.contacts, self.frame
         rows, n = np.array(contacts.rows), contacts.n
+        impulses = phase.impulses @ here.rows
         asked = self.projector.jacobian.product(phase.u - before)
-        _, multipliers = self.projector.solve(phase.impulses @ self.rows, asked)
-        multipliers = with_entries(multipliers, rows, phase.impulses)
+        _, multipliers = self.projector.solve(impulses, asked)
 
-        def unmet(system, t, q, first, u):
-            """The remaining rates, and the unbalanced momentum."""
-            rates = Instant(system, t, q, phase.u).velocity_rows
-            bounce = _restitution(system, t) * jnp.maximum(-slips_at(system, t, q, first)[:n], 0.0)
-            bounce = jnp.where(phase.held[:n] & self.rebound, self.share * bounce, 0.0)
-            rates = rates.at[rows[:n]].add(-bounce)
-            momentum = system.inertia(t, q, u).product(phase.u - u)
-            return rates, momentum - system.constraint_force(t, q, phase.u, multipliers)
+        def unmet(system, t, q, u):
+            """The remaining rates, and the unbalanced momentum, but for those of contacts and friction."""
+            at = Instant(system, t, q, phase.u)
+            momentum = at.inertia.product(phase.u - u)
+            if contacts.alone(system):
+                return jnp.zeros(system.acceleration_rows, u.dtype), momentum
+            return at.velocity_rows, momentum - at.constraint_force(multipliers)
 
-        point = system, t, contacts.bound(q), self.event.at, before
-        rates, forces = push(unmet, point, (*self.tangents, self.du, dbefore))
+        rates, forces = push(unmet, (*self.at, before), (*self.tangents, dbefore))
         # Rows of modes have no right-hand side.
-        plain, _ = self.projector.solve(-forces, jnp.where(np.isin(np.arange(rates.size), rows), 0.0, -rates))
-        asked = -(rates[rows] + self.rows @ plain)
-        law, right = jnp.eye(rows.size, dtype=q.dtype), jnp.pad(normal, (0, contacts.m))
+        is_law, forces = np.isin(np.arange(rates.size), rows), forces - phase.impulses @ moved.rows
+        plain, _ = self.projector.solve(-forces, jnp.where(is_law, 0.0, -rates))
+        closing, change = -here.rates(self.event.at)[:n], -self.frame.change_of_rates(self.event.at, self.du)[:n]
+        bounce = moved.restitution * closing + here.restitution * change
+        bounces = phase.held[:n] & self.rebound & (closing > 0)
+        bounce = jnp.pad(jnp.where(bounces, self.share * bounce, 0.0), (0, contacts.m))
+        asked = bounce - moved.rates(phase.u) - here.rows @ plain
+        law, right = jnp.eye(rows.size, dtype=plain.dtype), jnp.pad(normal, (0, contacts.m))
         if contacts.m:
             law, right = self.friction_laws(plain, phase, law, right)
-        matrix = jnp.where(phase.held[:, None], self.rows @ self.moves.T, law)
+        matrix = jnp.where(phase.held[:, None], here.rows @ self.moves.T, law)
         return plain, matrix, jnp.where(phase.held, asked, right)
 
     def friction_laws(self, plain, phase: Phase, law, right):
         """The equations with the laws of slipping friction, with impulses proportional to the contacts'."""
-        contacts, (coefficient, change) = self.contacts, self.coefficients
+        contacts, (here, moved) = self.contacts, self.frame
+        coefficient, change = here.coefficient, moved.coefficient
         n, contact_of = contacts.n, np.array(contacts.contact_of)
         pushed = jnp.where(contacts.in_joints, 0.0, phase.impulses[contact_of])
         right = jnp.concatenate([right[:n], -change * phase.slips * pushed])
         for k in np.flatnonzero(~contacts.in_joints):
             law = law.at[n + k, contact_of[k]].set(coefficient[k] * phase.slips[k])
-        rates = lambda system, t, q: slips_at(system, t, q, phase.u)
         for both in of_pairs(contacts.pairs):
             # The direction of slip changes with the velocity after the impact.
             k, laws, slips = both[0], n + both, phase.slips[both]
-            turned, last, speed = push(rates, self.at, self.tangents)[laws], rates(*self.at)[laws], norm(slips)
+            turned, last, speed = moved.rates(phase.u)[laws], here.rates(phase.u)[laws], norm(slips)
             across = jnp.eye(2, dtype=law.dtype) - jnp.outer(slips, slips)
             by = coefficient[k] * pushed[k] * speed * across / jnp.where(speed > 0, norm(last), 1.0)
             law = law.at[laws].add(by @ self.rows[laws] @ self.moves.T, unique_indices=True)
             right = right.at[laws].add(-by @ (turned + self.rows[laws] @ plain), unique_indices=True)
         return law, right
-
-
-def slips_at(system: Any, t: Any, q: Any, u: Any) -> Float[Array, "laws"]:
-    """The rates of gaps, and the velocities of slip."""
-    return Instant(system, t, q, u).contact_motion.rates
-
-
-def _coefficients(event: Event, at, tangents):
-    """The coefficients of friction, and their derivatives."""
-    system, _, q = at
-    if not system.contacts.m:
-        return jnp.zeros(0, q.dtype), jnp.zeros(0, q.dtype)
-    coefficients = lambda system, t, q: friction_coefficients(Instant(system, t, q, event.u))[0]
-    return coefficients(*at), push(coefficients, at, tangents)
-
-
-def _restitution(system, t):
-    return system.contact_numbers(t).restitution

@@ -2,7 +2,7 @@
 
 from .._moved import tell_of_moved as _tell_of_moved
 from .formulation import AbstractFormulation as AbstractFormulation
-from .laws import accelerations as accelerations, accelerations_at as accelerations_at
+from .laws import accelerations as accelerations
 from .multipliers import Multipliers as Multipliers
 from .null_space import NullSpace as NullSpace
 from .partitioned import Partitioned as Partitioned

@@ -23,7 +23,7 @@ from ..linalg.sums import unchecked_take, with_entries
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .formulation import AbstractFormulation, check_mass, suitable_jacobian
-from .friction import find_multipliers
+from .friction import contracts, find_multipliers, solve_coupled
 
 Memory: TypeAlias = Float[Array, "k"] | None
 
@@ -49,6 +49,14 @@ class AbstractLaws(eqx.Module):
         """Accelerations and multipliers, from the Jacobian A and γ."""
         solved = formulation.solve(at.inertia, self.applied(at, None), jacobian, gamma)
         return Solution(*solved, jnp.array(False))
+
+    def slopes(self, at: Instant, multipliers: Float[Array, "m"]) -> Float[Array, "k nu"]:
+        """The derivatives of C by the multipliers that it depends on."""
+        return jnp.zeros((0, at.u.size), multipliers.dtype)
+
+    def coupling(self, at: Instant, formulation: AbstractFormulation) -> Float[Array, "k k"]:
+        """The influence of C on the multipliers that it depends on, see `friction`; without derivative."""
+        return jnp.zeros((0, 0), at.u.dtype)
 
     def remembered(self, at: Instant, multipliers: Float[Array, "m"]) -> Memory:
         """The memory, from all multipliers."""
@@ -93,6 +101,14 @@ class ReactiveLaws(AbstractLaws):
         memory = root(lambda memory: memory - self.remembered(at, solved(memory)[1]), start, lambda _, start: start)
         return Solution(*solved(memory), failed)
 
+    def slopes(self, at, multipliers):
+        return jax.jacfwd(at.friction_force)(self.remembered(at, multipliers)).T
+
+    def coupling(self, at, formulation):
+        at = lax.stop_gradient(at)
+        jacobian = suitable_jacobian(at, formulation)
+        return _friction(at, formulation.prepared(at.inertia, jacobian), jacobian, at.gamma)[1]
+
     def remembered(self, at, multipliers):
         return unchecked_take(multipliers, at.system.friction_rows)
 
@@ -100,15 +116,55 @@ class ReactiveLaws(AbstractLaws):
         return with_entries(multipliers, at.system.friction_rows, memory)
 
 
+class LinearLaws(ReactiveLaws):
+    """C is linear in the multipliers, such as friction in contacts with known directions of slip: unit multipliers give
+    the columns of one linear system.
+    """
+
+    def applied(self, at, memory: Any):
+        return at.force + memory @ at.friction_matrix
+
+    def solve(self, at, formulation, jacobian, gamma):
+        udot, multipliers, influence = self._by_unit(at, formulation, jacobian, gamma)
+        start = self.remembered(at, multipliers[0])
+        failed = ~contracts(self._coupled(at, influence))
+        memory = jnp.where(failed, start, solve_coupled(jnp.eye(start.size, dtype=start.dtype) - influence, start))
+        return Solution(udot[0] + memory @ udot[1:], multipliers[0] + memory @ multipliers[1:], failed)
+
+    def slopes(self, at, multipliers):
+        return at.friction_matrix
+
+    def coupling(self, at, formulation):
+        at = lax.stop_gradient(at)
+        *_, influence = self._by_unit(at, formulation, suitable_jacobian(at, formulation), at.gamma)
+        return self._coupled(at, influence)
+
+    def _by_unit(self, at, formulation, jacobian, gamma):
+        """Accelerations and multipliers without C, then those that unit multipliers in C add; and the additions to the
+        multipliers that C depends on.
+        """
+        formulation = formulation.prepared(at.inertia, jacobian)
+        forces = jnp.concatenate([at.force[None], at.friction_matrix])
+        asked = jnp.concatenate([gamma[None], jnp.zeros((len(forces) - 1, gamma.size), gamma.dtype)])
+        solve = jax.vmap(lambda force, gamma: formulation.solve(at.inertia, force, jacobian, gamma))
+        udot, multipliers = solve(forces, asked)
+        return udot, multipliers, unchecked_take(multipliers[1:].T, at.system.friction_rows)
+
+    def _coupled(self, at, influence):
+        return lax.stop_gradient(jnp.where(np.diag(_pushes(at.system)), influence, jnp.abs(influence)))
+
+
 # The laws, made once.
-_IDEAL, _GIVEN, _REACTIVE = IdealLaws(), GivenLaws(), ReactiveLaws()
+_IDEAL, _GIVEN, _REACTIVE, _LINEAR = IdealLaws(), GivenLaws(), ReactiveLaws(), LinearLaws()
 
 
 def laws_of(system: AbstractEquation) -> AbstractLaws:
     """The laws of a system's constraint forces."""
     if system.ideal:
         return _IDEAL
-    return _REACTIVE if system.friction_rows.size else _GIVEN
+    if not system.friction_rows.size:
+        return _GIVEN
+    return _LINEAR if system.ideal_without_friction and not system.contacts.of_reactions else _REACTIVE
 
 
 def accelerations(
@@ -158,12 +214,9 @@ def _friction(at, formulation, jacobian, gamma):
     start, influence = unchecked_take(multipliers[0], rows), -udot[1:]
     # Newton's method evaluates the law several times, but only for other multipliers.
     law = with_rest_computed(at.friction_force, start)
-    contacts = at.system.contacts
-    return find_multipliers(law, influence, start, np.isin(rows, contacts.rows[: contacts.n]))
+    return find_multipliers(law, influence, start, _pushes(at.system))
 
 
-def friction_coupling(at: Instant, formulation: AbstractFormulation) -> Float[Array, "k k"]:
-    """The influence of friction on its own reactions, see `friction`; without derivative."""
-    at = lax.stop_gradient(at)
-    jacobian = suitable_jacobian(at, formulation)
-    return _friction(at, formulation.prepared(at.inertia, jacobian), jacobian, at.gamma)[1]
+def _pushes(system):
+    """Which multipliers of the `friction_rows` cannot change their sign, those of contacts."""
+    return np.isin(system.friction_rows, system.contacts.rows[: system.contacts.n])

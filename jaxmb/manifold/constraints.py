@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._types import Coordinates, Scalar, State, Velocities
 from ..formulations.laws import Memory, laws_of
 from ..linalg.pushed import dense, push
-from ..system.instant import Instant
+from ..system.instant import Instant, given
 
 
 class AbstractConstraints(eqx.Module):
@@ -138,8 +138,16 @@ def _implicitly_jvp(primals, tangents):
     out = implicitly(*primals)
     along, at = dense_along(tangents[1], at), at.with_(q=out.q, u=out.u)
     here = linearise(at)
-    along, multipliers = _on_constraints(here, at, along), here.multipliers(at, out)
-    residuals = push(lambda at: _equations(at, out.udot, multipliers), (at,), (along,))
+    multipliers = here.multipliers(at, out)
+    along = along.with_(q=here.push_positions(at, along))
+    # What follows from the coordinates has one derivative.
+    placed = at.placed, eqx.filter_jvp(lambda at: at.placed, (at,), (along,))[1]
+    pushed = lambda function, along: push(
+        lambda at, placed: function(given(at, placed=placed)), (at, placed[0]), (along, placed[1])
+    )
+    rows = pushed(lambda at: at.velocity_residual, along)
+    along = along.with_(u=along.u + here.cancel_velocities(rows))
+    residuals = pushed(lambda at: _equations(at, out.udot, multipliers), along)
     return out, RestoredState(along.q, along.u, *here.cancel_residuals(at, multipliers, *residuals))
 
 

@@ -11,7 +11,7 @@ from .._results import RESULTS
 from ..formulations import AbstractFormulation, Multipliers
 from ..formulations.formulation import row_levels
 from ..formulations.friction import contracts
-from ..formulations.laws import friction_coupling
+from ..formulations.laws import laws_of
 from ..linalg.elimination import full_pivot
 from ..system.instant import Instant
 
@@ -67,6 +67,6 @@ def diagnose_friction(
     none = jnp.zeros((at.system.friction_rows.size,) * 2, at.q.dtype)
     # Without a search for pivots.
     formulation = Multipliers() if at.system.positive_definite_mass else formulation
-    coupling = lax.cond(failed, lambda: friction_coupling(at, formulation), lambda: none)
+    coupling = lax.cond(failed, lambda: laws_of(at.system).coupling(at, formulation), lambda: none)
     singular = failed & jnp.all(jnp.isfinite(coupling)) & ~contracts((1 + _SINGULAR_COUPLING) * coupling)
     return RESULTS.where(singular, RESULTS.friction_undetermined, result), jnp.where(singular, coupling, none)

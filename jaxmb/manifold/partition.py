@@ -236,7 +236,7 @@ class ChartConstraints(AbstractConstraints):
         if places.size == 0:
             return change, None
         # Friction responds to a change of the multipliers that it depends on, and so changes them again.
-        frictions = jax.jacfwd(at.friction_force)(unchecked_take(multipliers, places)).T
+        frictions = laws_of(at.system).slopes(at, multipliers)
         responses = jax.vmap(lambda force: cancel(jnp.zeros_like(rows), -force))(frictions)
         balance = unchecked_take(self._of_accelerations.right_inverse.T, places)
         reaction = lambda change, forces: jnp.sum(balance * (inertia.product(change) + forces)[None], axis=1)

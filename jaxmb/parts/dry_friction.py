@@ -21,11 +21,10 @@ from .base import (
     Poses,
     ScalarCoordinate,
     Velocities,
-    Wrenches,
 )
 from .combinations import JointCoupling
 from .coordinate_parts import AbstractCoordinateForce, AbstractOfJoints, AbstractScalarPart
-from .modes import STICK, kind_of, slip_direction
+from .modes import CLOSED, STICK, kind_of, slip_direction
 from .space import AbstractSpace, rate_of
 from .unilateral import AbstractRigidContact, AbstractUnilateralConstraint
 
@@ -44,8 +43,8 @@ class AbstractStickSlip(AbstractVelocityConstraint):
     # Those of slip and stick, as multiples of the normal forces; the latter may be None.
     coefficient: AbstractVar[Any]
     static_coefficient: AbstractVar[Any]
-    # What the law needs of its joint: reaction "wrenches", or the "multipliers" of its rows; "nothing" if the normal
-    # force is one, and the coefficients are forces.
+    # What the law needs of its joint: reaction "wrenches", the "multipliers" of its rows, or the "normal" force of a
+    # contact; "nothing" if the normal force is one, and the coefficients are forces.
     needs: AbstractVar[Any]
 
     @property
@@ -113,8 +112,13 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
     directions: int = eqx.field(static=True, default_factory=lambda: 1, init=False)
 
     @property
-    def needs(self) -> Literal["wrenches", "multipliers"]:
-        return "wrenches"
+    def needs(self) -> Literal["wrenches", "multipliers", "normal"]:
+        return "normal" if self.in_contact else "wrenches"
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether it rubs in a rigid contact."""
+        return isinstance(self.joints["0"], AbstractRigidContact)
 
     @property
     def rows(self) -> int:
@@ -161,15 +165,21 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
     def slip(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, "rows"]:
         """The velocities of slip [m/s], from poses and velocities of the bodies of the joint."""
 
-    def normal_force(self, space: AbstractSpace, poses: Poses, reactions: Wrenches) -> Float[Array, ""]:
-        """The normal force [N], from the reactions on the bodies: the size of a joint's force, or a contact's force
-        along its normal, positive if it pushes.
+    def normal_force(self, space: AbstractSpace, poses: Poses, reactions: Array) -> Float[Array, ""]:
+        """The normal force [N]: the size of a joint's force, from the reactions on its bodies; or a closed contact's
+        force along its normal, positive if it pushes.
         """
-        held = self.joints["0"]
-        force = reactions[self.last, : space.dimension]
-        if isinstance(held, AbstractRigidContact):
-            return jnp.dot(held.outward(space, held.seen_poses(space, poses[: len(held.bodies)])), force)
-        return norm(force)
+        if not self.in_contact:
+            return norm(reactions[self.last, : space.dimension])
+        closed = kind_of(lax.stop_gradient(poses[self.places[0][-1], 0])) == CLOSED
+        return jnp.where(closed, reactions[0], 0.0)
+
+    def limits(self, space: AbstractSpace, poses: Poses, reactions: Float[Array, "1"]) -> Float[Array, "rows"]:
+        """The normal force in a contact or a coupling, for each direction of slip."""
+        return jnp.repeat(self.normal_force(space, poses, reactions)[None], self.rows)
+
+    def seen_wrenches(self, space, poses, wrenches):
+        return super().seen_wrenches(space, poses, wrenches) if self.needs == "wrenches" else wrenches
 
     def slip_forces(self, space, poses, slips, reactions):
         # The direction does not depend on reactions; an iteration solves for these.
@@ -248,7 +258,7 @@ class DryFriction(AbstractDryFriction):
 
     @property
     def needs(self):
-        return "multipliers" if self.in_gear else "wrenches"
+        return "multipliers" if self.in_gear else super().needs
 
     @property
     def homogeneous(self):
@@ -318,16 +328,8 @@ class DryFriction(AbstractDryFriction):
         in_contact = keys[0] == "joints" and isinstance(self.joints["0"], AbstractRigidContact)
         return not in_contact or "terrain" in keys
 
-    def seen_wrenches(self, space, poses, wrenches):
-        return wrenches if self.in_gear else super().seen_wrenches(space, poses, wrenches)
-
     def normal_force(self, space, poses, reactions):
         return norm(reactions) if self.in_gear else super().normal_force(space, poses, reactions)
-
-    def limits(self, space: AbstractSpace, poses: Poses, multipliers: Float[Array, "1"]) -> Float[Array, "1"]:
-        """The force along the coordinate of a coupling, from its multiplier."""
-        del space, poses
-        return multipliers
 
     def slip(self, space, poses, velocities):
         return self.over_belt(self._relative_velocity(space, poses, velocities))

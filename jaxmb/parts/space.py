@@ -98,6 +98,10 @@ class AbstractSpace(abc.ABC):
         """Wrench `Nᵀ g` that does the work of a gradient with respect to the pose."""
 
     @abc.abstractmethod
+    def point_gradient(self, s: Point, weights: Point) -> Pose:
+        """The derivative of `weights · point(pose, s)` by a prepared pose."""
+
+    @abc.abstractmethod
     def normalize(self, pose: Pose) -> Pose:
         """The nearest pose with unit Euler parameters."""
 

@@ -15,9 +15,11 @@ where z is up. A profile along x is constant along y, so it serves in both.
 
 import abc
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import is_traced
@@ -80,22 +82,16 @@ def pace_over(terrain: AbstractTerrain, point: Float[Array, "d"], velocity: Floa
     return norm(velocity[:-1]) / terrain.detail(point[:-1])
 
 
+def _upwards(point: Float[Array, "d"]) -> Float[np.ndarray, "d"]:
+    return np.eye(point.size, dtype=point.dtype)[-1]
+
+
 def _beyond(place: Place, start: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
     """How far a place lies before the start or behind the end of an uneven stretch along x."""
     return jnp.maximum(jnp.maximum(start - place[0], place[0] - end), 0.0)
 
 
-class _EvenTerrain(AbstractTerrain):
-    """Even ground, whose normal is the same everywhere."""
-
-    def facing(self, point):
-        return outward(self, point), None
-
-    def facing_rate(self, point, velocity):
-        return None
-
-
-class Flat(_EvenTerrain):
+class Flat(AbstractTerrain):
     """Level ground.
 
     **Arguments:** `level` [m].
@@ -105,6 +101,12 @@ class Flat(_EvenTerrain):
 
     def height(self, place):
         return self.level
+
+    def facing(self, point):
+        return jnp.asarray(_upwards(point)), None
+
+    def facing_rate(self, point, velocity):
+        return None
 
 
 class Bump(AbstractTerrain):
@@ -142,7 +144,7 @@ class Sinusoid(AbstractTerrain):
         return _SHARE * self.wavelength
 
 
-class Slope(_EvenTerrain):
+class Slope(AbstractTerrain):
     """A plane that rises along x.
 
     **Arguments:** `gradient` [m/m]; `level` [m], at x = 0.
@@ -153,6 +155,14 @@ class Slope(_EvenTerrain):
 
     def height(self, place):
         return self.level + self.gradient * place[0]
+
+    def facing(self, point):
+        along: Any = np.eye(1, point.size)[0]
+        normal = _upwards(point) - self.gradient * along
+        return normal.astype(point.dtype) / jnp.sqrt(1 + self.gradient**2), None
+
+    def facing_rate(self, point, velocity):
+        return None
 
 
 class Ramp(AbstractTerrain):

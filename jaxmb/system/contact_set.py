@@ -148,6 +148,10 @@ class ContactSet:
         """The first laws of those that are linked: contacts, and friction in joints."""
         return np.flatnonzero(np.argmax(self.linked, axis=1) == np.arange(self.n + self.m))
 
+    def alone(self, system: Any) -> bool:
+        """Whether the system has no other rows of A."""
+        return len(self.rows) == system.acceleration_rows
+
     @property
     def in_groups(self) -> bool:
         """Whether there can be several groups of laws that act on each other."""

@@ -4,6 +4,7 @@ Each quantity is computed at its first use, and cached on the instant for the re
 copy an instant by flattening; the copy has an empty cache.
 """
 
+import copy
 from collections.abc import Callable
 from typing import Any, Generic, Self, TypeVar, overload
 
@@ -46,6 +47,14 @@ class kept(Generic[T]):
         if entry is None or entry[0] not in traces_around():
             entry = values[self] = next(traces_around()), self._compute(instant)
         return entry[1]
+
+
+def given(instant: Any, **values: Any) -> Any:
+    """A copy of a keeper that has these values of its properties."""
+    out, around = copy.copy(instant), next(traces_around())
+    known = {getattr(type(instant), name): (around, value) for name, value in values.items()}
+    object.__setattr__(out, "_kept", known)
+    return out
 
 
 def hand_on(instant: Any, other: Any, *properties: kept) -> None:
@@ -173,6 +182,11 @@ class Instant(eqx.Module, Keeper):
         """C, from the multipliers of the `friction_rows`."""
         of_rows = placed_sums(self.system.friction_rows, self.system.acceleration_rows)
         return self._by_motion("nonideal_force", of_rows(multipliers))
+
+    @kept
+    def friction_matrix(self) -> Float[Array, "k nu"]:
+        """C by unit multipliers of the `friction_rows`, in which it must be linear."""
+        return jax.vmap(self.friction_force)(jnp.eye(self.system.friction_rows.size, dtype=self.u.dtype))
 
     def friction_reactions(self, multipliers: Float[Array, "m"]) -> Float[Array, "frictions d"]:
         """For each direction of dry friction a vector [N] as long as its normal force is large."""

@@ -70,6 +70,10 @@ class PlanarSpace(AbstractSpace):
         turning = gradient[2] - gradient[3] * pose[4] + gradient[4] * pose[3]
         return jnp.concatenate([gradient[:2], turning[None]])
 
+    def point_gradient(self, s, weights):
+        turned = jnp.stack([jnp.dot(weights, s), jnp.dot(weights, _quarter_turn(s))])
+        return jnp.concatenate([weights, jnp.zeros(1, weights.dtype), turned])
+
     def normalize(self, pose):
         return pose
 

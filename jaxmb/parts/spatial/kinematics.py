@@ -114,6 +114,9 @@ class SpatialSpace(AbstractSpace):
             moment = moment + rot.pull_back_matrix(_matrix(pose), gradient[7:].reshape(3, 3))
         return jnp.concatenate([gradient[:3], moment])
 
+    def point_gradient(self, s, weights):
+        return jnp.concatenate([weights, jnp.zeros(4, weights.dtype), jnp.outer(weights, s).reshape(-1)])
+
     def normalize(self, pose):
         return jnp.concatenate([pose[:3], rot.normalize(pose[3:])])
 
