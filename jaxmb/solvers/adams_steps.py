@@ -125,8 +125,11 @@ class AdamsSteps(AbstractSteps):
     def chosen(self, solver_state):
         return solver_state.chosen
 
+    def found(self, solver_state):
+        return solver_state.found
+
     def again(self, solver, *step):
-        return solver.step_again(*step)
+        return solver.step_again(*step, True)
 
     def memory(self, solver_state):
         return solver_state.memory
