@@ -9,7 +9,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import planar
 from jaxmb.contacts.impacting import find_event
-from jaxmb.contacts.phases import Phases
+from jaxmb.contacts.phases import MovingFrame, Phases
 from jaxmb.contacts.tolerance import ContactTolerance
 from jaxmb.parts import terrain
 
@@ -32,7 +32,8 @@ def test_changes_are_those_of_another_impact(law):
         """The impulses of an event and the velocities after it, and their changes."""
         event = find_event(system, method, tolerance, t, mb.State(q, u))
         still = jax.tree.map(jnp.zeros_like, eqx.filter((system, t, q), eqx.is_inexact_array))
-        return (event.impulses, event.u), Phases.of(event, (system, t, q), still, du).changes()
+        at, still = (system, t, q), tuple(still)
+        return (event.impulses, event.u), Phases.of(event, at, still, du, MovingFrame.of(at, still)).changes()
 
     h = 1e-6
     for spin in (0.0, -40.0):
