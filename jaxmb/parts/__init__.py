@@ -54,6 +54,7 @@ from .base import (
 from .unilateral import (
     AbstractRigidContact as AbstractRigidContact,
     AbstractGeometricContact as AbstractGeometricContact,
+    AbstractSurfaceContact as AbstractSurfaceContact,
 )
 from .contact import AbstractNormalLaw as AbstractNormalLaw, AbstractFrictionLaw as AbstractFrictionLaw
 from .terrain import AbstractTerrain as AbstractTerrain

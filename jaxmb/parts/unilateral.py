@@ -164,7 +164,33 @@ class AbstractRigidContact(AbstractGeometricContact):
     """A unilateral constraint of bodies that touch at a point, perhaps with friction (`DryFriction`).
 
     Subclasses define the point of contact, `touching`, and a `gap` that grows by one metre a metre as the last body
-    moves away.
+    moves away:
+
+    ```python
+    class RingContact(jaxmb.parts.AbstractRigidContact):
+        # A ring about the z-axis of its body, on the plane z = 0.
+        name: str = jaxmb.parts.name()
+        body: str = jaxmb.parts.body_name()
+        ring: jaxmb.parts.Number = jaxmb.parts.length(sign="positive")
+        tube: jaxmb.parts.Number = jaxmb.parts.length(sign="positive")
+
+        def lowest(self, space, poses):
+            up = jnp.array([0.0, 0.0, 1.0])
+            axis = space.direction(poses[0], up)
+            across = up - jnp.dot(up, axis) * axis
+            return poses[0, :3] - self.ring * across / jnp.linalg.norm(across)
+
+        def gap(self, space, poses):
+            return self.lowest(space, poses)[2] - self.tube
+
+        def touching(self, space, poses):
+            return self.lowest(space, poses) - jnp.array([0.0, 0.0, 1.0]) * self.tube
+
+    floor = RingContact("floor", "hoop", ring=0.5, tube=0.1)
+    ```
+
+    The derivatives of a gap are found by automatic differentiation. A ball on a surface has them in closed form, see
+    `AbstractSurfaceContact`.
     """
 
     touches: ClassVar[bool] = True
@@ -231,8 +257,25 @@ class AbstractSurfaceContact(AbstractRigidContact):
     """A rigid contact of a ball (in the plane a disc), fixed in the last body, with a surface, fixed in the first of
     two bodies or in the world.
 
-    Subclasses say what the ball is, and how far a place of its centre is from touching the surface. The gap, the point
+    Subclasses say what the ball is, and how far it is from the surface with its centre at a place. The gap, the point
     of contact, the normal and their rates follow. Places, gradients and rates are in the axes of the surface's body.
+
+    ```python
+    class DrumContact(jaxmb.parts.AbstractSurfaceContact):
+        name: str = jaxmb.parts.name()
+        body: str = jaxmb.parts.body_name()
+        drum: jaxmb.parts.Number = jaxmb.parts.length(sign="positive")
+        radius: jaxmb.parts.Number = jaxmb.parts.length(sign="positive")
+
+        @property
+        def ball(self):
+            return jnp.zeros(3), self.radius
+
+        def clearance(self, place):
+            return jnp.hypot(place[0], place[2]) - self.drum - self.radius
+
+    on = DrumContact("on", "ball", drum=1.0, radius=0.1)
+    ```
     """
 
     @property
@@ -281,7 +324,8 @@ class RigidContact(AbstractSurfaceContact):
     ```
 
     The gap is normal to the terrain, exact on even ground and to first order in its curvature. `Contact` is compliant.
-    The rim of a disc in space has no rigid contact with ground; `spatial.RollingDisc` rolls on a plane.
+    The rim of a disc in space has no rigid contact with ground; `spatial.RollingDisc` rolls on a plane. For contacts of
+    other shapes see `parts.AbstractRigidContact` and `parts.AbstractSurfaceContact`.
 
     **Arguments:**
 

@@ -59,7 +59,7 @@ def test_gap_by_hand(part, gap):
     assert gap > 0.1
 
 
-@pytest.mark.slow(but=("a contact of a user", "Stop in the plane"))
+@pytest.mark.slow(but=("a contact of a user", "a ring of a user", "a drum of a user", "Stop in the plane"))
 @pytest.mark.parametrize("name", CONTACTS)
 def test_gap_and_its_derivatives(name):
     """Rates and second derivatives are those of the gap along a motion; the row of a closed contact is its gradient."""

@@ -5,7 +5,7 @@ import numpy as np
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.parts import AbstractGeometricContact, fields, terrain
+from jaxmb.parts import AbstractGeometricContact, AbstractRigidContact, AbstractSurfaceContact, fields, terrain
 
 
 def _body_2d(name, x=0.4, y=0.9):
@@ -31,6 +31,52 @@ class InsideBowl(AbstractGeometricContact):
         return (self.radius**2 - jnp.dot(x, x)) / (2 * self.radius)
 
 
+class RingContact(AbstractRigidContact):
+    """A user's own contact: a ring about the z-axis of its body, on the plane z = 0."""
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    ring: fields.Number = fields.length(sign="positive")
+    tube: fields.Number = fields.length(sign="positive")
+
+    def lowest(self, space, poses):
+        up = jnp.array([0.0, 0.0, 1.0])
+        axis = space.direction(poses[0], up)
+        across = up - jnp.dot(up, axis) * axis
+        return poses[0, :3] - self.ring * across / jnp.linalg.norm(across)
+
+    def gap(self, space, poses):
+        return self.lowest(space, poses)[2] - self.tube
+
+    def touching(self, space, poses):
+        return self.lowest(space, poses) - jnp.array([0.0, 0.0, 1.0]) * self.tube
+
+
+class DrumContact(AbstractSurfaceContact):
+    """A user's own contact: a ball on a drum about the y-axis through the origin."""
+
+    name: str = fields.name()
+    body: str = fields.body_name()
+    drum: fields.Number = fields.length(sign="positive")
+    radius: fields.Number = fields.length(sign="positive")
+
+    @property
+    def ball(self):
+        return jnp.array([0.05, 0.0, -0.1]), self.radius
+
+    def clearance(self, place):
+        return jnp.sqrt(place[0] ** 2 + place[2] ** 2) - self.drum - self.radius
+
+
+_TILTED = spatial.Body(
+    "a",
+    mass=1.5,
+    inertia=(0.2, 0.25, 0.3),
+    position=(0.4, 0.1, 1.9),
+    orientation=tuple(np.array([0.8, 0.5, 0.2, 0.1]) / np.linalg.norm([0.8, 0.5, 0.2, 0.1])),
+    velocity=(0.5, 0.2, -0.7),
+    angular_velocity=(0.6, -0.3, 0.2),
+)
 _GROUND = {"terrain": terrain.Bump(start=0.0, length=2.0, peak=0.2), "radius": 0.1}
 # Links that turn about their pins.
 _LINK_2D = planar.Body(
@@ -103,6 +149,8 @@ CONTACTS = {
         [],
     ),
     "a contact of a user": (InsideBowl("c", "a", radius=3.0, point=(0.1, 0.0)), [_body_2d("a")], []),
+    "a ring of a user": (RingContact("c", "a", ring=0.5, tube=0.1), [_TILTED], []),
+    "a drum of a user": (DrumContact("c", "a", drum=0.7, radius=0.1), [_TILTED], []),
 }
 
 
