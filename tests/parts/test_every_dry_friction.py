@@ -200,3 +200,19 @@ def test_what_needs_smooth_forces_refuses_it():
         mb.equilibrium(system)
     with pytest.raises(ValueError, match="joints must hold constraints"):
         mb.Scene([BODY], joints=[SLIDE, mb.DryFriction("rub", "joint", coefficient=0.3)])
+
+
+def test_ball_rubs_on_a_surface_of_the_user_as_on_the_slope_that_it_is():
+    """Also where its normal is known only by automatic differentiation."""
+    ball = spatial.Body("ball", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.3))
+    q, u = np.array([0.1, 0.2, 0.4, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.linspace(-1.0, 1.0, 9)
+
+    def seen(ground):
+        floor = mb.RigidContact("floor", "ball", terrain=ground, radius=0.2)
+        system = mb.Scene([ball], joints=[floor], forces=[mb.DryFriction("rub", "floor", coefficient=0.3)]).compile()
+        at = lambda q, u: Instant(system, jnp.zeros(()), q, u)
+        return jax.jit(lambda q, u: (*at(q, u).contact_place[:2], *at(q, u).contact_motion))(q, u)
+
+    surface = mb.terrain.Surface(lambda place, p: p["rise"] * place[0], parameters={"rise": 0.5})
+    for own, known in zip(seen(surface), seen(mb.terrain.Slope(0.5)), strict=True):
+        np.testing.assert_allclose(own, known, rtol=0, atol=1e-14)
