@@ -95,5 +95,6 @@ def test_velocity_over_ground_that_rises():
     floor = mb.RigidContact("floor", "body", terrain=terrain.Slope(0.2, level=np.array(-0.3)), radius=0.1)
     level = lambda part: part.terrain.level
     rates = eqx.tree_at(level, eqx.filter(floor, False), np.array(0.4), is_leaf=lambda x: x is None)
-    over = jax.jit(floor.with_fields(drift=rates).over_ground)
+    floor = floor.with_fields(drift=rates)
+    over = jax.jit(lambda point, velocity: floor.over_ground(point, velocity))
     np.testing.assert_allclose(over(np.array([1.0, 0.2]), np.array([0.6, 0.9])), [0.6, 0.5], rtol=1e-14)

@@ -54,7 +54,7 @@ def test_a_plate_in_the_ground_is_a_slope_of_terrain():
 
 def test_energy_fades_at_both_ends_of_a_plate():
     """From all of it inside to none behind the ends, and half of it at the ends."""
-    part = plate(edge=0.1, **SHARP)
+    part = plate(edge=0.1, **SHARP).resolve(PLANE, np.zeros((2, 3)))
     poses = np.zeros((9, 2, 3))
     poses[:, 0, 0] = -1.3, -1.1, -1.0, -0.9, 0.0, 0.9, 1.0, 1.1, 1.3
     poses[:, 0, 1] = 0.15
