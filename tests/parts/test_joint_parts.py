@@ -196,7 +196,7 @@ def test_row_of_a_coupling_is_its_polynomials():
 
 
 def test_length_of_a_tendon_goes_on_over_full_turns():
-    """The count tells the turns, and the hinges the angles; an angle is not that of another hinge."""
+    """The scalar coordinates count the turns, and the hinges give the angles within them."""
     turns, axis, count = np.array([7.0, -3.5]), np.array([0.0, 0.6, 0.8]), np.array([7.2, -3.3])
     numbers = {"axis_a": axis, "axis_b": axis, "x_a": (1.0, 0.0, 0.0), "x_b": (1.0, 0.0, 0.0)}
     still = {"point_a": np.zeros(3), "point_b": np.zeros(3)}
