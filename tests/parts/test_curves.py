@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import contact, planar, spatial, terrain
 from jaxmb.parts import magic_formula
+from jaxmb.parts.planar.kinematics import PLANE
 
 ANGLE, RATE, FLAT = 0.4, 1.3, terrain.Flat()
 ON_ANGLE = {
@@ -44,6 +46,34 @@ def test_curves_by_hand():
     motor = mb.Motor("motor", "pin.angle", mode="speed", command=10.0, gain=2.0, lag=0.05, limit=15.0)
     np.testing.assert_allclose(motor.curve(rate=[0.0, 10.0]), [15 * np.tanh(20 / 15), 0.0])
     assert ON_ANGLE["friction"].curve(rate=0.5) == pytest.approx(-0.7 * np.tanh(1.0))
+    held = mb.Motor("motor", "pin.angle", mode="position", command=0.2, gain=4.0, damping=0.5, lag=0.05)
+    np.testing.assert_allclose(held.curve([0.7, 0.7, 0.2], rate=[0.0, 2.0, -3.0]), [-2.0, -3.0, 1.5])
+    servo = mb.Actuator("servo", "pin.angle", bias=(0.0, -10.0, 0.0), force_range=(-2.0, 3.0))
+    np.testing.assert_allclose(servo.curve([-1.0, 0.1, 1.0]), [3.0, -1.0, -2.0])
+
+
+def test_activation_follows_the_control_by_hand():
+    """At the rate of its distance from the control over the lag; the control is that within its range."""
+    numbers = {"control": np.array(1.6), "control_range": np.array([-1.0, 1.0]), "activation": np.array(0.2)}
+    servo = mb.Actuator("servo", "pin.angle", lag=0.05, **numbers)
+    assert float(servo.state_rates(PLANE, None, None, 0.0)["activation"]) == pytest.approx((1.0 - 0.2) / 0.05)
+
+
+def test_a_progressive_stop_by_hand():
+    """Its force at either end, and its energy, whose slope is the force."""
+    width, stiffness, exponent, at = 0.1, 100.0, 1.5, np.array([-0.9, -0.45, 0.1, 0.32, 0.5])
+    limits = {"lower": -0.5, "upper": 0.3, "stiffness": stiffness, "exponent": exponent, "smoothing": width}
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    stop = mb.JointStop("stop", "pin.angle", **limits).of_sources([pin], [(0, 1)])
+    beyond = np.stack([-0.5 - at, at - 0.3])
+    depths = 0.5 * (beyond + np.hypot(beyond, width))
+    slopes = 0.5 * (1 + beyond / np.hypot(beyond, width))
+    np.testing.assert_allclose(stop.curve(at), np.array([1, -1]) @ (stiffness * depths**exponent * slopes), rtol=1e-12)
+    poses = np.zeros((5, 2, 3))
+    poses[:, 1, 2] = at
+    found = jax.jit(jax.vmap(lambda q: (stop.energy(PLANE, q, 0.0), stop.gaps(PLANE, q, 0.0))))(poses)
+    np.testing.assert_allclose(found[0], np.sum(stiffness * depths**2.5 / 2.5, axis=0), rtol=1e-12)
+    np.testing.assert_allclose(found[1], -beyond.T, rtol=0, atol=1e-14)
 
 
 def test_steady_forces_of_a_tyre_by_hand():

@@ -7,10 +7,12 @@ import pytest
 from every_contact import CONTACTS, system_of
 
 import jaxmb as mb
+from jaxmb import spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import terrain
 from jaxmb.parts.modes import CLOSED, OPEN
 from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.parts.spatial.kinematics import SPACE
 from jaxmb.system.instant import Instant
 
 A, B, R, S = np.array([0.4, 0.9]), np.array([1.5, 2.0]), 0.1, 0.25
@@ -57,6 +59,31 @@ def test_gap_by_hand(part, gap):
     found = part.resolve(PLANE, poses).gap(PLANE, poses)
     np.testing.assert_allclose(found, gap, rtol=1e-12)
     assert gap > 0.1
+
+
+def test_gap_of_stops_in_space_is_that_to_the_nearer_stop():
+    """Also where the angle of the hinge, in (−π, π], has jumped."""
+    axis, angles = np.array([0.0, 0.6, 0.8]), np.array([2.4, 3.0, 3.6, 4.1])
+    hinge = {"axis_a": axis, "axis_b": axis, "x_a": (1.0, 0.0, 0.0), "x_b": (1.0, 0.0, 0.0)}
+    hinge = spatial.Revolute("hinge", "ground", "b", point_a=np.zeros(3), point_b=np.zeros(3), **hinge)
+    part = mb.Stop("c", "hinge.angle", lower=2.5, upper=4.0).of_sources([hinge], [(0, 1)])
+    poses = np.zeros((4, 2, 7))
+    poses[:, 0, 3] = 1.0
+    poses[:, 1, 3], poses[:, 1, 4:] = np.cos(angles / 2), np.sin(angles / 2)[:, None] * axis
+    gaps = jax.jit(jax.vmap(lambda q: part.gap(SPACE, q)))(poses)
+    np.testing.assert_allclose(gaps, [-0.1, 0.5, 0.4, -0.1], rtol=0, atol=1e-14)
+
+
+def test_slip_between_bodies_is_relative():
+    """Bodies that move as one do not slip; otherwise the slip is along the normal turned clockwise."""
+    poses = np.array([(*A, 0.2), (*B, -0.4)])
+    part = GAPS["balls"][0].resolve(PLANE, poses)
+    as_one = np.array([[0.3 - 0.7 * y, -0.2 + 0.7 * x, 0.7] for x, y, _ in poses])
+    normal = BETWEEN / np.linalg.norm(BETWEEN)
+    slip = jax.jit(lambda u: part.slip(PLANE, poses, u))
+    np.testing.assert_allclose(slip(as_one), 0.0, rtol=0, atol=1e-15)
+    shifted = as_one + np.array([[0.0] * 3, [0.5, 0.9, 0.0]])
+    np.testing.assert_allclose(slip(shifted), [normal @ [-0.9, 0.5]], rtol=1e-12)
 
 
 @pytest.mark.slow(but=("a contact of a user", "a ring of a user", "a drum of a user", "Stop in the plane"))

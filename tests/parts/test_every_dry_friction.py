@@ -11,6 +11,7 @@ from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers, accelerations
 from jaxmb.parts import terrain
 from jaxmb.parts.modes import FREE, STICK
+from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.system.instant import Instant
 
 # The velocities of the bodies are any: those in the closest state are used.
@@ -29,6 +30,15 @@ def test_slip_counts_from_the_belt():
     both = jax.jit(lambda q, u: (at(q, u).contact_motion.rates[-1], at(q, u).contact_place.gradients[-1] @ u))
     slip, moves = both(system.guess.q, system.guess.u)
     np.testing.assert_allclose(slip, moves - FRICTIONS["disc on a belt"][2].speed, rtol=1e-12)
+
+
+def test_slip_in_a_pin_is_its_radius_times_the_relative_rate():
+    pin = planar.Revolute("pin", "a", "b", point_a=(0.1, 0.2), point_b=(0.3, 0.0))
+    rub = mb.DryFriction("rub", "pin", coefficient=0.3, radius=0.1).of_sources([pin], [(0, 1)])
+    rub = rub.resolve(PLANE, np.zeros((2, 3)))
+    turning = np.array([[0.2, 0.1, 0.6], [0.4, -0.3, -0.4]])
+    slip = jax.jit(lambda u: rub.slip(PLANE, jnp.zeros((2, 3)), u))(turning)
+    np.testing.assert_allclose(slip, [0.1 * (-0.4 - 0.6)], rtol=1e-14)
 
 
 @pytest.mark.slow

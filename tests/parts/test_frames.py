@@ -4,9 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from part_cases import random_poses, rotated
 
 import jaxmb as mb
 from jaxmb import planar, rotations, spatial
+from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.parts.spatial.kinematics import SPACE
 
 J = np.diag([0.02, 0.09, 0.07])
 TURN = np.asarray(rotations.from_axis_angle(np.array([0.6, 0.0, 0.8]), 0.7))
@@ -93,6 +96,25 @@ def test_a_torque_in_the_axes_of_a_frame_turns_with_it():
     push = jax.jit(lambda system: system.force(0.0, q, u))
     own = np.asarray(push(system)) - np.asarray(push(two_bodies()))
     np.testing.assert_allclose(own[3:6], in_a([1.0, 2.0, 3.0]), rtol=0, atol=1e-13)
+
+
+def test_points_of_a_frame_are_fixed_in_its_body():
+    """A point given in the frame, and the same one in the body, are at one place of the world."""
+    frame, pose = planar.Frame("tip", "bar", position=(0.3, 0.1), angle=0.4), np.array([0.7, -0.2, 1.1])
+    own, c, s = np.array([0.5, -0.6]), np.cos(0.4), np.sin(0.4)
+    in_body = np.array([0.3 + c * own[0] - s * own[1], 0.1 + s * own[0] + c * own[1]])
+    np.testing.assert_allclose(frame.point(own), in_body, rtol=1e-14)
+    np.testing.assert_allclose(PLANE.point(frame.pose(PLANE, pose), own), PLANE.point(pose, in_body), rtol=1e-14)
+
+
+def test_a_frame_turns_with_its_body():
+    """Its angular velocity is the body's, in its own axes; its origin moves with the body."""
+    rng, (frame, _) = np.random.default_rng(2), FRAMES
+    (pose,), velocity = random_poses(rng, SPACE, 1), rng.normal(size=6)
+    found = np.asarray(frame.velocity(SPACE, pose, velocity))
+    np.testing.assert_allclose(rotated(TURN, found[3:]), velocity[3:], rtol=1e-13)
+    arm = np.array([0.3, 0.1, -0.2])
+    np.testing.assert_allclose(found[:3], velocity[:3] + rotated(pose[3:], np.cross(velocity[3:], arm)), rtol=1e-13)
 
 
 def test_a_blade_on_a_frame_slides_along_its_axis():

@@ -1,11 +1,13 @@
 """Shapes that functions of the user's parts may return."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.parts.planar.kinematics import PLANE
 
 
 def pulled(space, rows):
@@ -105,3 +107,42 @@ def test_indices_out_of_bounds_of_derived_arrays():
     slide = planar.Prismatic("slide", "ground", "body", point=(1.0, 0.0), axis=(1.0, 0.0))
     with pytest.raises(ValueError, match="index 4 is out of bounds for axis 0 with size 2"):
         mb.Scene([BODY], joints=[slide], forces=[push]).compile()
+
+
+def test_functions_see_the_time():
+    """The functions of forces, of their energies, and of constraints."""
+    poses, velocities, t = np.array([[0.4, -0.2, 0.3]]), np.array([[1.5, 0.2, -0.6]]), 0.7
+    numbers = {"parameters": {"k": 3.0}}
+    push = mb.Force(
+        "push", "body", lambda x, v, t, p: p["k"] * t * x, potential=lambda x, t, p: -p["k"] * t * x[0, 1], **numbers
+    )
+    np.testing.assert_allclose(push.wrenches(PLANE, poses, velocities, t), 2.1 * poses, rtol=1e-14)
+    np.testing.assert_allclose(push.energy(PLANE, poses, t), 0.42, rtol=1e-14)
+    ring = mb.Constraint("ring", "body", lambda x, t, p: x[0, :1] - p["k"] * t, **numbers)
+    np.testing.assert_allclose(ring.residual(PLANE, poses, t), [0.4 - 2.1], rtol=1e-14)
+    belt = mb.VelocityConstraint("belt", "body", lambda x, v, t, p: v[0, :1] - p["k"] * t, **numbers)
+    np.testing.assert_allclose(belt.residual(PLANE, poses, velocities, t), [1.5 - 2.1], rtol=1e-14)
+
+
+def test_a_non_ideal_force_is_that_of_its_function():
+    """A brake: in proportion to the reaction, to the time, and against the slide."""
+    reactions, velocities = np.array([[3.0, 40.0, -2.0]]), np.array([[0.5, 0.0, 0.0]])
+    brake = lambda x, v, r, t, p: np.array([[-1.0, 0.0, 0.0]]) * p["mu"] * t * r[0, 1] * np.sign(v[0, 0])
+    part = mb.NonIdeal("brake", "slide", brake, parameters={"mu": 0.3})
+    found = part.wrenches(PLANE, np.zeros((1, 3)), velocities, reactions, 2.0)
+    np.testing.assert_allclose(found, [[-24.0, 0.0, 0.0]], rtol=1e-14)
+
+
+def test_a_controller_measures_rates_and_velocities_at_frames():
+    pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    tip = planar.Frame("tip", "bar", position=(0.5, -0.1), angle=0.2)
+    law = lambda t, seen, states, p: (-2.0 * seen["rate"] + seen["speed"] @ jnp.array([3.0, 5.0]), {})
+    push = mb.Controller("push", law, {"rate": "pin.angle_rate", "speed": "tip.velocity"}, "pin.angle")
+    push = push.of_sources([pin, tip], [(0, 1), (1,)])
+    poses, velocities = np.array([[0.0] * 3, [0.1, 0.2, 0.3]]), np.array([[0.0] * 3, [0.4, -0.2, 1.5]])
+    wrenches = jax.jit(lambda q, u: push.wrenches(PLANE, q, u, 0.0))(poses, velocities)
+    c, s = np.cos(0.3), np.sin(0.3)
+    arm = np.array([c * 0.5 + s * 0.1, s * 0.5 - c * 0.1])
+    speed = np.array([0.4 - 1.5 * arm[1], -0.2 + 1.5 * arm[0]])
+    force = -2.0 * 1.5 + speed @ [3.0, 5.0]
+    np.testing.assert_allclose(wrenches, [[0.0, 0.0, -force], [0.0, 0.0, force]], rtol=1e-13, atol=1e-15)

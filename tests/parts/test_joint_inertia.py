@@ -11,6 +11,7 @@ from every_formulation import FORMULATIONS
 import jaxmb as mb
 from jaxmb import parts, planar, spatial
 from jaxmb.formulations import accelerations
+from jaxmb.parts.planar.kinematics import PLANE
 
 X, Y, Z = np.eye(3)
 J = np.array([[0.05, 0.01, 0.0], [0.01, 0.09, 0.02], [0.0, 0.02, 0.07]])
@@ -203,6 +204,13 @@ def test_linear_and_steady_motion():
     free = mb.Scene([wheel], joints=[axle, own]).compile()
     state = mb.steady_motion(free, mb.assemble(free), rates={"axle.angle": 3.0})
     assert float(state.u[-1]) == pytest.approx(3.0, rel=1e-9)
+
+
+def test_row_holds_its_coordinate_at_that_of_the_joint():
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    part = mb.JointInertia("rotor", "pin.angle", inertia=INERTIA).of_sources([pin], [(0, 1)])
+    poses = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.7], [0.9, 0.0, 0.0]])
+    np.testing.assert_allclose(part.residual(PLANE, poses, 0.0), [0.2], rtol=1e-13)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
+from jaxmb.parts.planar.kinematics import PLANE
+from jaxmb.parts.spatial.kinematics import SPACE
 
 MOST_PROGRAMS = 100
 
@@ -178,6 +180,36 @@ def on_one_axis(names, *joints):
     hinge = {"point": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0)}
     axles = [spatial.Revolute(f"{name} axle", "ground", name, **hinge) for name in names]
     return mb.Scene(wheels, joints=[*axles, *joints]).compile()
+
+
+def test_row_of_a_coupling_is_its_polynomials():
+    pins = [planar.Revolute(name, "ground", name, point_a=(0.0, 0.0), point_b=(0.0, 0.0)) for name in "xyz"]
+    powers, zeros = np.array([[0.4, 0.5, -0.3, 0.7], [0.1, -0.2, 0.6, 0.0]]), np.array([0.2, -0.3])
+    numbers = {"coefficients": powers, "zero": 0.15, "other_zero": zeros}
+    part = mb.JointCoupling("couple", "x.angle", ("y.angle", "z.angle"), **numbers)
+    part = part.of_sources(pins, [(0, 1), (0, 2), (0, 3)])
+    poses = np.zeros((4, 3))
+    poses[:, 2] = 0.0, 0.9, 1.4, -0.8
+    expected = 0.9 - 0.15 - np.polyval(powers[0, ::-1], 1.4 - 0.2) - np.polyval(powers[1, ::-1], 0.3 - 0.8)
+    found = jax.jit(lambda q: part.residual(PLANE, q, 0.0))(poses)
+    np.testing.assert_allclose(found, [expected], rtol=0, atol=1e-14)
+
+
+def test_length_of_a_tendon_goes_on_over_full_turns():
+    """The scalar coordinates count the turns, and the hinges give the angles within them."""
+    turns, axis, count = np.array([7.0, -3.5]), np.array([0.0, 0.6, 0.8]), np.array([7.2, -3.3])
+    numbers = {"axis_a": axis, "axis_b": axis, "x_a": (1.0, 0.0, 0.0), "x_b": (1.0, 0.0, 0.0)}
+    still = {"point_a": np.zeros(3), "point_b": np.zeros(3)}
+    hinges = [spatial.Revolute(name, "ground", name, **numbers, **still) for name in "ab"]
+    part = mb.FixedTendon("cord", ("a.angle", "b.angle"), coefficients=(0.3, -0.2))
+    part = part.of_sources(hinges, [(0, 1), (0, 2)])
+    poses = np.zeros((5, 7))
+    poses[0, 3] = 1.0
+    poses[1:3, 3], poses[1:3, 4:] = np.cos(turns / 2), np.sin(turns / 2)[:, None] * axis
+    poses[3:, 0] = count
+    length, rows = jax.jit(lambda q: (part.length(SPACE, q), part.residual(SPACE, q, 0.0)))(poses)
+    np.testing.assert_allclose(length, 0.3 * 7.0 - 0.2 * -3.5, rtol=1e-13)
+    np.testing.assert_allclose(rows, count - turns, rtol=0, atol=1e-13)
 
 
 def test_couplings_that_jump_at_half_a_turn_are_named():

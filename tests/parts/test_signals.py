@@ -25,6 +25,13 @@ def test_the_clamped_spline(count):
     np.testing.assert_allclose(rates, spline(at, 1), rtol=0, atol=1e-12 * np.abs(spline(at, 1)).max())
 
 
+def test_a_held_series_keeps_each_value_until_the_next_time():
+    ts, values = np.array([0.0, 1.0, 3.0, 3.5]), np.array([5.0, 6.0, -8.0, 2.0])
+    at = np.array([-1.0, 0.0, 0.9, 1.0, 2.9, 3.0, 3.4, 3.5, 7.0])
+    found = jax.jit(jax.vmap(mb.Series(ts, values, "held")))(at)
+    np.testing.assert_array_equal(found, [5.0, 5.0, 5.0, 6.0, 6.0, -8.0, -8.0, 2.0, 2.0])
+
+
 def test_derivatives_by_values_and_times_of_a_clamped_series():
     def at(x):
         return mb.Series(x[:4], x[4:], "clamped")(0.83)

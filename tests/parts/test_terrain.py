@@ -1,5 +1,6 @@
 """Heights and slopes of terrain."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from laws import TERRAINS
 from oracles import tracked_vehicle as oracle
 
+import jaxmb as mb
 from jaxmb.parts import terrain
 
 
@@ -86,3 +88,13 @@ def test_spline_goes_through_its_points_and_follows_parabolas():
 def test_terrain_that_is_refused(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_velocity_over_ground_that_rises():
+    """A body that rises with the ground is at rest over it."""
+    floor = mb.RigidContact("floor", "body", terrain=terrain.Slope(0.2, level=np.array(-0.3)), radius=0.1)
+    level = lambda part: part.terrain.level
+    rates = eqx.tree_at(level, eqx.filter(floor, False), np.array(0.4), is_leaf=lambda x: x is None)
+    floor = floor.with_fields(drift=rates)
+    over = jax.jit(lambda point, velocity: floor.over_ground(point, velocity))
+    np.testing.assert_allclose(over(np.array([1.0, 0.2]), np.array([0.6, 0.9])), [0.6, 0.5], rtol=1e-14)

@@ -52,6 +52,17 @@ def test_a_plate_in_the_ground_is_a_slope_of_terrain():
         np.testing.assert_allclose(part.energy(PLANE, both, 0.0), slope.energy(PLANE, pose, 0.0), rtol=1e-12)
 
 
+def test_energy_fades_at_both_ends_of_a_plate():
+    """From all of it inside to none behind the ends, and half of it at the ends."""
+    part = plate(edge=0.1, **SHARP).resolve(PLANE, np.zeros((2, 3)))
+    poses = np.zeros((9, 2, 3))
+    poses[:, 0, 0] = -1.3, -1.1, -1.0, -0.9, 0.0, 0.9, 1.0, 1.1, 1.3
+    poses[:, 0, 1] = 0.15
+    energies = jax.jit(jax.vmap(lambda q: part.energy(PLANE, q, 0.0)))(poses)
+    whole = 0.5 * 4e4 * 0.05**2
+    np.testing.assert_allclose(energies, whole * np.array([0, 0, 0.5, 1, 1, 1, 0.5, 0, 0]), rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_plates_in_line_bear_as_one():
     """Wherever a disc is, and whichever body they are of: its wrench is that of one long plate."""

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from part_cases import move, turned_2d
 
 import jaxmb as mb
 from jaxmb import planar
@@ -37,6 +38,28 @@ def test_gears_that_mesh_outside_turn_against_each_other():
     assert gear.bodies == ("a", "b", "ground")
 
 
+def test_displacement_is_along_the_axis_of_a_body_that_is_turned():
+    rng = np.random.default_rng(5)
+    given, (c, s) = rng.normal(size=(2, 3)), np.array([0.6, 0.8])
+    moved = given + np.array([[0.0] * 3, [0.7 * c, 0.7 * s, 0.0]])
+    for cls in (planar.Prismatic, planar.PointOnLine):
+        part = cls("J", "a", "b", point=(0.3, -0.4), axis=(c, s)).resolve(PLANE, given)
+        # The slot turns with A, and B with it about the same place.
+        together = np.stack([move(pose, 0.9, np.array([0.2, 0.5])) for pose in moved])
+        for poses in (moved, together):
+            np.testing.assert_allclose(part.coordinates(PLANE, poses)["displacement"], 0.7, rtol=1e-13)
+
+
+def test_slide_is_pictured_beside_the_mass_centre():
+    """On its line, and where this is nearest to the origin of B."""
+    poses = np.array([[0.3, -0.2, 0.4], [1.1, 0.9, -0.5]])
+    part = planar.Prismatic("J", "a", "b", point=(0.8, 0.1), axis=(0.6, 0.8)).resolve(PLANE, poses)
+    ends = [PLANE.point(poses[1], np.asarray(own.point_b)) for own in (part, part.pictured(PLANE))]
+    np.testing.assert_allclose(ends[0], [0.8, 0.1], rtol=1e-13)
+    expected = poses[1, :2] + (ends[0] - poses[1, :2]) @ [0.8, -0.6] * np.array([0.8, -0.6])
+    np.testing.assert_allclose(ends[1], expected, rtol=1e-13)
+
+
 def test_knife_edge():
     pose = np.array([[0.3, 0.4, 0.7]])
     blade = planar.KnifeEdge("blade", "a", point=(0.2, 0.0)).resolve(PLANE, pose)
@@ -48,6 +71,26 @@ def test_knife_edge():
 
 
 # Forces
+
+
+def test_rotational_damper_acts_against_the_relative_rate():
+    part = planar.RotationalDamper("F", "a", "b", damping=2.0)
+    turning = np.array([[0.1, 0.2, 0.7], [-0.3, 0.4, -0.5]])
+    found = part.wrenches(PLANE, np.zeros((2, 3)), turning, 0.0)
+    np.testing.assert_allclose(found, [[0.0, 0.0, -2.4], [0.0, 0.0, 2.4]], rtol=1e-14)
+
+
+def test_slip_in_a_joint_is_relative():
+    """Bodies that move as one do not slip."""
+    rng = np.random.default_rng(6)
+    poses, (along, turning), relative = rng.normal(size=(2, 3)), (np.array([0.4, -0.3]), 0.8), np.array([0.2, -0.1])
+    part = planar.Friction("rub", "pin", coefficient=0.2, radius=0.05, point=POINT_B)
+    sideways = lambda arm: np.array([-arm[1], arm[0]])
+    velocities = np.stack([np.append(along + turning * sideways(pose[:2]), turning) for pose in poses])
+    np.testing.assert_allclose(part.slip(PLANE, poses, velocities), 0.0, rtol=0, atol=1e-15)
+    arm = turned_2d(poses[1, 2], POINT_B)
+    velocities[1] += [*(relative - 1.7 * sideways(arm)), 1.7]
+    np.testing.assert_allclose(part.slip(PLANE, poses, velocities), [*relative, 0.05 * 1.7], rtol=1e-12)
 
 
 def test_deflection_of_a_tyre_decays_over_its_relaxation_length():

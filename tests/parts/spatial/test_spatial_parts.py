@@ -30,15 +30,17 @@ def residual(part, poses):
         (("slide", "slide", "ball"), {}),
         # Zero is no value of the second angle here: the first and the third axis are parallel.
         (("hinge", "hinge", "hinge"), {"middle": 1.0, "axes": AXES[[0, 2, 0]], "orientation": GROUND[3:]}),
+        (("hinge", "hinge", "hinge"), {"middle": -1.0, "axes": AXES[[0, 2, 0]], "orientation": GROUND[3:]}),
     ],
-    ids=["slides and hinges", "a ball", "hinges"],
+    ids=["slides and hinges", "a ball", "hinges", "hinges on the other side"],
 )
 def test_composite_coordinates(sequence, options):
-    """Those of the joints in succession."""
+    """Those of the joints in succession, of which the last one is fixed in B."""
     axes = options.get("axes", AXES[: len(sequence)])
     own = {"point_a": POINT_A, "point_b": POINT_B, "orientation": turn(AXES[0], 0.5), "axes": axes} | options
     part = spatial.Composite("J", "a", "b", sequence=sequence, **own).resolve(SPACE, TWO_GROUNDS)
-    values = [np.array([0.3, -0.5, 0.2]) if word == "ball" else 0.7 + 0.1 * k for k, word in enumerate(sequence)]
+    numbers = np.sign(options.get("middle", 1.0)) * (0.7 + 0.1 * np.arange(len(sequence)))
+    values = [np.array([0.3, -0.5, 0.2]) if word == "ball" else x for word, x in zip(sequence, numbers, strict=True)]
     pose = np.append(POINT_A - rotated(own["orientation"], POINT_B), own["orientation"])
     for word, axis, value in reversed([*zip(sequence, axes, values, strict=True)]):
         if word == "slide":
@@ -46,10 +48,71 @@ def test_composite_coordinates(sequence, options):
         else:
             pose = move(pose, turn_3(value if word == "ball" else value * axis), POINT_A)
     coordinates = lambda q: [*part.coordinates(SPACE, q).values()]
-    rows, found = jax.jit(lambda q: (part.residual(SPACE, q, 0.0), coordinates(q)))(np.stack([GROUND, pose]))
+
+    @jax.jit
+    def seen(q):
+        joints = [] if "ball" in sequence else part.elementary_joints(SPACE, q)
+        return part.residual(SPACE, q, 0.0), coordinates(q), [(joint.point, joint.axis) for joint in joints]
+
+    rows, found, joints = seen(np.stack([GROUND, pose]))
     np.testing.assert_allclose(rows, 0.0, atol=1e-15)
+    if joints:
+        direction = rotated(pose[3:], rotated(own["orientation"] * [1, -1, -1, -1], axes[-1]))
+        np.testing.assert_allclose(joints[-1], [pose[:3] + rotated(pose[3:], POINT_B), direction], rtol=0, atol=1e-14)
     for x, expected in zip(found, values, strict=True):
         np.testing.assert_allclose(x, expected, rtol=0, atol=1e-14)
+
+
+def test_coordinates_are_the_turns_and_shifts_from_the_given_poses():
+    """Of joints with several coordinates, about axes that turn with A."""
+    rng = np.random.default_rng(9)
+    given, point, first = random_poses(rng, SPACE), rng.normal(size=3), random_unit(rng)
+    second, third = across(first)
+    places = {"point": point, "axis_1_W": first, "axis_2_W": second, "axis_3_W": third}
+    parts = [
+        spatial.Universal("J", "a", "b", point=point, axis_a_W=first, axis_b_W=second),
+        spatial.Gimbal("J", "a", "b", **places),
+        spatial.Planar("J", "a", "b", point=point, axis=first),
+    ]
+    parts = [part.resolve(SPACE, given) for part in parts]
+    x_a = rotated(given[0, 3:], np.asarray(parts[2].x_a))
+    x, y, z = 0.7, -0.5, 1.1
+    turns = product(turn(first, x), turn(second, y))
+    moved = [
+        move(given[1], turns, point),
+        move(given[1], product(turns, turn(third, z)), point),
+        move(given[1], turn(first, x), point, y * x_a + z * np.cross(first, x_a)),
+    ]
+    # A turns and B along with it, which changes no coordinate.
+    away = [np.stack([move(pose, turn(third, 0.9), POINT_A) for pose in (given[0], own)]) for own in moved]
+
+    @jax.jit
+    def seen(poses):
+        return [part.coordinates(SPACE, q) for part, q in zip(parts, poses, strict=True)]
+
+    expected = (
+        {"angle_a": x, "angle_b": y},
+        {"angle_1": x, "angle_2": y, "angle_3": z},
+        {"angle": x, "displacement": [y, z]},
+    )
+    for found, wanted in zip(seen(away), expected, strict=True):
+        assert found.keys() == wanted.keys()
+        for name, value in wanted.items():
+            np.testing.assert_allclose(found[name], value, rtol=0, atol=1e-13)
+
+
+def test_angle_counts_from_the_shortest_turn_that_makes_axes_parallel():
+    """Where the axes of a hinge are not parallel at the given poses."""
+    rng = np.random.default_rng(10)
+    given, axis_a, axis_b = random_poses(rng, SPACE), random_unit(rng), random_unit(rng)
+    hinge = {"point_a": POINT_A, "point_b": POINT_B, "axis_a": axis_a, "axis_b": axis_b}
+    part = spatial.Revolute("J", "a", "b", **hinge).resolve(SPACE, given)
+    start, end = rotated(given[1, 3:], axis_b), rotated(given[0, 3:], axis_a)
+    about, angle = np.cross(start, end), np.arccos(start @ end)
+    straight = move(given[1], turn(about / np.linalg.norm(about), angle), STILL)
+    turned = move(straight, turn(end, 0.6), STILL)
+    angles = jax.jit(jax.vmap(lambda b: part.coordinates(SPACE, jnp.stack([given[0], b]))["angle"]))
+    np.testing.assert_allclose(angles(np.stack([straight, turned])), [0.0, 0.6], rtol=0, atol=1e-13)
 
 
 def test_hinge_rows_are_regular_for_every_axis():
@@ -158,9 +221,9 @@ def test_rolling_point_of_contact_rests(name):
         u, v = across(rotated(pose[3:], axis))
         phi = np.arctan2(-v @ normal, -u @ normal)
         arm = rotated(pose[3:], np.asarray(link.centre)) + 0.5 * (np.cos(phi) * u + np.sin(phi) * v)
-        np.testing.assert_allclose(normal @ (pose[:3] + arm - origin), 0.0, atol=1e-14)
     else:
         arm = -0.2 * normal
+    np.testing.assert_allclose(normal @ (pose[:3] + arm - origin), 0.0, atol=1e-14)
     _, _, basis = np.linalg.svd(jacobian)
     particular = np.linalg.lstsq(jacobian, -at_rest, rcond=None)[0]
     for free in basis[3:]:
