@@ -55,7 +55,7 @@ def gap_rows(space: AbstractSpace, part: AbstractSurfaceContact, x: Float[Array,
     """The row of the gap, shape (1, k, v)."""
     force = at.outward if at.size is None else at.size * at.outward
     last = space.point_force(x[-1], part.ball[0], force)
-    rows = [last] if len(x) == 1 else [-space.point_force(x[0], at.seen, force), last]
+    rows = [last] if len(x) == 1 else [-space.force_at(x[0], at.centre, force), last]
     return jnp.stack(rows)[None]
 
 
@@ -101,7 +101,7 @@ def gap_motion(space: AbstractSpace, part: AbstractSurfaceContact, x, v, at: Tou
 def slip_rows(space: AbstractSpace, pole: int, x: Float[Array, "k p"], at: Touch) -> Float[Array, "r k v"]:
     """The rows of the slip; `pole`: see `AbstractRigidContact.tangents`."""
     tangents = _in_world(space, x, tangents_of(at.normal, pole))
-    force = lambda pose: jax.vmap(lambda w: space.point_force(pose, space.body_point(pose, at.point), w))(tangents)
+    force = lambda pose: jax.vmap(lambda w: space.force_at(pose, at.point, w))(tangents)
     return jnp.stack([force(x[0])] if len(x) == 1 else [-force(x[0]), force(x[1])], axis=1)
 
 

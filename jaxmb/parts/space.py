@@ -54,6 +54,10 @@ class AbstractSpace(abc.ABC):
         """Wrench of a force [N], in world axes, at the body-fixed point `s` [m]."""
 
     @abc.abstractmethod
+    def force_at(self, pose: Pose, point_W: Point, force_W: Point) -> Wrench:
+        """Wrench of a force [N] at a point [m] of the world, in world axes."""
+
+    @abc.abstractmethod
     def turning(self, pose: Pose, velocity: Velocity) -> Float[Array, "r"]:
         """The angular velocity [rad/s], in world axes; one number in the plane."""
 

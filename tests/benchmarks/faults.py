@@ -521,8 +521,8 @@ FAULTS = [
     Fault("bodies/touch.py", "outward, c - radius * outward)", "outward, c + radius * outward)"),
     Fault(
         "bodies/touch.py",
-        "[-space.point_force(x[0], at.seen, force), last]",
-        "[space.point_force(x[0], at.seen, force), last]",
+        "[-space.force_at(x[0], at.centre, force), last]",
+        "[space.force_at(x[0], at.centre, force), last]",
     ),
     Fault("bodies/touch.py", "carried + 2 * relative", "carried + relative"),
     Fault("bodies/touch.py", "bias = bias + jnp.dot(gradient, along)", "bias = bias - jnp.dot(gradient, along)"),

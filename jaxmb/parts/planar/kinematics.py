@@ -26,8 +26,13 @@ class PlanarSpace(AbstractSpace):
         return velocity[:2] + velocity[2:3] * _quarter_turn(_turned(pose, s))
 
     def point_force(self, pose, s, force_W):
-        arm = _turned(pose, s)
+        return self._wrench(_turned(pose, s), force_W)
+
+    def _wrench(self, arm, force_W):
         return jnp.concatenate([force_W, (arm[0] * force_W[1] - arm[1] * force_W[0])[None]])
+
+    def force_at(self, pose, point_W, force_W):
+        return self._wrench(point_W - pose[:2], force_W)
 
     def turning(self, pose, velocity):
         return velocity[2:]

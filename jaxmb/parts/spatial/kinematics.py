@@ -71,6 +71,9 @@ class SpatialSpace(AbstractSpace):
     def point_force(self, pose, s, force_W):
         return jnp.concatenate([force_W, rot.cross(s, _turned_back(pose, force_W))])
 
+    def force_at(self, pose, point_W, force_W):
+        return jnp.concatenate([force_W, _turned_back(pose, rot.cross(point_W - pose[:3], force_W))])
+
     def turning(self, pose, velocity):
         return _turned(pose, velocity[3:])
 
