@@ -511,6 +511,26 @@ def test_traces_are_told_apart(compat):
     assert of_program[0] == of_program[1] and outside not in inside and of_loop not in of_program, about
 
 
+def test_traces_around_a_trace(compat):
+    """The program's trace is around its loop's and its derivative's; a loop's is around nothing after it."""
+    inside = {}
+
+    def see(name, x):
+        inside[name] = list(compat.traces_around())
+        return x
+
+    def program(x):
+        see("program", x)
+        lax.fori_loop(0, 2, lambda _, x: see("loop", x), x)
+        jax.jvp(lambda x: see("derivative", x), (x,), (x,))
+        return see("after", x)
+
+    jax.jit(program)(1.0)
+    own, about = inside["program"][0], "the traces around one can no longer be found: kept values are computed again"
+    assert own in inside["loop"] and own in inside["derivative"] and own == inside["after"][0], about
+    assert inside["loop"][0] not in inside["after"], about
+
+
 def test_functions_with_their_rest_computed(compat):
     def slow(angle, x):
         return jax.jit(lambda angle, x: jnp.sin(angle) * x**2 + jnp.cos(angle))(angle, x)

@@ -32,6 +32,9 @@ class Angle(eqx.Module, Keeper):
 def test_instant_computes_a_quantity_once_in_a_trace():
     assert counted(lambda x: (lambda angle: angle.sine + angle.sine)(Angle(x)), 0.3) == 1
     assert counted(lambda x: Angle(x).sine + Angle(x).sine, 0.3) == 2
+    branch = lambda angle: lax.cond(angle.x > 0, lambda: angle.sine, lambda: 2 * angle.sine)
+    assert counted(lambda x: (lambda angle: angle.sine + branch(angle))(Angle(x)), 0.3) == 1
+    assert counted(lambda x: branch(Angle(x)), 0.3) == 2
 
 
 @pytest.mark.slow
