@@ -14,26 +14,28 @@ MOST_PROGRAMS = 90
 
 # The step of differences, of values that change by about their size in one second.
 H = 1e-4
-RADII = {"flat": 0.1, "waves": 0.15, "ball": 0.2, "plane": 0.12, "box": 0.17, "rises": 0.3}
-# A bump along x, and the rate at which that below one of the balls grows.
-START, LENGTH, PEAK, GROWTH = -1.0, 4.0, 0.7, 0.4
+RADII = {"flat": 0.1, "bump": 0.15, "ball": 0.2, "plane": 0.12, "box": 0.17, "waves": 0.3}
+# Waves along x that grow.
+AMPLITUDE, WAVELENGTH, GROWTH = 0.3, 5.0, 0.4
 
 
 def scene(dimension):
     """A body with surfaces and one with balls, away from each other; friction in each contact."""
     of = (lambda *v: v) if dimension == 3 else (lambda x, y, z: (x, z))
-    bump = terrain.Bump(start=START, length=LENGTH, peak=PEAK)
+    waves = terrain.Sinusoid(amplitude=AMPLITUDE, wavelength=WAVELENGTH)
     radius = lambda name: {"radius": RADII[name]}
     on_a, on_b = of(0.1, 0.2, -0.1), of(-0.2, 0.1, 0.15)
     size = {"size": of(1.2, 0.5, 0.4), "point_a": of(0.1, 0.0, 0.1), "point_b": on_b}
     normal = (0.48, 0.36, 0.8) if dimension == 3 else (0.6, 0.8)
     contacts = [
         mb.RigidContact("flat", "b", terrain=terrain.Flat(), centre=on_b, **radius("flat")),
-        mb.RigidContact("waves", "b", terrain=bump, centre=on_b, **radius("waves")),
+        mb.RigidContact(
+            "bump", "b", terrain=terrain.Bump(start=-1.0, length=4.0, peak=0.7), centre=on_b, **radius("bump")
+        ),
         mb.RigidBallContact("ball", "a", "b", radius_a=0.1, radius_b=RADII["ball"], point_a=on_a, point_b=on_b),
         mb.RigidPlaneContact("plane", "a", "b", normal=normal, point_a=on_a, point_b=on_b, **radius("plane")),
         mb.RigidBoxContact("box", "a", "b", **size, **radius("box")),
-        mb.RigidContact("rises", "b", terrain=bump, centre=on_b, **radius("rises")),
+        mb.RigidContact("waves", "b", terrain=waves, centre=on_b, **radius("waves")),
     ]
     rubs = [mb.DryFriction(f"rub on {name}", name, coefficient=0.3) for name in RADII]
     if dimension == 2:
@@ -49,7 +51,9 @@ def scene(dimension):
         ]
     system = mb.Scene(bodies, joints=contacts, forces=rubs).compile()
     # A contact with ground that changes in time has its rows by automatic differentiation.
-    return mb.with_inputs(system, {"rises.terrain.peak": lambda t: PEAK * jnp.exp(GROWTH * t)}), np.array(on_b)
+    return mb.with_inputs(system, {"waves.terrain.amplitude": lambda t: AMPLITUDE * jnp.exp(GROWTH * t)}), np.array(
+        on_b
+    )
 
 
 def turned(p, v):
@@ -133,8 +137,9 @@ def test_touch_along_motions(dimension):
             normal = force / np.linalg.norm(force)
             first, last = speed_at(q, u, c - radius * normal)
             past = last - (first if name in ("ball", "plane", "box") else 0.0)
-            if name == "rises":
-                past[-1] -= GROWTH * PEAK * np.sin(np.pi * ((c - radius * normal)[0] - START) / LENGTH) ** 2
+            if name == "waves":
+                place = (c - radius * normal)[0]
+                past[-1] -= GROWTH * AMPLITUDE * np.sin(2 * np.pi * place / WAVELENGTH)
             if d == 2:
                 np.testing.assert_allclose(slip, past @ [normal[1], -normal[0]], atol=1e-12, err_msg=name)
             else:
@@ -143,4 +148,4 @@ def test_touch_along_motions(dimension):
             # The force of a unit multiplier is larger where the gap is not measured along the normal.
             expected = np.linalg.norm(force)
             np.testing.assert_allclose(sizes[0, np.array(laws) - n], expected, rtol=1e-12, err_msg=name)
-            assert (expected == pytest.approx(1.0, abs=1e-9)) == (name not in ("waves", "rises")), name
+            assert (expected == pytest.approx(1.0, abs=1e-9)) == (name not in ("bump", "waves")), name
