@@ -22,6 +22,7 @@ AMPLITUDE, WAVELENGTH, GROWTH = 0.3, 5.0, 0.4
 def scene(dimension):
     """A body with surfaces and one with balls, away from each other; friction in each contact."""
     of = (lambda *v: v) if dimension == 3 else (lambda x, y, z: (x, z))
+    bump = terrain.Bump(start=-1.0, length=4.0, peak=0.7)
     waves = terrain.Sinusoid(amplitude=AMPLITUDE, wavelength=WAVELENGTH)
     radius = lambda name: {"radius": RADII[name]}
     on_a, on_b = of(0.1, 0.2, -0.1), of(-0.2, 0.1, 0.15)
@@ -29,9 +30,7 @@ def scene(dimension):
     normal = (0.48, 0.36, 0.8) if dimension == 3 else (0.6, 0.8)
     contacts = [
         mb.RigidContact("flat", "b", terrain=terrain.Flat(), centre=on_b, **radius("flat")),
-        mb.RigidContact(
-            "bump", "b", terrain=terrain.Bump(start=-1.0, length=4.0, peak=0.7), centre=on_b, **radius("bump")
-        ),
+        mb.RigidContact("bump", "b", terrain=bump, centre=on_b, **radius("bump")),
         mb.RigidBallContact("ball", "a", "b", radius_a=0.1, radius_b=RADII["ball"], point_a=on_a, point_b=on_b),
         mb.RigidPlaneContact("plane", "a", "b", normal=normal, point_a=on_a, point_b=on_b, **radius("plane")),
         mb.RigidBoxContact("box", "a", "b", **size, **radius("box")),
@@ -51,9 +50,8 @@ def scene(dimension):
         ]
     system = mb.Scene(bodies, joints=contacts, forces=rubs).compile()
     # A contact with ground that changes in time has its rows by automatic differentiation.
-    return mb.with_inputs(system, {"waves.terrain.amplitude": lambda t: AMPLITUDE * jnp.exp(GROWTH * t)}), np.array(
-        on_b
-    )
+    grows = lambda t: AMPLITUDE * jnp.exp(GROWTH * t)
+    return mb.with_inputs(system, {"waves.terrain.amplitude": grows}), np.array(on_b)
 
 
 def turned(p, v):
@@ -87,22 +85,21 @@ def speed_at(q, u, point):
     return out
 
 
+@pytest.mark.slow("2")
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_touch_along_motions(dimension):
     system, centre = scene(dimension)
-    n, d = len(RADII), dimension
-    random = np.random.default_rng(0)
-    of_bodies = 2 * (3 if d == 2 else 6)
-    poses = 2 * (3 if d == 2 else 7)
-    start = np.asarray(system.guess.q)
+    n, d, random, start = len(RADII), dimension, np.random.default_rng(0), np.asarray(system.guess.q)
+    # The numbers of coordinates and velocities of a body, and of two.
+    pose, size = (3, 3) if d == 2 else (7, 6)
+    poses, of_bodies = 2 * pose, 2 * size
 
     @jax.jit
     @jax.vmap
     def seen(t, q, u):
         at = Instant(system, t, q, u)
         place, motion = at.contact_place, at.contact_motion
-        along = jax.jvp(lambda t, q: Instant(system, t, q, u).gaps, (t, q), (1.0, system.rates(t, q, u)))[1]
-        return place.gaps, place.gradients, place.sizes, motion.rates, motion.biases, along
+        return place.gaps, place.gradients, place.sizes, motion.rates, motion.biases
 
     # The last is at rest.
     velocities = np.append(random.normal(size=(3, of_bodies)), np.zeros((1, of_bodies)), axis=0)
@@ -113,11 +110,10 @@ def test_touch_along_motions(dimension):
     found = [np.asarray(x).reshape(4, 3, *x.shape[1:]) for x in found]
     assert np.all(found[0] > 0.05)
     for k, u in enumerate(velocities):
-        gaps, gradients, sizes, rates, biases, along = (x[k] for x in found)
+        gaps, gradients, sizes, rates, biases = (x[k] for x in found)
         central = lambda x: (x[2] - x[1]) / (2 * H)
         # The rates of gaps and of slips are first derivatives, their biases second ones.
         np.testing.assert_allclose(rates[0, :n], central(gaps), rtol=0, atol=1e-6)
-        np.testing.assert_allclose(along[0], central(gaps), rtol=0, atol=1e-6)
         np.testing.assert_allclose(biases[0], central(rates), rtol=0, atol=1e-6)
 
         # They are linear in velocities, beside those of the ground.
@@ -125,17 +121,16 @@ def test_touch_along_motions(dimension):
         np.testing.assert_allclose(rates[0], moves + found[3][3][0], rtol=0, atol=1e-12)
 
         # Slip is the velocity of one body past the other at the point of the ball that is nearest to the surface.
-        pose, q = (3, 3) if d == 2 else (7, 6), start
-        x = q[pose[0] : 2 * pose[0]]
-        turn = np.array([[np.cos(x[2]), -np.sin(x[2])], [np.sin(x[2]), np.cos(x[2])]]) if d == 2 else None
-        c = x[:d] + (turn @ centre if d == 2 else turned(x[3:], centre))
+        x = start[pose:poses]
+        matrix = np.array([[np.cos(x[2]), -np.sin(x[2])], [np.sin(x[2]), np.cos(x[2])]])
+        c = x[:d] + (matrix @ centre if d == 2 else turned(x[3:], centre))
         names = system.contacts.names
         for name, radius in RADII.items():
             laws = [k for k, own in enumerate(names) if own == f"rub on {name}"]
             slip = rates[0, laws]
-            force = gradients[0, names.index(name), pose[1] : pose[1] + d]
+            force = gradients[0, names.index(name), size : size + d]
             normal = force / np.linalg.norm(force)
-            first, last = speed_at(q, u, c - radius * normal)
+            first, last = speed_at(start, u, c - radius * normal)
             past = last - (first if name in ("ball", "plane", "box") else 0.0)
             if name == "waves":
                 place = (c - radius * normal)[0]
