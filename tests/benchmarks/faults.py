@@ -685,7 +685,7 @@ FAULTS = [
     ),
     Fault(
         "contacts/phases.py",
-        "bounce = _restitution(*at[:2]) * jnp.maximum(-rates[: contacts.n], 0.0)",
+        "bounce = frame.here.restitution * jnp.maximum(-rates[: contacts.n], 0.0)",
         "bounce = jnp.maximum(-rates[: contacts.n], 0.0)",
     ),
     # Formulations
@@ -828,8 +828,8 @@ FAULTS = [
     ),
     Fault(
         "solvers/events.py",
-        "back = before._replace(a=jnp.zeros_like(search.s), b=search.s, of_b=least)",
-        "back = before._replace(a=jnp.zeros_like(search.s), b=search.s)",
+        "turns = jnp.where(rates > 0, start < 0, ends > 0)",
+        "turns = jnp.where(rates > 0, start < 0, ends < 0)",
     ),
     Fault(
         "solvers/events.py",

@@ -8,10 +8,13 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import parts, planar, spatial
-from jaxmb.bodies.elementary import is_elementary
+from jaxmb.bodies.elementary import HostRows, is_elementary
 from jaxmb.parts import coincident, perpendicular
+from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.report import check_elements
 from jaxmb.states.consistency import consistent, is_consistent
+
+MOST_PROGRAMS = 70
 
 POINTS = {"point_a": (0.3, -0.2, 0.5), "point_b": (-0.4, 0.1, 0.2)}
 PLACE = {"point": (0.2, 0.1, 0.4)}
@@ -101,6 +104,35 @@ def assert_agree(system, state, acceleration, tol=1e-13):
     found, exact = both(system, state, acceleration)
     for what, own in found.items():
         assert largest(own - exact[what]) < tol * (1 + largest(exact[what])), what
+
+
+def test_elements_along_a_motion_change_at_their_rates():
+    """Of a rod and of a pin in a slot, where these are open: a rod's row is half of the square over the length."""
+    a, b = (planar.Body(name, mass=1.0, inertia=0.1, position=x) for name, x in (("a", (0.0, 0.0)), ("b", (1.0, 0.5))))
+    rod = planar.Distance("rod", "a", "b", point_a=(0.1, 0.2), point_b=(-0.2, 0.1), length=0.8)
+    slot = planar.PointOnLine("slot", "a", "b", axis_a=(0.6, 0.8), point_a=(0.3, 0.0), point_b=(0.1, -0.3))
+    system = mb.Scene([a, b], joints=[rod, slot]).compile()
+    rows = HostRows.of(jax.tree.map(np.asarray, system.prepared().constraints.elements))
+    start, (velocity, acceleration) = (
+        np.array([[0.0, 0.0, 0.3], [1.0, 0.5, -0.4]]),
+        np.random.default_rng(0).normal(size=(2, 2, 3)),
+    )
+
+    def at(t):
+        moving = start + t * velocity + 0.5 * t**2 * acceleration, velocity + t * acceleration, acceleration
+        poses, *rates = (np.append(values, np.zeros((1, 3)), axis=0) for values in moving)
+        return np.stack([PLANE.prepare(pose) for pose in poses]), *rates
+
+    h, now = 1e-5, at(0.0)
+    difference = lambda function: (function(at(h)) - function(at(-h))) / (2 * h)
+    rates, second = rows.velocity(*now[:2]), rows.acceleration(*now)
+    np.testing.assert_allclose(rates, difference(lambda at: rows.residual(at[0])), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(second, difference(lambda at: rows.velocity(*at[:2])), rtol=0, atol=1e-8)
+    turned = lambda angle, x, y: np.array(
+        [np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y]
+    )
+    apart = start[1, :2] + turned(-0.4, -0.2, 0.1) - turned(0.3, 0.1, 0.2)
+    np.testing.assert_allclose(rows.residual(now[0])[0], 0.5 * (apart @ apart / 0.8 - 0.8), rtol=1e-12)
 
 
 @pytest.mark.slow

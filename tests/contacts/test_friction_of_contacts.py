@@ -82,6 +82,23 @@ def test_equations_of_slip_hold_at_a_solution():
     np.testing.assert_array_equal(e.slips, answers.slips)
 
 
+def test_equations_of_slip_in_any_direction():
+    """Of a contact that is pushed by one and has friction of 0.3 against its slip; they have no other solution."""
+
+    @jax.jit
+    def equations(along, x):
+        answers = Answers(x[:1] > 0, jnp.zeros(2, bool), along, jnp.array(True), jnp.zeros(2, bool))
+        search = searched(jnp.diag(jnp.array([1.0, 2.0, 2.0])), jnp.append(-1.0, 5.0 * along))
+        return search.corrected(answers, along[None], x)
+
+    for angle in (0.25 * np.pi, -0.9):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        x = np.append(1.0, -0.3 * along)
+        matrix, right = equations(along, x)
+        np.testing.assert_allclose(matrix @ x, right, atol=1e-14)
+        assert np.linalg.cond(matrix) < 100
+
+
 def test_stick_that_others_imply():
     """Of three feet that stick in one direction, as their rows depend on each other."""
     rows = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])

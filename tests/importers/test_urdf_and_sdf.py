@@ -38,6 +38,9 @@ def test_urdf_tree_is_what_mujoco_reads_of_it():
         np.testing.assert_allclose(rigid.orientation, data.xquat[k], atol=1e-14)
         turn = roll_pitch_yaw((0.0, 0.3, 0.0))
         np.testing.assert_allclose(rigid.inertia, turn @ np.diag([0.02, 0.05, 0.04]) @ turn.T, atol=1e-15)
+    # The turn about x comes first, about axes that stay: roll by a quarter takes y to z, then yaw takes x to y.
+    quarters = roll_pitch_yaw((np.pi / 2, 0.0, np.pi / 2))
+    np.testing.assert_allclose(quarters, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-15)
     np.testing.assert_allclose(part(own, "shoulder").axis_a, roll_pitch_yaw((0, 0, 1.0)) @ [0, 1, 0], atol=1e-15)
 
 

@@ -10,6 +10,7 @@ from jaxmb.linalg.complementarity import (
     largest_least,
     least_norm,
     positive_components,
+    reduced,
     solved_components,
 )
 
@@ -62,6 +63,16 @@ def test_independent_components():
         rank = lambda rows: np.linalg.matrix_rank(rows, tol=1e-4) if len(rows) else 0
         assert not np.any(found & ~among)
         assert rank(units[found]) == np.sum(found) == rank(units[among])
+
+
+def test_elimination_of_components():
+    """What is left between the others has the inverse that they have among all; what is eliminated is zero."""
+    random = np.random.default_rng(1)
+    A, given = random.normal(size=(5, 7)), np.array([False, True, False, True, False])
+    left = np.asarray(jax.jit(reduced)(A @ A.T, given))
+    others = np.ix_(~given, ~given)
+    np.testing.assert_allclose(np.linalg.inv(left[others]), np.linalg.inv(A @ A.T)[others], rtol=1e-10)
+    np.testing.assert_allclose(left[given], 0.0, atol=1e-12)
 
 
 def moves_of(instead, free):

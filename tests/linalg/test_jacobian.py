@@ -26,3 +26,22 @@ def test_projector_on_some_rows():
         assert np.count_nonzero(multipliers) == rank
         assert not np.any(multipliers[[1, 4]])
         np.testing.assert_array_equal(active, multipliers != 0)
+
+
+def test_null_space_solution_beside_large_forces_of_the_rows():
+    """It stays on the rows to all digits, although almost all of the force is theirs."""
+    random = np.random.default_rng(1)
+    A, B, mass = random.normal(size=(3, 6)), random.normal(size=(6, 6)), random.uniform(1.0, 2.0, 6)
+    curved, own = B @ B.T + np.eye(6), random.normal(size=6)
+    force = own + A.T @ (1e8 * random.normal(size=3))
+
+    @jax.jit
+    def solve(force):
+        projector = DenseJacobian(A).of_rows((0, 1, 2)).selected(3, np.ones(6)).projector(DiagonalInertia(mass))
+        return projector.null_space_solution(lambda x: curved @ x, force)
+
+    x = np.asarray(solve(force))
+    space = np.linalg.svd(A)[2][3:].T
+    expected = space @ np.linalg.solve(space.T @ curved @ space, space.T @ own)
+    np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(A @ x, 0.0, atol=1e-13)

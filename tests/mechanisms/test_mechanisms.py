@@ -17,6 +17,7 @@ from trajectories import motion_of
 
 import jaxmb as mb
 from jaxmb import mechanisms, planar
+from jaxmb.mechanisms.four_bar import circles_meet
 
 MOST_PROGRAMS = 120
 
@@ -44,6 +45,14 @@ def run(name, **parameters):
 def energy_at_start(mechanism):
     system, state = mechanism.system, mechanism.state
     return system.kinetic_energy(0.0, state.q, state.u) + system.potential_energy(0.0, state.q)
+
+
+def test_four_bar_closes_where_circles_meet():
+    """On the left of the line between their centres, at both distances."""
+    B, D = np.array([0.4, 0.3]), np.array([1.5, -0.2])
+    found = circles_meet(B, D, 1.1, 0.7)
+    np.testing.assert_allclose([np.linalg.norm(found - B), np.linalg.norm(found - D)], [1.1, 0.7], rtol=1e-13)
+    assert (D - B)[0] * (found - B)[1] > (D - B)[1] * (found - B)[0]
 
 
 ANGLES = ("beta", "Theta", "gamma", "Phi", "delta", "Omega", "epsilon")

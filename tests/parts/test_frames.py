@@ -10,6 +10,7 @@ import jaxmb as mb
 from jaxmb import planar, rotations, spatial
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
+from jaxmb.system.quantities import Solved
 
 J = np.diag([0.02, 0.09, 0.07])
 TURN = np.asarray(rotations.from_axis_angle(np.array([0.6, 0.0, 0.8]), 0.7))
@@ -186,14 +187,17 @@ def test_frames_on_frames_and_on_the_ground():
     ]
     arm = planar.Body("arm", mass=1.0, inertia=0.1, position=(1.0, 2.0), angle=0.5)
     pin = planar.Revolute("pin", "bench", "arm", point_a=(0.0, 0.0), point_b=(0.0, 0.0))
-    system = mb.Scene([arm], joints=[pin], frames=frames).compile()
+    system = mb.Scene([arm], joints=[pin], forces=[mb.Gravity((0.0, -9.81))], frames=frames).compile()
     state = mb.assemble(system)
     ys = jax.tree.map(lambda y: y[None], state)
-    tool = lambda field: system.quantities()[f"tool.{field}"].value(jnp.zeros(1), ys, None)[0]
+    solved = Solved(jnp.array([[2.0, 1.0, 0.0]]), jnp.zeros((1, 2)))
+    tool = lambda field: system.quantities()[f"tool.{field}"].value(jnp.zeros(1), ys, solved)[0]
     turn = lambda angle: np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     hand = np.array([1.0, 2.0]) + turn(0.5) @ [0.3, 0.0]
     np.testing.assert_allclose(tool("position"), hand + turn(0.7) @ [0.0, 0.1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(tool("angle"), 0.3, rtol=0, atol=1e-12)
+    # At rest it feels the force that holds it up, in its own axes.
+    np.testing.assert_allclose(turn(0.3) @ tool("specific_force"), [2.0, 1.0 + 9.81], rtol=0, atol=1e-12)
     assert {"tool.position", "hand.angle", "bench.position"} < set(mb.parameters(system))
 
 

@@ -43,17 +43,32 @@ def test_a_force_on_two_bodies_returns_a_row_for_each():
 
 
 def test_a_gap_is_a_number_or_a_vector():
+    """Its rate is that along the motion, also by time."""
+
     def scene(gap):
         body = planar.Body("body", mass=1.0, inertia=1.0)
         return mb.Scene([body], forces=[mb.Force("layer", "body", lambda x, v, t, p: 0 * v, gap=gap)])
 
-    for gap, count in ((lambda x, t, p: x[0, 0], 1), (lambda x, t, p: jnp.stack([x[0, 0] - 1.0, 2.0 - x[0, 0]]), 2)):
+    falls = lambda x, t, p: x[0, 0] + 3.0 * t
+    between = lambda x, t, p: jnp.stack([x[0, 0] - 1.0, 2.0 - x[0, 0] + t])
+    for gap, rates in ((falls, [5.0]), (between, [2.0, -1.0])):
         system = scene(gap).compile()
         seen = system.gaps_seen(jnp.array(0.0), system.guess.q, system.guess.u.at[0].set(2.0))
-        assert system.has_gaps and seen.gaps.shape == (count,) and abs(seen.rates[0]) == 2
+        assert system.has_gaps and seen.gaps.shape == (len(rates),)
+        np.testing.assert_allclose(seen.rates, rates, rtol=1e-15)
     assert not scene(None).compile().has_gaps
     with pytest.raises(ValueError, match=r"'layer': gaps must return a vector, got shape \(1, 3\)"):
         scene(lambda x, t, p: x).compile()
+
+
+def test_a_velocity_constraint_of_time_prescribes_its_rate():
+    """The rate of v − x t² is v̇ − v t² − 2 x t."""
+    body = planar.Body("body", mass=1.0, inertia=0.1)
+    pace = mb.VelocityConstraint("pace", "body", lambda x, v, t, p: v[0, :1] - x[0, :1] * t**2, linear=True)
+    system = mb.Scene([body], joints=[pace]).compile()
+    q, u, udot = np.array([1.5, 0.0, 0.0]), np.array([0.7, 0.2, 0.1]), np.array([-0.4, 0.3, 0.0])
+    found = jax.jit(lambda *at: system.acceleration_residual(*at))(2.0, q, u, udot)
+    np.testing.assert_allclose(found, [-0.4 - 0.7 * 4.0 - 2 * 1.5 * 2.0], rtol=1e-14)
 
 
 BODY = planar.Body("body", mass=1.0, inertia=0.1, position=(1.0, 0.0))

@@ -62,7 +62,7 @@ def test_correction_follows_the_derivatives_along_the_motion():
 
 
 def test_derivative_of_a_step():
-    """With complex and real roots, and with roots of opposite signs."""
+    """With complex and real roots, and with roots of opposite signs; the length of the step changes as well."""
     x, rng = np.array([4.0, 0.7, 0.3, -0.5]), np.random.default_rng(0)
     direction, weights = rng.normal(size=4), tuple(rng.normal(size=(3, 2)))
 
@@ -71,11 +71,17 @@ def test_derivative_of_a_step():
     def run(b):
         a, free = jnp.asarray(0.15), jnp.arange(2)
         end = solved(x, a, b, x[2:], 8)
+        # Coefficients of the step with these values, and with derivatives.
+        of_f, of_g = lambda x: a * x[1] / 0.7, lambda x: b * (x[1] / 0.7) ** 2
         matrix = DenseLinearization.unknown(end[0], free)
         solution = lambda x: eqx.Partial(along, Field(x[0]))
-        stepped = lambda x: at_end(end, KnownStep(solution(x), x[1], x[2:], a, b, free), matrix, None)
+        stepped = lambda x: at_end(end, KnownStep(solution(x), x[1], x[2:], of_f(x), of_g(x), free), matrix, None)
         push = lambda f: jax.jvp(f, (jnp.asarray(x),), (jnp.asarray(direction),))[1]
-        return push(lambda x: solved(x, a, b, end[0], 1)), push(stepped), jax.vjp(stepped, jnp.asarray(x))[1](weights)
+        return (
+            push(lambda x: solved(x, of_f(x), of_g(x), end[0], 1)),
+            push(stepped),
+            jax.vjp(stepped, jnp.asarray(x))[1](weights),
+        )
 
     expected, forward, (reverse,) = run(np.array([-0.02, -0.002, 0.003]))
     for own, other in zip(forward, expected, strict=True):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxmb.solvers import Adams, MultistepController
+from jaxmb.solvers.order import StepEstimate
 
 _DECAY = diffrax.ODETerm(lambda t, y, args: -y)
 
@@ -54,6 +55,26 @@ def test_refused():
     for call, message in REFUSED:
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_next_step_answers_to_the_error_by_a_power():
+    """A step that is good grows, one that is not is repeated shorter; without earlier steps all of them change."""
+    controller = MultistepController(1e-6, 1e-6, safety=0.5)
+
+    @jax.jit
+    def factor(error, opening, response):
+        one = jnp.ones(())
+        estimate = StepEstimate(error, 1.28 * one, 0.32 * one, response, 2.0 * one, jnp.zeros(2))
+        start = controller.init(_DECAY, one, 2 * one, one, 0.1 * one, None, None, None)[1]
+        start = start.__class__(start.intended, start.counters.at[2].set(opening))
+        keep, begins, ends, *_ = controller.adapt_step_size(one, 1.1 * one, one, one, None, estimate, None, start)
+        return keep, (ends - begins) / 0.1
+
+    # Half of 1.28 and half of 0.32, to the power.
+    for error, opening, response, expected in ((0.5, 0, 0.5, 0.8), (0.5, 1, 0.5, 0.64), (2.0, 0, 0.5, 0.4)):
+        keep, found = factor(error, opening, response)
+        assert keep == (error < 1)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_tolerances_under_a_trace():

@@ -2,6 +2,7 @@
 
 import functools
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -71,6 +72,30 @@ def test_the_first_zero_of_a_guard_that_is_negative_within_a_step():
     for first, last in ((0.3, 0.4), (0.1, 0.2), (0.45, 0.47), (0.8, 0.81), (0.3, 0.3001), (0.2, 0.9)):
         target, within = first_zero(first, last)
         assert within == 1 and abs(target - first) < 2e-13
+
+
+@jax.jit
+def counted(idle):
+    """The number of events after three steps without zeros that begin with jumps, the first at an event."""
+    controller, one = events.EventController(diffrax.PIDController(1e-6, 1e-6), 5), jnp.ones(())
+    state = controller.init(None, one, 9 * one, one, one, None, None, 5.0)[1]
+    state = eqx.tree_at(lambda state: (state.count, state.ended), state, (jnp.array(3), jnp.array(True)))
+    counts = []
+    for t, idle_there in ((1.0, idle), (2.0, 1.0), (3.0, 1.0)):
+        none = jnp.zeros(())
+        crossing = events.Crossing(
+            none, jnp.inf, none, one, none, none, none, 1e-9 * one, 1e-7 * one, jnp.inf * one, idle_there * one
+        )
+        step = t * one, (t + 1) * one
+        state = controller.adapt_step_size(*step, one, one, None, crossing, 5.0, state)[4]
+        counts.append(state.count)
+    return jnp.stack(counts)
+
+
+def test_an_event_counts_unless_it_changes_nothing():
+    """An announced jump later may change nothing, and takes no event away."""
+    np.testing.assert_array_equal(counted(0.0), [3, 3, 3])
+    np.testing.assert_array_equal(counted(1.0), [2, 2, 2])
 
 
 class Slip(AbstractGuards):

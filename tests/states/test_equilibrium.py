@@ -10,6 +10,7 @@ import pytest
 import jaxmb as mb
 from jaxmb import mechanisms, planar, spatial
 from jaxmb.formulations import Partitioned, accelerations
+from jaxmb.states.balance import Balance
 
 G = 9.81
 
@@ -153,6 +154,25 @@ def test_equilibrium_names_what_nothing_balances(pushed):
     for c, message in (((0.0, -19.6, 0.0), r"body\.y \(-19\.6\)"), ((0.0, 0.0, 3.0), r"body\.angle \(3\)")):
         with pytest.raises(ValueError, match=f"No static equilibrium.*{message}"):
             mb.equilibrium(pushed(c=c))
+
+
+def test_equilibrium_balances_applied_forces_by_those_of_rows():
+    """A bar that hangs from its pin, whose force is the weight."""
+    bar = planar.Body("bar", mass=2.0, inertia=0.1, position=(0.0, -0.5), angle=-np.pi / 2)
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    system = mb.Scene([bar], joints=[pin], forces=[mb.Gravity((0.0, -G))]).compile()
+    balance = Balance(system, jnp.zeros(()), jnp.zeros(0), ())
+    q, scale = system.guess.q, np.asarray(system.velocity_scale())
+
+    @jax.jit
+    def sums(multipliers):
+        return balance.forces(q, 0 * multipliers), balance.of_rows(q, multipliers), balance.forces(q, multipliers)
+
+    applied, _, _ = sums(np.ones(2))
+    np.testing.assert_allclose(applied, scale * np.array([0.0, -2.0 * G, 0.0]), rtol=0, atol=1e-13)
+    columns = np.stack([sums(unit)[1] for unit in np.eye(2)], axis=1)
+    multipliers = np.linalg.lstsq(columns, scale * np.array([0.0, 2.0 * G, 0.0]))[0]
+    np.testing.assert_allclose(sums(multipliers)[2], 0.0, atol=1e-13)
 
 
 def test_equilibrium_of_a_bar_on_a_pin():

@@ -111,6 +111,18 @@ def test_loads_of_needed_forces_are_those_of_the_motion(boom):
         needed.quantity("lift.lenght")
 
 
+def test_balance_of_loads_is_about_the_mass_centre(boom):
+    """Not about the origin of the body's frame: a force there has no arm."""
+    found = mb.loads(boom, "boom")
+    force, moment = np.array([3.0, -2.0, 0.0]), np.array([0.0, 0.0, 0.5])
+    at = np.array([CENTRE[0], CENTRE[1] + 0.7, 0.0])
+    alone = lambda point: dataclasses.replace(
+        found, points=np.array([[point]]), forces=np.array([[force]]), moments=np.array([[moment]])
+    )
+    np.testing.assert_allclose(alone([*CENTRE, 0.0]).balance[1], [moment], atol=1e-15)
+    np.testing.assert_allclose(alone(at).balance[1], [moment - [0.0, 0.0, 0.7 * force[0]]], atol=1e-14)
+
+
 def test_loads_at_the_worst_instants_and_in_files(boom, tmp_path):
     found = mb.loads(boom, "boom")
     sizes = np.max(np.linalg.norm(np.asarray(found.forces), axis=2)[:, :4], axis=1)

@@ -191,6 +191,8 @@ def test_speed_stretches_and_shortens_the_time_of_playing(pendulum):
     times, texts = fast.values("/clock", "text")
     assert np.allclose(times, np.array([0.0, 1.5, 4.0]) / 8) and [float(text[4:8]) for text in texts] == [0.0, 1.5, 4.0]
     assert "/trails/pin" in fast.names()
+    # The bodies move at the speed of the clock.
+    assert np.allclose(fast.values("/solids/cylinder", "batched_positions")[0], times)
     short = dataclasses.replace(trajectory, ts=np.asarray(trajectory.ts) / 100)
     times, texts = Page(viz.show(short, points=["pin", "pin"]).html).values("/clock", "text")
     assert times[-1] == pytest.approx(2.0) and "0.02 × real time" in texts[0] and texts[-1].startswith("t = 0.0400 s")
