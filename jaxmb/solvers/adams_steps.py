@@ -125,11 +125,8 @@ class AdamsSteps(AbstractSteps):
     def chosen(self, solver_state):
         return solver_state.chosen
 
-    def found(self, solver_state):
-        return solver_state.found
-
     def again(self, solver, *step):
-        return solver.step_again(*step, True)
+        return solver.step_again(*step)
 
     def memory(self, solver_state):
         return solver_state.memory

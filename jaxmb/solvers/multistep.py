@@ -165,12 +165,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         return y1, estimate, dense_info, state, result
 
     @eqx.filter_jit
-    def step_again(self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any, known: bool = False):
-        """The end of an accepted step, and the solver state there: `step` without a search for events.
-
-        **Arguments:** `known`: whether the state has the numbers of the event at its start, if there is one.
-        """
-        y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump, known)
+    def step_again(self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any) -> tuple[Y, Any]:
+        """The end of an accepted step, and the solver state there: `step` without a search for events."""
+        y0, state = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
         y1, _, _, state, _ = self._advanced(terms, t1, y0, args, state)
         return y1, state
 
@@ -180,9 +177,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         state = eqx.tree_at(lambda state: state.chart, state, chart, is_leaf=lambda x: x is None)
         return y1, estimate, dense_info, state, failed
 
-    def restarted(
-        self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any, known: bool = False
-    ) -> tuple[Y, Any]:
+    def restarted(self, terms, t0, t1, y0: Y, args: Args, solver_state: Any, made_jump: Any) -> tuple[Y, Any]:
         """The state and the solver state, restarted after a jump and otherwise unchanged."""
         if made_jump is False:
             return y0, solver_state
@@ -192,7 +187,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
 
         def restarted(before):
             y0, solver_state = layout.unpacked(before)
-            numbers = solver_state.found if known else found_at_jump(terms, t0, y0, args)
+            numbers = found_at_jump(terms, t0, y0, args)
             after = after_jump(terms, t0, y0, numbers, args)
             chart = chart_after_jump(terms, solver_state.chart)
             state = self.initial_state(terms, t0, t1, after, args, chart, solver_state).with_found(numbers)

@@ -45,7 +45,7 @@ class Choice(NamedTuple):
 
     **Fields:** its end `tnext`, its start `tprev`, and whether it `made_jump`, as in the states of diffrax's loop.
     Without jumps the last two are None: a step starts at the end of the last. `at_event` of its row; `chosen`: the
-    choices of its error estimate for the next step; `found`: the numbers of the jump at its start, or an earlier one.
+    choices of its error estimate for the next step.
     """
 
     tnext: Any
@@ -53,7 +53,6 @@ class Choice(NamedTuple):
     made_jump: Any
     at_event: Any
     chosen: PyTree[Array]
-    found: PyTree[Array]
 
 
 class Between(NamedTuple):
@@ -80,9 +79,8 @@ def first_of(steps: AbstractSteps, terms: PyTree, old: Any, new: Any) -> Row:
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
     """The choices made for the step between two states of diffrax's loop."""
     jump = (old.tprev, jnp.asarray(old.made_jump)) if steps.jumps else (None, None)
-    alone = steps.alone(new.solver_state)
-    found = steps.found(alone) if steps.jumps else None
-    return Choice(old.tnext, *jump, _at_event(old, new), steps.chosen(alone), found)
+    chosen = steps.chosen(steps.alone(new.solver_state))
+    return Choice(old.tnext, *jump, _at_event(old, new), chosen)
 
 
 def start_of(steps: AbstractSteps, since: Any, state: Any) -> tuple[Any, Any, PyTree[Array], PyTree[Array]]:
@@ -134,8 +132,6 @@ class Segments(eqx.Module):
             choice = self.of_choices.unpacked([buffer[k] for buffer in self.choices])
             tprev = t if choice.tprev is None else choice.tprev
             made_jump = False if choice.made_jump is None else choice.made_jump
-            if choice.found is not None:
-                solver_state = solver_state.with_found(choice.found)
             old = Between(tprev, choice.tnext, y, made_jump, solver_state)
             y, after = steps.again(solver, terms, old.tprev, old.tnext, y, args, solver_state, made_jump)
             if choice.chosen is not None:

@@ -60,10 +60,6 @@ class AbstractSteps(eqx.Module):
     def chosen(self, solver_state: Any) -> PyTree[Array]:
         """The parts of the solver's state that the error estimate chose for the next step; None without any."""
 
-    def found(self, solver_state: Any) -> PyTree[Array]:
-        """The numbers of the last jump in the solver's state, if it keeps them."""
-        del solver_state
-
     def of_solver_alone(self) -> Self:
         """The same for runs of the solver without tangents."""
         return self
