@@ -104,6 +104,8 @@ class ConstraintSet(eqx.Module):
     def moving(self, placed: Placed, velocities: BodyVelocities) -> Kinematics:
         """The scene in motion, with the rates of the laws."""
         now = motions_of(self.groups, placed, velocities)
+        if not now.motions:
+            return now
         rates, biases = ([getattr(law, name) for law in now.motions] for name in ("rate", "bias"))
         return now._replace(contacts=ContactMotion(joined(rates, velocities.dtype), joined(biases, velocities.dtype)))
 

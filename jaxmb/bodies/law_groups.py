@@ -210,12 +210,16 @@ class FrictionGroup(AbstractLawGroup, VelocityConstraintGroup):
         """The laws of friction that slips."""
         return SlipLaws(self.group, self.joints, self.number, self.against)
 
+    def _touch(self, laws):
+        """The touch of its contacts, or its rates, if its rows follow from them: slip that a user defines does not."""
+        return None if self.group.kernels else touch_of(self.against, laws)
+
     def _slips(self, at, t, x, v):
         part = at(t)
         return self.group.kernel("slips")(part, *part.seen(self._space, x, v))
 
     def place(self, t, poses, before):
-        space, touch = self._space, touch_of(self.against, before)
+        space, touch = self._space, self._touch(before)
         if touch is None:
             single = lambda at, x: jax.jacfwd(lambda v: self._slips(at, t, x, v))(_at_rest(space, x))
             return LawPlace(self._map(single, poses), None, None)
@@ -241,8 +245,7 @@ class FrictionGroup(AbstractLawGroup, VelocityConstraintGroup):
             slips, bias = slip_motion(space, part.pole, x[:n], v[:n], touch, rates)
             return LawMotion(part.over_belt(slips), bias, None)
 
-        rates = touch_of(self.against, before)
-        return self._map(of_touch, now.poses, now.velocities, per_part=(touch, rates))
+        return self._map(of_touch, now.poses, now.velocities, per_part=(touch, self._touch(before)))
 
     @property
     def _bodies(self) -> int:

@@ -178,7 +178,7 @@ class AbstractRigidContact(AbstractGeometricContact):
             up = jnp.array([0.0, 0.0, 1.0])
             axis = space.direction(poses[0], up)
             across = up - jnp.dot(up, axis) * axis
-            return poses[0, :3] - self.ring * across / jnp.linalg.norm(across)
+            return poses[0, :3] - self.ring * across / jaxmb.rotations.norm(across)
 
         def gap(self, space, poses):
             return self.lowest(space, poses)[2] - self.tube
@@ -189,8 +189,8 @@ class AbstractRigidContact(AbstractGeometricContact):
     floor = RingContact("floor", "hoop", ring=0.5, tube=0.1)
     ```
 
-    The derivatives of a gap are found by automatic differentiation. A ball on a surface has them in closed form, see
-    `AbstractSurfaceContact`.
+    The derivatives of a gap are found by automatic differentiation. `AbstractSurfaceContact` needs less: the distance
+    of a ball from a surface.
     """
 
     touches: ClassVar[bool] = True

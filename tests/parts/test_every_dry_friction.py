@@ -226,3 +226,19 @@ def test_ball_rubs_on_a_surface_of_the_user_as_on_the_slope_that_it_is():
     surface = mb.terrain.Surface(lambda place, p: p["rise"] * place[0], parameters={"rise": 0.5})
     for own, known in zip(seen(surface), seen(mb.terrain.Slope(0.5)), strict=True):
         np.testing.assert_allclose(own, known, rtol=0, atol=1e-14)
+
+
+class HalfSlip(mb.DryFriction):
+    """Friction of a user, by half of the slip."""
+
+    def slip(self, space, poses, velocities):
+        return 0.5 * super().slip(space, poses, velocities)
+
+
+def test_slip_that_a_user_defines_counts_on_every_surface():
+    disc = planar.Body("disc", mass=1.0, inertia=0.1, position=(0.0, 0.2))
+    floor = mb.RigidContact("floor", "disc", terrain=terrain.Flat(), radius=0.2)
+    system = mb.Scene([disc], joints=[floor], forces=[HalfSlip("rub", "floor", coefficient=0.3)]).compile()
+    seen = jax.jit(lambda q, u: Instant(system, jnp.zeros(()), q, u).contact_motion.rates)
+    rates = seen(system.guess.q, np.array([1.0, 2.0, 3.0, 0.0, 0.0]))
+    np.testing.assert_allclose(rates, [2.0, 0.5 * (1.0 + 0.2 * 3.0)], rtol=1e-14)
