@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .._compat import with_values
+from ..linalg.jitted import on_host
 from ..linalg.rotations import norm
 from ..linalg.sums import unchecked_take
 from . import fields
@@ -315,10 +316,7 @@ class DryFriction(AbstractDryFriction):
             raise ValueError(f"{self.label}: friction in {held.label} is given by its name, {self.joint_name!r}.")
         if space.dimension == 2:
             return self
-        seen = jnp.asarray(held.seen_poses(space, poses[: len(held.bodies)]))
-        normal = held.outward(space, seen)
-        if len(held.bodies) == 2:
-            normal = space.body_direction(seen[0], normal)
+        normal = _normal_to(held, space, held.seen_poses(space, poses[: len(held.bodies)]))
         # The axis nearest to the normal.
         k = int(np.argmax(np.abs(normal)))
         return self.with_fields(pole=(k + 1) * int(np.sign(normal[k])))
@@ -454,3 +452,11 @@ class ExactFriction(AbstractScalarPart, AbstractStickSlip):
 
     def slip_forces(self, space, poses, slips, reactions):
         return -self.force * slip_direction(self._modes(poses), slips)
+
+
+@on_host
+def _normal_to(contact: AbstractRigidContact, space: AbstractSpace, poses: Any) -> Any:
+    """The normal of a contact in the first body, or in the world; `poses` as the contact sees them."""
+    poses = jnp.asarray(poses)
+    normal = contact.outward(space, poses)
+    return space.body_direction(poses[0], normal) if len(poses) == 2 else normal
