@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import pytest
 from compiling import compile_for_tests
+from slow_marks import case_of, is_slow
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -30,19 +31,6 @@ def pytest_collection_modifyitems(config, items):
     if not config.getoption("--all"):
         config.hook.pytest_deselected(items=[item for item in items if is_slow(item)])
         items[:] = [item for item in items if not is_slow(item)]
-
-
-def is_slow(item):
-    """`slow` marks a test or a case, `slow("a", "b")` two cases of a test, `slow(but=("c",))` all cases but one."""
-    return any(
-        (case_of(item) in mark.args if mark.args else case_of(item) not in mark.kwargs.get("but", ()))
-        for mark in item.iter_markers("slow")
-    )
-
-
-def case_of(item):
-    """The name of a case of a test, as pytest prints it in brackets."""
-    return item.callspec.id if hasattr(item, "callspec") else None
 
 
 def check_cases(items):

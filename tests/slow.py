@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> int:
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
     """Keep the slow tests, the longest without a run first, and those of one file together."""
-    from conftest import is_slow
+    from slow_marks import is_slow
 
     record, age = read_record(), _ages()
     changed = _git("diff", "--name-only", os.environ[SINCE]).split() if os.environ.get(SINCE) else []
