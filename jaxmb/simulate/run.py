@@ -16,6 +16,7 @@ from .._types import State
 from ..contacts.impact import NO_SECOND_DERIVATIVES
 from ..linalg.arrays import derivatives_of, is_traced
 from ..solvers import Adams, Hermite
+from ..solvers.evaluation import freeze
 from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..states.refusals import lost_rank
@@ -109,14 +110,12 @@ class Run:
     """A motion with checked arguments.
 
     **Fields:** `asked`: the arguments, with inputs included in the system; the `problem` of the program; the `rooms`
-    for steps, tried one after the other; `is_concrete`: whether values are concrete, so that the number of steps is
-    known afterwards.
+    for steps, tried one after the other.
     """
 
     asked: Asked
     problem: Problem
     rooms: list[int]
-    is_concrete: bool
 
     @classmethod
     def checked(cls, asked: Asked) -> "Run":
@@ -143,13 +142,15 @@ class Run:
         room = Room(asked.max_steps, None, asked.adjoint)
         angles = _counted_at_start(asked, first.fn)
         state = State(state.q, state.u, state.z)
-        problem = Problem(system, state, span, method, saves, interpolated, stops, watched, room, meter, False, angles)
+        problem = Problem(
+            system, state, span, method, saves, interpolated, stops, watched, room, meter, False, True, angles
+        )
         return cls(asked, *_settled(problem, asked))
 
     def solved(self) -> Ended:
         """The motion, repeated with larger buffers if it took more steps than fit."""
         problem, max_steps = self.problem, self.asked.max_steps
-        if not self.is_concrete:
+        if not problem.known:
             return Ended(problem, *solved(problem), None)
         with contextlib.nullcontext() if problem.traced else told_of_compiling(problem.system):
             trajectory, outcome = solved(problem)
@@ -166,6 +167,8 @@ class Run:
         if is_traced(outcome.flags):
             return Ended(problem, trajectory, outcome, None)
         flags = Flags(*np.asarray(outcome.flags))
+        if flags.stuck:
+            trajectory, outcome = _diagnosed(problem, trajectory, outcome)
         if flags.wrong_derivative:
             warn_of_wrong_derivative()
         if flags.long:
@@ -204,13 +207,6 @@ class Run:
         system, span, asked = problem.system, problem.span, self.asked
         if flags.inconsistent:
             consistent(system, span.t0, problem.state)
-        if flags.stuck:
-            result, coupling = made_precise(problem, trajectory.result, outcome)
-            if result == RESULTS.newton_failed and lost_rank(system.at(outcome.y), outcome.t, outcome.y) is not None:
-                # Elimination in blocks does not detect lost rank.
-                result = RESULTS.singular_configuration
-            trajectory = eqx.tree_at(lambda motion: motion.result, trajectory, result)
-            outcome = outcome._replace(coupling=coupling)
         if not system.drift_free and system.acceleration_rows > 0:
             warn_of_jumps(system, outcome, span, problem.stops.restarts, asked.jumps)
         if flags.failed and asked.throw is not False:
@@ -237,6 +233,16 @@ class Run:
             system, state = lax.stop_gradient((asked.system, asked.state))
             closer = closer._replace(system=system, state=state)
         return _motion(closer)
+
+
+def _diagnosed(problem, trajectory, outcome):
+    """A run that got stuck, with the precise reason, which has no derivative."""
+    problem, end = freeze((problem, outcome))
+    result, coupling = made_precise(problem, trajectory.result, end)
+    if result == RESULTS.newton_failed and lost_rank(problem.system.at(end.y), end.t, end.y) is not None:
+        # Elimination in blocks does not detect lost rank.
+        result = RESULTS.singular_configuration
+    return eqx.tree_at(lambda motion: motion.result, trajectory, result), outcome._replace(coupling=coupling)
 
 
 def _motion(asked):
@@ -267,7 +273,7 @@ def _counted_at_start(asked, seen):
 
 
 def _settled(problem, asked):
-    """The problem with the parts that depend on tracing, the rooms for its steps, and whether values are concrete."""
+    """The problem with the parts that depend on tracing, and the rooms for its steps."""
     system, state, span = problem.system, problem.state, problem.span
     traced = is_traced(problem)
     if traced and asked.solver == "switch":
@@ -283,9 +289,9 @@ def _settled(problem, asked):
     orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
     if max(orders, default=0) > 1 and system.contacts:
         raise ValueError(NO_SECOND_DERIVATIVES)
-    # With concrete values, the number of steps is known afterwards.
-    is_concrete = not traced or (taken is not None and taken.known)
-    tries = traced and is_concrete and not was_long(system, problem.method.solver)
+    # With concrete values, the number of steps and failures are known afterwards.
+    known = not traced or (taken is not None and taken.known)
+    tries = traced and known and not was_long(system, problem.method.solver)
     rooms = [asked.max_steps]
     if asked.adjoint is None:
         rooms = rooms_for(asked.max_steps, problem.saveat, state, traced, tries)
@@ -297,5 +303,6 @@ def _settled(problem, asked):
         watched=problem.watched._replace(differentiated=tuple(order > 0 for order in orders) if any(orders) else ()),
         room=problem.room.of(rooms[0], asked.max_steps),
         traced=traced,
+        known=known,
     )
-    return problem, rooms, is_concrete
+    return problem, rooms

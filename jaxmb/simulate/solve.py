@@ -44,8 +44,8 @@ class Problem(NamedTuple):
     """A motion to be computed, with checked arguments.
 
     **Fields:** `system` and `state` at the start; `saveat`: the user's series and the end; `interpolated`: whether
-    states are interpolated; `traced`: whether any argument is traced; `angles`: the counted angles at the start, None
-    if none are counted.
+    states are interpolated; `traced`: whether any argument is traced; `known`: whether values are concrete all the
+    same, as where only a derivative is taken; `angles`: the counted angles at the start, None if none are counted.
     """
 
     system: AbstractSystem
@@ -59,6 +59,7 @@ class Problem(NamedTuple):
     room: Room
     progress_meter: Any
     traced: bool
+    known: bool
     angles: Any = None
 
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
@@ -192,8 +193,8 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     elif angles is not None:
         ys = dataclasses.replace(ys, angles=angles)
     end = End.of(solution, stops, (problem.span.t0, start.given))
-    result, stuck, ran_out, coupling = _verdict(problem, span, start, end, solution, lost, saves.outside)
-    motion, failed = (ys, solution.interpolation), has_failed(result)
+    result, failed, stuck, ran_out, coupling = _verdict(problem, span, start, end, solution, lost, saves.outside)
+    motion = ys, solution.interpolation
     if problem.traced:
         # Otherwise a derivative computed alone, which raises no error, would be of the part before the failure.
         inputs = system, problem.state, problem.span, method.formulation, method.policy, stops.event, first.fn
@@ -225,8 +226,8 @@ def _parted(saved):
 
 
 def _verdict(problem, interval, start, end, solution, lost, outside):
-    """The result of a run by the first reason that holds; whether it is stuck on its way; whether it had too few steps;
-    and the coupling of friction with its own reactions if that is the reason, None without friction.
+    """The result of a run by the first reason that holds; whether it failed; whether it is stuck on its way; whether it
+    had too few steps; and the coupling of friction with its own reactions if that is the reason, None without friction.
     """
     system, policy, span = problem.system, problem.method.policy, problem.span
     reasons: list[tuple[Any, Any]] = [
@@ -248,17 +249,19 @@ def _verdict(problem, interval, start, end, solution, lost, outside):
     remaining = jnp.abs(interval.t1 - end.t)
     creeps = True if end.step is None else remaining > 1e3 * solution.stats["num_steps"] * jnp.abs(end.step)
     stuck, coupling = has_failed(result) & is_usable & (creeps | ~ran_out), None
-    if problem.traced:
-        evidence = policy.evidence(solution.solver_state)
-        result, coupling = diagnosed(problem, end.t, end.y, evidence, result, stuck)
-    reasons = [
-        (policy.violated(system.prepared(), end.t, end.y, problem.method.rtol), RESULTS.inconsistent_constraints),
-        (has_failed(result), result),
+    violated = policy.violated(system.prepared(), end.t, end.y, problem.method.rtol)
+    later = [
         (lost, RESULTS.newton_failed),
         (inputs_ended(system, span.t0, span.t1) if problem.traced else False, RESULTS.input_ended),
         (outside, RESULTS.saved_outside),
     ]
-    return first_of(reasons, result), stuck, ran_out, coupling
+    # A failure that is diagnosed stays one: a program that does not return the result needs no diagnosis.
+    failed = functools.reduce(jnp.logical_or, (holds for holds, _ in later), has_failed(result) | violated)
+    if not problem.known:
+        evidence = policy.evidence(solution.solver_state)
+        result, coupling = diagnosed(problem, end.t, end.y, evidence, result, stuck)
+    reasons = [(violated, RESULTS.inconsistent_constraints), (has_failed(result), result), *later]
+    return first_of(reasons, result), failed, stuck, ran_out, coupling
 
 
 def _statistics(problem, solver, solution, end):
@@ -277,7 +280,7 @@ def _statistics(problem, solver, solution, end):
 
 @eqx.filter_jit
 def made_precise(problem: Problem, result: Any, outcome: Outcome) -> tuple[Any, Any]:
-    """As `diagnosed`, for a run that got stuck: a separate program, which only such runs need."""
+    """As `diagnosed`, for a run with concrete values that got stuck: a separate program, which only such runs need."""
     stuck = result != RESULTS.inconsistent_constraints
     return diagnosed(problem, outcome.t, outcome.y, outcome.evidence, result, stuck)
 

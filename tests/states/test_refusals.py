@@ -3,6 +3,7 @@
 import re
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -119,6 +120,15 @@ def test_drive_that_leaves_its_reach_is_named():
         found = re.match(r"The motion came to t = (\S+) of ", str(error.value))
         np.testing.assert_allclose(float(found[1]), when, rtol=1e-5)
         assert "friction" not in str(error.value)
+
+    def end(rate):
+        motion = mb.simulate(mb.with_parameters(system, {"pull.rate": rate}), mb.assemble(system), t1=2 * when)
+        return motion.ys.q[-1, 0], motion.result
+
+    # The derivative is not a number, and the reason is the same.
+    for derivative in (jax.grad(end, has_aux=True), jax.jit(jax.grad(end, has_aux=True))):
+        slope, result = derivative(0.05)
+        assert np.isnan(slope) and result == mb.RESULTS.singular_configuration
 
 
 def test_drive_that_leaves_its_reach_is_told_apart_from_joints_that_lock():
