@@ -34,7 +34,7 @@ from .forces import over_ground
 from .shapes import Ground
 from .smooth import dry_friction, ramp, step, without_pull
 from .space import round_shapes
-from .terrain import AbstractTerrain, distance, outward, pace_over
+from .terrain import AbstractTerrain, distance, edge_near, outward, pace_over
 
 __all__ = ["AbstractFrictionLaw", "AbstractNormalLaw", "Bekker", "Contact", "Coulomb", "Hertz", "Janosi", "Linear"]
 
@@ -192,6 +192,7 @@ class AbstractContact(AbstractPotentialForce):
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
     has_gaps: ClassVar[bool] = True
     touches: ClassVar[bool] = True
+    has_limits: ClassVar[bool] = True
 
     @abc.abstractmethod
     def distance(self, centre: Vector) -> Number:
@@ -246,6 +247,9 @@ class AbstractContact(AbstractPotentialForce):
 
         turning = super().gap_pace(space, poses, velocities, t)
         return jnp.maximum(turning, jnp.max(self._each(space, passing, poses, velocities)))
+
+    def limit_reached(self, space, poses):
+        return edge_near(self.terrain, self._each(space, lambda pose, point, _: space.point(pose, point), poses))
 
     def shapes(self, space, size):
         n = len(self.bodies)

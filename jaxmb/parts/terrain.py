@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..linalg.arrays import is_traced
 from ..linalg.rotations import norm
@@ -34,6 +34,8 @@ __all__ = ["AbstractTerrain", "Bump", "Flat", "Ramp", "Sinusoid", "Slope", "Spli
 Place = Float[Array, "h"]
 # The fraction of a bump or wave within which the ground rises or falls once.
 _SHARE = 0.25
+# A motion that ends where the ground does comes this near to it, relative to the place, and to one metre.
+_NEAR = 1e-6
 
 
 class AbstractTerrain(AbstractLaw):
@@ -80,6 +82,17 @@ def outward(terrain: AbstractTerrain, point: Float[Array, "d"]) -> Float[Array, 
 def pace_over(terrain: AbstractTerrain, point: Float[Array, "d"], velocity: Float[Array, "d"]) -> Float[Array, ""]:
     """The rate [1/s] at which a point passes over the details of the ground below."""
     return norm(velocity[:-1]) / terrain.detail(point[:-1])
+
+
+def edge_near(terrain: AbstractTerrain, points: Float[ArrayLike, "n d"]) -> str:
+    """A place near concrete points at which the ground has no finite height or slope, for messages; empty without."""
+    for place in np.asarray(points)[:, :-1]:
+        steps = _NEAR * (1 + np.max(np.abs(place), initial=0.0)) * np.eye(place.size, dtype=place.dtype)
+        for at in (place, *(place - steps), *(place + steps)):
+            if not np.all(np.isfinite(np.hstack(jax.value_and_grad(terrain.height)(jnp.asarray(at))))):
+                where = ", ".join(f"{x:.6g}" for x in place)
+                return f"the height of its {type(terrain).__name__} or the slope is not finite at {where}"
+    return ""
 
 
 def _upwards(point: Float[Array, "d"]) -> Float[np.ndarray, "d"]:

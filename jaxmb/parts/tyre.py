@@ -24,7 +24,7 @@ from .forces import over_ground
 from .magic_formula import Forces
 from .shapes import Ground, wheel
 from .smooth import dry_friction, ramp, step, without_pull
-from .terrain import AbstractTerrain, distance, outward, pace_over
+from .terrain import AbstractTerrain, distance, edge_near, outward, pace_over
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -70,6 +70,7 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
     # Numbers of one direction along the ground or of all.
     of_directions: ClassVar[tuple[str, ...]] = ("deflection",)
     moving: ClassVar[tuple[str, ...]] = ("terrain",)
+    has_limits: ClassVar[bool] = True
     has_gaps: ClassVar[bool] = True
     touches: ClassVar[bool] = True
 
@@ -106,6 +107,9 @@ class AbstractTyre(AbstractDynamicForce, AbstractPotentialForce):
         centre = space.point(poses[0], self.centre)
         passing = pace_over(self.terrain, centre, space.point_velocity(poses[0], velocities[0], self.centre))
         return jnp.maximum(super().gap_pace(space, poses, velocities, t), passing)
+
+    def limit_reached(self, space, poses):
+        return edge_near(self.terrain, space.point(poses[0], self.centre)[None])
 
     def shapes(self, space, size):
         # In the plane the axle points to the viewer.

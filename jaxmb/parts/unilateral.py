@@ -30,7 +30,7 @@ from .kinks import clipped
 from .modes import CLOSED, kind_of
 from .shapes import Box, Ground
 from .space import AbstractSpace, round_shapes, separation
-from .terrain import AbstractTerrain, distance
+from .terrain import AbstractTerrain, distance, edge_near
 
 
 class AbstractUnilateralConstraint(AbstractInertialConstraint):
@@ -339,6 +339,7 @@ class RigidContact(AbstractSurfaceContact):
     terrain: AbstractTerrain = fields.law(AbstractTerrain, what="a law from jaxmb.terrain")
     radius: fields.Number = fields.length(sign="non-negative", default=0.0)
     centre: fields.Number = fields.point(body=0, default="origin")
+    has_limits: ClassVar[bool] = True
 
     @property
     def ball(self):
@@ -355,6 +356,9 @@ class RigidContact(AbstractSurfaceContact):
 
     def over_ground(self, point, velocity):
         return over_ground(self, point, velocity)
+
+    def limit_reached(self, space, poses):
+        return edge_near(self.terrain, self._place(space, poses[:1])[None])
 
     def shapes(self, space, size):
         return (None, Ground(height=self.terrain.height)), *round_shapes(space, 0, self.radius, self.centre)

@@ -24,7 +24,7 @@ from .evaluation import (
     guards_of,
     refused,
 )
-from .events import Crossing, cond_of_jumps, crossing
+from .events import Crossing, cond_of_jumps, crossing, map_error
 from .gaps import Hidden, hidden
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
@@ -157,6 +157,10 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
             retry = jnp.inf if estimate is None else estimate.retry
             ends = first, y0, y1
             estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), ends, at, made_jump, retry)
+            # No step goes to where guards are not numbers, as beyond the edge of a terrain.
+            off = jnp.isnan(estimate.lowest)
+            failed = failed | off
+            estimate = map_error(lambda error: error if error is None else refuse(error, off), estimate)
         if gaps is not None:
             estimate = hidden(gaps, direction_of(terms), estimate, (t0, t1), y1, at)
         result: Any = diffrax.RESULTS.successful

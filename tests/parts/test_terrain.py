@@ -9,6 +9,7 @@ from laws import TERRAINS
 from oracles import tracked_vehicle as oracle
 
 import jaxmb as mb
+from jaxmb import planar
 from jaxmb.parts import terrain
 
 
@@ -98,3 +99,19 @@ def test_velocity_over_ground_that_rises():
     floor = floor.with_fields(drift=rates)
     over = jax.jit(lambda point, velocity: floor.over_ground(point, velocity))
     np.testing.assert_allclose(over(np.array([1.0, 0.2]), np.array([0.6, 0.9])), [0.6, 0.5], rtol=1e-14)
+
+
+@pytest.mark.slow("rolls on rigid ground", "flies over soft ground")
+@pytest.mark.parametrize("case", ["flies over rigid ground", "rolls on rigid ground", "flies over soft ground"])
+def test_motion_ends_where_terrain_does(case):
+    """It does not pass over ground that has no height, and the message says which."""
+    ground = terrain.Surface(lambda place, p: jnp.where(place[0] < 1.0, p["h"], jnp.nan), parameters={"h": 0.0})
+    disc = planar.Body("disc", mass=1.0, inertia=0.02, position=(0.0, 0.5 if "flies" in case else 0.2), velocity=(4, 0))
+    soft = planar.Contact("floor", "disc", terrain=ground, radius=0.2, normal=mb.contact.Linear(1e4))
+    rigid, down = mb.RigidContact("floor", "disc", terrain=ground, radius=0.2), mb.Gravity((0.0, -9.81))
+    joints, forces = ([], [down, soft]) if "soft" in case else ([rigid], [down])
+    system = mb.Scene([disc], joints=joints, forces=forces).compile()
+    with pytest.raises(
+        RuntimeError, match=r"came to t = 0.25 of 1.*Contact 'floor' .* its Surface .* not finite at 1\."
+    ):
+        mb.simulate(system, mb.assemble(system), t1=1.0)
