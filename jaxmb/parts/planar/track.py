@@ -114,11 +114,10 @@ class Track(AbstractPlanarPart, AbstractPotentialForce):
 
     def _measured(self, d):
         """From the lines of centres `d`: the length of the track, and the unit vectors of its straight parts."""
-        xp = namespace(d)
         if self.radii is None:
-            sizes = norm(d)
+            xp, sizes = namespace(d), norm(d)
             return xp.sum(sizes), d / xp.where(sizes > 0, sizes, 1.0)[:, None]
-        straight, along, turn = self._tangents(d)
+        xp, (straight, along, turn) = namespace(d, self.radii), self._tangents(d)
         return xp.sum(straight) + xp.dot(self.radii, turn), along
 
     def _tangents(self, d):

@@ -137,6 +137,10 @@ def car(times, *, height, speed, turn, p=CAR, g=9.81):
             load = p["stiffness"] * depth
             slope = height_of(hub[0])[1]
             n = np.array([-slope, 0.0, 1.0]) / np.sqrt(1 + slope**2)
+            # The forces of spring and damper along the normal: friction sees their sum, which never pulls.
+            spring = load / (1 + (0.5 * p["smoothing"] / depth) ** 2)
+            x = np.clip(depth / p["damping_depth"], 0.0, 1.0)
+            damping = max(-p["damping"] * x**3 * (10 + x * (6 * x - 15)) * (travel @ n), -spring)
             up = n - (n @ a) * a
             low = -R * up / np.linalg.norm(up)
             forwards = np.cross(a, n)
@@ -148,9 +152,9 @@ def car(times, *, height, speed, turn, p=CAR, g=9.81):
             rates[k] = -slip - rolling / np.array(p["relaxation"]) * d[k]
             s = np.array(p["slip_stiffness"]) * d[k] / (np.array(p["relaxation"]) * p["coefficient"])
             size = np.linalg.norm(s)
-            own = p["coefficient"] * load * (np.tanh(size) / size if size > 1e-6 else 1 - size**2 / 3) * s
-            x = np.clip(depth / p["damping_depth"], 0.0, 1.0)
-            own = own @ along - p["damping"] * x**3 * (10 + x * (6 * x - 15)) * (travel @ n) * n
+            limit = p["coefficient"] * (spring + damping)
+            own = limit * (np.tanh(size) / size if size > 1e-6 else 1 - size**2 / 3) * s
+            own = own @ along + damping * n
             elastic = -load * by_hub
             force = force + own + elastic
             # Moments about the hub in world axes: of the contact force, and of the load by the inclination of the axle.
