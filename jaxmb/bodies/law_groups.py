@@ -114,8 +114,8 @@ class AbstractLawGroup(AbstractConstraintGroup):
 
 
 class ContactGroup(AbstractLawGroup, ConstraintGroup):
-    """Kernels of stacked contacts. Contacts of a ball with a surface have their rows in closed form, others by
-    automatic differentiation of their gap.
+    """Kernels of stacked contacts. Contacts of a ball with a surface have their rows in closed form, stops of joints
+    that know their rates by these, others by automatic differentiation of their gap.
     """
 
     number: int = eqx.field(static=True, default=-1)
@@ -128,9 +128,17 @@ class ContactGroup(AbstractLawGroup, ConstraintGroup):
     @property
     def of_surfaces(self) -> bool:
         """Whether the rows have a closed form."""
-        group = self.group
-        plain = not group.inputs and not group.kernels and not group.part.body_frames
-        return plain and isinstance(group.part, AbstractSurfaceContact)
+        return self._plain and not self.group.part.body_frames and isinstance(self.group.part, AbstractSurfaceContact)
+
+    @property
+    def _of_rates(self) -> bool:
+        """Whether the rates of gaps are known."""
+        return self._plain and self.group.part.knows_gap_rate
+
+    @property
+    def _plain(self) -> bool:
+        """Whether the parts are constant, and none of their kernels is a user's."""
+        return not self.group.inputs and not self.group.kernels
 
     def _gap(self, at, t, x):
         part = at(t)
@@ -149,7 +157,12 @@ class ContactGroup(AbstractLawGroup, ConstraintGroup):
             value, pull = jax.vjp(lambda x: self._gap(at, t, x), x)
             return jax.vmap(space.pull_back)(x, *pull(jnp.ones_like(value)))[None], value[0], None
 
-        rows, *others = self._map(of_surface if self.of_surfaces else by_gap, poses)
+        def by_rate(at, x):
+            x, part = x[:-n], at(t)
+            _, pull = jax.vjp(lambda v: part.gap_rate(space, x, v), _at_rest(space, x))
+            return pull(jnp.ones((), x.dtype))[0][None], part.gap(space, x), None
+
+        rows, *others = self._map(of_surface if self.of_surfaces else by_rate if self._of_rates else by_gap, poses)
         return LawPlace(self._padded(rows), *others)
 
     def along(self, t, poses, moves):
@@ -183,8 +196,13 @@ class ContactGroup(AbstractLawGroup, ConstraintGroup):
             value, bias = jax.jvp(rate, (t, x, along[0]), (jnp.ones_like(t), *along))
             return LawMotion(value, bias, None)
 
+        def by_rate(at, x, v):
+            part, x, v = at(t), x[:-n], v[:-n]
+            rate, bias = jax.jvp(lambda x: part.gap_rate(space, x, v), (x,), (jax.vmap(space.rates)(x, v),))
+            return LawMotion(rate[None], bias[None], None)
+
         if touch is None:
-            return self._map(by_gap, now.poses, now.velocities)
+            return self._map(by_rate if self._of_rates else by_gap, now.poses, now.velocities)
         return self._map(of_surface, now.poses, now.velocities, per_part=(touch,))
 
 

@@ -372,6 +372,21 @@ class AbstractLink(AbstractActor):
         """The coordinates at these poses of the bodies."""
         return type(self).coordinates(self, space, self.seen_poses(space, poses))
 
+    def coordinate_rates(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> dict[str, Array]:
+        """Hook: the rates of `coordinates` of a joint with constant numbers on its constraints, linear in velocities;
+        otherwise they follow by automatic differentiation.
+        """
+        raise NotImplementedError(f"{self.kind} has no rates of coordinates in closed form.")
+
+    @property
+    def knows_rates(self) -> bool:
+        """Whether the rates of its coordinates have a closed form."""
+        return self.drift is None and type(self).declares("coordinate_rates", "coordinates")
+
+    def rates_at(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> dict[str, Array]:
+        """The rates of the coordinates at these poses and velocities of the bodies, of a joint that `knows_rates`."""
+        return type(self).coordinate_rates(self, space, *self.seen(space, poses, velocities))
+
     def resolve(self, space: AbstractSpace, poses: Poses) -> Self:
         """A checked copy with every number filled in; world points and axes become body-fixed at the given poses."""
         # Methods are called through the class: binding a method creates a module, too slow for thousands of parts.

@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
+from ..linalg.sums import unchecked_take
 from . import fields
 from .base import (
     AbstractForce,
@@ -83,6 +84,11 @@ class AbstractOfJoints(AbstractLink):
         return self.joints[str(k)].coordinates_at(
             space, poses if at == tuple(range(len(poses))) else poses[np.array(at)]
         )
+
+    def rates_of(self, k: int, space, poses, velocities) -> dict[str, Array]:
+        """The rates of the coordinates of a source that knows them."""
+        at = np.array(self.places[k])
+        return self.joints[str(k)].rates_at(space, unchecked_take(poses, at), unchecked_take(velocities, at))
 
     def given_coordinate(self, k: int, coordinate: str, space: Any, poses: Any) -> np.ndarray:
         """A coordinate of a source at the given poses.
@@ -169,7 +175,13 @@ class AbstractCoordinatePart(AbstractOfCoordinates):
 
     def measured_with_rate(self, space, poses, velocities) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """The coordinate and its rate, raveled."""
+        if self.drift is None and self.joint.knows_rates:
+            return self.measured(space, poses), self.rate(space, poses, velocities)
         return rate_of(space, self, lambda part, x: part.measured(space, x), poses, velocities)
+
+    def rate(self, space, poses, velocities) -> Float[Array, "n"]:
+        """The rate of the coordinate, raveled, of a joint that knows it."""
+        return self.rates_of(0, space, poses, velocities)[self.within[0]].reshape(-1)
 
     def force_along(self, space, poses, velocities, law) -> Wrenches:
         """Wrenches of a force along the coordinate, `law(value, rate)`, raveled."""

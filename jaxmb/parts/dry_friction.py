@@ -346,10 +346,12 @@ class DryFriction(AbstractDryFriction):
                 held = held.with_fields(drift=self.drift.joints["0"])
             bodies = len(held.bodies)
             return held.slip(space, *held.seen(space, poses[:bodies], velocities[:bodies]), self.pole)
-        return rate_of(space, self, lambda part, x: part._lengths(space, x), poses, velocities)[1]
+        if self.drift is None and held.knows_rates:
+            return self._lengths(held.rates_at(space, poses, velocities))
+        lengths = lambda part, x: part._lengths(part.joints["0"].coordinates_at(space, x))
+        return rate_of(space, self, lengths, poses, velocities)[1]
 
-    def _lengths(self, space, poses):
-        coordinates = self.joints["0"].coordinates_at(space, poses)
+    def _lengths(self, coordinates):
         return jnp.concatenate([self._length(name, coordinates[name].reshape(-1)) for name in self.within])
 
     def _length(self, name, value):

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from ..linalg.rotations import norm, normalize
@@ -81,6 +82,15 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
         """
 
     @property
+    def knows_gap_rate(self) -> bool:
+        """Hook: whether `gap_rate` is the rate of the gap."""
+        return False
+
+    def gap_rate(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> Float[Array, ""]:
+        """Hook: the rate of the gap of bodies on their other constraints, linear in velocities."""
+        raise NotImplementedError(f"{self.kind} has no rate of its gap in closed form.")
+
+    @property
     def peak(self) -> Float[Array, "..."]:
         """The largest value of a gap that rises to a kink and falls again, as between two stops; by default infinite,
         without a kink.
@@ -146,9 +156,23 @@ class Stop(AbstractScalarPart, AbstractUnilateralConstraint):
         (value,) = self.measured(space, poses)
         if self.lower is None or self.upper is None:
             return value - self.lower if self.upper is None else self.upper - value
-        middle = 0.5 * (self.lower + self.upper)
         # The nearer of the two stops.
-        return self.peak - jnp.abs(self.near(value[None], middle)[0] - middle)
+        return self.peak - jnp.abs(self._from_middle(value))
+
+    def _from_middle(self, value):
+        middle = 0.5 * (self.lower + self.upper)
+        return self.near(value[None], middle)[0] - middle
+
+    @property
+    def knows_gap_rate(self):
+        return self.joint.knows_rates
+
+    def gap_rate(self, space, poses, velocities):
+        (rate,) = self.rate(space, poses, velocities)
+        if self.lower is None or self.upper is None:
+            return rate if self.upper is None else -rate
+        (value,) = self.measured(space, lax.stop_gradient(poses))
+        return -jnp.sign(self._from_middle(value)) * rate
 
 
 class AbstractGeometricContact(AbstractUnilateralConstraint):

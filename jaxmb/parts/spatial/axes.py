@@ -97,6 +97,20 @@ def displacement_along(space, part, poses: Float[Array, "k p"]) -> Float[Array, 
     return rot.dot(part.axis_a, offset_in_a(space, part, poses))
 
 
+def offset_rate_in_a(space, part, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]) -> Vector3:
+    """The rate of the components in A of `d` [m/s]."""
+    held = space.body_point(poses[0], space.point(poses[1], part.point_b))
+    ends = zip(poses, velocities, (held, part.point_b), strict=False)
+    back, ahead = (space.point_velocity(pose, velocity, point) for pose, velocity, point in ends)
+    return space.body_direction(poses[0], ahead - back)
+
+
+def turning_rate(space, part, poses: Float[Array, "k p"], velocities: Float[Array, "k v"]) -> Float[Array, ""]:
+    """The rate [rad/s] of the `angle` of bodies whose axes are parallel."""
+    turning = direction_in_a(space, poses, velocities[1, 3:]) - velocities[0, 3:]
+    return rot.dot(part.axis_a, turning)
+
+
 def relative_orientation(poses: Float[Array, "k p"]) -> Float[Array, "4"]:
     """Euler parameters of B relative to A."""
     return rot.multiply(rot.conjugate(poses[0, 3:7]), poses[1, 3:7])

@@ -31,12 +31,14 @@ from .axes import (
     joints_through_b,
     measured_from_given_poses,
     offset_in_a,
+    offset_rate_in_a,
     parallel,
     perpendiculars,
     relative_orientation,
     rotation_error,
     rotation_vector,
     turn_about,
+    turning_rate,
     with_given_orientation,
 )
 
@@ -142,6 +144,9 @@ class Revolute(AbstractAxial):
 
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses)}
+
+    def coordinate_rates(self, space, poses, velocities):
+        return {"angle": turning_rate(space, self, poses, velocities)}
 
     def elementary_joints(self, space, poses):
         return joints_through_b(space, self, poses, angle=space.direction(poses[0], self.axis_a))
@@ -296,6 +301,10 @@ class AbstractSliding(AbstractAxial):
     def coordinates(self, space, poses):
         return {"angle": angle(space, self, poses), "displacement": displacement_along(space, self, poses)}
 
+    def _rates(self, space, poses, velocities):
+        shifting = dot(self.axis_a, offset_rate_in_a(space, self, poses, velocities))
+        return {"angle": turning_rate(space, self, poses, velocities), "displacement": shifting}
+
     def pictured(self, space):
         return self.with_fields(point_b=nearest_to_origin(self.point_b, self.axis_b))
 
@@ -328,6 +337,9 @@ class Cylindrical(AbstractSliding):
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
         return jnp.concatenate([_parallel(space, self, poses), across(self.axis_a, shift)])
+
+    def coordinate_rates(self, space, poses, velocities):
+        return self._rates(space, poses, velocities)
 
     def elementary_joints(self, space, poses):
         axis = space.direction(poses[0], self.axis_a)
@@ -382,6 +394,9 @@ class Screw(AbstractSliding):
         near = (out["displacement"] - self.offset) * (2 * np.pi) / self.pitch
         return out | {"angle": out["angle"] + turns(near - out["angle"])}
 
+    def coordinate_rates(self, space, poses, velocities):
+        return self._rates(space, poses, velocities)
+
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)
         lead = self.pitch / (2 * np.pi)
@@ -424,6 +439,9 @@ class Prismatic(AbstractOriented, AbstractAxisJoint):
     def coordinates(self, space, poses):
         return {"displacement": displacement_along(space, self, poses)}
 
+    def coordinate_rates(self, space, poses, velocities):
+        return {"displacement": dot(self.axis_a, offset_rate_in_a(space, self, poses, velocities))}
+
     def elementary_joints(self, space, poses):
         return joints_through_b(space, self, poses, displacement=space.direction(poses[0], self.axis_a))
 
@@ -465,6 +483,11 @@ class Planar(AbstractAxial):
         shift, y_a = offset_in_a(space, self, poses), cross(self.axis_a, self.x_a)
         displacement = jnp.stack([dot(self.x_a, shift), dot(y_a, shift)])
         return {"displacement": displacement, "angle": angle(space, self, poses)}
+
+    def coordinate_rates(self, space, poses, velocities):
+        shifting, y_a = offset_rate_in_a(space, self, poses, velocities), cross(self.axis_a, self.x_a)
+        displacement = jnp.stack([dot(self.x_a, shifting), dot(y_a, shifting)])
+        return {"displacement": displacement, "angle": turning_rate(space, self, poses, velocities)}
 
     def elementary_joints(self, space, poses):
         ways = {"x": self.x_a, "y": cross(self.axis_a, self.x_a)}
