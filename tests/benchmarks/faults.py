@@ -293,10 +293,11 @@ FAULTS = [
         "return jnp.stack([forwards, cross(forwards, normal_W)])",
     ),
     Fault("parts/unilateral.py", "jnp.dot(d, d)) / (2 * self.length)", "jnp.dot(d, d)) / self.length"),
+    Fault("parts/unilateral.py", "return self.near(value[None], middle)[0] - middle", "return value - middle"),
     Fault(
         "parts/unilateral.py",
-        "return self.peak - jnp.abs(self.near(value[None], middle)[0] - middle)",
-        "return self.peak - jnp.abs(value - middle)",
+        "return -jnp.sign(self._from_middle(value)) * rate",
+        "return jnp.sign(self._from_middle(value)) * rate",
     ),
     Fault(
         "parts/unilateral.py",
@@ -330,6 +331,7 @@ FAULTS = [
         "return axes - ((axes @ normal) / (1 + upwards @ normal))",
         "return axes - ((axes @ normal) / (2 + upwards @ normal))",
     ),
+    Fault("parts/terrain.py", "(place, *(place - steps), *(place + steps))", "(place,)"),
     # Parts of the plane
     Fault("parts/planar/bodies.py", "return mass * radius**2 / 2", "return mass * radius**2 / 4"),
     Fault(
@@ -413,6 +415,16 @@ FAULTS = [
     ),
     Fault(
         "parts/spatial/axes.py", "2 * jax.numpy.arctan2(sine, cosine) / sine", "jax.numpy.arctan2(sine, cosine) / sine"
+    ),
+    Fault(
+        "parts/spatial/axes.py",
+        "turning = direction_in_a(space, poses, velocities[1, 3:]) - velocities[0, 3:]",
+        "turning = direction_in_a(space, poses, velocities[1, 3:]) + velocities[0, 3:]",
+    ),
+    Fault(
+        "parts/spatial/axes.py",
+        "held = space.body_point(poses[0], space.point(poses[1], part.point_b))",
+        "held = part.point_a",
     ),
     Fault("parts/spatial/axes.py", "x - (end @ x) / half * (start + end)", "x - (end @ x) / half * end"),
     Fault("parts/spatial/bodies.py", "(3 * radius**2 + length**2) / 12", "(radius**2 + length**2) / 12"),
@@ -839,6 +851,7 @@ FAULTS = [
     Fault("solvers/hermite.py", "used.size), dtype) @ (1 / (formula.end", "used.size), dtype) @ (2 / (formula.end"),
     Fault("solvers/mesh.py", "lw = lw + table[0]", "lw = lw"),
     Fault("solvers/mesh.py", "jnp.where(is_last, c, 0)", "jnp.where(is_last, 0, c)"),
+    Fault("solvers/multistep.py", "off = jnp.isnan(estimate.lowest)", "off = jnp.array(False)"),
     Fault("solvers/stability.py", "polynomial = a - mu * b - mu**2 * c", "polynomial = a - mu * b + mu**2 * c"),
     # Motions
     Fault(

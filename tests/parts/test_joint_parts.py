@@ -157,6 +157,27 @@ REFUSED = {
         lambda: pendulums(joints=[mb.Tendon("cord", MEET)]),
         r"'cord': the neighbours path\[1\] and path\[2\] coincide at the given poses",
     ),
+    "a stop without ends": (lambda: pendulums(joints=[mb.Stop("s", "hip.angle")]), "give lower, upper or both"),
+    "a stop without range": (
+        lambda: pendulums(joints=[mb.Stop("s", "hip.angle", lower=1.0, upper=-1.0)]),
+        "lower must be less than upper, got 1.0 and -1.0",
+    ),
+    "a stop that gives more back": (
+        lambda: pendulums(joints=[mb.Stop("s", "hip.angle", lower=0.0, restitution=1.5)]),
+        "restitution must lie between 0 and 1, got 1.5",
+    ),
+    "a stop that draws": (
+        lambda: pendulums(joints=[mb.Stop("s", "hip.angle", lower=0.0, restitution=-0.5)]),
+        "restitution must be non-negative",
+    ),
+    "one stop of an angle in space": (
+        lambda: hinged(joints=[mb.Stop("s", "hip.angle", lower=-1.0)]),
+        "an angle in space is known up to full turns; give lower and upper of its range",
+    ),
+    "stops of more than a turn in space": (
+        lambda: hinged(joints=[mb.Stop("s", "hip.angle", lower=-4.0, upper=4.0)]),
+        "must be less than a full turn, got -4.0 to 4.0",
+    ),
     "a weld": (
         lambda: mb.Scene([ROD], joints=[WELD], forces=[mb.JointForce("f", "weld.angle", force=1.0)]).compile(),
         "Fixed 'weld' has no coordinate",

@@ -756,20 +756,6 @@ def test_ball_starts_and_ends_in_all_ways():
     assert len(motion.events) == 0 and motion.stats["num_events"] == 0
 
 
-BAD_STOPS = [
-    ({"lower": None, "upper": None}, "give lower, upper or both"),
-    ({"upper": -1.0}, "lower must be less than upper"),
-    ({"restitution": 1.5}, "restitution must lie between 0 and 1, got 1.5"),
-    ({"restitution": -0.5}, "restitution must be non-negative"),
-]
-
-
-def test_stops_that_make_no_sense_are_refused():
-    for wrong, message in BAD_STOPS:
-        with pytest.raises(ValueError, match=message):
-            ball(**({"restitution": 0.5} | wrong))
-
-
 @pytest.mark.slow
 def test_motions_with_contacts_that_cannot_be_are_refused():
     state = mb.assemble(BALL)
