@@ -740,6 +740,7 @@ FAULTS = [
         "manifold/constraints.py", "laws.remembered(at, multipliers)) + at.constraint", "multipliers) + at.constraint"
     ),
     Fault("manifold/constraints.py", "return along.with_(u=along.u + here", "return along.with_(u=along.u - here"),
+    Fault("manifold/constraints.py", "along = along.with_(u=along.u + here", "along = along.with_(u=along.u - here"),
     Fault(
         "manifold/implied.py",
         "bound = jnp.where(rows.independent > eps**_IMPLIED, displaced, allowed)",

@@ -15,9 +15,10 @@ from jaxmb.manifold import Partition, Projection
 from jaxmb.solvers import Hermite
 from jaxmb.solvers.manifold_term import AbstractManifoldTerm
 
-pytestmark = pytest.mark.slow
+MOST_PROGRAMS = 110
 
 
+@pytest.mark.slow("projection")
 @pytest.mark.parametrize(
     "manifold, formulation", [(Partition(), Partitioned()), (Projection(), Multipliers())], ids=["chart", "projection"]
 )
