@@ -191,6 +191,8 @@ LONG = (
 )
 
 
+# One process alone has computed by ways of its own before the example of `setup`.
+@pytest.mark.filterwarnings("ignore:JAX has computed something already")
 @pytest.mark.slow(*LONG)
 @pytest.mark.parametrize("name", TOGETHER)
 def test_examples(name, names, request, tmp_path, monkeypatch):
