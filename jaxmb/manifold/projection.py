@@ -19,7 +19,7 @@ from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractMultistep, AbstractMultistepState
-from ..solvers.events import cond_of_jumps, crossing
+from ..solvers.events import cond_of_jumps, crossing, map_error
 from ..solvers.manifold_term import ManifoldEvaluation
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
@@ -275,4 +275,8 @@ class ProjectedSolver(WrappedSolver):
         if self.guards is not None:
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate
             error = crossing(self.guards, direction, error, (first, last), (before, y0, y1), at, made_jump)
+            # No step goes to where guards are not numbers, as beyond the edge of a terrain.
+            off = jnp.isnan(error.lowest)
+            error = map_error(lambda of_step: jax.tree.map(lambda x: jnp.where(off, jnp.inf, x), of_step), error)
+            result = diffrax.RESULTS.where(off, NOT_PROJECTED, result)
         return y1, error, dense_info, solver_state, result

@@ -1,5 +1,6 @@
 """Heights and slopes of terrain."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -101,8 +102,11 @@ def test_velocity_over_ground_that_rises():
     np.testing.assert_allclose(over(np.array([1.0, 0.2]), np.array([0.6, 0.9])), [0.6, 0.5], rtol=1e-14)
 
 
-@pytest.mark.slow("rolls on rigid ground", "flies over soft ground")
-@pytest.mark.parametrize("case", ["flies over rigid ground", "rolls on rigid ground", "flies over soft ground"])
+@pytest.mark.slow(but=("flies over rigid ground",))
+@pytest.mark.parametrize(
+    "case",
+    ["flies over rigid ground", "flies over rigid ground by Dopri8", "rolls on rigid ground", "flies over soft ground"],
+)
 def test_motion_ends_where_terrain_does(case):
     """It does not pass over ground that has no height, and the message says which."""
     ground = terrain.Surface(lambda place, p: jnp.where(place[0] < 1.0, p["h"], jnp.nan), parameters={"h": 0.0})
@@ -114,4 +118,4 @@ def test_motion_ends_where_terrain_does(case):
     with pytest.raises(
         RuntimeError, match=r"came to t = 0.25 of 1.*Contact 'floor' .* its Surface .* not finite at 1\."
     ):
-        mb.simulate(system, mb.assemble(system), t1=1.0)
+        mb.simulate(system, mb.assemble(system), t1=1.0, solver=diffrax.Dopri8() if "Dopri8" in case else None)

@@ -756,6 +756,12 @@ def test_ball_starts_and_ends_in_all_ways():
     assert len(motion.events) == 0 and motion.stats["num_events"] == 0
 
 
+def test_given_steps_with_contacts_are_refused():
+    steps = {"solver": diffrax.Dopri8(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01}
+    with pytest.raises(ValueError, match="With contacts .* end at events, which ConstantStepSize does not allow"):
+        mb.simulate(BALL, BALL.guess, t1=0.1, **steps)
+
+
 @pytest.mark.slow
 def test_motions_with_contacts_that_cannot_be_are_refused():
     state = mb.assemble(BALL)
