@@ -44,10 +44,8 @@ def check_kinds(*given: Any) -> None:
             check_kind(name, value, kind, f"an object such as {example}", "leave it out for the default")
 
 
-def check_fixed_steps(solver: Any, stepsize_controller: Any, contacts: bool) -> None:
-    """Refuse steps without error estimates for a method that chooses its order by tolerances, unless it has its own, and
-    with contacts.
-    """
+def check_fixed_steps(solver: Any, stepsize_controller: Any) -> None:
+    """Refuse steps without error estimates for a method that chooses its order by tolerances, unless it has its own."""
     estimates = stepsize_controller is None or isinstance(
         stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
     )
@@ -57,11 +55,6 @@ def check_fixed_steps(solver: Any, stepsize_controller: Any, contacts: bool) -> 
             f"{method} chooses its order by tolerances, which {steps} does not have: give them to the solver, as in "
             f"solver=jaxmb.solvers.{method}(rtol=1e-8, atol=1e-10), or take a method of one order, as diffrax.Tsit5(). "
             "To bound steps only, use simulate(..., dtmax=0.01)."
-        )
-    if not estimates and contacts:
-        raise ValueError(
-            f"With contacts or dry friction steps end at events, which {type(stepsize_controller).__name__} does not "
-            "allow: leave out stepsize_controller, and bound steps by simulate(..., dtmax=0.01)."
         )
 
 

@@ -256,7 +256,7 @@ def _method(asked, rtol, atol):
     solver, controller = asked.solver, asked.stepsize_controller
     solver = named_solver(solver) if isinstance(solver, str) else _ADAMS if solver is None else solver
     check_kinds(solver, asked.formulation, asked.manifold, controller, asked.adjoint, asked.event, asked.progress_meter)
-    check_fixed_steps(solver, controller, bool(asked.system.contacts))
+    check_fixed_steps(solver, controller)
     dtmax = checked_longest_step(asked.dtmax, controller, solver, asked.state.q.dtype)
     tolerances = {"controller": controller, "rtol": rtol, "atol": atol, "dtmax": dtmax}
     return Method.chosen(asked.system, solver, asked.manifold, asked.formulation, **tolerances)

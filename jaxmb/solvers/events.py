@@ -446,6 +446,11 @@ class EventController(AbstractControllerAround):
     most: int = eqx.field(static=True)
 
     def __init__(self, controller: Any, most: int):
+        if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+            raise ValueError(
+                f"With contacts or dry friction steps end at events, which {type(controller).__name__} does not allow: "
+                "leave out stepsize_controller, and bound steps by simulate(..., dtmax=0.01)."
+            )
         self.controller = controller
         self.most = most
 

@@ -758,7 +758,7 @@ def test_ball_starts_and_ends_in_all_ways():
 
 def test_given_steps_with_contacts_are_refused():
     steps = {"solver": diffrax.Dopri8(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01}
-    with pytest.raises(ValueError, match="With contacts .* end at events, which ConstantStepSize does not allow"):
+    with pytest.raises(ValueError, match=r"With contacts .* end at events, which ConstantStepSize does not allow"):
         mb.simulate(BALL, BALL.guess, t1=0.1, **steps)
 
 
