@@ -4,7 +4,6 @@ Each stands here once, with its purpose and the versions where it was found. `te
 of them, and says what is missing when an update removes it.
 """
 
-import dataclasses
 import functools
 import importlib.util
 import mmap
@@ -23,8 +22,6 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 import numpy as np
-from diffrax._integrate import SaveState
-from diffrax._term import AdjointTerm, WrapTerm
 from jax import lax
 from jax._src import compilation_cache, xla_bridge
 from jax._src.compilation_cache_interface import CacheInterface
@@ -442,31 +439,6 @@ def changed(module: T, **values: Any) -> T:
 # diffrax
 
 
-def unwrapped(term: Any) -> Any:
-    """The user's term, which diffrax wraps so that time increases, and once more in `BacksolveAdjoint`.
-
-    (diffrax._term.WrapTerm and AdjointTerm, 0.7.)
-    """
-    while isinstance(term, (WrapTerm, AdjointTerm)):
-        term = term.term
-    return term
-
-
-def inner_term(term: Any) -> Any:
-    """The term inside the wrapper that makes time increase. (WrapTerm.term, 0.7.)"""
-    return term.term
-
-
-def direction_of(term: Any) -> Any:
-    """The sign of the user's time in the solver's time; 1 for an unwrapped term. (WrapTerm.direction, 0.7.)"""
-    return term.direction if isinstance(term, WrapTerm) else 1
-
-
-def with_inner(terms: Any, inner: Any, direction: Any) -> Any:
-    """Wrapped terms with another inner term and another direction."""
-    return eqx.tree_at(lambda terms: (terms.term, terms.direction), terms, (inner, direction))
-
-
 def from_controller(tolerances: Callable[..., T]) -> T:
     """Tolerances with `rtol`, `atol` and `norm` that diffrax fills in from the step size controller.
 
@@ -477,75 +449,15 @@ def from_controller(tolerances: Callable[..., T]) -> T:
     return diffrax.with_stepsize_controller_tols(tolerances)()  # pyright: ignore[reportArgumentType]
 
 
-class WrappedSolver(diffrax.AbstractWrappedSolver):
-    """A diffrax solver inside another one, to which diffrax's settings are passed on.
+def with_loops(solver: Any, kind: str) -> Any:
+    """A solver whose Runge–Kutta methods, also inside others, loop over their stages by a `kind` of loop.
 
-    diffrax's adjoints set `scan_kind` of solvers that are, or wrap, Runge–Kutta methods: the kind of loop over stages.
-    Without it the solver is not differentiable in forward mode or by `DirectAdjoint`. (0.7.)
+    (AbstractRungeKutta.scan_kind, 0.7.)
     """
-
-    solver: diffrax.AbstractSolver
-    scan_kind: Any = eqx.field(default=None, kw_only=True)
-
-    @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore
-        return self.solver.interpolation_cls
-
-    # For implicit solvers: the place where diffrax fills in their tolerances.
-    @property
-    def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self) -> int:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
-
-    def func(self, terms, t0, y0, args):
-        return self.solver.func(terms, t0, y0, args)
-
-    @property
-    def inner(self) -> Any:
-        """The solver, with the loops chosen by the adjoint."""
-        return self.with_own_loops(self.solver)
-
-    def with_own_loops(self, solver: Any) -> Any:
-        """Another solver with these loops."""
-        return with_loops(solver, self.scan_kind)
-
-
-def with_loops(solver: Any, kind: Any) -> Any:
-    """A solver with loops of a kind over its stages, if it has any."""
-    if kind is None or not hasattr(solver, "scan_kind"):
-        return solver
-    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
-
-
-def save_states(state: Any) -> list[Any]:
-    """The parts of a state of diffrax's loop for each series of saved states: `ts`, `ys` and counts.
-
-    (diffrax._integrate.SaveState, 0.7; the loop's state has the fields `y`, `tprev`, `tnext`, `made_jump`,
-    `solver_state`, `num_accepted_steps`, `dense_infos` and `event_dense_info`.)
-    """
-    is_one = lambda x: isinstance(x, SaveState)
-    return [x for x in jax.tree.leaves(state.save_state, is_leaf=is_one) if is_one(x)]
-
-
-def with_save_states(state: Any, change: Callable[[Any], Any]) -> Any:
-    """A state of diffrax's loop with a change of each of its `save_states`."""
-    is_one = lambda x: isinstance(x, SaveState)
-    changed_one = lambda x: change(x) if is_one(x) else x
-    save_state = jax.tree.map(changed_one, state.save_state, is_leaf=is_one)
-    return dataclasses.replace(state, save_state=save_state)
+    # diffrax counts a solver around a Runge–Kutta method as one of them.
+    is_one = lambda x: diffrax.AbstractRungeKutta in type(x).__mro__
+    change = lambda x: eqx.tree_at(lambda s: s.scan_kind, x, kind, is_leaf=lambda x: x is None) if is_one(x) else x
+    return jax.tree.map(change, solver, is_leaf=is_one)
 
 
 def steps_of(interpolation: diffrax.DenseInterpolation) -> tuple[Array, Array]:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._compat import WrappedSolver, direction_of, inner_term
 from ..contacts.guards import ContactGuards, contact_guards
 from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation
@@ -19,8 +18,10 @@ from ..formulations.multipliers import FactoredMultipliers
 from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractMultistep, AbstractMultistepState
+from ..solvers.directed import direction_of, inner_term
 from ..solvers.events import cond_of_jumps, crossing, map_error
 from ..solvers.manifold_term import ManifoldEvaluation
+from ..solvers.wrapped import AbstractSolverAround
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .constraints import SolvedState, restore
@@ -237,7 +238,7 @@ class NormalisedTerm(AbstractProjectionTerm):
         return None
 
 
-class ProjectedSolver(WrappedSolver):
+class ProjectedSolver(AbstractSolverAround):
     """A Runge–Kutta solver whose steps end with a projection on the constraints of the term's system, or at events of
     contacts.
 
@@ -248,9 +249,6 @@ class ProjectedSolver(WrappedSolver):
     guards: ContactGuards | None
     rtol: Float[Array, ""] | None = None
 
-    def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
-
     # A nested program, so that the step is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -260,7 +258,7 @@ class ProjectedSolver(WrappedSolver):
             after = lambda y: after_jump(system, self.guards, t0 * direction, y)
             y0 = cond_of_jumps(self.guards)(made_jump, after, lambda y: y, y0)
         first, last = t0, t1
-        y1, error, dense_info, solver_state, result = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1, error, dense_info, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         t1 = t1 * direction
         y1, failed = projected(system, t1, y1)
         # A step without a projected end has an infinite error. If no error estimate shortens it, the run ends there.

@@ -27,7 +27,6 @@ _KINDS: dict[str, tuple[type, str]] = {
     "formulation": (AbstractFormulation, "jaxmb.formulations.Multipliers()"),
     "manifold": (AbstractManifold, "jaxmb.manifold.Partition()"),
     "stepsize_controller": (diffrax.AbstractStepSizeController, "jaxmb.solvers.MultistepController(rtol, atol)"),
-    "adjoint": (diffrax.AbstractAdjoint, "diffrax.ForwardMode()"),
     "event": (diffrax.Event, "diffrax.Event(function)"),
     "progress_meter": (diffrax.AbstractProgressMeter, "diffrax.TqdmProgressMeter()"),
 }

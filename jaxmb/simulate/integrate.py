@@ -1,20 +1,19 @@
-"""The integration of a motion by diffrax's protocol, on a mesh that also resolves derivatives if there are any."""
+"""The integration of a motion, on a mesh that also resolves derivatives if there are any."""
 
 import dataclasses
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 from jax import lax
 
 from ..lanes.members import of_one_or_more
 from ..manifold.orthogonal_projection import project
-from ..solvers import MeshAdjoint
+from ..solvers.mesh import on_mesh
 from ..solvers.one_step import with_tangents
+from ..solvers.stepping import begun, loop, solution_of
 from ..solvers.tangent import TangentControl
-from .loop import Loop
-from .room import Room, kept_steps
+from .room import Room
 from .saves import STATES, seen
 from .watch import pushed
 
@@ -26,9 +25,9 @@ def integrated(
     projects_steps: bool,
     differentiated: bool,
 ) -> Any:
-    """The solution of `diffrax.diffeqsolve`, with derivatives.
+    """The `diffrax.Solution`, with derivatives.
 
-    **Arguments:** `integration`: term, solver and options of `diffeqsolve`; `control` of tangents, None for none;
+    **Arguments:** `integration`: term, solver and options of `begun`; `control` of tangents, None for none;
     `projects_steps`: whether states return to constraints after steps; `differentiated`: whether derivatives are known
     to be taken.
     """
@@ -67,22 +66,22 @@ def _with_tangents(integration, control, room, projects_steps):
             control = control.on_constraints(restore, *lax.stop_gradient((term, options["y0"])))
         solver, controller, without_tangents = with_tangents(solver, options["stepsize_controller"], control)
         options = options | {"stepsize_controller": controller}
-    derivatives = MeshAdjoint(kept_steps(options["y0"]), "made_jump" in options)
-    solution = _solution(term, solver, options, room, derivatives)
+    solution = _solution(term, solver, options, room, room.kept)
     return eqx.tree_at(lambda s: s.solver_state, solution, replace_fn=without_tangents)
 
 
-def _solution(term, solver, options, room, derivatives):
-    """The solution; with `derivatives`, the user's function is applied after states are saved."""
-    adjoint, saveat = room.adjoint, options["saveat"]
-    function = saveat.subs[0].fn
-    if function is not STATES and derivatives is not None:
-        saveat = eqx.tree_at(lambda saveat: saveat.subs[0].fn, saveat, STATES)
-    if adjoint is None:
-        adjoint, saveat = Loop.around(saveat, room.limit, derivatives)
-    options = options | {"adjoint": adjoint, "saveat": saveat, "max_steps": room.rows}
-    solution: Any = diffrax.diffeqsolve(term, solver, throw=False, **options)
-    if function is STATES or derivatives is None:
+def _solution(term, solver, options, room, kept):
+    """The solution. With derivatives, rows of this many steps are `kept`, and the user's function is applied after
+    states are saved.
+    """
+    function = options["saveat"].subs[0].fn
+    later = function is not STATES and kept is not None
+    if later:
+        options = options | {"saveat": eqx.tree_at(lambda saveat: saveat.subs[0].fn, options["saveat"], STATES)}
+    solve, first = begun(term, solver, max_steps=room.rows, **options)
+    last = loop(solve, first, room.limit) if kept is None else on_mesh(solve, first, room.limit, kept)
+    solution: Any = solution_of(solve, last, first.y)
+    if not later:
         return solution
     ys = seen(function, solution.ts[0], solution.ys[0], (options["t0"], options["y0"]))
     return eqx.tree_at(lambda solution: solution.ys[0], solution, ys)

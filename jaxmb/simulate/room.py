@@ -16,6 +16,8 @@ _MEMORY, _FEWEST_STEPS = 2**24, 1024
 _MORE = 8
 # Derivatives keep the rows of this many steps, or of fewer if they do not fit in this many bytes.
 MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
+# Second derivatives keep the rows of all steps, if `max_steps` is at most this.
+_MOST_OF_SECOND = 2**14
 # The structures of systems and solvers with long motions in this process, with or without derivatives. Long motions
 # take at least as many steps as derivatives keep at once; the next derivative outside of `jit` then does not try the
 # smaller program first.
@@ -26,13 +28,13 @@ _long: collections.deque[Any] = collections.deque(maxlen=16)
 class Room(NamedTuple):
     """Buffers for steps.
 
-    **Fields:** `rows`: the number of steps that fit; `limit`: the largest number of steps; the user's `adjoint`, None
-    for derivatives on the mesh.
+    **Fields:** `rows`: the number of steps that fit; `limit`: the largest number of steps; `kept`: the
+    number of steps whose rows derivatives keep at once.
     """
 
     rows: int
     limit: Any
-    adjoint: diffrax.AbstractAdjoint | None
+    kept: int
 
     def of(self, rows: int, max_steps: int) -> "Room":
         return self._replace(rows=rows, limit=np.asarray(min(max_steps, rows)))
@@ -66,8 +68,10 @@ def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool
     return [*rooms[:-1], max_steps]
 
 
-def kept_steps(state: State) -> int:
-    """The number of steps whose rows derivatives keep at once."""
+def kept_steps(state: State, max_steps: int = _MOST_OF_SECOND + 1) -> int:
+    """The number of steps whose rows derivatives keep at once, for second derivatives of at most `max_steps` steps."""
+    if max_steps <= _MOST_OF_SECOND:
+        return _MOST_OF_SECOND
     size = 2 * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
     return max(min(MOST_ROWS, _ROW_BYTES // max(size, 1)), _FEWEST_ROWS)
 

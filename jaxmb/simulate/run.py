@@ -46,7 +46,7 @@ from .outcome import (
     warn_of_stiffness,
     warn_of_wrong_derivative,
 )
-from .room import Room, note_long, rooms_for, was_long
+from .room import Room, kept_steps, note_long, rooms_for, was_long
 from .saves import STATES, checked_saveat, padded, with_end
 from .solve import Problem, made_precise, solved
 from .span import Span
@@ -77,7 +77,6 @@ class Asked(NamedTuple):
     atol: Any
     dtmax: Any
     stepsize_controller: Any
-    adjoint: Any
     inputs: Any
     jumps: Any
     event: Any
@@ -139,7 +138,7 @@ class Run:
         watched = Watch(parameter_changes(system, asked.direction), ())
         meter = _NO_METER if asked.progress_meter is None else asked.progress_meter
         interpolated = asked.event is not None or first.ts is not None
-        room = Room(asked.max_steps, None, asked.adjoint)
+        room = Room(asked.max_steps, None, 0)
         angles = _counted_at_start(asked, first.fn)
         state = State(state.q, state.u, state.z)
         problem = Problem(
@@ -221,7 +220,7 @@ class Run:
         if problem.method.policy.restores:
             # The user's choice for another method need not suit the method that tests for stiffness.
             end = end._replace(formulation=None, manifold=None)
-        on = end._replace(**_ALONE, saveat=None, dt0=None, stepsize_controller=None, adjoint=None)
+        on = end._replace(**_ALONE, saveat=None, dt0=None, stepsize_controller=None)
         return lambda solver, steps: _motion(on._replace(solver=solver, max_steps=steps))
 
     def _closer(self, problem):
@@ -255,7 +254,7 @@ def _method(asked, rtol, atol):
     check_steps(asked.max_events, "max_events")
     solver, controller = asked.solver, asked.stepsize_controller
     solver = named_solver(solver) if isinstance(solver, str) else _ADAMS if solver is None else solver
-    check_kinds(solver, asked.formulation, asked.manifold, controller, asked.adjoint, asked.event, asked.progress_meter)
+    check_kinds(solver, asked.formulation, asked.manifold, controller, asked.event, asked.progress_meter)
     check_fixed_steps(solver, controller)
     dtmax = checked_longest_step(asked.dtmax, controller, solver, asked.state.q.dtype)
     tolerances = {"controller": controller, "rtol": rtol, "atol": atol, "dtmax": dtmax}
@@ -264,10 +263,10 @@ def _method(asked, rtol, atol):
 
 def _counted_at_start(asked, seen):
     """The angles that a run counts, at its start, to within half a turn; None if it counts none. A function of saved
-    states does not see them, and diffrax's own loop does not count.
+    states does not see them.
     """
     count = len(asked.system.wrapped_angle_names())
-    if count == 0 or seen is not STATES or asked.adjoint is not None:
+    if count == 0 or seen is not STATES:
         return None
     return np.zeros(count, asked.state.q.dtype) if asked.state.angles is None else asked.state.angles
 
@@ -283,7 +282,7 @@ def _settled(problem, asked):
         )
     turns = turns_of(system, state, span.t0, span.t1, problem.method.controller)
     saves = problem.saveat
-    if not traced and asked.adjoint is None:
+    if not traced:
         saves = padded(saves, span.t0, span.t1)
     taken = derivatives_of(problem) if traced else None
     orders = () if taken is None else taken.orders[: len(jax.tree.leaves((system, state)))]
@@ -292,16 +291,17 @@ def _settled(problem, asked):
     # With concrete values, the number of steps and failures are known afterwards.
     known = not traced or (taken is not None and taken.known)
     tries = traced and known and not was_long(system, problem.method.solver)
-    rooms = [asked.max_steps]
-    if asked.adjoint is None:
-        rooms = rooms_for(asked.max_steps, problem.saveat, state, traced, tries)
+    # Derivatives of a program under `jit` may be of any order.
+    second = max(orders) > 1 if any(orders) else traced
+    kept = kept_steps(state, asked.max_steps) if second else kept_steps(state)
+    rooms = rooms_for(asked.max_steps, problem.saveat, state, traced, tries)
     if span.is_backward() and system.contacts:
         raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {asked.t0} and {asked.t1}.")
     problem = problem._replace(
         saveat=saves,
         stops=problem.stops._replace(turns=turns),
         watched=problem.watched._replace(differentiated=tuple(order > 0 for order in orders) if any(orders) else ()),
-        room=problem.room.of(rooms[0], asked.max_steps),
+        room=problem.room._replace(kept=kept).of(rooms[0], asked.max_steps),
         traced=traced,
         known=known,
     )

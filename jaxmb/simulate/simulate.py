@@ -35,7 +35,6 @@ def simulate(
     atol: ArrayLike | None = None,
     dtmax: Scalar | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
     inputs: Signals | None = None,
     jumps: ArrayLike | None = None,
     event: diffrax.Event | None = None,
@@ -81,13 +80,12 @@ def simulate(
     - `manifold`: how the state stays on the constraints, `Partition()`, `Projection()` or others; default by the scene.
     - `dt0`: first step [s], default chosen from the motion. `dtmax`: longest step [s], default none.
     - `stepsize_controller`: instead of `rtol` and `atol`; a `MultistepController` for `Adams` and `Hermite`.
-    - `adjoint`: another method of differentiation, one of diffrax's adjoints.
     - `direction`: changes of parameters by name; in a differentiated run, steps resolve the effect of these changes.
         Default: all parameters with derivatives. `{}` leaves the steps of the motion alone.
     - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector; the solver restarts there.
-    - `event`, `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event sees interpolated states between
-        the ends of steps, off the constraints by about `rtol`.
+    - `event`, `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event sees the time [s], also in a run
+        backwards, and interpolated states between the ends of steps, off the constraints by about `rtol`.
     - `max_steps`: the largest number of steps. `max_events`: the largest number of impacts and other events of
         contacts.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
@@ -114,7 +112,6 @@ def simulate(
         atol=atol,
         dtmax=dtmax,
         stepsize_controller=stepsize_controller,
-        adjoint=adjoint,
         inputs=inputs,
         jumps=jumps,
         event=event,

@@ -63,7 +63,7 @@ class Problem(NamedTuple):
     angles: Any = None
 
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
-        """The options of `diffrax.diffeqsolve`."""
+        """The options of the integration."""
         system, method = self.system, self.method
         contacts, gaps = bool(system.contacts), method.watches_gaps(system)
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
@@ -270,7 +270,7 @@ def _statistics(problem, solver, solution, end):
     linearised = False
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
-        linearised = problem.room.adjoint is None and solver.linear_steps(False) is not None
+        linearised = solver.linear_steps(False) is not None
     stats |= {"linearised_steps": jnp.array(linearised)}
     stats |= problem.method.policy.statistics(solution.solver_state)
     if end.events is not None:

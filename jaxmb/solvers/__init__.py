@@ -1,15 +1,14 @@
 """Multistep methods as diffrax solvers, with variable order and step, on vector fields and on manifolds.
 
-`simulate` takes any solver of diffrax, and `diffrax.diffeqsolve` takes these with a `MultistepController`. A multistep
-method of your own derives from `AbstractMultistep`, with a field for its tolerances. A step evaluates the term that
-diffrax gives it, at predicted and at corrected states:
+`simulate` and `integrate` take any solver of diffrax, and `diffrax.diffeqsolve` takes these with a
+`MultistepController`. A multistep method of your own derives from `AbstractMultistep`, with a field for its tolerances.
+A step evaluates the term that it is given, at predicted and at corrected states:
 
 ```python
 from jax.flatten_util import ravel_pytree
 from jaxmb import solvers
 
 tolerances: solvers.Tolerances = solvers.tolerances_of("Heun")
-adjoint = solvers.MeshAdjoint(most=1024)  # Keeps the numbers of so many steps for derivatives.
 
 def heun(term, t, h, y, args, chart):
     flat, unravel = ravel_pytree(y)  # Methods compute with the components of a state in one vector.
@@ -34,7 +33,7 @@ from .adams import Adams as Adams
 from .controller import MultistepController as MultistepController
 from .evaluation import evaluate as evaluate, next_chart as next_chart, project_near as project_near
 from .hermite import Hermite as Hermite
-from .mesh import MeshAdjoint as MeshAdjoint
+from .integrate import integrate as integrate
 from .multistep import (
     AbstractAttempt as AbstractAttempt,
     AbstractMultistep as AbstractMultistep,

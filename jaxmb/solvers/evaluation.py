@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .._compat import direction_of, inner_term, unwrapped
+from .directed import direction_of, inner_term, term_of
 from .manifold_term import (
     AbstractGaps,
     AbstractGuards,
@@ -40,7 +40,7 @@ class Evaluation(NamedTuple):
 
 def check_term(term: Any) -> None:
     """Raise a `ValueError` unless `term` is an ordinary differential equation."""
-    term = unwrapped(term)
+    term = term_of(term)
     if not isinstance(term, (diffrax.ODETerm, AbstractManifoldTerm)):
         raise ValueError(
             f"Multistep methods integrate a single `diffrax.ODETerm` or `AbstractManifoldTerm`, but got a "

@@ -12,11 +12,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import WrappedSolver, direction_of, loop_of_lanes
+from .._compat import loop_of_lanes
 from .controller import AbstractControllerAround
+from .directed import direction_of
 from .evaluation import gaps_of
 from .events import AbstractErrorWithMore
 from .manifold_term import AbstractGaps
+from .wrapped import AbstractSolverAround
 
 # A stretch of a step is examined in this many pieces; stretches that hide nothing grow by this factor.
 _PIECES, _GROWTH = 8, 4.0
@@ -218,17 +220,14 @@ class GapController(AbstractWithoutJumps):
         return keep & ~again, next_t0, next_t1, made_jump, inner, result
 
 
-class GapSolver(WrappedSolver):
+class GapSolver(AbstractSolverAround):
     """A one-step solver that examines the gaps in which the forces of its term act."""
-
-    def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
 
     # A nested program, so that the step is traced once.
     @eqx.filter_jit
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y1, error, dense_info, *rest = self.inner.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1, error, dense_info, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         gaps = gaps_of(terms)
         assert gaps is not None, "a term without gaps needs no solver that looks at them"
         at = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
-        return y1, hidden(gaps, direction_of(terms), error, (t0, t1), y1, at), dense_info, *rest
+        return y1, hidden(gaps, direction_of(terms), error, (t0, t1), y1, at), dense_info, state, result

@@ -16,21 +16,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._compat import buffer_set, save_states, while_loop
+from .._compat import buffer_set, while_loop
 from .closures import opened
 from .evaluation import freeze, ravel, unravel_like
 from .events import events_found
 from .linear_map import filled, linear_map
 from .packing import Layout
 from .segments import Row, Segments, choice_of, first_of, remainder, row_of, start_of
-from .stepping import constant_fields, ended, stepped
+from .stepping import Integration, Progress, constant_fields, ended, stepped
 from .steps import AbstractSteps, LinearStep, Moving
 from .turning import Counted
 from .whole_steps import jump_times, steps_of
 
 _TOO_LONG = (
-    "Second derivatives need the rows of all steps, of which {} are kept. This run has more steps: choose the number "
-    "of rows by simulate(..., adjoint=jaxmb.solvers.MeshAdjoint(most))."
+    "Second derivatives need the rows of all steps, of which {} are kept. This run has more steps. In `simulate` a "
+    "max_steps of at most 16384 keeps all; `integrate` has the argument `kept`."
 )
 
 
@@ -332,66 +332,39 @@ def _unsaved(series: Saved, table, place, k, row, lw, ldense, at):
     return lw, ldense, place
 
 
-class MeshAdjoint(diffrax.AbstractAdjoint):
-    """Derivatives of a solve on its mesh, in every mode.
+def on_mesh(solve: Integration, first: Progress, limit: Any, most: int) -> Progress:
+    """The end of an integration after at most `limit` steps, with derivatives on its mesh, in every mode.
 
-    **Arguments:** `most`: the number of steps whose rows are kept; `begins`: whether the run begins with a jump; then
-    its first step uses nothing from before.
+    **Arguments:** `most`: the number of steps whose rows are kept at once.
     """
-
-    most: int = eqx.field(static=True)
-    begins: bool = eqx.field(static=True, default=False)
-
-    def loop(self, *, terms, event, max_steps, **options):
-        # Values that a function closes over are arguments of the rule below; otherwise their derivatives would be zero.
-        terms, event = jax.tree.map(opened, (terms, event))
-        return self.run(max_steps, max_steps, terms=terms, event=event, **options)
-
-    def run(
-        self,
-        max_steps: int,
-        limit: Any,
-        *,
-        terms,
-        args,
-        solver,
-        saveat,
-        init_state,
-        throw,
-        passed_solver_state,
-        passed_controller_state,
-        **options,
-    ):
-        """diffrax's loop with buffers for `max_steps` steps, of which at most `limit` are taken."""
-        del throw, passed_controller_state
-        steps, untracked = steps_of(solver, options["stepsize_controller"])
-        steps = steps.after_first_jump() if self.begins else steps
-        steps = steps if passed_solver_state else steps.from_start()
-        jumps = jump_times(options["stepsize_controller"])
-        given = {"solver": solver, "saveat": saveat, "max_steps": max_steps, **options}
-        fixed = given, steps = freeze((given, steps))
-        still = freeze({"terms": terms, "args": args})
-        first = freeze(init_state)
-        constants = constant_fields(first, **still, **given)
-        recorded = _recorded(still, first, fixed, constants, freeze(limit), self.most)
-        final, *_ = _with_derivatives(recorded, (terms, args, untracked), jumps, init_state, fixed)
-        # The time of an event depends on its function, after the steps are taken.
-        given = given | {"event": options["event"]}
-        return ended(final, constants, terms=terms, args=args, **given), {}
+    # Values that a function closes over are arguments of the rule below; otherwise their derivatives would be zero.
+    terms, event = jax.tree.map(opened, (solve.terms, solve.event))
+    solve = solve._replace(terms=terms, event=event)
+    steps, untracked = steps_of(solve.solver, solve.stepsize_controller)
+    # A first step after a jump uses nothing from before.
+    steps = (steps if first.made_jump is False else steps.after_first_jump()).from_start()
+    jumps, args = jump_times(solve.stepsize_controller), solve.args
+    fixed = alone, steps = freeze((solve._replace(terms=None, args=None), steps))
+    still, start = freeze((terms, args)), freeze(first)
+    whole = alone._replace(terms=still[0], args=still[1])
+    constants = constant_fields(whole, start)
+    recorded = _recorded(whole, start, steps, constants, freeze(limit), most)
+    final, *_ = _with_derivatives(recorded, (terms, args, untracked), jumps, first, fixed)
+    # The time of an event depends on its function, after the steps are taken.
+    return ended(alone._replace(terms=terms, args=args, event=event), final, constants)
 
 
-def _recorded(equations, init_state, fixed, constants, limit, most):
-    """The last state of diffrax's loop, the rows of the last segment, and the data to repeat steps: the starts of all
-    segments and the choices of all steps, None for a single segment. All but the state are packed.
+def _recorded(solve, init_state, steps, constants, limit, most):
+    """The last state, the rows of the last segment, and the data to repeat steps: the starts of all segments and the
+    choices of all steps, None for a single segment. All but the state are packed.
 
     A segment has at most `most` steps. The row of the start, if there is one, follows behind its rows.
     """
-    (given, steps), terms = fixed, equations["terms"]
-    size = min(most, given["max_steps"])
-    segments = -(-given["max_steps"] // size)
+    terms = solve.terms
+    size = min(most, solve.max_steps)
+    segments = -(-solve.max_steps // size)
 
-    def outer(cond_fun, body_fun, init, *, max_steps, buffers):
-        del max_steps
+    def outer(cond_fun, body_fun, init, buffers):
         since = jnp.asarray(-jnp.inf, init.tprev.dtype)
         layout = Layout(eqx.filter_eval_shape(lambda init: row_of(steps, terms, since, init, body_fun(init)), init))
         of_starts, of_choices = _layouts_again(steps, init, eqx.filter_eval_shape(body_fun, init))
@@ -432,7 +405,7 @@ def _recorded(equations, init_state, fixed, constants, limit, most):
             rows = _written(rows, size, [table[0] for table in first], True)
         return last, rows, None if starts is None else (starts, choices)
 
-    return stepped(init_state, outer, constants, **equations, **given)
+    return stepped(solve, init_state, constants, outer)
 
 
 def _written(tables, index, row, kept):
@@ -440,7 +413,7 @@ def _written(tables, index, row, kept):
 
 
 def _layouts_again(steps, old, new):
-    """The layouts of the starts of segments and of choices, from two states of diffrax's loop."""
+    """The layouts of the starts of segments and of choices, from two states."""
     return (
         Layout(eqx.filter_eval_shape(lambda new: start_of(steps, new.tprev, new), new)),
         Layout(eqx.filter_eval_shape(lambda old, new: choice_of(steps, old, new), old, new)),
@@ -469,18 +442,18 @@ def _with_derivatives_jvp(primals, tangents):
     # Second derivatives need the derivatives of the rows.
     out = _with_derivatives(*primals)
     final, rows, again = out
-    given, steps = fixed
-    saveat = given["saveat"]
+    solve, steps = fixed
+    saveat = solve.saveat
     moved, still = eqx.partition(equations, jax.tree.map(_is_known, dequations, is_leaf=_is_none))
     y0, memory = init_state.y, steps.memory(init_state.solver_state)
     w, inner = ravel(filled(y0, dinit.y)), filled(memory, steps.memory(dinit.solver_state))
     x = Moving(dequations, djumps), (w, inner)
-    series = jax.tree.leaves(saveat.subs, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
+    series = solve.subs
     if any(sub.fn is not diffrax.SubSaveAt(t1=True).fn for sub in series):
-        raise ValueError("MeshAdjoint differentiates saved states: apply the function of SaveAt(fn=...) to those.")
+        raise ValueError("Derivatives are those of saved states: apply the function of SaveAt(fn=...) to them.")
     saved = tuple(
-        Saved(sub.t0, sub.ts, sub.steps, False, state.ts.shape[0], jnp.stack([state.save_index, state.saveat_ts_index]))
-        for sub, state in zip(series, save_states(final), strict=True)
+        Saved(sub.t0, sub.ts, sub.steps, False, state.ts.shape[0], jnp.stack([state.count, state.passed]))
+        for sub, state in zip(series, final.saved, strict=True)
     )
     events = events_found(final.controller_state)
     if events is not None:
@@ -497,8 +470,8 @@ def _with_derivatives_jvp(primals, tangents):
         saved=saved,
         like=y0,
         memory=memory,
-        dense=given["max_steps"] if saveat.dense else 0,
-        event=given["event"] is not None,
+        dense=solve.max_steps if saveat.dense else 0,
+        event=solve.event is not None,
         segments=_segments(again, layout, steps, init_state, final),
     )
     like = eqx.filter_eval_shape(Mesh.blank, mesh)
@@ -515,19 +488,21 @@ def _segments(again, layout, steps, old, new):
 
 
 def _of_loop(final, along: Tangents, like):
-    """The tangent of the last state of diffrax's loop."""
+    """The tangent of the last state."""
     state = lambda flat: unravel_like(like, flat)
     none, event_state = jax.tree.map(lambda _: None, final), lambda final: events_found(final.controller_state)
+    has_dense, has_event = final.dense is not None, final.near is not None
     parts = lambda final: (
         final.y,
-        final.dense_infos,
-        final.event_dense_info,
-        *(_states(saved.ys) for saved in save_states(final)),
+        *((final.dense.infos,) if has_dense else ()),
+        *((final.near.info,) if has_event else ()),
+        *(_states(saved.ys) for saved in final.saved),
         *(() if (events := event_state(final)) is None else (events.states,)),
     )
-    series = len(save_states(final))
+    series = len(final.saved)
     tables, events = along.saved[:series], along.saved[series:]
-    new = state(along.end[0]), along.dense, along.last, *(jax.vmap(state)(table) for table in tables), *events
+    outputs = [x for x in (along.dense, along.last) if x is not None]
+    new = state(along.end[0]), *outputs, *(jax.vmap(state)(table) for table in tables), *events
     return eqx.tree_at(parts, none, new, is_leaf=_is_none)
 
 

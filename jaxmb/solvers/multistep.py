@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import direction_of, from_controller
+from .._compat import from_controller
+from .directed import direction_of
 from .evaluation import (
     after_jump,
     chart_after_jump,

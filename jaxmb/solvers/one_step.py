@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import WrappedSolver, with_loops
+from .._compat import with_loops
 from .controller import AbstractControllerState, MultistepController
 from .evaluation import ravel, unravel_like
 from .events import error_of, map_error
@@ -19,26 +19,17 @@ from .multistep import AbstractMultistep
 from .scales import RunningScales
 from .tangent import Tangent, TangentControl, pushed, pushed_only
 from .tolerances import MultistepNorm, NormOfCounted, Tolerances
+from .wrapped import AbstractSolverAround
 
 
-class WithTangents(WrappedSolver):
+class WithTangents(AbstractSolverAround):
     """A one-step solver that carries tangents along, in its state."""
 
     control: TangentControl
     rtol: Any
-    # The wrapper around `solver`, if any: diffrax looks for Runge–Kutta methods in one wrapper only.
-    outer: diffrax.AbstractWrappedSolver | None = None
-
-    @property
-    def inner(self) -> Any:
-        return self.with_own_loops(self._whole)
-
-    @property
-    def _whole(self) -> Any:
-        return self.solver if self.outer is None else eqx.tree_at(lambda s: s.solver, self.outer, self.solver)
 
     def init(self, terms, t0, t1, y0, args):
-        start = lambda terms, y0: self.inner.init(terms, t0, t1, y0, args)
+        start = lambda terms, y0: self.solver.init(terms, t0, t1, y0, args)
         tangents = []
         for of_terms, w in zip(self.control.of_terms(terms), self.control.starts(), strict=True):
             memory = pushed_only(start, (terms, y0), (of_terms, unravel_like(y0, w)))
@@ -52,8 +43,8 @@ class WithTangents(WrappedSolver):
         step = lambda solver: eqx.Partial(_step_from, solver, t0, t1, args, made_jump)
         of_terms = self.control.of_terms(terms)
         along = tuple((of, unravel_like(y0, x.w), x.memory) for of, x in zip(of_terms, before, strict=True))
-        # Loops over stages in the form of the adjoint have no forward derivatives.
-        out, along = pushed(step(with_loops(self._whole, "lax")), (terms, y0, state), along, step(self.inner))
+        # Loops over stages that can be differentiated in both modes are slower in forward mode.
+        out, along = pushed(step(with_loops(self.solver, "lax")), (terms, y0, state), along, step(self.solver))
         y1, error, dense_info, state, result = out
         tangents, errors = [], []
         scales = self.control.scales(self.rtol, before, [ravel(dy1) for dy1, *_ in along])
@@ -115,8 +106,7 @@ def with_tangents(solver: Any, controller: Any, control: TangentControl) -> tupl
         return dataclasses.replace(with_scales, tangents=True)
 
     controller = jax.tree.map(watched, controller, is_leaf=is_known)
-    inner, outer = (solver.solver, solver) if isinstance(solver, diffrax.AbstractWrappedSolver) else (solver, None)
-    return WithTangents(inner, control, controllers[0].rtol, outer), controller, lambda state: state[0]
+    return WithTangents(solver, control, controllers[0].rtol), controller, lambda state: state[0]
 
 
 class ErrorWithTangents(NamedTuple):

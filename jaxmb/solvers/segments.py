@@ -43,7 +43,7 @@ class Row(NamedTuple):
 class Choice(NamedTuple):
     """The choices made for a step.
 
-    **Fields:** its end `tnext`, its start `tprev`, and whether it `made_jump`, as in the states of diffrax's loop.
+    **Fields:** its end `tnext`, its start `tprev`, and whether it `made_jump`, as in the states of an integration.
     Without jumps the last two are None: a step starts at the end of the last. `at_event` of its row; `chosen`: the
     choices of its error estimate for the next step.
     """
@@ -56,7 +56,7 @@ class Choice(NamedTuple):
 
 
 class Between(NamedTuple):
-    """The parts of a state of diffrax's loop that determine a step."""
+    """The parts of the state of an integration that determine a step."""
 
     tprev: Any
     tnext: Any
@@ -66,7 +66,7 @@ class Between(NamedTuple):
 
 
 def row_of(steps: AbstractSteps, terms: PyTree, since: Any, old: Any, new: Any) -> Row:
-    """The row of the step between two states of diffrax's loop; `since`: the end of the step before it."""
+    """The row of the step between two states of an integration; `since`: the end of the step before it."""
     return Row(since, old.tnext, _at_event(old, new), steps.row(terms, old, new))
 
 
@@ -77,7 +77,7 @@ def first_of(steps: AbstractSteps, terms: PyTree, old: Any, new: Any) -> Row:
 
 
 def choice_of(steps: AbstractSteps, old: Any, new: Any) -> Choice:
-    """The choices made for the step between two states of diffrax's loop."""
+    """The choices made for the step between two states of an integration."""
     jump = (old.tprev, jnp.asarray(old.made_jump)) if steps.jumps else (None, None)
     chosen = steps.chosen(steps.alone(new.solver_state))
     return Choice(old.tnext, *jump, _at_event(old, new), chosen)

@@ -1,14 +1,12 @@
-"""The loop over the steps of a solve, in place of diffrax's loop.
+"""The integration of any term by any solver of diffrax's protocol, step by step.
 
-From the same state it computes the same, for `diffrax.diffeqsolve` and the adjoints of this package. A step that would
-end within a hundred rounding errors of the end of the run ends there. One operation finds that time: diffrax takes
-fifteen hundred, a tenth of the time to trace and compile a small mechanism. A run that fails has no event. The time of
-an event is searched only in members of a batch that have an event, so a failed member does not stop the others.
+A step that would end within a hundred rounding errors of the end of the run ends there. A run that fails has no event.
+The time of an event is searched only in members of a batch that have an event, so a failed member does not stop the
+others.
 """
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_origin
 
 import diffrax
 import equinox as eqx
@@ -19,16 +17,85 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import PyTree
 
-from .._compat import any_of_batch, buffer_set, save_states, while_loop, with_save_states
+from .._compat import any_of_batch, buffer_set, changed, while_loop, with_loops
+from .directed import directed, undirected
 from .turning import Counted, turning_of
+from .wrapped import with_tolerances
 
 _RESULTS = diffrax.RESULTS
 # A step that would end within this many rounding errors of the end of the run ends there.
 _LAST = 100
+# The function of a series that saves states unchanged.
+_STATES = diffrax.SubSaveAt(t1=True).fn
+_NO_METER = diffrax.NoProgressMeter()
 
 
-class _Solve(NamedTuple):
-    """The arguments of `diffrax.diffeqsolve` that the loop does not change."""
+class Series(eqx.Module):
+    """A series of saved states, in tables as long as it may get.
+
+    **Fields:** the times `ts` in the solver's time, and the states `ys`; the `count` of entries; how many of its times
+    are `passed`.
+    """
+
+    ts: Any
+    ys: PyTree
+    count: Any
+    passed: Any
+
+
+class Dense(eqx.Module):
+    """The dense output of all steps: their ends `ts` after the start, the data `infos`, and their `count`."""
+
+    ts: Any
+    infos: PyTree
+    count: Any
+
+
+class EventNear(eqx.Module):
+    """The last step, in which an event may lie.
+
+    **Fields:** its start and its end; the data `info` of its interpolant; the `values` of the event's functions at its
+    end; the `mask`: which event happened.
+    """
+
+    start: Any
+    end: Any
+    info: PyTree
+    values: PyTree
+    mask: PyTree
+
+
+class Progress(eqx.Module):
+    """An integration between two steps, in the solver's time, which increases.
+
+    **Fields:** `tprev`: the end of the last accepted step; `tnext`: the end of the next attempted step; `y` at `tprev`;
+    whether there was a jump (`made_jump`); the states of solver, controller and progress meter; the `result` so far;
+    numbers of steps; the series `saved`; `dense` output, None without; `near`: where an event may lie, None without
+    events.
+    """
+
+    tprev: Any
+    tnext: Any
+    y: PyTree
+    made_jump: Any
+    solver_state: PyTree
+    controller_state: PyTree
+    meter_state: PyTree
+    result: Any
+    num_steps: Any
+    num_accepted_steps: Any
+    num_rejected_steps: Any
+    saved: tuple[Series, ...]
+    dense: Dense | None
+    near: EventNear | None
+
+
+class Integration(NamedTuple):
+    """What an integration does, in the solver's time; made by `begun`.
+
+    **Fields:** as the arguments of `diffrax.diffeqsolve`; `max_steps`: the number of steps for which there are tables;
+    the `direction` of the user's time.
+    """
 
     terms: PyTree
     args: PyTree
@@ -39,49 +106,148 @@ class _Solve(NamedTuple):
     t0: Any
     t1: Any
     dt0: Any
-    max_steps: int | None
+    max_steps: int
     progress_meter: Any
+    direction: Any
 
-    def on_series(self, function: Callable[[diffrax.SubSaveAt, Any], Any], saved: PyTree) -> PyTree:
-        """Map a function of `(series, saved)` over the series of saved states."""
-        return jax.tree.map(function, self.saveat.subs, saved, is_leaf=lambda x: isinstance(x, diffrax.SubSaveAt))
+    @property
+    def subs(self) -> list[diffrax.SubSaveAt]:
+        """What each series saves."""
+        return jax.tree.leaves(self.saveat.subs, is_leaf=_is_sub)
+
+    def on_series(self, function: Callable[..., Any], saved: tuple[Series, ...]) -> tuple[Series, ...]:
+        """Apply a function of `(sub, series)` to each series of saved states."""
+        return tuple(function(sub, series) for sub, series in zip(self.subs, saved, strict=True))
 
     def guard(self, function: Callable[..., Any], t: Any, y: PyTree) -> Any:
-        """The value of a function of the event."""
-        names = ("terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller", "max_steps")
-        return function(t, y, self.args, **{name: getattr(self, name) for name in names})
+        """The value of a function of the event, which sees the user's time and terms."""
+        given = {name: getattr(self, name) for name in ("solver", "saveat", "stepsize_controller", "max_steps")}
+        in_time = lambda t: None if t is None else t * self.direction
+        times = {name: in_time(getattr(self, name)) for name in ("t0", "t1", "dt0")}
+        return function(in_time(t), y, self.args, terms=undirected(self.terms), **given, **times)
+
+    def first(self, y0: PyTree, made_jump: Any) -> Progress:
+        """The start of the integration."""
+        controller, solver = self.stepsize_controller, self.solver
+        tnext, controller_state = controller.init(
+            self.terms, self.t0, self.t1, y0, self.dt0, self.args, solver.func, solver.error_order(self.terms)
+        )
+        tnext = jnp.minimum(tnext, self.t1)
+        solver_state = solver.init(self.terms, self.t0, tnext, y0, self.args)
+        info = None
+        if self.saveat.dense or self.event is not None:
+            step = self.terms, self.t0, tnext, y0, self.args, solver_state, made_jump
+            info = eqx.filter_eval_shape(solver.step, *step)[2]
+        dense, near, result = None, None, _RESULTS.successful
+        if self.saveat.dense:
+            tables = jax.tree.map(lambda x: jnp.full((self.max_steps, *x.shape), jnp.inf, x.dtype), info)
+            ts = jnp.full(self.max_steps + 1, jnp.inf, self.t0.dtype)
+            dense = Dense(ts.at[0].set(self.t0), tables, 0)
+        if self.event is not None:
+            info = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), info)
+            values = jax.tree.map(lambda guard: self.guard(guard, self.t0, y0), self.event.cond_fn, is_leaf=callable)
+            mask, happened = _first_of(jax.tree.map(_holds, values))
+            near, result = (
+                EventNear(self.t0, self.t0, info, values, mask),
+                _RESULTS.where(happened, _RESULTS.event_occurred, result),
+            )
+        saved = tuple(self._tables(sub, y0, controller_state) for sub in self.subs)
+        start = (self.t0, tnext, y0, made_jump, solver_state, controller_state, self.progress_meter.init())
+        first = Progress(*start, result, 0, 0, 0, saved, dense, near)
+        at_start = lambda sub, saved: _saved(self, sub, saved, first, self.t0, y0) if sub.t0 else saved
+        return changed(first, saved=self.on_series(at_start, saved))
+
+    def _tables(self, sub: diffrax.SubSaveAt, y0: PyTree, controller_state: Any) -> Series:
+        every, rows = sub.steps, self.max_steps
+        size = int(sub.t0) + (0 if sub.ts is None else len(sub.ts)) + (rows // every if every else 0)
+        size += int(sub.t1 and (every == 0 or rows % every != 0))
+        shapes = eqx.filter_eval_shape(lambda: _seen(self, sub, controller_state, self.t0, y0))
+        # Entries that are never written are infinite.
+        ys = jax.tree.map(lambda x: jnp.full((size, *x.shape), jnp.inf, x.dtype), shapes)
+        return Series(self.direction * jnp.full(size, jnp.inf, self.t0.dtype), ys, 0, 0)
 
 
-def loop(*, init_state: Any, outer_while_loop: Callable[..., Any], **given: Any) -> tuple[Any, dict[str, Any]]:
-    """The last state of the loop, and its statistics (none), for an adjoint.
+def begun(
+    terms: PyTree,
+    solver: Any,
+    *,
+    t0: Any,
+    t1: Any,
+    dt0: Any,
+    y0: PyTree,
+    args: PyTree = None,
+    saveat: diffrax.SaveAt,
+    stepsize_controller: Any,
+    event: diffrax.Event | None = None,
+    max_steps: int,
+    progress_meter: Any = _NO_METER,
+    made_jump: Any = False,
+) -> tuple[Integration, Progress]:
+    """An integration and its start.
 
-    **Arguments:** as of diffrax's loop. The loop over steps is `outer_while_loop(proceed, advance, state, max_steps=,
-    buffers=)`.
+    **Arguments:** as of `diffrax.diffeqsolve`, checked, with floating-point times of one type.
     """
-    constants = constant_fields(init_state, **given)
-    return ended(stepped(init_state, outer_while_loop, constants, **given), constants, **given), {}
+    _check_terms(terms, solver)
+    direction = jnp.where(t0 < t1, 1, -1)
+    along = lambda t: None if t is None else t * direction
+    has_times = lambda saveat: [x.ts for x in jax.tree.leaves(saveat.subs, is_leaf=_is_sub) if x.ts is not None]
+    saveat = eqx.tree_at(has_times, saveat, replace_fn=along)
+    controller = stepsize_controller.wrap(direction)
+    solver = with_loops(with_tolerances(solver, controller), "lax")
+    integration = Integration(
+        terms=directed(terms, direction),
+        args=args,
+        solver=solver,
+        stepsize_controller=controller,
+        event=event,
+        saveat=saveat,
+        t0=along(t0),
+        t1=along(t1),
+        dt0=along(dt0),
+        max_steps=max_steps,
+        progress_meter=progress_meter,
+        direction=direction,
+    )
+    return integration, integration.first(y0, made_jump)
 
 
-def with_tables_of_angles(state: Any) -> Any:
-    """The state before the loop, with tables for the angles that its controller counts, if any."""
-    turning = turning_of(state.controller_state)
-    if turning is None:
-        return state
-    table = lambda saved: jnp.full((*saved.ts.shape, turning.angles.shape[1]), jnp.inf, turning.angles.dtype)
-    return with_save_states(state, lambda saved: dataclasses.replace(saved, ys=Counted(saved.ys, table(saved))))
+def _check_terms(terms: PyTree, solver: Any) -> None:
+    """Raise a `ValueError` unless the solver takes such terms."""
+    is_term = lambda x: isinstance(x, diffrax.AbstractTerm)
+    fits = lambda kind, term: isinstance(term, get_origin(kind) or kind)
+    try:
+        suits = jax.tree.all(jax.tree.map(fits, solver.term_structure, terms, is_leaf=is_term))
+    except ValueError:
+        suits = False
+    if not suits:
+        while isinstance(solver, diffrax.AbstractWrappedSolver):
+            solver = solver.solver
+        raise ValueError(
+            f"{type(solver).__name__} integrates terms of the form {solver.term_structure}, got "
+            f"{jax.tree.map(lambda x: type(x).__name__, terms, is_leaf=is_term)}."
+        )
 
 
-def constant_fields(state: Any, **given: Any) -> dict[str, Any]:
+def loop(solve: Integration, first: Progress, limit: Any) -> Progress:
+    """The end of an integration after at most `limit` steps."""
+    constants = constant_fields(solve, first)
+
+    def outer(proceed, advance, init, buffers):
+        going = lambda state: proceed(state) & (state.num_steps < limit)
+        return while_loop(going, advance, init, max_steps=None, buffers=buffers, kind="lax")
+
+    return ended(solve, stepped(solve, first, constants, outer), constants)
+
+
+def constant_fields(solve: Integration, state: Progress) -> dict[str, Any]:
     """The fields of the state that are the same constants in all steps, by name: for example, that nothing fails and
     that there are no jumps. The compiler then knows them.
-
-    **Arguments:** as of `loop`.
     """
-    solve, constants = _Solve(**given), _concrete_fields(state)
+    constants = _concrete_fields(state)
     while True:
         # A constant that turns out to vary may make others vary.
         fields_after = lambda state, constants=constants: _concrete_fields(
-            _advanced(solve, dataclasses.replace(state, **constants))
+            _advanced(solve, changed(state, **constants))
         )
         shapes = eqx.filter_eval_shape(fields_after, state)
         same = {name: value for name, value in constants.items() if name in shapes and shapes[name] == value}
@@ -90,36 +256,76 @@ def constant_fields(state: Any, **given: Any) -> dict[str, Any]:
         constants = same
 
 
-def stepped(state: Any, outer_while_loop: Callable[..., Any], constants: dict[str, Any], **given: Any) -> Any:
-    """The state after the last step, with the constants of `constant_fields`."""
-    solve = _Solve(**given)
-    if solve.saveat.dense:
-        state = dataclasses.replace(state, dense_ts=state.dense_ts.at[0].set(solve.t0))
-    at_start = lambda sub, saved: _saved(solve, sub, saved, state, solve.t0, state.y) if sub.t0 else saved
-    state = dataclasses.replace(state, save_state=solve.on_series(at_start, state.save_state))
-    proceed = lambda state: _proceeds(solve, dataclasses.replace(state, **constants))
-    advance = lambda state: _advanced(solve, dataclasses.replace(state, **constants))
-    return outer_while_loop(proceed, advance, state, max_steps=solve.max_steps, buffers=_buffers)
+def stepped(solve: Integration, first: Progress, constants: dict[str, Any], outer: Callable[..., Any]) -> Progress:
+    """The state after the last step, by the loop `outer(proceed, advance, first, buffers)`, with the constants of
+    `constant_fields`.
+    """
+    proceed = lambda state: _proceeds(solve, changed(state, **constants))
+    advance = lambda state: _advanced(solve, changed(state, **constants))
+    return outer(proceed, advance, first, _buffers)
 
 
-def ended(last: Any, constants: dict[str, Any], **given: Any) -> Any:
+def ended(solve: Integration, last: Progress, constants: dict[str, Any]) -> Progress:
     """The last state with its result, the end of the run among the saved states, and an event at its time."""
-    solve = _Solve(**given)
-    t, y, result, saved = last.tprev, last.y, last.result, last.save_state
+    t, y, result, saved = last.tprev, last.y, last.result, last.saved
     finds = solve.event is not None and solve.event.root_finder is not None
     if finds:
-        happened = jnp.any(jnp.stack(jax.tree.leaves(last.event_mask)))
+        near: Any = last.near
+        happened = jnp.any(jnp.stack(jax.tree.leaves(near.mask)))
         find = lambda: _time_of_event(solve, last, happened)
         t, y, result = lax.cond(any_of_batch(happened), find, lambda: (t, y, result))
         saved = solve.on_series(lambda _, saved: _until(saved, t), saved)
     saved = solve.on_series(lambda sub, saved: _without_steps(solve, sub, saved, last, y), saved)
     saved = solve.on_series(lambda sub, saved: _with_end(solve, sub, saved, last, (t, y), finds), saved)
-    last = dataclasses.replace(last, **constants | {"save_state": saved})
+    last = changed(last, **constants | {"saved": saved})
     result = _RESULTS.where(_proceeds(solve, last), _RESULTS.max_steps_reached, result)
-    return dataclasses.replace(last, result=result)
+    return changed(last, result=result)
 
 
-def _proceeds(solve: _Solve, state: Any) -> Any:
+def solution_of(solve: Integration, last: Progress, y0: PyTree) -> diffrax.Solution:
+    """The end of an integration as diffrax's solution, in the user's time; with the states of solver and controller."""
+    interpolation, in_form = None, jax.tree.structure(solve.saveat.subs, is_leaf=_is_sub).unflatten
+    if last.dense is not None:
+        interpolation = diffrax.DenseInterpolation(
+            ts=last.dense.ts,
+            ts_size=last.dense.count + 1,
+            infos=last.dense.infos,
+            interpolation_cls=solve.solver.interpolation_cls,
+            direction=solve.direction,
+            t0_if_trivial=solve.t0,
+            y0_if_trivial=y0,
+        )
+    counts = {name: getattr(last, name) for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
+    return diffrax.Solution(
+        t0=solve.t0 * solve.direction,
+        t1=solve.t1 * solve.direction,
+        ts=in_form([series.ts * solve.direction for series in last.saved]),
+        ys=in_form([series.ys for series in last.saved]),
+        interpolation=interpolation,
+        stats=counts | {"max_steps": solve.max_steps},
+        result=last.result,
+        solver_state=last.solver_state,
+        controller_state=last.controller_state,
+        made_jump=None,
+        event_mask=None if last.near is None else last.near.mask,
+    )
+
+
+def _is_sub(x):
+    return isinstance(x, diffrax.SubSaveAt)
+
+
+def _holds(value):
+    """Whether an event happened at the start, by the value of its function; a sign has not changed yet."""
+    if jax.tree.structure(value) != jax.tree.structure(0) or jnp.shape(value) != ():
+        raise ValueError(f"The function of an event must return a number, got {value}.")
+    kind = jnp.result_type(value)
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.bool_)):
+        raise ValueError(f"The function of an event must return a truth value or a float, got {kind}.")
+    return value if jnp.issubdtype(kind, jnp.bool_) else False
+
+
+def _proceeds(solve: Integration, state: Any) -> Any:
     """Whether another step is tried."""
     if isinstance(solve.stepsize_controller, diffrax.StepTo):
         before_end = state.num_steps < len(solve.stepsize_controller.ts) - 1
@@ -136,11 +342,12 @@ def _concrete_fields(state):
 
 def _buffers(state):
     """The tables in a state, which the loop may write in place."""
-    series = save_states(state)
-    return [saved.ts for saved in series] + [saved.ys for saved in series] + [state.dense_ts, state.dense_infos]
+    series = state.saved
+    dense = None if state.dense is None else (state.dense.ts, state.dense.infos)
+    return [saved.ts for saved in series] + [saved.ys for saved in series] + [dense]
 
 
-def _advanced(solve: _Solve, state: Any) -> Any:
+def _advanced(solve: Integration, state: Any) -> Any:
     """The state after one attempted step."""
     start, end = state.tprev, state.tnext
     y, error, dense, solver_state, of_solver = solve.solver.step(
@@ -165,7 +372,7 @@ def _advanced(solve: _Solve, state: Any) -> Any:
     result = _RESULTS.where(diffrax.is_okay(result), of_controller, result)
     accepted = state.num_accepted_steps + jnp.where(keep, 1, 0)
     meter = solve.progress_meter
-    new = dataclasses.replace(
+    new = changed(
         state,
         y=y,
         tprev=tprev,
@@ -173,36 +380,26 @@ def _advanced(solve: _Solve, state: Any) -> Any:
         made_jump=_chosen(keep, made_jump, state.made_jump),
         solver_state=jax.tree.map(kept, solver_state, state.solver_state),
         controller_state=controller_state,
-        progress_meter_state=meter.step(state.progress_meter_state, _share(solve.t0, tprev, t1)),
+        meter_state=meter.step(state.meter_state, _share(solve.t0, tprev, t1)),
         num_steps=state.num_steps + 1,
         num_accepted_steps=accepted,
         num_rejected_steps=state.num_rejected_steps + jnp.where(keep, 0, 1),
     )
     within = solve.solver.interpolation_cls(t0=start, t1=end, **dense)
-    saved = solve.on_series(lambda sub, saved: _with_times(solve, sub, saved, new, within, end, keep), state.save_state)
+    saved = solve.on_series(lambda sub, saved: _with_times(solve, sub, saved, new, within, end, keep), state.saved)
     saved = solve.on_series(lambda sub, saved: _with_step(solve, sub, saved, new, (tprev, y), keep), saved)
-    new = dataclasses.replace(new, save_state=saved)
-    if solve.saveat.dense:
-        place = state.dense_save_index
-        new = dataclasses.replace(
-            new,
-            dense_ts=buffer_set(state.dense_ts, place + 1, tprev, pred=keep),
-            dense_infos=jax.tree.map(lambda x, table: buffer_set(table, place, x, pred=keep), dense, state.dense_infos),
-            dense_save_index=place + jnp.where(keep, 1, 0),
-        )
-    if solve.event is not None:
+    new = changed(new, saved=saved)
+    if state.dense is not None:
+        tables, place = state.dense, state.dense.count
+        ts = buffer_set(tables.ts, place + 1, tprev, pred=keep)
+        infos = jax.tree.map(lambda x, table: buffer_set(table, place, x, pred=keep), dense, tables.infos)
+        new = changed(new, dense=Dense(ts, infos, place + jnp.where(keep, 1, 0)))
+    if solve.event is not None and state.near is not None:
         values = jax.tree.map(lambda guard: solve.guard(guard, tprev, y), solve.event.cond_fn, is_leaf=callable)
-        mask, happened = _first_of(_changes(solve.event, state.event_values, values, _is_finite(y)))
+        mask, happened = _first_of(_changes(solve.event, state.near.values, values, _is_finite(y)))
         result = _RESULTS.where(happened, _RESULTS.event_occurred, result)
-        new = dataclasses.replace(
-            new,
-            event_tprev=start,
-            event_tnext=end,
-            event_dense_info=dense,
-            event_values=values,
-            event_mask=mask,
-        )
-    return dataclasses.replace(new, result=result)
+        new = changed(new, near=EventNear(start, end, dense, values, mask))
+    return changed(new, result=result)
 
 
 def _chosen(keep, new, old):
@@ -218,19 +415,22 @@ def _share(t0, t, t1):
     return jnp.where(same, 0.0, t - t0) / jnp.where(same, 1.0, t1 - t0)
 
 
-def _seen(solve: _Solve, sub: diffrax.SubSaveAt, state: Any, t: Any, y: PyTree) -> PyTree:
+def _seen(solve: Integration, sub: diffrax.SubSaveAt, controller_state: Any, t: Any, y: PyTree) -> PyTree:
     """What a series saves of a state at a time in the last accepted step."""
-    seen, turning = sub.fn(t, y, solve.args), turning_of(state.controller_state)
+    seen = y if sub.fn is _STATES else sub.fn(t * solve.direction, y, solve.args)
+    turning = turning_of(controller_state)
     return seen if turning is None else Counted(seen, turning.at(t))
 
 
-def _saved(solve: _Solve, sub: diffrax.SubSaveAt, saved: Any, state: Any, t: Any, y: PyTree, times: int = 1) -> Any:
+def _saved(
+    solve: Integration, sub: diffrax.SubSaveAt, saved: Any, state: Any, t: Any, y: PyTree, times: int = 1
+) -> Any:
     """A series with a further state, written `times` times."""
     write = lambda table, x: lax.dynamic_update_slice_in_dim(
-        table, jnp.broadcast_to(x, (times, *jnp.shape(x))), saved.save_index, axis=0
+        table, jnp.broadcast_to(x, (times, *jnp.shape(x))), saved.count, axis=0
     )
-    ys = jax.tree.map(write, saved.ys, _seen(solve, sub, state, t, y))
-    return dataclasses.replace(saved, ts=write(saved.ts, t), ys=ys, save_index=saved.save_index + times)
+    ys = jax.tree.map(write, saved.ys, _seen(solve, sub, state.controller_state, t, y))
+    return changed(saved, ts=write(saved.ts, t), ys=ys, count=saved.count + times)
 
 
 def _with_times(solve, sub, saved, state, within, end, keep):
@@ -240,15 +440,15 @@ def _with_times(solve, sub, saved, state, within, end, keep):
     count = len(sub.ts)
 
     def is_due(saved):
-        return keep & (sub.ts[saved.saveat_ts_index] <= end) & (saved.saveat_ts_index < count)
+        return keep & (sub.ts[saved.passed] <= end) & (saved.passed < count)
 
     def save(saved):
-        t = sub.ts[saved.saveat_ts_index]
-        place = saved.save_index
-        y = _seen(solve, sub, state, t, within.evaluate(t))
+        t = sub.ts[saved.passed]
+        place = saved.count
+        y = _seen(solve, sub, state.controller_state, t, within.evaluate(t))
         ys = jax.tree.map(lambda x, table: table.at[place].set(x), y, saved.ys)
         ts = saved.ts.at[place].set(t)
-        return dataclasses.replace(saved, ts=ts, ys=ys, save_index=place + 1, saveat_ts_index=saved.saveat_ts_index + 1)
+        return changed(saved, ts=ts, ys=ys, count=place + 1, passed=saved.passed + 1)
 
     tables = lambda saved: (saved.ts, saved.ys)
     return while_loop(is_due, save, saved, max_steps=count, buffers=tables, kind="lax")
@@ -259,16 +459,16 @@ def _with_step(solve, sub, saved, state, at, keep):
     if sub.steps == 0:
         return saved
     here = keep & (state.num_accepted_steps % sub.steps == 0)
-    value = lambda: _seen(solve, sub, state, *at)
+    value = lambda: _seen(solve, sub, state.controller_state, *at)
     if sub.steps == 1:
         y = value()
     else:
         zeros = lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(value))
         y = lax.cond(any_of_batch(here), value, zeros)
-    place = saved.save_index
+    place = saved.count
     ys = jax.tree.map(lambda x, table: buffer_set(table, place, x, pred=here), y, saved.ys)
     ts = buffer_set(saved.ts, place, at[0], pred=here)
-    return dataclasses.replace(saved, ts=ts, ys=ys, save_index=place + jnp.where(here, 1, 0))
+    return changed(saved, ts=ts, ys=ys, count=place + jnp.where(here, 1, 0))
 
 
 def _without_steps(solve, sub, saved, state, y):
@@ -297,7 +497,7 @@ def _with_end(solve, sub, saved, state, at, finds):
     if here is True:
         return with_end
     ts, ys = jax.tree.map(lambda new, old: jnp.where(here, new, old), (with_end.ts, with_end.ys), (saved.ts, saved.ys))
-    return dataclasses.replace(with_end, ts=ts, ys=ys)
+    return changed(with_end, ts=ts, ys=ys)
 
 
 def _until(saved, t):
@@ -305,12 +505,12 @@ def _until(saved, t):
     after = saved.ts > t
     count = jnp.sum(after & (saved.ts < jnp.inf))
     drop = lambda x: jnp.where(after.reshape(-1, *[1] * (x.ndim - 1)), jnp.inf, x)
-    return dataclasses.replace(
+    return changed(
         saved,
         ts=drop(saved.ts),
         ys=jax.tree.map(drop, saved.ys),
-        save_index=saved.save_index - count,
-        saveat_ts_index=saved.saveat_ts_index - count,
+        count=saved.count - count,
+        passed=saved.passed - count,
     )
 
 
@@ -347,12 +547,13 @@ def _first_of(mask: PyTree) -> tuple[PyTree, Any]:
     return jax.tree.unflatten(structure, first), happened
 
 
-def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree, Any]:
+def _time_of_event(solve: Integration, last: Any, happened: Any) -> tuple[Any, PyTree, Any]:
     """The time of the event in the last step, the state there, and the result; without an event, at the end."""
     event: Any = solve.event
-    finite = jnp.isfinite(last.event_tnext)
-    end = jnp.where(finite, last.event_tnext, solve.t1)
-    within = solve.solver.interpolation_cls(t0=last.event_tprev, t1=last.event_tnext, **last.event_dense_info)
+    near: Any = last.near
+    finite = jnp.isfinite(near.end)
+    end = jnp.where(finite, near.end, solve.t1)
+    within = solve.solver.interpolation_cls(t0=near.start, t1=near.end, **near.info)
 
     def left(t, _):
         """Zero at the event."""
@@ -367,9 +568,9 @@ def _time_of_event(solve: _Solve, last: Any, happened: Any) -> tuple[Any, PyTree
             value = lax.cond(mask, guard_value, lambda: jnp.zeros(shape.shape, shape.dtype))
             return jnp.where(happened & finite, value, (end - t).astype(value.dtype))
 
-        return jax.tree.map(of, event.cond_fn, last.event_mask, is_leaf=callable)
+        return jax.tree.map(of, event.cond_fn, near.mask, is_leaf=callable)
 
-    limits = {"lower": jnp.where(finite, last.event_tprev, solve.t0), "upper": end}
+    limits = {"lower": jnp.where(finite, near.start, solve.t0), "upper": end}
     root = optx.root_find(left, event.root_finder, y0=end, options=limits, throw=False)
     # A NaN derivative, as of a failed member of a batch, does not reach the search.
     t = jnp.where(happened, root.value, last.tprev)

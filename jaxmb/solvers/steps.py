@@ -50,7 +50,7 @@ class AbstractSteps(eqx.Module):
 
     @abc.abstractmethod
     def row(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
-        """The row that is stored of an accepted step, from the states of diffrax's loop before and after the step."""
+        """The row that is stored of an accepted step, from the states of an integration before and after the step."""
 
     @abc.abstractmethod
     def alone(self, solver_state: Any) -> Any:

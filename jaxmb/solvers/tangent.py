@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import with_inner
+from .directed import Directed
 from .evaluation import freeze, ravel, unravel_like
 from .scales import ends_of
 
@@ -104,7 +104,7 @@ class TangentControl(eqx.Module):
     def of_terms(self, terms: PyTree) -> tuple[PyTree, ...]:
         """The tangents of a solver's terms, which diffrax has wrapped."""
         none = jax.tree.map(lambda _: None, terms)
-        return tuple(none if direction is None else with_inner(terms, direction, None) for direction in self.directions)
+        return tuple(none if direction is None else Directed(direction, None) for direction in self.directions)
 
     def largest(self, w: Float[Array, " n"]) -> Float[Array, " n"]:
         """The largest entry of the group of each component, in its unit."""

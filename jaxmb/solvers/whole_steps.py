@@ -101,7 +101,7 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
     # A concrete class: only this one holds another solver beside tangents.
     watched = isinstance(solver, WithTangents)
     # Loops over stages in the form that both modes can differentiate.
-    return WholeSteps(False, watched, jumps), with_loops(solver.inner if watched else solver, "bounded")
+    return WholeSteps(False, watched, jumps), with_loops(solver.solver if watched else solver, "bounded")
 
 
 def jump_times(controller: Any) -> Any:

@@ -255,7 +255,6 @@ ARGUMENTS = {
     "name of a manifold": ({"manifold": "partition"}, r"manifold must be .*Partition\(\), got 'partition'"),
     "name of a formulation": ({"formulation": "multipliers"}, r"formulation must be .*Multipliers\(\), got"),
     "controller": ({"stepsize_controller": 1e-6}, "stepsize_controller must be .*MultistepController"),
-    "adjoint": ({"adjoint": "forward"}, "adjoint must be .*ForwardMode"),
     "event": ({"event": lambda t, y, args, **kwargs: t - 1.0}, "event must be .*diffrax.Event"),
     "progress meter": ({"progress_meter": True}, "progress_meter must be .*got True"),
     "no bound of steps": ({"max_steps": None}, "max_steps must be an integer of at least 1, got None"),

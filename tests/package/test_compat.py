@@ -1,7 +1,6 @@
 """Names and habits of other libraries that `jaxmb._compat` relies on; a test of each says what an update took away."""
 
 import contextlib
-import dataclasses
 import importlib
 import multiprocessing
 import os
@@ -18,6 +17,8 @@ from jax import lax
 from precision import single_precision
 
 from jaxmb.linalg.sums import unchecked_take
+from jaxmb.solvers import directed
+from jaxmb.solvers.gaps import GapSolver
 
 MOST_PROGRAMS = 70
 
@@ -346,42 +347,6 @@ def test_loops_with_buffers(compat):
 # diffrax
 
 
-def test_the_state_of_the_loop_of_diffrax(compat):
-    """Its fields, and what `diffeqsolve` gives to an adjoint with it."""
-    given = {}
-
-    class Spy(diffrax.AbstractAdjoint):
-        def loop(self, *, throw, passed_solver_state, passed_controller_state, init_state, **options):
-            given.update(options, state=init_state)
-            return diffrax.DirectAdjoint().loop(
-                throw=throw,
-                passed_solver_state=passed_solver_state,
-                passed_controller_state=passed_controller_state,
-                init_state=init_state,
-                **options,
-            )
-
-    saveat = diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=[0.55, 1.0]), diffrax.SubSaveAt(t1=True)))
-    jax.eval_shape(lambda: solve(diffrax.Euler(), adjoint=Spy(), saveat=saveat).ys)
-    state = given.pop("state")
-    assert {*given} == {
-        *("terms", "args", "solver", "stepsize_controller", "event", "saveat"),
-        *("t0", "t1", "dt0", "max_steps", "progress_meter"),
-    }
-    assert {field.name for field in dataclasses.fields(state)} == {
-        *("y", "tprev", "tnext", "made_jump", "solver_state", "controller_state", "progress_meter_state", "result"),
-        *("num_steps", "num_accepted_steps", "num_rejected_steps"),
-        *("save_state", "dense_ts", "dense_infos", "dense_save_index"),
-        *("event_tprev", "event_tnext", "event_dense_info", "event_values", "event_mask"),
-    }
-    series = compat.save_states(state)
-    assert [{field.name for field in dataclasses.fields(one)} for one in series] == 2 * [
-        {"saveat_ts_index", "ts", "ys", "save_index"}
-    ]
-    doubled = compat.with_save_states(state, lambda one: dataclasses.replace(one, ys=(one.ys, one.ts)))
-    assert [len(one.ys) for one in compat.save_states(doubled)] == [2, 2]
-
-
 def solve(solver, rate=-1.0, t1=1.0, *, adjoint=None, controller=None, saveat=None):
     term = diffrax.ODETerm(lambda t, y, args: rate * y)
     return diffrax.diffeqsolve(
@@ -399,26 +364,21 @@ def solve(solver, rate=-1.0, t1=1.0, *, adjoint=None, controller=None, saveat=No
 
 
 @pytest.mark.slow
-def test_terms_are_wrapped_once(compat):
+def test_terms_are_wrapped_once():
+    """The names of diffrax's wrapper are those of `Directed`."""
     seen = []
 
-    class Spy(compat.WrappedSolver):
-        def init(self, terms, t0, t1, y0, args):
-            seen.append((compat.inner_term(terms), compat.unwrapped(terms), compat.direction_of(terms)))
-            renewed = compat.with_inner(terms, "another", 1)
-            assert (compat.inner_term(renewed), compat.direction_of(renewed)) == ("another", 1)
-            return self.solver.init(terms, t0, t1, y0, args)
-
+    class Spy(diffrax.Euler):
         def step(self, terms, *args):
-            return self.inner.step(terms, *args)
+            seen.append(terms)
+            return super().step(terms, *args)
 
     with jax.disable_jit():
-        solve(Spy(diffrax.Euler()), t1=-1.0)
-    (inner, unwrapped, direction), *_ = seen
-    about = "diffrax no longer puts one WrapTerm with a term and a direction around the terms of a solver"
-    assert isinstance(inner, diffrax.ODETerm) and inner is unwrapped, about
-    assert direction == -1, about
-    assert compat.direction_of(diffrax.ODETerm(lambda t, y, args: y)) == 1
+        solve(Spy(), t1=-1.0)
+    about = "diffrax no longer puts one wrapper with a `term` and a `direction` around the term of a solver"
+    assert isinstance(directed.inner_term(seen[0]), diffrax.ODETerm), about
+    assert directed.term_of(seen[0]) is directed.inner_term(seen[0]) and directed.direction_of(seen[0]) == -1, about
+    assert directed.direction_of(diffrax.ODETerm(lambda t, y, args: y)) == 1
 
 
 def test_solvers_are_told_tolerances(compat):
@@ -458,31 +418,14 @@ def test_solvers_are_told_tolerances(compat):
     assert set(seen) == {(0.25, 0.125, jnp.max)}, about
 
 
-@pytest.mark.slow(but=("forward",))
-@pytest.mark.parametrize(
-    "adjoint, kind",
-    [
-        (diffrax.ForwardMode(), "lax"),
-        (diffrax.DirectAdjoint(), "bounded"),
-        (diffrax.RecursiveCheckpointAdjoint(), None),
-    ],
-    ids=["forward", "direct", "checkpoints"],
-)
-def test_adjoints_choose_the_loops_of_wrapped_solvers(compat, adjoint, kind):
-    seen = set()
-
-    class Spy(compat.WrappedSolver):
-        def init(self, terms, t0, t1, y0, args):
-            return self.solver.init(terms, t0, t1, y0, args)
-
-        def step(self, terms, *args):
-            seen.add((self.scan_kind, self.inner.scan_kind, compat.with_loops(self.solver, "lax").scan_kind))
-            return self.inner.step(terms, *args)
-
-    final = lambda rate: solve(Spy(diffrax.Tsit5()), rate, adjoint=adjoint).ys[0, 0]
-    jax.eval_shape((jax.jacfwd if kind == "lax" else jax.grad)(final), -1.0)
-    about = f"{type(adjoint).__name__} no longer sets `scan_kind` of Runge–Kutta methods, also of wrapped ones"
-    assert seen == {(kind, kind, "lax")}, about
+def test_loops_of_runge_kutta_methods(compat):
+    """Also of those inside others."""
+    about = "Runge–Kutta methods of diffrax no longer have the field `scan_kind`"
+    explicit = diffrax.Tsit5()
+    for solver in (explicit, diffrax.Kvaerno3(), GapSolver(explicit), diffrax.HalfSolver(explicit)):
+        whole = compat.with_loops(solver, "lax")
+        assert getattr(whole, "solver", whole).scan_kind == "lax", about
+    assert compat.with_loops(diffrax.SemiImplicitEuler(), "lax") == diffrax.SemiImplicitEuler()
 
 
 def test_steps_of_dense_solutions(compat):

@@ -182,7 +182,7 @@ LONG = (
     *("robust", "linearise", "Linearisation", "root_locus", "RootLocus", "steady_motion", "floquet", "Floquet"),
     *("sweep", "mechanisms.Shoes", "viz.show", "viz.plot_root_locus", "report.stress_test", "report.work_precision"),
     *("formulations.Multipliers", "formulations.NullSpace", "formulations.Poincare", "formulations.UdwadiaKalaba"),
-    *("manifold.Baumgarte", "manifold.Partition", "manifold.Projection", "solvers.Adams"),
+    *("manifold.Baumgarte", "manifold.Partition", "manifold.Projection", "solvers.Adams", "solvers.integrate"),
     *("solvers.MultistepController", "solvers.Hermite", "Trajectory.events", "Rope", "planar.Cylinder"),
     *("kinematics_and_compliance", "required_forces", "KinematicsAndCompliance", "RequiredForces", "Servo"),
     *("formulations.Partitioned", "lagrangian.QuasiVelocities", "formulations.accelerations", "system"),

@@ -3,15 +3,12 @@
 import importlib
 import re
 
-import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxmb as mb
 from jaxmb.simulate import compiling
-from jaxmb.simulate.loop import Loop
 
 pytestmark = pytest.mark.slow
 
@@ -80,22 +77,6 @@ def test_run_that_is_differentiated_is_traced_once(monkeypatch):
     # Here JAX traces the run first, and learns of the derivative afterwards.
     np.testing.assert_allclose(jax.grad(jax.jit(end))(9.81), known, rtol=1e-12)
     assert traced == [False, True]
-
-
-@pytest.mark.parametrize("end", [0.3, -0.3])
-def test_saved_states_are_those_of_diffrax(end):
-    """Whatever is saved beside the times."""
-    machine, ts = mb.mechanisms.pendulum(), jnp.linspace(0.0, end, 4)
-
-    def run(saveat, adjoint):
-        return mb.simulate(machine.system, machine.state, t1=end, saveat=saveat, max_steps=512, adjoint=adjoint)
-
-    for options in ({"t0": True}, {"t1": True}, {"t0": True, "t1": True}, {"steps": 3}, {}):
-        saveat = diffrax.SaveAt(ts=ts[1:3], **options)
-        own, theirs = run(saveat, None), run(saveat, diffrax.ForwardMode())
-        np.testing.assert_array_equal(own.ts, theirs.ts)
-        np.testing.assert_array_equal(own.ys.q, theirs.ys.q)
-    assert Loop.around(diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts),)), 1, None)[1].subs[0].ts is None
 
 
 def test_motion_that_fails_under_jit(programs):

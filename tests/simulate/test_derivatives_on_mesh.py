@@ -1,7 +1,6 @@
 """Derivatives on the mesh of a run: all modes and their combinations are one, in all forms of a run.
 
-The reference is the derivative of the discrete solution step by step, in forward mode by diffrax, on a mesh that
-resolves the same tangents.
+The reference is the derivative of the loop itself, step by step, in forward mode, with the same tangents controlled.
 """
 
 import diffrax
@@ -14,8 +13,9 @@ from sprung_pendulums import GRAVITY, SPRING, rod
 
 import jaxmb as mb
 from jaxmb import parts, planar
-from jaxmb.simulate import saves
-from jaxmb.solvers import Adams, Hermite, MeshAdjoint
+from jaxmb.simulate import integrate, run as of_runs, saves
+from jaxmb.solvers import Adams, Hermite
+from jaxmb.solvers.stepping import loop
 
 SYSTEM = mb.Scene(
     [planar.Body("bar", mass=2.0, inertia=0.3, position=(0.5, 0.0))],
@@ -128,12 +128,14 @@ MACHINES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*FORMS, *MACHINES])
-def test_forward_mode_is_reverse_mode_and_that_of_the_discrete_solution(name):
+def test_forward_mode_is_reverse_mode_and_that_of_the_discrete_solution(name, monkeypatch):
     implicit = {} if name == "fully driven" else {"solver": Hermite()}
     observe = FORMS[name] if name in FORMS else of_scene(*MACHINES[name], **implicit)
-    step_by_step = lambda p: observe(p, adjoint=diffrax.ForwardMode())
-    derivatives = jax.jacfwd(observe), jax.jacrev(observe), jax.jacfwd(step_by_step)
-    forward, reverse, exact = (np.asarray(jax.jit(derivative)(POINT)) for derivative in derivatives)
+    forward, reverse = (np.asarray(jax.jit(mode(observe))(POINT)) for mode in (jax.jacfwd, jax.jacrev))
+    monkeypatch.setattr(integrate, "on_mesh", lambda solve, first, limit, kept: loop(solve, first, limit))
+    jax.clear_caches()
+    exact = np.asarray(jax.jit(jax.jacfwd(observe))(POINT))
+    jax.clear_caches()
     scale = np.max(np.abs(exact), axis=0)
     assert np.all(scale > 1e-4)
     np.testing.assert_allclose(forward / scale, reverse / scale, rtol=0, atol=5e-11)
@@ -168,10 +170,24 @@ def test_second_derivatives_are_in_forward_mode_over_reverse():
         jax.jacrev(jax.grad(end))(1.0)
 
 
+@pytest.fixture
+def with_rows(monkeypatch):
+    """A function with derivatives that keep so many rows."""
+
+    def keeping(most, function):
+        def kept(*x):
+            monkeypatch.setattr(of_runs, "kept_steps", lambda *_: most)
+            return function(*x)
+
+        return kept
+
+    return keeping
+
+
 @pytest.mark.slow
-def test_rows_of_long_runs_are_found_again():
+def test_rows_of_long_runs_are_found_again(with_rows):
     """Rows of segments are found again from their starts."""
-    end = lambda p, most: states(run(p, adjoint=MeshAdjoint(most), saveat=TIMES))
+    end = lambda p, most: with_rows(most, lambda p: states(run(p, saveat=TIMES)))(p)
     of = lambda most: (
         jax.jit(jax.jacfwd(lambda p: end(p, most)))(POINT),
         jax.jit(jax.jacrev(lambda p: end(p, most)))(POINT),
@@ -189,16 +205,16 @@ LONGER = ["backward", "jumps", "event", "projection", "hermite", "implicit"]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LONGER)
-def test_steps_of_segments_are_taken_again(name):
+def test_steps_of_segments_are_taken_again(name, with_rows):
     """Also those of other solvers and manifolds, after jumps, and up to an event."""
-    of = lambda most: jax.jit(jax.jacrev(lambda p: FORMS[name](p, adjoint=MeshAdjoint(most))))(POINT)
+    of = lambda most: jax.jit(jax.jacrev(with_rows(most, FORMS[name])))(POINT)
     whole, cut = of(2048), of(16)
     np.testing.assert_allclose(cut, whole, rtol=1e-9, atol=1e-9 * np.max(np.abs(whole)))
 
 
 @pytest.mark.slow
-def test_second_derivatives_of_a_run_that_is_too_long():
-    second = jax.hessian(lambda p: jnp.sum(states(run(p, adjoint=MeshAdjoint(16)))))
+def test_second_derivatives_of_a_run_that_is_too_long(with_rows):
+    second = jax.hessian(with_rows(16, lambda p: jnp.sum(states(run(p)))))
     with pytest.raises(RuntimeError, match="Second derivatives need the rows of all steps, of which 16 are kept"):
         jax.block_until_ready(jax.jit(second)(POINT))
 

@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jaxmb.solvers import Adams, MeshAdjoint, MultistepController
+from jaxmb.solvers import Adams, MultistepController, integrate
 from jaxmb.solvers.closures import opened
 
 
@@ -74,7 +74,7 @@ def test_vector_field_of_a_solve_on_its_mesh():
 
     def run(rate, level):
         event = diffrax.Event(lambda t, y, args, **_: y - level, optx.Newton(1e-10, 1e-10))
-        return diffrax.diffeqsolve(
+        return integrate(
             diffrax.ODETerm(lambda t, y, args: -rate * y),
             Adams(),
             0.0,
@@ -82,7 +82,6 @@ def test_vector_field_of_a_solve_on_its_mesh():
             None,
             jnp.ones(()),
             stepsize_controller=MultistepController(1e-9, 1e-9),
-            adjoint=MeshAdjoint(256),
             event=None if level is None else event,
         )
 

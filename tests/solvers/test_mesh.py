@@ -6,15 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from jaxmb._compat import WrapTerm
-from jaxmb.solvers import Adams, MeshAdjoint, MultistepController
+from jaxmb.solvers import Adams, MultistepController, integrate
 from jaxmb.solvers.adams_steps import _at_start
+from jaxmb.solvers.directed import Directed
 from jaxmb.solvers.mesh import Saved, _saved, _unsaved
 from jaxmb.solvers.segments import AtEvent, Row
 
 
 def decay(rate, start, **options):
-    return diffrax.diffeqsolve(
+    return integrate(
         diffrax.ODETerm(lambda t, y, rate: -rate * y),
         Adams(),
         0.0,
@@ -23,7 +23,6 @@ def decay(rate, start, **options):
         start[None],
         rate,
         stepsize_controller=MultistepController(1e-10, 1e-10),
-        adjoint=MeshAdjoint(256),
         max_steps=256,
         **options,
     )
@@ -55,7 +54,7 @@ def test_cotangents_of_saved_states_and_of_the_time_of_an_event():
 
 def test_the_first_row_has_the_field_at_the_start():
     field = lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0]) + t])
-    solver, term, start = Adams(rtol=1e-6, atol=1e-6), WrapTerm(diffrax.ODETerm(field), 1), np.array([0.4, 1.2])
+    solver, term, start = Adams(rtol=1e-6, atol=1e-6), Directed(diffrax.ODETerm(field), 1), np.array([0.4, 1.2])
     step = lambda: solver.step(term, 0.1, 0.2, start, None, solver.init(term, 0.1, 0.2, start, None), False)
     found = jax.jit(lambda: _at_start(term, step()[3])[0])()
     np.testing.assert_allclose(found, [start[1], -np.sin(start[0]) + 0.1], rtol=1e-14)

@@ -7,7 +7,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jaxmb.solvers import MeshAdjoint
+from jaxmb.solvers import integrate
 
 
 def falling(t, y, args, **_):
@@ -55,17 +55,16 @@ CASES = {
 SWING = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -4.0 * y[0]]))
 
 
-def solve(adjoint=None, **given):
+def solve(integrate=diffrax.diffeqsolve, **given):
     options = {"t0": 0.0, "t1": 3.0, "dt0": None, "stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-8)}
-    options |= {} if adjoint is None else {"adjoint": adjoint}
     options["terms"] = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -4.0 * y[0] + jnp.where(t > 1.0, 1.0, 0.0)]))
-    return diffrax.diffeqsolve(**{"solver": diffrax.Tsit5(), "y0": jnp.array([1.0, 0.0]), **options, **given})
+    return integrate(**{"solver": diffrax.Tsit5(), "y0": jnp.array([1.0, 0.0]), **options, **given})
 
 
 @pytest.mark.slow(but=("jump",))
 @pytest.mark.parametrize("name", CASES)
 def test_solve_is_that_of_diffrax(name):
-    own, other = solve(MeshAdjoint(64), **CASES[name]), solve(**CASES[name])
+    own, other = solve(integrate, **CASES[name]), solve(**CASES[name])
     assert own.result == other.result and own.stats == other.stats
     for a, b in zip(*(jax.tree.leaves((x.ts, x.ys, x.event_mask)) for x in (own, other)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
@@ -80,7 +79,7 @@ def test_event_in_a_batch_beside_members_without_one():
     def at_event(start, **options):
         start = jnp.stack([start, 0.0 * start])
         event = diffrax.Event(falling, **EVENT)
-        return solve(**{"adjoint": MeshAdjoint(64)} | options, y0=start, event=event, throw=False)
+        return solve(**{"integrate": integrate} | options, y0=start, event=event, throw=False)
 
     swings = jax.vmap(jax.value_and_grad(lambda start: at_event(start, terms=SWING).ts[0]))
     times, rates = swings(jnp.array([1.0, jnp.nan, 0.5]))
@@ -90,11 +89,12 @@ def test_event_in_a_batch_beside_members_without_one():
     np.testing.assert_allclose(rates[::2], [slope(1.0), slope(0.5)], rtol=1e-4)
     # Some members end with their last step, before an event. Steps of a batch are not quite those of one member.
 
-    def in_steps(adjoint):
+    def in_steps(integrate):
         ends = lambda found: (found.ts[0], found.ys[0])
-        return jax.vmap(lambda start: ends(at_event(start, adjoint=adjoint, max_steps=12)))(jnp.array([1.0, 0.5, 0.3]))
+        run = lambda start: ends(at_event(start, integrate=integrate, max_steps=12))
+        return jax.vmap(run)(jnp.array([1.0, 0.5, 0.3]))
 
-    own, other = in_steps(MeshAdjoint(64)), in_steps(diffrax.RecursiveCheckpointAdjoint())
+    own, other = in_steps(integrate), in_steps(diffrax.diffeqsolve)
     for one, known in zip(own, other, strict=True):
         np.testing.assert_allclose(one, known, rtol=1e-12)
 
@@ -105,7 +105,7 @@ def test_time_of_an_event_beside_one_without_a_derivative():
         norm = lambda t, y, args, **_: jnp.sqrt(y[2] ** 2 + y[3] ** 2) - 1.0
         term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -rate * y[0], 0.0 * y[0], 0.0 * y[0]]))
         start, event = jnp.array([1.0, 0.0, 0.0, 0.0]), diffrax.Event([norm, falling], **EVENT)
-        return solve(MeshAdjoint(64), terms=term, y0=start, event=event).ts[0]
+        return solve(integrate, terms=term, y0=start, event=event).ts[0]
 
     exact = -np.arccos(-0.4) / 16
     np.testing.assert_allclose([jax.grad(at_event)(4.0), jax.jacfwd(at_event)(4.0)], exact, rtol=1e-4)

@@ -215,7 +215,7 @@ def _known_noise(experiments, sensors, sigma, trials) -> bool:
 
 
 def _checked(options: dict[str, Any]) -> dict[str, Any]:
-    for name in ("saveat", "t1", "adjoint", "throw", "event", "inputs"):
+    for name in ("saveat", "t1", "throw", "event", "inputs"):
         if name in options:
             where = "give it to an Experiment" if name == "inputs" else "leave it out"
             raise ValueError(f"identify sets {name!r} of simulate itself; {where}.")

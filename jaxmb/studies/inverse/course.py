@@ -20,7 +20,7 @@ from ...parts.coordinate_parts import shortest
 from ...parts.names import unknown
 from ...parts.series import AbstractSignal, Series, as_signal
 from ...simulate.integrate import integrated
-from ...simulate.room import Room
+from ...simulate.room import MOST_ROWS, Room
 from ...solvers import Adams, MultistepController
 from ...solvers.tangent import TangentControl
 from ...states.arguments import holding
@@ -274,7 +274,7 @@ def _rolled(system, signals, guess, ts) -> tuple[Array, Array]:
     }
     problem = diffrax.ODETerm(rates), Adams(), options
     watched = TangentControl(scale, (first.size,))
-    ys = integrated(problem, watched, Room(_MOST_STEPS, np.asarray(_MOST_STEPS), None), False, False).ys[0]
+    ys = integrated(problem, watched, Room(_MOST_STEPS, np.asarray(_MOST_STEPS), MOST_ROWS), False, False).ys[0]
     ys = jnp.where(jnp.isfinite(ys), ys, jnp.nan)
     return ts, ys + jax.vmap(lambda t, q, ahead: ahead * rates(t, q, None))(still, ys, ts - still)
 

@@ -200,5 +200,5 @@ def with_derivatives(program: Program, rows: int) -> Program:
         return trial
     raise ValueError(
         "The function has no derivatives in either mode. A jax.custom_vjp rules out forward mode; a loop such as "
-        "jax.lax.while_loop rules out reverse mode; a simulation has the mode of its adjoint."
+        "jax.lax.while_loop rules out reverse mode."
     ) from first
