@@ -57,6 +57,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "too much (Painlevé's paradox). A smaller coefficient, or a compliant contact, has one. With `throw=False` the "
         "motion up to there is kept."
     )
+    interrupted = "The run was interrupted by Ctrl-C; the motion up to there is kept."
 
 
 # The message of diffrax is empty, which says nothing of a good run.

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ._arguments import package_for_tables
 from ._compat import changed, steps_of
 from ._results import RESULTS
-from ._types import State
+from ._types import Scalar, State
 from .contacts.events import ContactEvents, FoundEvents, contact_events
 from .formulations import AbstractFormulation
 from .formulations.laws import accelerations_at
@@ -57,6 +57,8 @@ class ConstraintViolation(NamedTuple):
 
 # The default solver of a motion.
 _ADAMS = Adams()
+# The attribute of a motion from which it can be continued.
+CONTINUATION = "_continuation"
 # A later motion may begin this power of the precision from where the first ends, in units of coordinates.
 _MOVED = 0.375
 # The number of names that `print` of a motion shows.
@@ -377,6 +379,29 @@ class Trajectory(eqx.Module):
             return _saved(self, -1)[1]
         last = numbers.maximum(numbers.sum(reached, axis=-1) - 1, 0)[..., None, None]
         return jax.tree.map(lambda x: jnp.squeeze(jnp.take_along_axis(x, last, -2), -2), states)
+
+    def continued(self, *, t1: Scalar, saveat: diffrax.SaveAt | ArrayLike | None = None) -> "Trajectory":
+        """The motion from the end of this one to `t1` [s], by the same system, method and tolerances.
+
+        ```python
+        motion = jaxmb.simulate(system, state, t1=1.0, saveat=[0.0, 1.0])
+        later = motion.continued(t1=2.0, saveat=[1.0, 2.0])
+        whole = motion + later
+        ```
+
+        The method goes on as if the motion had not ended: with its history, orders and steps. It starts anew where
+        drivers or inputs have kinks, jumps or turns. `saveat` is as in `simulate`.
+
+        **Raises:** `ValueError` for a motion that ended early, and for one that was joined, loaded, copied or taken
+        from a batch: for those `simulate(system, motion.end, t0=…, t1=…)`.
+        """
+        going_on = vars(self).get(CONTINUATION)
+        if going_on is None:
+            raise ValueError(
+                "Only a motion as simulate returns it can be continued, not one that was joined, loaded, copied, "
+                "traced or taken from a batch: simulate(system, motion.end, t0=..., t1=...) begins where it ended."
+            )
+        return going_on(t1, saveat)
 
     @_of_each_member
     def _at(self, t):

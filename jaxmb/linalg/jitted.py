@@ -3,7 +3,7 @@
 import contextlib
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -20,6 +20,29 @@ _NO_TRACE = current_trace()
 FOR_FEW_CALLS = {"xla_backend_optimization_level": 0}
 
 
+class Split(NamedTuple):
+    """A pytree as its `arrays` and the rest, which is `static`: the structure, and the leaves that are not arrays."""
+
+    arrays: list[Any]
+    static: tuple[Any, tuple[Any, ...]]
+
+    @classmethod
+    def of(cls, tree: Any) -> "Split":
+        leaves, structure = jax.tree.flatten(tree)
+        # A pytree has no leaves that are None.
+        rest = tuple(None if isinstance(x, ARRAYS) else x for x in leaves)
+        return cls([x for x, static in zip(leaves, rest, strict=True) if static is None], (structure, rest))
+
+    def whole(self) -> Any:
+        """The pytree."""
+        (structure, rest), remaining = self.static, iter(self.arrays)
+        return jax.tree.unflatten(structure, [next(remaining) if x is None else x for x in rest])
+
+    def kinds(self) -> tuple[Any, ...]:
+        """The shapes and types of the arrays."""
+        return tuple((np.shape(x), x.dtype) for x in self.arrays)
+
+
 def jitted(
     function: Callable[_Arguments, _Result], options: dict[str, Any] | None = None
 ) -> Callable[_Arguments, _Result]:
@@ -32,10 +55,8 @@ def jitted(
 
     any_function: Callable[..., _Result] = function
 
-    def of_arrays(arrays, program):
-        structure, rest = program
-        remaining = iter(arrays)
-        arguments, named = jax.tree.unflatten(structure, [next(remaining) if x is None else x for x in rest])
+    def of_arrays(arrays, static):
+        arguments, named = Split(arrays, static).whole()
         return any_function(*arguments, **named)
 
     # The name in profiles and logs of compilations.
@@ -44,13 +65,21 @@ def jitted(
 
     @functools.wraps(function)
     def called(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:
-        leaves, structure = jax.tree.flatten((arguments, named))
-        # A pytree has no leaves that are None.
-        rest = tuple(None if isinstance(x, ARRAYS) else x for x in leaves)
-        arrays = [x for x, static in zip(leaves, rest, strict=True) if static is None]
-        return compiled(arrays, (structure, rest))
+        return compiled(*Split.of((arguments, named)))
 
     return called
+
+
+def shapes_of(function: Callable[[Any], Any]) -> Callable[[Split], Any]:
+    """A function of a split pytree: the result of `function` with zeros for its numbers, all of which are arrays."""
+
+    @functools.lru_cache(64)
+    def zeros(kinds, static):
+        arrays = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
+        shapes = jax.eval_shape(lambda arrays: function(Split(arrays, static).whole()), arrays)
+        return jax.tree.map(lambda x: jax.device_put(np.zeros(x.shape, x.dtype)), shapes)
+
+    return lambda split: zeros(split.kinds(), split.static)
 
 
 def on_host(function: Callable[_Arguments, Any]) -> Callable[_Arguments, Any]:

@@ -11,7 +11,7 @@ from ..lanes.members import of_one_or_more
 from ..manifold.orthogonal_projection import project
 from ..solvers.mesh import on_mesh
 from ..solvers.one_step import with_tangents
-from ..solvers.stepping import begun, loop, solution_of
+from ..solvers.stepping import Carry, begun, loop, solution_of
 from ..solvers.tangent import TangentControl
 from .room import Room
 from .saves import STATES, seen
@@ -24,8 +24,9 @@ def integrated(
     room: Room,
     projects_steps: bool,
     differentiated: bool,
-) -> Any:
-    """The `diffrax.Solution`, with derivatives.
+    carry: Carry | None,
+) -> tuple[Any, Carry | None]:
+    """The `diffrax.Solution`, with derivatives; and what the next call needs with a `carry` of the last.
 
     **Arguments:** `integration`: term, solver and options of `begun`; `control` of tangents, None for none;
     `projects_steps`: whether states return to constraints after steps; `differentiated`: whether derivatives are known
@@ -33,8 +34,13 @@ def integrated(
     """
     if differentiated:
         # Then the run without derivatives is not traced.
-        return _with_tangents(integration, control, room, projects_steps)
-    return _on_mesh(integration, control, room, projects_steps)
+        return _with_tangents(integration, control, room, projects_steps), None
+    if carry is None:
+        return _on_mesh(integration, control, room, projects_steps), None
+    term, solver, options = integration
+    solve, first = begun(term, solver, max_steps=room.rows, **options)
+    last, carry = loop(solve, first, room.limit, carry)
+    return solution_of(solve, last, first.y), carry
 
 
 @eqx.filter_custom_jvp
@@ -79,7 +85,7 @@ def _solution(term, solver, options, room, kept):
     if later:
         options = options | {"saveat": eqx.tree_at(lambda saveat: saveat.subs[0].fn, options["saveat"], STATES)}
     solve, first = begun(term, solver, max_steps=room.rows, **options)
-    last = loop(solve, first, room.limit) if kept is None else on_mesh(solve, first, room.limit, kept)
+    last = loop(solve, first, room.limit)[0] if kept is None else on_mesh(solve, first, room.limit, kept)
     solution: Any = solution_of(solve, last, first.y)
     if not later:
         return solution

@@ -10,10 +10,8 @@ import numpy as np
 
 from .._types import State
 
-# Buffers of steps take this memory at first [bytes], or hold this many steps if that is more.
-_MEMORY, _FEWEST_STEPS = 2**24, 1024
-# A motion that takes more steps than its buffers hold is computed again with this many times as many.
-_MORE = 8
+# Tables of steps take about this memory [bytes], and hold numbers of steps between these; without tables, any number.
+_MEMORY, _FEWEST_STEPS, _MOST_STEPS, _ANY = 2**24, 64, 4096, 2**31 - 1
 # Derivatives keep the rows of this many steps, or of fewer if they do not fit in this many bytes.
 MOST_ROWS, _FEWEST_ROWS, _ROW_BYTES = 2048, 64, 2**27
 # Second derivatives keep the rows of all steps, if `max_steps` is at most this.
@@ -40,32 +38,39 @@ class Room(NamedTuple):
         return self._replace(rows=rows, limit=np.asarray(min(max_steps, rows)))
 
 
-def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, traced: bool, tries: bool) -> list[int]:
-    """The numbers of steps for which programs have buffers; if a motion takes more steps, the next program is used.
-
-    If nothing is kept of single steps, the number is the next power of 4 from `max_steps`, so that one program serves
-    several numbers. Derivatives of more than `kept_steps` steps recompute rows. With `tries`, which needs concrete
-    values, the first program therefore has only `kept_steps`.
-
-    If states of steps are kept, the number is `max_steps` under a trace; otherwise the first takes little memory.
-    """
-    # Dense output keeps, for each number of the state, the history of a multistep method; `steps` one state of so many.
-    every = int(saveat.subs[0].steps)
-    kept = 16 if saveat.dense else 1 / every if every else 0
+def room_of_calls(saveat: diffrax.SaveAt, state: State) -> int:
+    """The number of steps of one call of a program with concrete numbers, for which it has tables."""
+    kept = _kept_each_step(saveat)
     if not kept:
-        room, fewer = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9), kept_steps(state)
-        if room <= fewer:
-            return [room]
-        if max_steps <= fewer:
-            return [fewer]
-        return [fewer, room] if traced and tries and fewer == MOST_ROWS else [room]
-    if traced:
+        return _ANY
+    size = kept * sum(x.nbytes for x in jax.tree.leaves(state))
+    return int(np.clip(2 ** int(math.log2(_MEMORY / size)), _FEWEST_STEPS, _MOST_STEPS))
+
+
+def rooms_for(max_steps: int, saveat: diffrax.SaveAt, state: State, tries: bool) -> list[int]:
+    """The numbers of steps for which programs under a trace have buffers; if a motion takes more steps, the next
+    program is used.
+
+    If states of steps are kept, the number is `max_steps`. Otherwise it is the next power of 4, so that one program
+    serves several numbers. Derivatives of more than `kept_steps` steps recompute rows. With `tries`, which needs
+    concrete values, the first program therefore has only `kept_steps`.
+    """
+    if _kept_each_step(saveat):
         return [max_steps]
-    size = sum(x.nbytes for x in jax.tree.leaves(state))
-    rooms = [max(2 ** int(math.log2(_MEMORY / (kept * size))), _FEWEST_STEPS)]
-    while rooms[-1] < max_steps:
-        rooms.append(_MORE * rooms[-1])
-    return [*rooms[:-1], max_steps]
+    room, fewer = 4 ** math.ceil(math.log(max(max_steps, 4), 4) - 1e-9), kept_steps(state)
+    if room <= fewer:
+        return [room]
+    if max_steps <= fewer:
+        return [fewer]
+    return [fewer, room] if tries and fewer == MOST_ROWS else [room]
+
+
+def _kept_each_step(saveat):
+    """How many times the numbers of a state are kept of each step: dense output keeps the history of a multistep
+    method; `steps` one state of so many.
+    """
+    every = int(saveat.subs[0].steps)
+    return 16 if saveat.dense else 1 / every if every else 0
 
 
 def kept_steps(state: State, max_steps: int = _MOST_OF_SECOND + 1) -> int:

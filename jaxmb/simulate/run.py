@@ -1,6 +1,5 @@
 """A requested motion: checked, solved, and finished."""
 
-import contextlib
 import dataclasses
 from typing import Any, NamedTuple
 
@@ -11,18 +10,21 @@ import numpy as np
 from jax import lax
 
 from .._arguments import check_kind
+from .._compat import changed
 from .._results import RESULTS
 from .._types import State
 from ..contacts.impact import NO_SECOND_DERIVATIVES
 from ..linalg.arrays import derivatives_of, is_traced
 from ..solvers import Adams, Hermite
 from ..solvers.evaluation import freeze
+from ..solvers.stepping import Carry
+from ..solvers.turning import turning_of
 from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..states.refusals import lost_rank
 from ..system import AbstractSystem
 from ..system.inputs import with_inputs
-from ..trajectory import Trajectory
+from ..trajectory import CONTINUATION, Trajectory
 from .arguments import (
     check_error_estimate,
     check_fixed_steps,
@@ -34,6 +36,7 @@ from .arguments import (
     closer_tolerances,
     named_solver,
 )
+from .calls import carried_on, in_calls, interruption
 from .captured import captured_event
 from .compiling import told_of_compiling
 from .method import Method
@@ -46,7 +49,7 @@ from .outcome import (
     warn_of_stiffness,
     warn_of_wrong_derivative,
 )
-from .room import Room, kept_steps, note_long, rooms_for, was_long
+from .room import Room, kept_steps, note_long, room_of_calls, rooms_for, was_long
 from .saves import STATES, checked_saveat, padded, with_end
 from .solve import Problem, made_precise, solved
 from .span import Span
@@ -55,10 +58,6 @@ from .watch import Watch, parameter_changes
 
 # Defaults, made once: their construction takes as long as the rest of a call.
 _ADAMS, _NO_METER = Adams(), diffrax.NoProgressMeter()
-_HIDDEN = (
-    "A function that this simulation calls uses a value that JAX traces and cannot find, such as a global variable or "
-    "an attribute of an object: make it a parameter, or let the function close over it."
-)
 
 
 class Asked(NamedTuple):
@@ -92,16 +91,25 @@ class Asked(NamedTuple):
 _ALONE = {"event": None, "direction": None, "error": False, "throw": False, "progress_meter": None}
 
 
+# Counts of a run that a further one continues.
+_COUNTS = (
+    *("num_steps", "num_accepted_steps", "num_rejected_steps", "num_evaluations", "num_matrices", "newton_iterations"),
+    *("charts", "orders", "past_points", "stiff_steps"),
+)
+
+
 class Ended(NamedTuple):
     """A run that was solved.
 
-    **Fields:** `flags`: the flags of the `outcome` as numbers, None under a trace.
+    **Fields:** `flags`: the flags of the `outcome` as numbers, None under a trace; `carry`: what a later run needs that
+    goes on from the end, None under a trace.
     """
 
     problem: Problem
     trajectory: Trajectory
     outcome: Outcome
     flags: Flags | None
+    carry: Any = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,30 +157,49 @@ class Run:
     def solved(self) -> Ended:
         """The motion, repeated with larger buffers if it took more steps than fit."""
         problem, max_steps = self.problem, self.asked.max_steps
+        if not problem.traced:
+            return self.in_calls()
         if not problem.known:
             return Ended(problem, *solved(problem), None)
-        with contextlib.nullcontext() if problem.traced else told_of_compiling(problem.system):
+        trajectory, outcome = solved(problem)
+        for rows in self.rooms[1:]:
+            # With a traced value hidden in a function, the number of steps is unknown.
+            if is_traced(outcome.flags) or not Flags(*np.asarray(outcome.flags)).ran_out:
+                break
+            problem = problem._replace(room=problem.room.of(rows, max_steps))
             trajectory, outcome = solved(problem)
-            if is_traced(outcome.flags) and not problem.traced:
-                raise ValueError(_HIDDEN)
-            for rows in self.rooms[1:]:
-                # With a traced value hidden in a function, the number of steps is unknown.
-                if is_traced(outcome.flags) or not Flags(*np.asarray(outcome.flags)).ran_out:
-                    break
-                problem = problem._replace(room=problem.room.of(rows, max_steps))
-                trajectory, outcome = solved(problem)
         if problem.room.rows < max_steps:
             trajectory = eqx.tree_at(lambda motion: motion.stats["max_steps"], trajectory, np.asarray(max_steps))
         if is_traced(outcome.flags):
             return Ended(problem, trajectory, outcome, None)
-        flags = Flags(*np.asarray(outcome.flags))
+        return self._known(problem, trajectory, outcome, Flags(*np.asarray(outcome.flags)))._replace(flags=None)
+
+    def in_calls(self, carry: Carry | None = None) -> Ended:
+        """The motion with concrete numbers, from its start or from the `carry` of another.
+
+        **Raises:** `KeyboardInterrupt` with the motion so far, `motion`, after Ctrl-C, unless `throw` is false.
+        """
+        meter, alone = self.asked.progress_meter, self.problem._replace(progress_meter=_NO_METER)
+        with told_of_compiling(alone.system):
+            calls = in_calls(alone, self.asked.max_steps, meter, carry)
+        stats = calls.trajectory.stats | {"max_steps": np.asarray(self.asked.max_steps)}
+        trajectory = changed(calls.trajectory, stats=stats)
+        if calls.interrupted:
+            trajectory = changed(trajectory, result=RESULTS.interrupted).trimmed()
+            if self.asked.throw is not False:
+                raise interruption(trajectory, calls.outcome.t)
+            return Ended(alone, trajectory, calls.outcome, calls.flags._replace(whole=True))
+        return self._known(alone, trajectory, calls.outcome, calls.flags)._replace(carry=calls.carry)
+
+    def _known(self, problem, trajectory, outcome, flags):
+        """A solved run whose flags are numbers."""
         if flags.stuck:
             trajectory, outcome = _diagnosed(problem, trajectory, outcome)
         if flags.wrong_derivative:
             warn_of_wrong_derivative()
         if flags.long:
             note_long(problem.system, problem.method.solver)
-        return Ended(problem, trajectory, outcome, None if problem.traced else flags)
+        return Ended(problem, trajectory, outcome, flags)
 
     def finished(self, ended: Ended) -> Trajectory:
         """The motion for the user.
@@ -185,7 +212,8 @@ class Run:
             told = {name: stats[name] for name in ("stiff", "stiff_steps")}
             run = Run.checked(asked._replace(solver=Hermite()))
             trajectory = run.finished(run.solved())
-            return eqx.tree_at(lambda motion: motion.stats, trajectory, trajectory.stats | told)
+            vars(trajectory)["stats"] = trajectory.stats | told
+            return trajectory
         if asked.solver == "auto":
             warn_of_stiffness(stats)
         if ended.flags is None:
@@ -198,11 +226,14 @@ class Run:
         if asked.error:
             closer = self._closer(ended.problem)
             trajectory = eqx.tree_at(lambda t: t.closer, trajectory, closer, is_leaf=lambda leaf: leaf is None)
+        if ended.carry is not None:
+            # Not a field, so that a copy with other fields does not have it.
+            vars(trajectory)[CONTINUATION] = Continuation(self, ended)
         return trajectory
 
     def _explained(self, ended):
         """A motion with concrete numbers, and if it failed, with the precise reason."""
-        problem, trajectory, outcome, flags = ended
+        problem, trajectory, outcome, flags, _ = ended
         system, span, asked = problem.system, problem.span, self.asked
         if flags.inconsistent:
             consistent(system, span.t0, problem.state)
@@ -232,6 +263,43 @@ class Run:
             system, state = lax.stop_gradient((asked.system, asked.state))
             closer = closer._replace(system=system, state=state)
         return _motion(closer)
+
+
+class Continuation:
+    """A further run from the end of a motion.
+
+    **Arguments:** the `run` that was `ended`.
+    """
+
+    def __init__(self, run: Run, ended: Ended):
+        self.run, self.ended = run, ended
+
+    def __reduce__(self):
+        # A pickled motion is without it, since it has functions of the user.
+        return type(None), ()
+
+    def __call__(self, t1: Any, saveat: Any) -> Trajectory:
+        """The motion to `t1`.
+
+        **Raises:** `ValueError` for a motion that ended early, and for a `t1` that is not beyond its end.
+        """
+        _, motion, outcome, _, carry = self.ended
+        if motion.result != RESULTS.successful:
+            raise ValueError(f"Only a motion that came to its end can be continued. {RESULTS[motion.result]}")
+        turning = turning_of(carry.progress.controller_state)
+        state = changed(outcome.y, angles=None if turning is None else np.asarray(turning.angles[1]))
+        asked = self.run.asked._replace(state=state, t0=np.asarray(outcome.t), t1=t1, saveat=saveat)
+        run, before = Run.checked(asked._replace(dt0=None, error=False)), self.run.problem.span
+        if run.problem.traced:
+            raise ValueError("A motion is not continued under jit, vmap or a derivative; simulate from `motion.end`.")
+        if not (before.t1 - before.t0) * (run.problem.span.t1 - run.problem.span.t0) > 0:
+            raise ValueError(f"t1 must be beyond the end of the motion at {float(outcome.t):g}, got {t1}.")
+        carry = carried_on(self.run.problem, run.problem, carry)
+        ended = run.in_calls(carry)
+        if carry is not None:
+            stats = ended.trajectory.stats
+            stats |= {name: stats[name] - motion.stats[name] for name in _COUNTS if name in stats}
+        return run.finished(ended)
 
 
 def _diagnosed(problem, trajectory, outcome):
@@ -294,7 +362,7 @@ def _settled(problem, asked):
     # Derivatives of a program under `jit` may be of any order.
     second = max(orders) > 1 if any(orders) else traced
     kept = kept_steps(state, asked.max_steps) if second else kept_steps(state)
-    rooms = rooms_for(asked.max_steps, problem.saveat, state, traced, tries)
+    rooms = rooms_for(asked.max_steps, problem.saveat, state, tries) if traced else [room_of_calls(saves, state)]
     if span.is_backward() and system.contacts:
         raise ValueError(f"Impacts cannot be undone: with contacts t1 must be after t0, got {asked.t0} and {asked.t1}.")
     problem = problem._replace(

@@ -129,14 +129,14 @@ class SavedTimes(NamedTuple):
         first, *rest = saveat.subs
         return changed(saveat, subs=(changed(first, ts=times, fn=function), *rest))
 
-    def restored(self, ts: Any, start: Any, finite: Any) -> Any:
+    def restored(self, ts: Any, start: Any, finite: Any, begins: Any) -> Any:
         """The requested times, from the times at which states were saved.
 
         **Arguments:** `start`: the time at the start if a run may begin just before it, else None; `finite`: whether
-        the run started from finite numbers.
+        the run started from finite numbers; `begins`: whether the series begins here.
         """
         if start is not None and self.series.t0:
-            ts = ts.at[0].set(lax.stop_gradient(start))
+            ts = ts.at[0].set(jnp.where(begins, lax.stop_gradient(start), ts[0]))
         if self.times is not None:
             ts = jnp.where(finite, ts, jnp.inf)
         return ts if self.after is self.times else _replaced(ts, self.after, self.times)

@@ -1,6 +1,7 @@
 """From a system and a state to a motion."""
 
 import contextlib
+import functools
 from collections.abc import Mapping
 from typing import Literal
 
@@ -18,8 +19,11 @@ from ..trajectory import Trajectory
 from .arguments import DEFAULT_RTOL
 from .run import Asked, Run
 
+# Arguments of other versions.
+_GONE = {"adjoint": "every mode differentiates the steps of the run; jaxmb.solvers.integrate does so for other terms"}
 
-@names_arguments
+
+@functools.partial(names_arguments, gone=_GONE)
 def simulate(
     system: AbstractSystem,
     state: State,
@@ -84,15 +88,17 @@ def simulate(
         Default: all parameters with derivatives. `{}` leaves the steps of the motion alone.
     - `error`: whether to estimate the global error of the result, `Trajectory.error`, by a second run.
     - `jumps`: times [s] at which drivers or forces have kinks or jumps, a vector; the solver restarts there.
-    - `event`, `progress_meter`: as in `diffrax.diffeqsolve`. The function of an event sees the time [s], also in a run
-        backwards, and interpolated states between the ends of steps, off the constraints by about `rtol`.
+    - `event`: as in `diffrax.diffeqsolve`. Its function sees the time [s], also in a run backwards, and interpolated
+        states between the ends of steps, off the constraints by about `rtol`.
+    - `progress_meter`: as in `diffrax.diffeqsolve`, such as `diffrax.TqdmProgressMeter()`.
     - `max_steps`: the largest number of steps. `max_events`: the largest number of impacts and other events of
         contacts.
     - `throw`: whether a motion that fails is an error. By default it is, but under `jit`, `vmap` or a derivative the
         motion is NaN instead.
 
-    **Returns:** a `Trajectory`. With `throw=False` it has the part of the motion before a failure, and `result` says
-    why it failed; under a trace it is NaN.
+    **Returns:** a `Trajectory`, which can be `continued`. With `throw=False` it has the part of the motion before a
+    failure, and `result` says why it failed; under a trace it is NaN. Ctrl-C ends a long run: the `KeyboardInterrupt`
+    has the motion so far, `motion`.
 
     **Raises:** `ValueError` for arguments of the wrong type or out of range, and for combinations that cannot work.
     Also for a state that violates the constraints, unless the manifold lets states drift. `RuntimeError` if the

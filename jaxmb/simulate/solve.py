@@ -16,12 +16,13 @@ from .._types import State
 from ..contacts.events import FoundEvents
 from ..contacts.guards import contact_guards
 from ..linalg.failure import nan_where
-from ..linalg.jitted import jitted
+from ..linalg.jitted import Split, jitted, shapes_of
 from ..manifold.diagnosis import diagnose_friction
 from ..manifold.manifold import normalize_state
 from ..solvers import AbstractMultistep
 from ..solvers.controller import intended_step
 from ..solvers.events import NO_STATE, events_found
+from ..solvers.stepping import Carry, begun
 from ..solvers.turning import Counted, turning_of, with_turning
 from ..states.consistency import is_consistent
 from ..states.headings import are_short
@@ -45,7 +46,8 @@ class Problem(NamedTuple):
 
     **Fields:** `system` and `state` at the start; `saveat`: the user's series and the end; `interpolated`: whether
     states are interpolated; `traced`: whether any argument is traced; `known`: whether values are concrete all the
-    same, as where only a derivative is taken; `angles`: the counted angles at the start, None if none are counted.
+    same, as where only a derivative is taken; `angles`: the counted angles at the start, None if none are counted;
+    `carry`: what the last call of the program left, None under a trace.
     """
 
     system: AbstractSystem
@@ -61,6 +63,7 @@ class Problem(NamedTuple):
     traced: bool
     known: bool
     angles: Any = None
+    carry: Carry | None = None
 
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
         """The options of the integration."""
@@ -153,43 +156,100 @@ class End(NamedTuple):
         return cls(t, y, RESULTS.promote(solution.result), intended_step(solution.controller_state), contact_events)
 
 
+class Plan(NamedTuple):
+    """What a run integrates.
+
+    **Fields:** `term`, `solver` and `options` of the integration; its `start`; the saved times (`saves`); the `span` of
+    the solver; the `correction` of saved states, None for none; whether the user's function sees states `later`.
+    """
+
+    term: Any
+    solver: Any
+    options: dict[str, Any]
+    start: Start
+    saves: SavedTimes
+    span: Span
+    correction: Any
+    later: bool
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Plan":
+        system, method, stops = problem.system, problem.method, problem.stops
+        method.check_impulses(system, stops.restarts is not None)
+        term, solver = method.prepared(system)
+        start = Start.of(problem, term)
+        # From a start that is not finite no step is taken: the interval is empty, and contains every requested time.
+        whole, first = problem.span.frozen(start.finite), problem.saveat.subs[0]
+        saves = SavedTimes.of(first, *lax.stop_gradient(problem.span[:2]), problem.traced)
+        saves, span = saves.behind_jumps(stops.restarts, whole.t0, whole.t1), whole.before_jump(stops.restarts)
+        # The user's function sees states on the constraints, at moving times.
+        correction = method.policy.correction(problem.interpolated)
+        later = first.fn is not STATES and (correction is not None or any(problem.span.moving))
+        saveat = saves.told(problem.saveat, whole.t0, start.finite, STATES if later else first.fn)
+        options = problem.options(start.y, span, saveat)
+        return cls(term, solver, options, start, saves, span, correction, later)
+
+
+@shapes_of
+def blank(problem: Problem) -> Carry:
+    """The carry of a run, of a split problem, with zeros."""
+    plan = Plan.of(problem)
+    return Carry.of(begun(plan.term, plan.solver, max_steps=problem.room.rows, **plan.options)[1])
+
+
 def solved(problem: Problem) -> tuple[Trajectory, Outcome]:
-    """The motion, and how it ended; under a trace, a motion that failed is NaN."""
-    motion, outcome = _solved(problem)
+    """The motion under a trace, and how it ended; a motion that failed is NaN."""
+    motion, outcome, _ = _traced(problem)
+    return _trajectory(problem, motion), outcome
+
+
+def call(problem: Problem, split: Split, carry: Carry, limit: Any) -> tuple[Trajectory, Outcome, Carry]:
+    """One call of the program of a run: the motion until there were `limit` steps, how it ended, and what the next call
+    needs.
+
+    **Arguments:** `split` of the problem; `carry`: what the last call left.
+    """
+    motion, outcome, carry = _called(split.arrays, carry, limit, split.static)
+    return _trajectory(problem, motion), outcome, carry
+
+
+def _trajectory(problem, motion):
     # Without the checks of `Trajectory`, which would take as long as the checks of all arguments.
-    return with_values(Trajectory, {"system": problem.system, "closer": None} | motion), outcome
+    return with_values(Trajectory, {"system": problem.system, "closer": None} | motion)
 
 
 @jitted
-def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
+def _traced(problem: Problem):
+    return _solved(problem)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _called(arrays, carry, limit, static):
+    problem: Problem = Split(arrays, static).whole()
+    return _solved(problem._replace(room=problem.room._replace(limit=limit), carry=carry))
+
+
+def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome, Carry | None]:
     """The results of the program: fields of the `Trajectory` without the system, which is an argument."""
     tracing_begins()
     system, method, stops, watched = problem.system, problem.method, problem.stops, problem.watched
-    method.check_impulses(system, stops.restarts is not None)
-    term, solver = method.prepared(system)
     direction = watched.direction(system, lambda system: method.prepared(system)[0])
-    start = Start.of(problem, term)
-    # From a start that is not finite no step is taken: the interval is empty, and contains every requested time.
-    whole, first = problem.span.frozen(start.finite), problem.saveat.subs[0]
-    saves = SavedTimes.of(first, *lax.stop_gradient(problem.span[:2]), problem.traced)
-    saves, span = saves.behind_jumps(stops.restarts, whole.t0, whole.t1), whole.before_jump(stops.restarts)
-    # The user's function sees states on the constraints, at moving times.
-    correction = method.policy.correction(problem.interpolated)
-    later = first.fn is not STATES and (correction is not None or any(problem.span.moving))
-    saveat = saves.told(problem.saveat, whole.t0, start.finite, STATES if later else first.fn)
-    options = problem.options(start.y, span, saveat)
+    plan = Plan.of(problem)
+    term, solver, start, saves, span = plan.term, plan.solver, plan.start, plan.saves, plan.span
     control = watched.control(system, start.y, jnp.abs(span.t1 - span.t0), direction)
-    solution = integrated(
-        (term, solver, options), control, problem.room, method.projects_steps(system), bool(watched.differentiated)
+    solution, carry = integrated(
+        (term, solver, plan.options),
+        control,
+        problem.room,
+        method.projects_steps(system),
+        bool(watched.differentiated),
+        problem.carry,
     )
-
-    (ys, angles), ts, lost = _parted(solution.ys[0]), solution.ts[0], False
-    ts = saves.restored(ts, None if stops.restarts is None else problem.span.t0, start.finite)
-    if correction is not None:
-        ys, lost = corrected(correction, system.prepared(), ts, ys, (span.t0, start.y))
+    ts, ys, angles, lost = _states_of(problem, plan, solution)
     ts, ys = moved(saves.series, term, problem.span, start.given, ts, ys)
-    if later:
-        ys = seen(first.fn, ts, ys, (problem.span.t0, start.y))
+    function = problem.saveat.subs[0].fn
+    if plan.later:
+        ys = seen(function, ts, ys, (problem.span.t0, start.y))
     elif angles is not None:
         ys = dataclasses.replace(ys, angles=angles)
     end = End.of(solution, stops, (problem.span.t0, start.given))
@@ -197,7 +257,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
     motion = ys, solution.interpolation
     if problem.traced:
         # Otherwise a derivative computed alone, which raises no error, would be of the part before the failure.
-        inputs = system, problem.state, problem.span, method.formulation, method.policy, stops.event, first.fn
+        inputs = system, problem.state, problem.span, method.formulation, method.policy, stops.event, function
         motion = nan_where(failed, motion, inputs)
     stats = _statistics(problem, solver, solution, end)
     complete, long = jnp.all(jnp.isfinite(ts)), stats["num_steps"] >= MOST_ROWS
@@ -217,7 +277,20 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome]:
         "event_mask": solution.event_mask,
         "found_events": end.events,
     }
-    return fields, outcome
+    return fields, outcome, carry
+
+
+def _states_of(problem, plan, solution):
+    """The saved times and states of a solution, returned to the constraints; the counted angles, or None; and whether
+    the return failed.
+    """
+    (ys, angles), lost = _parted(solution.ys[0]), False
+    begins = True if problem.carry is None else problem.carry.begins
+    starts = None if problem.stops.restarts is None else problem.span.t0
+    ts = plan.saves.restored(solution.ts[0], starts, plan.start.finite, begins)
+    if plan.correction is not None:
+        ys, lost = corrected(plan.correction, problem.system.prepared(), ts, ys, (plan.span.t0, plan.start.y))
+    return ts, ys, angles, lost
 
 
 def _parted(saved):
@@ -247,7 +320,8 @@ def _verdict(problem, interval, start, end, solution, lost, outside):
     # A run without enough steps is stuck if the rest would take a thousand times as many steps as it took.
     ran_out = result == RESULTS.max_steps_reached
     remaining = jnp.abs(interval.t1 - end.t)
-    creeps = True if end.step is None else remaining > 1e3 * solution.stats["num_steps"] * jnp.abs(end.step)
+    steps = jnp.asarray(solution.stats["num_steps"], remaining.dtype)
+    creeps = True if end.step is None else remaining > 1e3 * steps * jnp.abs(end.step)
     stuck, coupling = has_failed(result) & is_usable & (creeps | ~ran_out), None
     violated = policy.violated(system.prepared(), end.t, end.y, problem.method.rtol)
     later = [

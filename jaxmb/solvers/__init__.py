@@ -45,6 +45,7 @@ from .tolerances import Tolerances as Tolerances
 
 _tell_of_moved(
     __name__,
+    MeshAdjoint="jaxmb.solvers.integrate, in place of diffrax.diffeqsolve with this adjoint",
     ravel="the first result of jax.flatten_util.ravel_pytree",
     unravel_like="the second result of jax.flatten_util.ravel_pytree",
 )

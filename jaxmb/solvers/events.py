@@ -596,6 +596,16 @@ def _ended(step: _Tried, plan: _Plan) -> _Plan:
     return plan._replace(ends=yes, next_t1=next_t1, starts=yes, ended=yes)
 
 
+def without_events(controller_state: Any) -> Any:
+    """The state of a controller that has recorded no events yet."""
+    events = events_found(controller_state)
+    if events is None:
+        return controller_state
+    none = jnp.zeros_like(events.count), jnp.full_like(events.times, jnp.inf)
+    found: Any = events_found
+    return eqx.tree_at(lambda state: (found(state).count, found(state).times), controller_state, none)
+
+
 def events_found(controller_state: Any) -> EventState | None:
     """The events that an `EventController` recorded, from the state of a controller that may be wrapped around it."""
     states = states_inside(controller_state, EventState)

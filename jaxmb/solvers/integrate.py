@@ -94,7 +94,7 @@ def _compiled(terms, solver, options, kept):
 def _integrated(terms, solver, options, kept):
     del kept
     solve, first = begun(terms, solver, **options)
-    return solution_of(solve, loop(solve, first, solve.max_steps), first.y)
+    return solution_of(solve, loop(solve, first, solve.max_steps)[0], first.y)
 
 
 @_integrated.def_jvp

@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import PyTree
 
 from .._compat import any_of_batch, buffer_set, changed, while_loop, with_loops
+from .controller import intended_step
 from .directed import directed, undirected
 from .turning import Counted, turning_of
 from .wrapped import with_tolerances
@@ -88,6 +89,60 @@ class Progress(eqx.Module):
     saved: tuple[Series, ...]
     dense: Dense | None
     near: EventNear | None
+
+
+class Carry(eqx.Module):
+    """What a call of a program keeps for the next call, which goes on with the same integration.
+
+    **Fields:** `fresh`: whether there was no call before, so that the rest has no meaning; `begins`: whether series of
+    saved states begin with the next call; the `progress` without tables; for each series how many times are `passed`,
+    and how many states are `written` without the state at the end.
+    """
+
+    fresh: Any
+    begins: Any
+    progress: Progress
+    passed: tuple[Any, ...]
+    written: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, progress: Progress) -> "Carry":
+        # Only a run without failures goes on.
+        bare = changed(progress, saved=(), dense=None, result=None, made_jump=jnp.asarray(progress.made_jump))
+        no = jnp.array(False)
+        of_series = lambda name: tuple(getattr(series, name) for series in progress.saved)
+        carry = cls(no, no, bare, of_series("passed"), of_series("count"))
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), carry)
+
+    def resumed(self, solve: "Integration", first: Progress, constants: dict[str, Any]) -> Progress:
+        """The start of the next call.
+
+        **Arguments:** `first`: the start of the integration; `constants`: its fields that are constant.
+        """
+        never = solve.direction * jnp.asarray(jnp.inf, first.tprev.dtype)
+        fresh, begins, before = self.fresh, self.begins, self.progress
+        again = lambda new, old: jnp.where(fresh, new, old)
+        bare = changed(first, saved=(), dense=None, result=None, made_jump=jnp.asarray(first.made_jump))
+        state = jax.tree.map(again, bare, before)
+        # At the end of an interval no further step was planned.
+        intended = intended_step(before.controller_state)
+        ahead = first.tnext - first.tprev if intended is None else intended
+        tnext = jnp.where(state.tnext > state.tprev, state.tnext, state.tprev + ahead)
+        tnext = jnp.minimum(tnext, solve.t1)
+        saved = tuple(
+            Series(
+                jnp.where(begins, series.ts, never),
+                jax.tree.map(lambda x: jnp.where(begins, x, jnp.full_like(x, jnp.inf)), series.ys),
+                jnp.where(begins, series.count, 0),
+                jnp.where(begins, series.passed, passed),
+            )
+            for series, passed in zip(first.saved, self.passed, strict=True)
+        )
+        dense = first.dense
+        if dense is not None:
+            dense = changed(dense, ts=dense.ts.at[0].set(state.tprev))
+        given = {"result": first.result} | constants
+        return changed(state, tnext=tnext, saved=saved, dense=dense, **given)
 
 
 class Integration(NamedTuple):
@@ -228,15 +283,21 @@ def _check_terms(terms: PyTree, solver: Any) -> None:
         )
 
 
-def loop(solve: Integration, first: Progress, limit: Any) -> Progress:
-    """The end of an integration after at most `limit` steps."""
+def loop(solve: Integration, first: Progress, limit: Any, carry: Carry | None = None) -> tuple[Progress, Carry | None]:
+    """The end of an integration after at most `limit` steps, and what the next call needs with a `carry` of the last.
+
+    With a carry, the series of saved states have the states since the last call.
+    """
     constants = constant_fields(solve, first)
+    if carry is not None:
+        first = carry.resumed(solve, first, constants)
 
     def outer(proceed, advance, init, buffers):
         going = lambda state: proceed(state) & (state.num_steps < limit)
         return while_loop(going, advance, init, max_steps=None, buffers=buffers, kind="lax")
 
-    return ended(solve, stepped(solve, first, constants, outer), constants)
+    last = stepped(solve, first, constants, outer)
+    return ended(solve, last, constants), None if carry is None else Carry.of(last)
 
 
 def constant_fields(solve: Integration, state: Progress) -> dict[str, Any]:

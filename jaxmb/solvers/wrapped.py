@@ -31,15 +31,6 @@ class AbstractSolverAround(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self):  # pyright: ignore
         return self.solver.interpolation_cls
 
-    # The tolerances of an implicit solver.
-    @property
-    def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self) -> int:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
     def order(self, terms):
         return self.solver.order(terms)
 
@@ -58,6 +49,8 @@ def with_tolerances(solver: Any, controller: Any) -> Any:
 
     **Raises:** `ValueError` if the controller has none.
     """
+    if isinstance(solver, diffrax.AbstractWrappedSolver):
+        return eqx.tree_at(lambda s: s.solver, solver, with_tolerances(solver.solver, controller))
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     taken = [name for name in _Tolerances._fields if getattr(solver.root_finder, name, None) is _OF_CONTROLLER]

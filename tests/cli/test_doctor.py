@@ -15,7 +15,7 @@ from jaxmb.cli import doctor, main
 
 ROOT = Path(__file__).parents[2]
 # Durations without calls.
-NUMBERS = f"print({[0.25 * k for k in range(10)]})"
+NUMBERS = f"print({[0.25 * k for k in range(1 + max(doctor._SHOWN.values()))]})"
 
 
 def said(capsys, *words):

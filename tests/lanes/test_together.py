@@ -33,9 +33,9 @@ def side_by_side(function, *members):
 
 
 def carried_shapes(program):
-    """The shapes of arrays that the loops of a program carry."""
+    """The shapes of arrays that the loop over steps carries, which carries more than other loops."""
     for equation in getattr(program, "jaxpr", program).eqns:
-        if equation.primitive.name == "while":
+        if equation.primitive.name == "while" and len(equation.outvars) > 10:
             yield from (variable.aval.shape for variable in equation.outvars)
         for inner in sizes.inner_programs(equation):
             yield from carried_shapes(inner)

@@ -82,7 +82,7 @@ def test_tree_has_no_dense_matrix_and_programs_of_one_size():
         mechanism = mb.mechanisms.get("tree", n=n)
         system, state = mechanism.system, mechanism.state
         programs = (
-            structure._analyse.lower(system),
+            jax.jit(structure._met.__wrapped__).lower(system),
             jax.jit(lambda y, system=system: mb.assemble(system, y, throw=False)).lower(state),
             jax.jit(lambda y, system=system: mb.simulate(system, y, t1=0.1).ys).lower(state),
         )

@@ -311,6 +311,8 @@ def test_arguments_of_simulate(pendulum):
         with pytest.raises(ValueError, match=message) as refused:
             mb.simulate(arguments.pop("system"), arguments.pop("state"), **arguments)
         assert "\n" not in str(refused.value)
+    with pytest.raises(TypeError, match=r"no argument 'adjoint' any more: every mode.*jaxmb\.solvers\.integrate"):
+        mb.simulate(pendulum, pendulum.guess, t1=0.1, adjoint=diffrax.ForwardMode())
 
 
 NAMES = {

@@ -25,7 +25,7 @@ def pendulum():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", ["dense", "steps"])
-def test_long_motion_finds_more_room(pendulum, monkeypatch, kept):
+def test_tables_of_a_call_hold_a_part_of_a_motion(pendulum, monkeypatch, kept):
     system, state = pendulum
     saveat = diffrax.SaveAt(**{kept: True})
     run = lambda state, **options: mb.simulate(system, state, t1=1.0, saveat=saveat, **options)
@@ -37,7 +37,7 @@ def test_long_motion_finds_more_room(pendulum, monkeypatch, kept):
         assert steps > 16 and found.stats["max_steps"] == 65536 and found.result == mb.RESULTS.successful
         with pytest.raises(RuntimeError, match=f"max_steps = {steps - 1} steps"):
             run(state, max_steps=steps - 1)
-    # A program that is traced cannot be computed again.
+    # A program that is traced has tables for all steps.
     whole, count = jax.jit(lambda state: run(state, max_steps=256))(state), found.ts.size
     if kept == "dense":
         np.testing.assert_array_equal(found.at(0.7).q, whole.at(0.7).q)
@@ -143,17 +143,17 @@ def test_room_counts_internal_states():
     """Of which a system may have many more than coordinates."""
     saveat = saves.with_end(diffrax.SaveAt(steps=True), jnp.zeros(()), mb.State(jnp.zeros(8), jnp.zeros(8)))
     few, many = mb.State(jnp.zeros(8), jnp.zeros(8)), mb.State(jnp.zeros(8), jnp.zeros(8), jnp.zeros(4096))
-    first = [room.rooms_for(2**30, saveat, state, False, False)[0] for state in (few, many)]
-    assert first == [2**17, 2**8 * 4]
-    assert first[1] * (16 + 4096) * 8 < 4 * room._MEMORY
+    rows = [room.room_of_calls(saveat, state) for state in (few, many)]
+    assert rows == [4096, 256]
+    assert rows[1] * (16 + 4096) * 8 < room._MEMORY
 
 
 def test_few_systems_are_remembered_as_long():
     assert 0 < room._long.maxlen < 100
 
 
-def test_states_of_every_tenth_step_take_a_tenth_of_the_memory():
-    state = mb.State(jnp.zeros(100), jnp.zeros(100))
+def test_states_of_every_eighth_step_take_an_eighth_of_the_memory():
+    state = mb.State(jnp.zeros(8000), jnp.zeros(8000))
     saveat = lambda steps: diffrax.SaveAt(subs=(diffrax.SubSaveAt(steps=steps), diffrax.SubSaveAt(t1=True)))
-    one, eight = (room.rooms_for(2**30, saveat(steps), state, False, False)[0] for steps in (True, 8))
-    assert eight == 8 * one
+    one, eight = (room.room_of_calls(saveat(steps), state) for steps in (True, 8))
+    assert (one, eight) == (128, 1024)

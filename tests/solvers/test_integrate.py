@@ -10,7 +10,7 @@ import pytest
 import jaxmb as mb
 from jaxmb.solvers import Adams, integrate
 
-MOST_PROGRAMS = 20
+MOST_PROGRAMS = 25
 DECAY = diffrax.ODETerm(lambda t, y, rate: -rate * y)
 SWING = (diffrax.ODETerm(lambda t, p, args: p), diffrax.ODETerm(lambda t, q, args: -q))
 CONTROL = diffrax.PIDController(rtol=1e-8, atol=1e-10)

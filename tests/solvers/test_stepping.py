@@ -33,11 +33,6 @@ CASES = {
     "event among steps": {"event": diffrax.Event(falling, **EVENT), "saveat": diffrax.SaveAt(steps=2, t1=True)},
     "event without a search": {"event": diffrax.Event(falling)},
     "event that ends its function": {"event": diffrax.Event(lambda t, y, args, **_: jnp.sqrt(y[0] + 0.4) + 1.0)},
-    "a jump at the start": {
-        "stepsize_controller": diffrax.ConstantStepSize(),
-        "dt0": 0.1,
-        "made_jump": jnp.array(True),
-    },
     "truth": {"event": diffrax.Event(lambda t, y, args, **_: t > 1.0)},
     "two events": {"event": diffrax.Event([lambda t, *_, **__: t > 1.5, falling], **EVENT)},
     "too few steps": {"max_steps": 4, "throw": False},

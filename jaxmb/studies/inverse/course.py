@@ -274,7 +274,8 @@ def _rolled(system, signals, guess, ts) -> tuple[Array, Array]:
     }
     problem = diffrax.ODETerm(rates), Adams(), options
     watched = TangentControl(scale, (first.size,))
-    ys = integrated(problem, watched, Room(_MOST_STEPS, np.asarray(_MOST_STEPS), MOST_ROWS), False, False).ys[0]
+    room = Room(_MOST_STEPS, np.asarray(_MOST_STEPS), MOST_ROWS)
+    ys = integrated(problem, watched, room, False, False, None)[0].ys[0]
     ys = jnp.where(jnp.isfinite(ys), ys, jnp.nan)
     return ts, ys + jax.vmap(lambda t, q, ahead: ahead * rates(t, q, None))(still, ys, ts - still)
 
