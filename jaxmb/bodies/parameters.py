@@ -146,18 +146,23 @@ class SceneParameters(ParameterTable):
         numbers = (number for number in stacked_numbers(self._groups) if number.declared.sizes)
         return {number.name: (number.path, number.group, number.keys) for number in numbers}
 
-    def with_size(self, names):
+    def with_size(self, before, names):
         system, sized = self.system, self._sized()
         if not any(name in sized for name in names):
             return system
-        values = [_accessor(*place)(system) for place in dict.fromkeys(sized.values())]
-        old, values = lax.stop_gradient((system.length, [x for x in values if x is not None]))
-        xp = jnp if is_traced((old, values)) else np
-        old, *each = (xp.max(xp.abs(xp.asarray(x)), initial=0.0) for x in (old, *values))
-        size = functools.reduce(xp.maximum, each).astype(old.dtype)
-        # A size that stays about the same keeps the tolerances of a family of designs.
-        other = (size > _OTHER_SIZE * old) | ((size > 0) & (_OTHER_SIZE * size < old))
-        length = xp.where(other, size, old)
+        places = tuple(dict.fromkeys(sized.values()))
+        of = lambda system: [x for place in places if (x := _accessor(*place)(system)) is not None]
+        length, old, new = lax.stop_gradient((system.length, of(before), of(system)))
+        xp = jnp if is_traced((length, old, new)) else np
+        largest = lambda values: functools.reduce(
+            xp.maximum, (xp.max(xp.abs(xp.asarray(x)), initial=0.0) for x in values)
+        )
+        length = xp.asarray(length)
+        old, new = largest(old).astype(length.dtype), largest(new).astype(length.dtype)
+        # A size that stays about the same keeps the tolerances of a family of designs. Lengths that are much smaller
+        # than the scene, or zero, have not determined its size.
+        smaller = (new > 0) & (_OTHER_SIZE * new < length) & (_OTHER_SIZE * old >= length)
+        length = xp.where((new > _OTHER_SIZE * length) | smaller, new, length)
         return eqx.tree_at(lambda s: s.length, system, length if xp is jnp else jax.device_put(length))
 
     @property

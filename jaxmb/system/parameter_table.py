@@ -55,9 +55,9 @@ class ParameterTable:
         del before
         return self.system
 
-    def with_size(self, names: Collection[str]) -> Any:
-        """The system after a change of some parameters, with the scale of its lengths."""
-        del names
+    def with_size(self, before: Any, names: Collection[str]) -> Any:
+        """The system after a change of some parameters of the system `before`, with the scale of its lengths."""
+        del before, names
         return self.system
 
     @property

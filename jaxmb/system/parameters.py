@@ -111,7 +111,7 @@ def with_parameters(system: System, values: Mapping[str, VectorLike | eqx.Module
                 raise ValueError(f"Parameter {name!r} has shape {shape}, got {value.shape}.")
             system = eqx.tree_at(where, system, value if index is None else replaced(old, index, value))
     system = system.parameter_table.with_frames_of(before)
-    system = system.parameter_table.with_size(given)
+    system = system.parameter_table.with_size(before, given)
     if design:
         system = eqx.tree_at(lambda s: s.design, system, tuple(design))
     system.parameter_table.check(given)

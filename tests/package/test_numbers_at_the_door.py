@@ -198,3 +198,23 @@ def test_the_size_of_a_scene_after_a_change():
         np.testing.assert_allclose(value, expected * system.length, rtol=1e-12)
         assert slope == 0.0
     np.testing.assert_allclose(length(1e-3), 1e-3 * system.length, rtol=1e-12)
+
+
+def test_lengths_that_were_zero_leave_the_size_of_a_scene():
+    """A pin at the origin of a link frame moves by a little: the scene is as large as before, and so are its metric of
+    assembly and its tolerances. A larger scene counts.
+    """
+    rod = planar.Body("rod", mass=1.0, inertia=0.1, centre=(0.4, 0.02), position=(0.0, 0.0))
+    pin = planar.Revolute("pin", "ground", "rod", point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    forces = [mb.Gravity((0.0, -9.81)), mb.JointSpring("spring", "pin.angle", stiffness=6.0)]
+    system = mb.Scene([rod], joints=[pin], forces=forces).compile()
+    moved = lambda x: mb.with_parameters(system, {"pin.point_a": x * jnp.array([0.3, 0.7])})
+    for x in (1e-6, 1e-3):
+        assert moved(x).length == system.length
+        assert mb.with_parameters(moved(1e-6), {"pin.point_b": [x, 0.0]}).length == system.length
+    assert moved(1e3).length > 100 * system.length
+    placed = lambda x: mb.assemble(moved(x)).q
+    np.testing.assert_allclose(jax.jacfwd(placed)(0.0), (placed(1e-4) - placed(-1e-4)) / 2e-4, rtol=1e-6, atol=1e-7)
+    # The angle of balance does not depend on where the pin is.
+    still = [mb.equilibrium(moved(x)).q[2] for x in (0.0, 1e-6)]
+    np.testing.assert_allclose(still[1], still[0], rtol=1e-9)
