@@ -13,7 +13,6 @@ from ..manifold import AbstractManifold
 from ..manifold.default import default_manifold
 from ..manifold.internal_states import counted_components, natural_units, state_blocks
 from ..solvers import AbstractMultistep, MultistepController
-from ..solvers.gaps import GapSolver
 from ..solvers.one_step import OneStepController, with_counted
 from ..solvers.scales import RunningScales
 from ..system import AbstractSystem
@@ -79,10 +78,7 @@ class Method(NamedTuple):
 
     def prepared(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for the term."""
-        term, solver = self.policy.prepare(system.prepared(), self.formulation, self.solver, self.rtol)
-        if self.watches_gaps(system) and not isinstance(solver, AbstractMultistep):
-            solver = GapSolver(solver)
-        return term, solver
+        return self.policy.prepare(system.prepared(), self.formulation, self.solver, self.rtol)
 
     def controls(self, system: AbstractSystem, state: State, duration: Any) -> Any:
         """The controller of the steps of a motion from a state."""

@@ -18,7 +18,6 @@ from ..linalg.arrays import derivatives_of, is_traced
 from ..solvers import Adams, Hermite
 from ..solvers.evaluation import freeze
 from ..solvers.stepping import Carry
-from ..solvers.turning import turning_of
 from ..states.arguments import check_precision
 from ..states.consistency import consistent
 from ..states.refusals import lost_rank
@@ -286,7 +285,7 @@ class Continuation:
         _, motion, outcome, _, carry = self.ended
         if motion.result != RESULTS.successful:
             raise ValueError(f"Only a motion that came to its end can be continued. {RESULTS[motion.result]}")
-        turning = turning_of(carry.progress.controller_state)
+        turning = carry.progress.turning
         state = changed(outcome.y, angles=None if turning is None else np.asarray(turning.angles[1]))
         asked = self.run.asked._replace(state=state, t0=np.asarray(outcome.t), t1=t1, saveat=saveat)
         run, before = Run.checked(asked._replace(dt0=None, error=False)), self.run.problem.span

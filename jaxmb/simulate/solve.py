@@ -22,8 +22,8 @@ from ..manifold.manifold import normalize_state
 from ..solvers import AbstractMultistep
 from ..solvers.controller import intended_step
 from ..solvers.events import NO_STATE, events_found
-from ..solvers.stepping import Carry, begun
-from ..solvers.turning import Counted, turning_of, with_turning
+from ..solvers.stepping import Along, Carry, begun
+from ..solvers.turning import Counted
 from ..states.consistency import is_consistent
 from ..states.headings import are_short
 from ..system import AbstractSystem
@@ -68,11 +68,9 @@ class Problem(NamedTuple):
     def options(self, y0: State, span: Span, saveat: Any) -> dict[str, Any]:
         """The options of the integration."""
         system, method = self.system, self.method
-        contacts, gaps = bool(system.contacts), method.watches_gaps(system)
+        contacts, angles = bool(system.contacts), None if self.angles is None else WrappedAngles(system)
         controller = method.controls(system, self.state, jnp.abs(self.span.t1 - self.span.t0))
-        controller = self.stops.around(controller, contacts, gaps, method.headings(system))
-        if self.angles is not None:
-            controller = with_turning(controller, WrappedAngles(system), self.angles)
+        controller = self.stops.around(controller, contacts)
         return {
             "y0": y0,
             "t0": span.t0,
@@ -80,6 +78,7 @@ class Problem(NamedTuple):
             "dt0": span.dt0,
             "saveat": saveat,
             "stepsize_controller": controller,
+            "along": Along(method.watches_gaps(system), method.headings(system), angles, self.angles),
             "event": self.stops.event,
             "progress_meter": self.progress_meter,
             # Contacts may close, or be closed, at the start.
@@ -264,7 +263,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome, Carry | None]:
     wrong = stats.get("wrong_derivative", False)
     flags = Flags(failed, ~jnp.asarray(start.consistent), stuck, complete, ran_out, long, wrong)
     evidence = method.policy.evidence(solution.solver_state)
-    turning = turning_of(solution.controller_state)
+    turning = None if carry is None else carry.progress.turning
     reach = None if turning is None else turning.reach
     outcome = Outcome(jnp.stack([jnp.asarray(x) for x in flags]), end.t, end.y, end.step, coupling, evidence, reach)
     fields = {

@@ -11,8 +11,6 @@ from .._types import State
 from ..linalg.arrays import is_traced
 from ..linalg.recent import Recent
 from ..solvers.events import EventController
-from ..solvers.gaps import GapController
-from ..solvers.headings import HeadingController
 from ..system import AbstractSystem
 from ..system.inputs import input_break_times, turning_times
 from .method import adapts
@@ -33,14 +31,9 @@ class Stops(NamedTuple):
     event: diffrax.Event | None
     max_events: int
 
-    def around(self, controller: Any, contacts: bool, gaps: bool, headings: Any = None) -> Any:
-        """A controller that steps to these times and restarts there, and at events of `contacts`. If forces have
-        `gaps`, no step passes over a force that acts in a gap. No step passes a state at which one of the `headings`
-        vanishes, if these are given as a function of time and state.
-        """
-        controller = controller if headings is None else HeadingController(controller, headings)
+    def around(self, controller: Any, contacts: bool) -> Any:
+        """A controller that steps to these times and restarts there, and at events of `contacts`."""
         controller = EventController(controller, self.max_events) if contacts else controller
-        controller = GapController(controller) if gaps else controller
         if self.restarts is None and self.turns is None:
             return controller
         return diffrax.ClipStepSizeController(controller, step_ts=self.turns, jump_ts=self.restarts)

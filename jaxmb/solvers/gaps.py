@@ -7,18 +7,12 @@ hides a contact is tried again up to the time of least gap; all other steps are 
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool
 
 from .._compat import loop_of_lanes
-from .controller import AbstractControllerAround
-from .directed import direction_of
-from .evaluation import gaps_of
-from .events import AbstractErrorWithMore
 from .manifold_term import AbstractGaps
-from .wrapped import AbstractSolverAround
 
 # A stretch of a step is examined in this many pieces; stretches that hide nothing grow by this factor.
 _PIECES, _GROWTH = 8, 4.0
@@ -35,16 +29,11 @@ _SHORTEST, _LOOKS = 1e-9, 256
 _UNCERTAIN = 2.0
 
 
-class Hidden(AbstractErrorWithMore):
-    """The `y_error` that a solver passes to a `GapController`.
+class Hidden(NamedTuple):
+    """What a step hides: the `target`, the time up to which the step may go; whether it `hides` a force."""
 
-    **Fields:** the `error` for the controller inside; the `target`: the time up to which the step may go; `hides`: 1 if
-    the step hides a force, else 0, since diffrax expects no truth values in an error.
-    """
-
-    error: PyTree
     target: Any
-    hides: Float[Array, ""]
+    hides: Bool[Array, ""]
 
 
 class _Ends(NamedTuple):
@@ -74,7 +63,7 @@ class _Walk(NamedTuple):
     looks: Any
 
 
-def hidden(gaps: AbstractGaps, direction: Any, error: PyTree, step: tuple[Any, Any], y1: Any, at: Any) -> Hidden:
+def hidden(gaps: AbstractGaps, direction: Any, step: tuple[Any, Any], y1: Any, at: Any) -> Hidden:
     """Search for forces that a step hides.
 
     **Arguments:** `direction` of time; `step`: its first and last time, in the solver's time; `y1`: the state at its
@@ -107,7 +96,7 @@ def hidden(gaps: AbstractGaps, direction: Any, error: PyTree, step: tuple[Any, A
     goes = lambda walk: (walk.start < 1) & ~walk.hides
     # Most steps of most lanes need one look.
     last = loop_of_lanes(lambda walk: goes(walk) & (walk.looks < 2), goes, advance, first)
-    return Hidden(error, t0 + last.target * (t1 - t0), last.hides.astype(none.dtype))
+    return Hidden(t0 + last.target * (t1 - t0), last.hides)
 
 
 def _advanced(walk: _Walk, s, gaps, rates, pace, touch) -> _Walk:
@@ -191,43 +180,3 @@ def _least(gaps, rates, piece):
     way = jnp.clip((after - before - piece * opening) / jnp.where(turns, closing - opening, 1.0), 0.0, piece)
     least = jnp.minimum(before, after)
     return jnp.where(turns, jnp.minimum(before + closing * way, least), least)
-
-
-class AbstractWithoutJumps(AbstractControllerAround):
-    """Wraps a controller, and adds no jumps."""
-
-
-class GapController(AbstractWithoutJumps):
-    """Wraps a controller so that no step passes over a force that sets in and ends within it."""
-
-    controller: Any
-
-    def __init__(self, controller: Any):
-        self.controller = controller
-
-    def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
-        before, report = controller_state, y_error
-        keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, report.error, error_order, before
-        )
-        again = keep & (report.hides > 0)
-        # The controller inside does not learn of a good step that hid a force.
-        inner = jax.tree.map(lambda new, old: jnp.where(again, old, new), inner, before)
-        next_t0, next_t1 = jnp.where(again, t0, next_t0), jnp.where(again, report.target, next_t1)
-        return keep & ~again, next_t0, next_t1, made_jump, inner, result
-
-
-class GapSolver(AbstractSolverAround):
-    """A one-step solver that examines the gaps in which the forces of its term act."""
-
-    # A nested program, so that the step is traced once.
-    @eqx.filter_jit
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y1, error, dense_info, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        gaps = gaps_of(terms)
-        assert gaps is not None, "a term without gaps needs no solver that looks at them"
-        at = self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate
-        return y1, hidden(gaps, direction_of(terms), error, (t0, t1), y1, at), dense_info, state, result

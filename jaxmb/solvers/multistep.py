@@ -21,12 +21,10 @@ from .evaluation import (
     derivative,
     first_chart,
     found_at_jump,
-    gaps_of,
     guards_of,
     refused,
 )
 from .events import Crossing, cond_of_jumps, crossing, map_error
-from .gaps import Hidden, hidden
 from .manifold_term import Args, Chart, Y
 from .order import StepEstimate, refuse
 from .packing import Layout
@@ -144,7 +142,7 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         args: Args,
         solver_state: Any,
         made_jump: Any,
-    ) -> tuple[Y, StepEstimate | Crossing | Hidden | None, dict[str, Any], Any, diffrax.RESULTS]:
+    ) -> tuple[Y, StepEstimate | Crossing | None, dict[str, Any], Any, diffrax.RESULTS]:
         first = y0
         y0, before = self.restarted(terms, t0, t1, y0, args, solver_state, made_jump)
         y1, estimate, dense_info, state, failed = self._advanced(terms, t1, y0, args, before)
@@ -152,9 +150,9 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
         if off is not False:
             failed, estimate = failed | off, refuse(estimate, off)
         estimate = None if self.tolerances.fixed else estimate
-        guards, gaps = guards_of(terms), None if estimate is None else gaps_of(terms)
-        at = lambda t: self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate(t)
+        guards = guards_of(terms)
         if guards is not None:
+            at = lambda t: self.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate(t)
             retry = jnp.inf if estimate is None else estimate.retry
             ends = first, y0, y1
             estimate = crossing(guards, direction_of(terms), estimate, (t0, t1), ends, at, made_jump, retry)
@@ -162,8 +160,6 @@ class AbstractMultistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptive
             off = jnp.isnan(estimate.lowest)
             failed = failed | off
             estimate = map_error(lambda error: error if error is None else refuse(error, off), estimate)
-        if gaps is not None:
-            estimate = hidden(gaps, direction_of(terms), estimate, (t0, t1), y1, at)
         result: Any = diffrax.RESULTS.successful
         if failed is not False:
             result = diffrax.RESULTS.where(failed, _FAILED, result)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -41,12 +42,16 @@ class StepEstimate(eqx.Module):
     work: Float[Array, "2"]
 
 
-def refuse(estimate: StepEstimate, off: Bool[Array, ""]) -> StepEstimate:
-    """The estimate of a step, changed so that the step is not accepted where `off`."""
+def refuse(error: Any, off: Bool[Array, ""]) -> Any:
+    """An error estimate, changed so that the step is not accepted where `off`; a `StepEstimate` asks for a shorter
+    step as well.
+    """
+    if not isinstance(error, StepEstimate):
+        return jax.tree.map(lambda x: jnp.where(off, jnp.asarray(jnp.inf, x.dtype), x), error)
     parts = lambda e: (e.error, e.growth, e.retry, e.response)
-    values = zip(parts(estimate), (jnp.inf, 0.0, _REFUSED, 1.0), strict=True)
+    values = zip(parts(error), (jnp.inf, 0.0, _REFUSED, 1.0), strict=True)
     changed = [jnp.where(off, jnp.asarray(worst, value.dtype), value) for value, worst in values]
-    return eqx.tree_at(parts, estimate, changed)
+    return eqx.tree_at(parts, error, changed)
 
 
 def growth_factors(errors: Float[Array, " formulas"], powers: Any, target: float) -> Float[Array, " formulas"]:

@@ -20,7 +20,12 @@ from jaxtyping import PyTree
 from .._compat import any_of_batch, buffer_set, changed, while_loop, with_loops
 from .controller import intended_step
 from .directed import directed, undirected
-from .turning import Counted, turning_of
+from .evaluation import gaps_of
+from .events import map_error
+from .gaps import hidden
+from .headings import turns_over
+from .order import refuse
+from .turning import Counted, Turning
 from .wrapped import with_tolerances
 
 _RESULTS = diffrax.RESULTS
@@ -72,7 +77,7 @@ class Progress(eqx.Module):
     **Fields:** `tprev`: the end of the last accepted step; `tnext`: the end of the next attempted step; `y` at `tprev`;
     whether there was a jump (`made_jump`); the states of solver, controller and progress meter; the `result` so far;
     numbers of steps; the series `saved`; `dense` output, None without; `near`: where an event may lie, None without
-    events.
+    events; `turning`: the count of full turns, None without.
     """
 
     tprev: Any
@@ -89,6 +94,7 @@ class Progress(eqx.Module):
     saved: tuple[Series, ...]
     dense: Dense | None
     near: EventNear | None
+    turning: Turning | None
 
 
 class Carry(eqx.Module):
@@ -145,11 +151,25 @@ class Carry(eqx.Module):
         return changed(state, tnext=tnext, saved=saved, dense=dense, **given)
 
 
+class Along(NamedTuple):
+    """What an integration looks at along its steps, in the user's time.
+
+    **Fields:** whether no step passes over a force that acts in one of the term's `gaps`; `headings(t, y)`, vectors
+    that must not vanish, None for none; `angles(t, y)`, angles up to full turns and their rates, which are counted from
+    the angles `counted`, None for none.
+    """
+
+    gaps: bool = False
+    headings: Callable[..., Any] | None = None
+    angles: Callable[..., Any] | None = None
+    counted: Any = None
+
+
 class Integration(NamedTuple):
     """What an integration does, in the solver's time; made by `begun`.
 
     **Fields:** as the arguments of `diffrax.diffeqsolve`; `max_steps`: the number of steps for which there are tables;
-    the `direction` of the user's time.
+    the `direction` of the user's time; what is looked at `along` the steps.
     """
 
     terms: PyTree
@@ -164,6 +184,7 @@ class Integration(NamedTuple):
     max_steps: int
     progress_meter: Any
     direction: Any
+    along: Along
 
     @property
     def subs(self) -> list[diffrax.SubSaveAt]:
@@ -206,20 +227,24 @@ class Integration(NamedTuple):
                 EventNear(self.t0, self.t0, info, values, mask),
                 _RESULTS.where(happened, _RESULTS.event_occurred, result),
             )
-        saved = tuple(self._tables(sub, y0, controller_state) for sub in self.subs)
+        turning = None if self.along.angles is None else Turning.of(self.t0, self.along.counted)
+        saved = tuple(self._tables(sub, y0, turning) for sub in self.subs)
         start = (self.t0, tnext, y0, made_jump, solver_state, controller_state, self.progress_meter.init())
-        first = Progress(*start, result, 0, 0, 0, saved, dense, near)
+        first = Progress(*start, result, 0, 0, 0, saved, dense, near, turning)
         at_start = lambda sub, saved: _saved(self, sub, saved, first, self.t0, y0) if sub.t0 else saved
         return changed(first, saved=self.on_series(at_start, saved))
 
-    def _tables(self, sub: diffrax.SubSaveAt, y0: PyTree, controller_state: Any) -> Series:
+    def _tables(self, sub: diffrax.SubSaveAt, y0: PyTree, turning: Turning | None) -> Series:
         every, rows = sub.steps, self.max_steps
         size = int(sub.t0) + (0 if sub.ts is None else len(sub.ts)) + (rows // every if every else 0)
         size += int(sub.t1 and (every == 0 or rows % every != 0))
-        shapes = eqx.filter_eval_shape(lambda: _seen(self, sub, controller_state, self.t0, y0))
+        shapes = eqx.filter_eval_shape(lambda: _seen(self, sub, turning, self.t0, y0))
         # Entries that are never written are infinite.
         ys = jax.tree.map(lambda x: jnp.full((size, *x.shape), jnp.inf, x.dtype), shapes)
         return Series(self.direction * jnp.full(size, jnp.inf, self.t0.dtype), ys, 0, 0)
+
+
+_NOTHING = Along()
 
 
 def begun(
@@ -237,6 +262,7 @@ def begun(
     max_steps: int,
     progress_meter: Any = _NO_METER,
     made_jump: Any = False,
+    along: Along = _NOTHING,
 ) -> tuple[Integration, Progress]:
     """An integration and its start.
 
@@ -244,9 +270,9 @@ def begun(
     """
     _check_terms(terms, solver)
     direction = jnp.where(t0 < t1, 1, -1)
-    along = lambda t: None if t is None else t * direction
+    directed_time = lambda t: None if t is None else t * direction
     has_times = lambda saveat: [x.ts for x in jax.tree.leaves(saveat.subs, is_leaf=_is_sub) if x.ts is not None]
-    saveat = eqx.tree_at(has_times, saveat, replace_fn=along)
+    saveat = eqx.tree_at(has_times, saveat, replace_fn=directed_time)
     controller = stepsize_controller.wrap(direction)
     solver = with_loops(with_tolerances(solver, controller), "lax")
     integration = Integration(
@@ -256,12 +282,13 @@ def begun(
         stepsize_controller=controller,
         event=event,
         saveat=saveat,
-        t0=along(t0),
-        t1=along(t1),
-        dt0=along(dt0),
+        t0=directed_time(t0),
+        t1=directed_time(t1),
+        dt0=directed_time(dt0),
         max_steps=max_steps,
         progress_meter=progress_meter,
         direction=direction,
+        along=along,
     )
     return integration, integration.first(y0, made_jump)
 
@@ -416,10 +443,27 @@ def _advanced(solve: Integration, state: Any) -> Any:
     )
     # A step whose error is NaN is too long.
     error = jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
+    times = start * solve.direction, end * solve.direction
+    if solve.along.headings is not None:
+        turned = turns_over(solve.along.headings, times, (state.y, y))
+        error = map_error(lambda error: refuse(error, turned), error)
     order = solve.solver.error_order(solve.terms)
     keep, tprev, tnext, made_jump, controller_state, of_controller = solve.stepsize_controller.adapt_step_size(
         start, end, state.y, y, solve.args, error, order, state.controller_state
     )
+    within = solve.solver.interpolation_cls(t0=start, t1=end, **dense)
+    gaps = gaps_of(solve.terms) if solve.along.gaps else None
+    if gaps is not None:
+        found = hidden(gaps, solve.direction, (start, end), y, within.evaluate)
+        again = keep & found.hides
+        # The controller does not learn of a good step that hid a force.
+        controller_state = jax.tree.map(
+            lambda new, old: jnp.where(again, old, new), controller_state, state.controller_state
+        )
+        keep, tprev, tnext = keep & ~again, jnp.where(again, start, tprev), jnp.where(again, found.target, tnext)
+    turning = state.turning
+    if turning is not None:
+        turning = turning.after(solve.along.angles, solve.direction, (start, end), (state.y, y), keep)
     t1 = solve.t1
     tprev = jnp.minimum(tprev, t1)
     almost = t1 - _LAST * jnp.finfo(t1.dtype).eps * jnp.abs(t1) - jnp.finfo(t1.dtype).tiny
@@ -445,8 +489,8 @@ def _advanced(solve: Integration, state: Any) -> Any:
         num_steps=state.num_steps + 1,
         num_accepted_steps=accepted,
         num_rejected_steps=state.num_rejected_steps + jnp.where(keep, 0, 1),
+        turning=turning,
     )
-    within = solve.solver.interpolation_cls(t0=start, t1=end, **dense)
     saved = solve.on_series(lambda sub, saved: _with_times(solve, sub, saved, new, within, end, keep), state.saved)
     saved = solve.on_series(lambda sub, saved: _with_step(solve, sub, saved, new, (tprev, y), keep), saved)
     new = changed(new, saved=saved)
@@ -476,10 +520,9 @@ def _share(t0, t, t1):
     return jnp.where(same, 0.0, t - t0) / jnp.where(same, 1.0, t1 - t0)
 
 
-def _seen(solve: Integration, sub: diffrax.SubSaveAt, controller_state: Any, t: Any, y: PyTree) -> PyTree:
+def _seen(solve: Integration, sub: diffrax.SubSaveAt, turning: Turning | None, t: Any, y: PyTree) -> PyTree:
     """What a series saves of a state at a time in the last accepted step."""
     seen = y if sub.fn is _STATES else sub.fn(t * solve.direction, y, solve.args)
-    turning = turning_of(controller_state)
     return seen if turning is None else Counted(seen, turning.at(t))
 
 
@@ -490,7 +533,7 @@ def _saved(
     write = lambda table, x: lax.dynamic_update_slice_in_dim(
         table, jnp.broadcast_to(x, (times, *jnp.shape(x))), saved.count, axis=0
     )
-    ys = jax.tree.map(write, saved.ys, _seen(solve, sub, state.controller_state, t, y))
+    ys = jax.tree.map(write, saved.ys, _seen(solve, sub, state.turning, t, y))
     return changed(saved, ts=write(saved.ts, t), ys=ys, count=saved.count + times)
 
 
@@ -506,7 +549,7 @@ def _with_times(solve, sub, saved, state, within, end, keep):
     def save(saved):
         t = sub.ts[saved.passed]
         place = saved.count
-        y = _seen(solve, sub, state.controller_state, t, within.evaluate(t))
+        y = _seen(solve, sub, state.turning, t, within.evaluate(t))
         ys = jax.tree.map(lambda x, table: table.at[place].set(x), y, saved.ys)
         ts = saved.ts.at[place].set(t)
         return changed(saved, ts=ts, ys=ys, count=place + 1, passed=saved.passed + 1)
@@ -520,7 +563,7 @@ def _with_step(solve, sub, saved, state, at, keep):
     if sub.steps == 0:
         return saved
     here = keep & (state.num_accepted_steps % sub.steps == 0)
-    value = lambda: _seen(solve, sub, state.controller_state, *at)
+    value = lambda: _seen(solve, sub, state.turning, *at)
     if sub.steps == 1:
         y = value()
     else:

@@ -11,11 +11,9 @@ import jax.numpy as jnp
 from .._compat import with_loops
 from .controller import MultistepController
 from .evaluation import freeze, ravel, unravel_like
-from .gaps import AbstractWithoutJumps
 from .multistep import AbstractMultistep
 from .one_step import OneStepController, WithTangents
 from .steps import AbstractSteps, LinearStep, refuse_moving_jumps
-from .turning import without_turning
 
 
 class WholeSteps(AbstractSteps):
@@ -86,11 +84,8 @@ class WholeSteps(AbstractSteps):
 def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
     """The steps of a solver, and the solver without the tangents that it carries along."""
     jumpless = (MultistepController, OneStepController, diffrax.PIDController, diffrax.ConstantStepSize, diffrax.StepTo)
-    controller = without_turning(controller)
     # Concrete classes, since no attribute tells that a controller knows no jumps.
     if isinstance(controller, diffrax.ClipStepSizeController) and controller.jump_ts is None:
-        controller = controller.controller
-    while isinstance(controller, AbstractWithoutJumps):
         controller = controller.controller
     jumps = not isinstance(controller, jumpless)
     if isinstance(solver, AbstractMultistep):
@@ -106,7 +101,6 @@ def steps_of(solver: Any, controller: Any) -> tuple[AbstractSteps, Any]:
 
 def jump_times(controller: Any) -> Any:
     """The times of jumps that a step size controller knows, or None."""
-    controller = without_turning(controller)
     # A concrete class: no other has such times.
     return controller.jump_ts if isinstance(controller, diffrax.ClipStepSizeController) else None
 

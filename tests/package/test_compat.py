@@ -17,8 +17,8 @@ from jax import lax
 from precision import single_precision
 
 from jaxmb.linalg.sums import unchecked_take
+from jaxmb.manifold.projection import ProjectedSolver
 from jaxmb.solvers import directed
-from jaxmb.solvers.gaps import GapSolver
 
 MOST_PROGRAMS = 70
 
@@ -422,7 +422,7 @@ def test_loops_of_runge_kutta_methods(compat):
     """Also of those inside others."""
     about = "Runge–Kutta methods of diffrax no longer have the field `scan_kind`"
     explicit = diffrax.Tsit5()
-    for solver in (explicit, diffrax.Kvaerno3(), GapSolver(explicit), diffrax.HalfSolver(explicit)):
+    for solver in (explicit, diffrax.Kvaerno3(), ProjectedSolver(explicit, None), diffrax.HalfSolver(explicit)):
         whole = compat.with_loops(solver, "lax")
         assert getattr(whole, "solver", whole).scan_kind == "lax", about
     assert compat.with_loops(diffrax.SemiImplicitEuler(), "lax") == diffrax.SemiImplicitEuler()

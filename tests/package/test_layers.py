@@ -142,7 +142,7 @@ CONCRETE = {
     "system.design: Variable",
 }
 # The function that they stand in says what they hold beside what others hold.
-DESCRIBED = {"simulate.solve: Counted", "solvers.mesh: Counted", "solvers.headings: StepEstimate"}
+DESCRIBED = {"simulate.solve: Counted", "solvers.mesh: Counted", "solvers.order: StepEstimate"}
 
 
 def test_concrete_classes_are_seldom_looked_for():
