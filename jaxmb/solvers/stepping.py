@@ -127,7 +127,9 @@ class Carry(eqx.Module):
         """
         never = solve.direction * jnp.asarray(jnp.inf, first.tprev.dtype)
         fresh, begins, before = self.fresh, self.begins, self.progress
-        again = lambda new, old: jnp.where(fresh, new, old)
+        # `select` is one instruction, and `where` is a function.
+        again = lambda new, old: lax.select(fresh, jnp.asarray(new, old.dtype), old)
+        since = lambda new, old: lax.select(begins, new, jnp.full_like(new, old))
         bare = changed(first, saved=(), dense=None, result=None, made_jump=jnp.asarray(first.made_jump))
         state = jax.tree.map(again, bare, before)
         # At the end of an interval no further step was planned.
@@ -137,10 +139,10 @@ class Carry(eqx.Module):
         tnext = jnp.minimum(tnext, solve.t1)
         saved = tuple(
             Series(
-                jnp.where(begins, series.ts, never),
-                jax.tree.map(lambda x: jnp.where(begins, x, jnp.full_like(x, jnp.inf)), series.ys),
-                jnp.where(begins, series.count, 0),
-                jnp.where(begins, series.passed, passed),
+                since(series.ts, never),
+                jax.tree.map(lambda x: since(x, jnp.inf), series.ys),
+                since(jnp.asarray(series.count, passed.dtype), 0),
+                since(jnp.asarray(series.passed, passed.dtype), passed),
             )
             for series, passed in zip(first.saved, self.passed, strict=True)
         )
@@ -458,7 +460,7 @@ def _advanced(solve: Integration, state: Any) -> Any:
         again = keep & found.hides
         # The controller does not learn of a good step that hid a force.
         controller_state = jax.tree.map(
-            lambda new, old: jnp.where(again, old, new), controller_state, state.controller_state
+            lambda new, old: _chosen(again, old, new), controller_state, state.controller_state
         )
         keep, tprev, tnext = keep & ~again, jnp.where(again, start, tprev), jnp.where(again, found.target, tnext)
     turning = state.turning
@@ -470,7 +472,7 @@ def _advanced(solve: Integration, state: Any) -> Any:
     ended = jnp.where(keep, t1, tprev + 0.5 * (t1 - tprev))
     tnext = jnp.where(tnext > lax.stop_gradient(almost), ended, tnext)
 
-    kept = lambda new, old: jnp.where(keep, new, old)
+    kept = lambda new, old: _chosen(keep, jnp.asarray(new), jnp.asarray(old))
     y = jax.tree.map(kept, y, state.y)
     of_solver = _RESULTS.where(keep, of_solver, _RESULTS.successful)
     result = _RESULTS.where(diffrax.is_okay(state.result), of_solver, state.result)
@@ -508,7 +510,9 @@ def _advanced(solve: Integration, state: Any) -> Any:
 
 
 def _chosen(keep, new, old):
-    """One of two truth values; a Python one if `keep` is, or if both are the same."""
+    """One of two values; a Python one if `keep` is, or if both are the same. `select` is one instruction, and `where` a
+    function.
+    """
     if isinstance(keep, bool | np.bool_):
         return new if keep else old
     return new if new is old else lax.select(keep, new, old)
