@@ -11,7 +11,6 @@ from compiling import jit_quickly
 from oracles import large
 
 import jaxmb as mb
-from jaxmb.bodies import structure
 from jaxmb.mechanisms.observe import point_motion
 
 TIMES = np.array([0.2, 0.4, 0.6, 0.8])
@@ -82,7 +81,6 @@ def test_tree_has_no_dense_matrix_and_programs_of_one_size():
         mechanism = mb.mechanisms.get("tree", n=n)
         system, state = mechanism.system, mechanism.state
         programs = (
-            jax.jit(structure._met.__wrapped__).lower(system),
             jax.jit(lambda y, system=system: mb.assemble(system, y, throw=False)).lower(state),
             jax.jit(lambda y, system=system: mb.simulate(system, y, t1=0.1).ys).lower(state),
         )
