@@ -2,6 +2,7 @@
 ends a run between two calls.
 """
 
+import itertools
 import time
 from typing import Any, NamedTuple
 
@@ -53,16 +54,16 @@ def in_calls(problem: Problem, max_steps: int, meter: Any, carry: Carry | None =
         start = changed(blank(split), fresh=yes, begins=yes)
     before = steps = 0 if carry is None else int(start.progress.num_steps)
     parts: list[Trajectory] = []
-    done: Any = None
+    last: Any = None
     size, interrupted = _STEPS, False
     share = None if meter is None else meter.init()
     try:
-        while True:
+        for count in itertools.count():
             # Tables of steps have so many rows.
             limit = min(before + max_steps, steps + min(size, problem.room.rows))
             began = time.monotonic()
-            done = call(problem, split, start, np.asarray(limit))
-            trajectory, outcome, start = done
+            last = count, call(problem, split, start, np.asarray(limit))
+            trajectory, outcome, start = last[1]
             if is_traced(outcome.flags):
                 raise ValueError(_HIDDEN)
             flags, took = Flags(*np.asarray(outcome.flags)), time.monotonic() - began
@@ -78,14 +79,14 @@ def in_calls(problem: Problem, max_steps: int, meter: Any, carry: Carry | None =
                 # The first call may have compiled the program.
                 size = max(size // 2, 1)
     except KeyboardInterrupt:
-        if not parts:
+        if last is None:
             raise
-        interrupted, _ = True, parts.pop()
+        interrupted = True
     if meter is not None:
         meter.close(share)
-    trajectory, outcome, start = done
+    count, (trajectory, outcome, start) = last
     flags = Flags(*np.asarray(outcome.flags))
-    return Calls(_joined(parts, trajectory), outcome, flags, start, interrupted)
+    return Calls(_joined(parts[:count], trajectory), outcome, flags, start, interrupted)
 
 
 def carried_on(before: Problem, after: Problem, carry: Carry) -> Carry | None:
