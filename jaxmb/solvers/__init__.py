@@ -33,7 +33,7 @@ from .adams import Adams as Adams
 from .controller import MultistepController as MultistepController
 from .evaluation import evaluate as evaluate, next_chart as next_chart, project_near as project_near
 from .hermite import Hermite as Hermite
-from .integrate import integrate as integrate
+from .integration import integrate as integrate
 from .multistep import (
     AbstractAttempt as AbstractAttempt,
     AbstractMultistep as AbstractMultistep,

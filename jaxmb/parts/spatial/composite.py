@@ -81,6 +81,7 @@ class Composite(AbstractSpatialPart, AbstractJoint):
 
     @property
     def quantities(self):
+        """The kind of each coordinate, by its name."""
         kinds = {"hinge": "angle", "slide": "length", "ball": "rotation"}
         return {name: kinds[word] for name, word in zip(coordinate_names(self.sequence), self.sequence, strict=True)}
 

@@ -24,12 +24,12 @@ def integrate(
     y0: PyTree,
     args: PyTree = None,
     *,
-    saveat: diffrax.SaveAt = _END,
-    stepsize_controller: diffrax.AbstractStepSizeController = _STEPS,
+    saveat: diffrax.SaveAt | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     event: diffrax.Event | None = None,
     max_steps: int = 4096,
     kept: int = 2048,
-    progress_meter: diffrax.AbstractProgressMeter = _NO_METER,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = True,
 ) -> diffrax.Solution:
     """Integrate a differential equation, as `diffrax.diffeqsolve` does, with the derivatives of a simulation.
@@ -52,8 +52,9 @@ def integrate(
     Forward mode, reverse mode and their combinations differentiate the same steps. The functions of an event see the
     times of the user, also in a run backwards.
 
-    **Arguments:** as of `diffrax.diffeqsolve`; `kept`: the number of steps whose rows derivatives keep at once. Second
-    derivatives need the rows of all steps. A function of saved states (`SaveAt(fn=...)`) rules out derivatives.
+    **Arguments:** as of `diffrax.diffeqsolve`, with its defaults; `kept`: the number of steps whose rows derivatives
+    keep at once. Second derivatives need the rows of all steps. A function of saved states (`SaveAt(fn=...)`) rules out
+    derivatives.
 
     **Returns:** the solution, with the last states of the solver and the controller.
 
@@ -73,11 +74,11 @@ def integrate(
         "dt0": in_time(dt0),
         "y0": y0,
         "args": args,
-        "saveat": eqx.tree_at(has_times, saveat, replace_fn=in_time),
-        "stepsize_controller": stepsize_controller,
+        "saveat": eqx.tree_at(has_times, _END if saveat is None else saveat, replace_fn=in_time),
+        "stepsize_controller": _STEPS if stepsize_controller is None else stepsize_controller,
         "event": event,
         "max_steps": max_steps,
-        "progress_meter": progress_meter,
+        "progress_meter": _NO_METER if progress_meter is None else progress_meter,
     }
     solution = _compiled(terms, solver, options, kept)
     if throw:
