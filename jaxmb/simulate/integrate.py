@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 from jax import lax
 
-from ..lanes.members import of_one_or_more
 from ..manifold.orthogonal_projection import project
 from ..solvers.mesh import on_mesh
 from ..solvers.one_step import with_tangents
@@ -47,6 +46,9 @@ def integrated(
 def _on_mesh(integration, control, room, projects_steps):
     """The solution on a mesh that resolves the motion, and tangents as well if it is differentiated."""
     del control, projects_steps
+    # At first use: an import of the package does not load batches.
+    from ..lanes.members import of_one_or_more
+
     term, solver, options = integration
     return of_one_or_more(_solution, term, solver, options, room, None)
 
