@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._compat import ClosedJaxpr, canonical, default_float, is_weakly_typed, jaxpr_as_function
+from ._compat import ClosedJaxpr, canonical, is_weakly_typed, jaxpr_as_function
 from ._index_bounds import check_indices
 from ._jaxpr_digest import digest_of
 from ._traced_functions import shown_function
@@ -178,7 +178,7 @@ def _own(variable: Any, constant: Any) -> Any:
 
 
 def _as_array(leaf: Any) -> Any:
-    return np.asarray(leaf, default_float()) if type(leaf) in (int, float) else leaf
+    return np.asarray(leaf, canonical()) if type(leaf) in (int, float) else leaf
 
 
 def _kind(leaf: Any) -> Any:

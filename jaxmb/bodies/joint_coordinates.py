@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._compat import default_float
+from .._compat import canonical
 from .._types import Scalar
 from ..parts.combinations import JointCoupling
 from ..parts.coordinate_parts import AbstractCoordinatePart, JointDriver
@@ -45,7 +45,7 @@ def joint_coordinates(
     groups: Sequence[ConstraintGroup | CoordinateGroup], layout: Layout
 ) -> dict[str, JointCoordinate]:
     """The coordinates of all joints, by name."""
-    space, out, dtype, places = layout.space, {}, default_float(), itertools.count()
+    space, out, dtype, places = layout.space, {}, canonical(), itertools.count()
     ground = np.asarray(space.ground, dtype)
     # Only shapes are evaluated.
     poses = jax.eval_shape(lambda ground: jnp.tile(space.prepare(ground), (layout.ground + 1, 1)), ground)

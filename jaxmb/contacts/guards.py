@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import lax
 
-from .._compat import cond_of_any_lane
+from .._branches import cond_of_any_lane
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
 from ..linalg.pairs import for_first, of_pairs, placed_pairs
@@ -115,7 +115,7 @@ class ContactGuards(AbstractGuards):
 
 
 def contact_guards(
-    system: AbstractEquation, formulation: AbstractFormulation, tolerance: ContactTolerance | None
+    system: AbstractEquation, formulation: AbstractFormulation, tolerance: ContactTolerance
 ) -> ContactGuards | None:
-    """The guards of a system's contacts; None if `tolerance` is None, as it is for systems without contacts."""
-    return None if tolerance is None else ContactGuards(system, formulation, tolerance)
+    """The guards of a system's contacts, None without any."""
+    return ContactGuards(system, formulation, tolerance) if system.contacts else None

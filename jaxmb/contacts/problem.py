@@ -81,12 +81,9 @@ class Laws(NamedTuple):
 
         **Arguments:** `free`: the rates at the end of compression.
         """
-        bound = jnp.zeros(self.contacts.m, free.dtype)
-        if self.contacts.m:
-            pushes = jnp.where(self.contacts.in_joints, 0.0, again[np.array(self.contacts.contact_of)])
-            bound = self.coefficient * pushes
+        pushes = jnp.where(self.contacts.in_joints, 0.0, again[np.array(self.contacts.contact_of, int)])
         problem = self.of_impulses(free + self.influence[:, : self.contacts.n] @ again, touching, reactions)
-        return problem._replace(bound=bound)
+        return problem._replace(bound=self.coefficient * pushes)
 
     def of_forces(self, opening, reactions, staying, slips, modes, forces) -> Problem:
         """The forces after an event, of contacts that are `staying`, and of friction.

@@ -45,7 +45,7 @@ class Baumgarte(AbstractManifold):
 
     takes_impulses: ClassVar[bool] = False
 
-    def prepare(self, system, formulation, solver, rtol):
+    def prepare(self, system, formulation, solver, accuracy):
         check_mass(system, formulation)
         check_watched(system, "Baumgarte")
         return diffrax.ODETerm(StabilisedField(system, formulation, self.rate)), solver
@@ -54,8 +54,8 @@ class Baumgarte(AbstractManifold):
         # The distance from the constraints is of interest, and stays.
         return normalize_state
 
-    def violated(self, system, t, y, rtol):
-        return violated(system, t, y, rtol)
+    def violated(self, system, t, y, accuracy):
+        return violated(Instant.of(system, t, y), accuracy.rtol, project=True)
 
 
 class StabilisedField(AbstractVectorField):

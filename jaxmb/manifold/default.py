@@ -7,6 +7,7 @@ import diffrax
 from ..formulations import AbstractFormulation
 from ..solvers import AbstractMultistep
 from ..system.equation import AbstractEquation
+from ..system.instant import Instant
 from .implied import check_watched, violated
 from .manifold import AbstractManifold, VectorField
 from .orthogonal_projection import project_normalized
@@ -25,7 +26,7 @@ class Unconstrained(AbstractManifold):
     restores: ClassVar[bool] = False
     takes_impulses: ClassVar[bool] = False
 
-    def prepare(self, system, formulation, solver, rtol):
+    def prepare(self, system, formulation, solver, accuracy):
         check_watched(system, "Unconstrained")
         return diffrax.ODETerm(VectorField(system, formulation)), solver
 
@@ -33,8 +34,8 @@ class Unconstrained(AbstractManifold):
         # Steps do not end on the constraints, and Euler parameters are not of unit length.
         return project_normalized
 
-    def violated(self, system, t, y, rtol):
-        return violated(system, t, y, rtol)
+    def violated(self, system, t, y, accuracy):
+        return violated(Instant.of(system, t, y), accuracy.rtol, project=True)
 
 
 # Defaults, made once: their construction takes as long as the rest of a call.

@@ -13,9 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._types import State
 from ..formulations.formulation import row_levels
-from ..linalg.arrays import as_array
 from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
@@ -78,21 +76,17 @@ def check_watched(system: AbstractEquation, policy: str) -> None:
         )
 
 
-def tolerance_of_dropped(system: AbstractEquation, rtol: Any) -> Any:
-    """The tolerance of integration as an array if implied rows are dropped, else None."""
-    return as_array(rtol, jnp.result_type(float)) if drops_rows(system) else None
-
-
-def violated(system: AbstractEquation, t: Any, y: State, rtol: Any) -> Any:
-    """Whether a state near the kept rows, after a projection on them, violates dropped rows; False without any."""
-    if tolerance_of_dropped(system, rtol) is None:
-        return False
-    return _violated(*lax.stop_gradient((system, t, y, rtol)))
+def violated(at: Instant, rtol: Any, project: bool = False) -> Any:
+    """Whether a state on the kept rows, or near them and then to `project` on them, violates dropped rows; False
+    without any.
+    """
+    return _violated(*lax.stop_gradient((at, rtol)), project) if drops_rows(at.system) else False
 
 
 @eqx.filter_jit
-def _violated(system, t, y, rtol):
-    at = Instant.of(system, t, project_normalized(system, t, y))
+def _violated(at, rtol, project):
+    if project:
+        at = Instant.of(at.system, at.t, project_normalized(at.system, at.t, at.state))
     return violation_without_chart(at, rtol) > 1
 
 

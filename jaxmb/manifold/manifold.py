@@ -7,17 +7,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._types import Scalar, State
-from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation, Multipliers, NullSpace
 from ..formulations.laws import accelerations_at
-from ..linalg.arrays import as_array, namespace
 from ..solvers.manifold_term import AbstractVectorField
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
+from .accuracy import Accuracy
 from .compliant_gaps import compliant_gaps
 
 if TYPE_CHECKING:
@@ -50,7 +48,11 @@ class AbstractManifold(eqx.Module):
 
     @abc.abstractmethod
     def prepare(
-        self, system: AbstractEquation, formulation: AbstractFormulation, solver: diffrax.AbstractSolver, rtol: Scalar
+        self,
+        system: AbstractEquation,
+        formulation: AbstractFormulation,
+        solver: diffrax.AbstractSolver,
+        accuracy: Accuracy,
     ) -> tuple[diffrax.AbstractTerm, diffrax.AbstractSolver]:
         """The term to integrate and the solver for it.
 
@@ -68,26 +70,18 @@ class AbstractManifold(eqx.Module):
         **Arguments:** `interpolated`: whether states between steps are saved.
         """
 
-    def contact_tolerance(self, system: AbstractEquation, rtol: Scalar) -> ContactTolerance | None:
-        """The sizes that count as zero when contacts close, relative to the system's size; None without contacts. Gaps
-        count as zero up to a thousandth of the tolerance of integration, or up to `newton_tol` if this is larger.
-        """
-        if not system.contacts:
-            return None
-        touch = newton_tolerance(None, rtol)
-        return ContactTolerance(touch if self.newton_tol is None else namespace(touch).maximum(touch, self.newton_tol))
+    def accuracy(self, rtol: Scalar) -> Accuracy:
+        """The tolerances of a motion by that of integration."""
+        return Accuracy.of(rtol, self.newton_tol)
 
     def statistics(self, solver_state: Any) -> dict[str, Array]:
         """Counts of the policy's work, from the final state of the solver."""
         del solver_state
         return {}
 
-    def violated(self, system: AbstractEquation, t: Scalar, y: State, rtol: Scalar) -> Any:
-        """Whether the end of a simulation violates constraint rows that the policy omits; False if it omits none.
-
-        **Arguments:** `rtol`: the tolerance of integration.
-        """
-        del system, t, y, rtol
+    def violated(self, system: AbstractEquation, t: Scalar, y: State, accuracy: Accuracy) -> Any:
+        """Whether the end of a simulation violates constraint rows that the policy omits; False if it omits none."""
+        del system, t, y, accuracy
         return False
 
     def evidence(self, solver_state: Any) -> PyTree[Array]:
@@ -103,14 +97,14 @@ class AbstractManifold(eqx.Module):
         evidence: PyTree[Array],
         result: Any,
         failed: Any,
-        rtol: Scalar,
+        accuracy: Accuracy,
     ) -> Any:
         """The outcome of a simulation that failed, made precise if the policy knows the reason.
 
         **Arguments:** `t`, `y`: the last state; `evidence` of the solver there; `result`: a `RESULTS`; `failed`:
-        whether it is a failure that starts from finite numbers; `rtol`: the tolerance of integration.
+        whether it is a failure that starts from finite numbers.
         """
-        del system, t, y, evidence, failed, rtol
+        del system, t, y, evidence, failed, accuracy
         return result
 
 
@@ -134,11 +128,3 @@ class VectorField(AbstractVectorField):
 def normalize_state(system: AbstractEquation, t: Scalar, y: State) -> State:
     """The state with normalised coordinates."""
     return dataclasses.replace(y, q=system.normalize(t, y.q))
-
-
-def newton_tolerance(given: float | None, rtol: Scalar) -> Any:
-    """The size of the last Newton correction relative to the system's size: as given, or by the tolerance `rtol`."""
-    dtype = jnp.result_type(float)
-    if given is not None:
-        return as_array(given, dtype)
-    return namespace(rtol).clip(1e-3 * rtol, 64 * float(jnp.finfo(dtype).eps), 1e-6)

@@ -23,10 +23,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compat import cond_of_lanes
+from .._branches import cond_of_lanes
 from .._results import RESULTS
 from .._types import Velocities
-from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation, Partitioned
 from ..formulations.formulation import check_mass, row_levels
 from ..formulations.friction import solve_coupled
@@ -39,6 +38,7 @@ from ..solvers import AbstractMultistep
 from ..solvers.manifold_term import ManifoldEvaluation
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
+from .accuracy import Accuracy
 from .constraints import (
     AbstractConstraints,
     RestoredState,
@@ -52,12 +52,12 @@ from .implied import (
     contradiction_ahead,
     drops_accelerations,
     drops_positions,
+    drops_rows,
     independent_part,
-    tolerance_of_dropped,
     violation_of_accelerations,
     watched,
 )
-from .manifold import AbstractManifold, newton_tolerance
+from .manifold import AbstractManifold
 from .orthogonal_projection import project_normalized
 from .split import AbstractSplit, Independent, kind_of_split, quality_of, restore_positions
 from .term import AbstractConstrainedTerm
@@ -284,17 +284,15 @@ class Partition(AbstractManifold):
         if not self.max_influence > 1:
             raise ValueError(f"Partition: max_influence must be above 1, got {self.max_influence}.")
 
-    def prepare(self, system, formulation, solver, rtol):
+    def prepare(self, system, formulation, solver, accuracy):
         if not isinstance(solver, AbstractMultistep):
             raise ValueError(
                 f"Partition needs a solver that knows charts (Adams or Hermite), got {type(solver).__name__}; use "
                 "manifold=Projection() with it."
             )
         check_mass(system, formulation)
-        tolerances = newton_tolerance(self.newton_tol, rtol), self.contact_tolerance(system, rtol)
-        tolerances = *tolerances, tolerance_of_dropped(system, rtol)
         term = PartitionTerm if system.acceleration_rows else FreeTerm
-        return term(system, formulation, self.max_influence, *tolerances), solver
+        return term(system, formulation, accuracy, self.max_influence), solver
 
     def default_formulation(self, system):
         return _PARTITIONED
@@ -309,14 +307,14 @@ class Partition(AbstractManifold):
         chart = solver_state.chart
         return chart.singular, None if chart.redundant is None else chart.redundant.suspected
 
-    def diagnose(self, system, t, y, evidence, result, failed, rtol):
+    def diagnose(self, system, t, y, evidence, result, failed, accuracy):
         (singular, violation), at = evidence, Instant.of(system, t, y)
         result = diagnose(at, singular, result, failed)
         if violation is None:
             return result
         # Steps were refused until they reached the allowed violation.
         if drops_accelerations(system):
-            violation = jnp.maximum(violation, contradiction_ahead(*lax.stop_gradient((at, rtol))))
+            violation = jnp.maximum(violation, contradiction_ahead(*lax.stop_gradient((at, accuracy))))
         return RESULTS.where(failed & (violation > 0.5), RESULTS.inconsistent_constraints, result)
 
 
@@ -380,24 +378,20 @@ class Chart(eqx.Module):
 
 
 class AbstractChartTerm(AbstractConstrainedTerm):
-    """A system as a term with charts.
-
-    **Fields:** `rtol`: the tolerance of integration, None if all rows are independent.
-    """
+    """A system as a term with charts."""
 
     # The error is measured on all components: if dependent ones change fast, the error of the independent ones alone
     # shows it too late. (A four-bar at error 1e-6: 2949 evaluations and no rejected step, against 3461 and 122; a
     # spatial slider-crank 3107 against 3867.)
 
     max_influence: AbstractVar[float]
-    rtol: AbstractVar[Float[Array, ""] | None]
 
     def init_chart(self, t, y, args):
         # A useless chart, so that charts are chosen in one place.
         at = lax.stop_gradient(self.at(t, y))
         choose = lambda at: _choose(at, at.coordinate_jacobian)
         split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, at))
-        redundant = None if self.rtol is None else DroppedRows.at_start(at)
+        redundant = DroppedRows.at_start(at) if drops_rows(self.system) else None
         memory = laws_of(self.system).remembered(at, jnp.zeros(self.system.acceleration_rows, y.q.dtype))
         unknown, none = jnp.full_like(quality, jnp.inf), jnp.zeros(5, int)
         return Chart(split, unknown, quality, none, redundant, _both(memory, memory))
@@ -413,7 +407,7 @@ class AbstractChartTerm(AbstractConstrainedTerm):
 
     def _project(self, at, chart, split):
         """Restore positions with the matrix of a split, then evaluate there."""
-        q, iterations, failed = restore_positions(at, split, False, self.newton_tol)
+        q, iterations, failed = restore_positions(at, split, False, self.accuracy.newton)
         out = self._evaluate(at.with_(q=q), _counted(chart, iterations))
         return out._replace(failed=failed | out.failed)
 
@@ -454,42 +448,39 @@ class AbstractChartTerm(AbstractConstrainedTerm):
 
 
 class PartitionTerm(AbstractChartTerm):
-    """A constrained system; `at_contact`: the sizes that count as zero at contacts, None without contacts."""
+    """A constrained system."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
+    accuracy: Accuracy
     max_influence: float = eqx.field(static=True)
-    newton_tol: Float[Array, ""]
-    at_contact: ContactTolerance | None = None
-    rtol: Float[Array, ""] | None = None
 
     def _evaluate(self, at, chart: Any):
         out = acceleration(at, self.formulation, chart.split)
         split = chart.split.at_evaluation(out.factor)
         quality = _velocity_quality(self.system, out.factor, split.velocity)
         chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=_both(out.memory, out.memory))
-        if out.jacobian is not None and self.rtol is not None:
+        if out.jacobian is not None and chart.redundant is not None:
             # The state is off the constraints by an error of the prediction.
             sizes, scale = chart.redundant.sizes, self.system.velocity_scale()
             rows = out.jacobian[: self.system.position_rows]
             independent = independent_part(rows, sizes, out.factor, split.velocity, scale)
-            independent = jnp.maximum(independent - _UNRESOLVED * self.rtol, 0.0)
+            independent = jnp.maximum(independent - _UNRESOLVED * self.accuracy.rtol, 0.0)
             chart = eqx.tree_at(lambda chart: chart.redundant.independent, chart, independent)
         near = SolvedState(ChartConstraints(out.factor, split, out.every, chart.outdated), out.udot, out.memory)
         return self.evaluated(at.with_(u=out.u), out.udot, chart, chart.singular | out.failed, near)
 
     def project_near(self, t, y, linearized_at, args):
         at, chart, near = self.at(t, y), linearized_at.chart, linearized_at.factors
-        out: Any = restore(at, near, self.newton_tol)
+        out: Any = restore(at, near, self.accuracy.newton)
         memory = _both(near.multipliers, out.multipliers)
         chart = dataclasses.replace(_counted(chart, out.iterations), multipliers=memory)
         return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart, out.failed | chart.singular)
 
     def after_step(self, t, y, chart, args):
-        if self.rtol is None:
+        if chart.redundant is None:
             return chart
-        tolerances = self.newton_tol, self.rtol
-        redundant = _watched(*lax.stop_gradient((self.at(t, y), chart.split, chart.redundant, tolerances)))
+        redundant = _watched(*lax.stop_gradient((self.at(t, y), chart.split, chart.redundant, self.accuracy)))
         return dataclasses.replace(chart, redundant=redundant)
 
     def _kept(self, chart, k):
@@ -505,10 +496,8 @@ class FreeTerm(AbstractChartTerm):
 
     system: AbstractEquation
     formulation: AbstractFormulation
+    accuracy: Accuracy
     max_influence: float = eqx.field(static=True)
-    newton_tol: Float[Array, ""]
-    at_contact: ContactTolerance | None = None
-    rtol: Float[Array, ""] | None = None
 
     def _evaluate(self, at, chart):
         return self.evaluated(at, at.inertia.solve(at.force), chart, chart.singular)
@@ -575,14 +564,14 @@ def _updated(at, chart, max_influence):
 
 
 @eqx.filter_jit
-def _watched(at, split, redundant, tolerances):
+def _watched(at, split, redundant, accuracy):
     """The dropped rows at a state, with their violation."""
-    system, (newton_tol, rtol) = at.system, tolerances
-    redundant = watched(at, redundant, newton_tol, rtol)
+    system = at.system
+    redundant = watched(at, redundant, accuracy.newton, accuracy.rtol)
     if not drops_accelerations(system):
         return redundant
     every = eliminate(at.jacobian, split.acceleration, system.acceleration_rank)
-    contradiction = violation_of_accelerations(at, every.right_inverse @ at.gamma, rtol)
+    contradiction = violation_of_accelerations(at, every.right_inverse @ at.gamma, accuracy.rtol)
     return eqx.tree_at(lambda rows: rows.violation, redundant, jnp.maximum(redundant.violation, contradiction))
 
 

@@ -6,16 +6,13 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Float
 
+from .._types import Scalar
 from ..contacts.guards import ContactGuards, contact_guards
-from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation
 from ..formulations.formulation import check_mass
 from ..formulations.laws import laws_of
 from ..formulations.multipliers import FactoredMultipliers
-from ..linalg.arrays import namespace
 from ..linalg.jacobian import MassProjector
 from ..solvers import AbstractMultistep, AbstractMultistepState
 from ..solvers.directed import direction_of, inner_term
@@ -24,11 +21,12 @@ from ..solvers.manifold_term import ManifoldEvaluation
 from ..solvers.wrapped import AbstractSolverAround
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
+from .accuracy import Accuracy
 from .constraints import SolvedState, restore
 from .diagnosis import NOT_PROJECTED, diagnose, diagnose_newton
-from .implied import check_watched, drops_rows, tolerance_of_dropped, violation_without_chart
+from .implied import check_watched, drops_rows, violated
 from .impulse import after_jump
-from .manifold import AbstractManifold, VectorField, newton_tolerance, normalize_state
+from .manifold import AbstractManifold, VectorField, normalize_state
 from .orthogonal_projection import (
     ProjectorConstraints,
     project_in_metric,
@@ -80,11 +78,14 @@ class Projection(AbstractManifold):
     newton_tol: float | None = eqx.field(static=True, default=None)  # pyright: ignore[reportIncompatibleVariableOverride]
     restores: ClassVar[bool] = True
 
-    def prepare(self, system, formulation, solver, rtol):
+    def accuracy(self, rtol):
+        return Accuracy.of(rtol, self.newton_tol, float(jnp.finfo(jnp.result_type(float)).eps) ** _LEFT_OUT)
+
+    def prepare(self, system, formulation, solver, accuracy):
         check_mass(system, formulation)
         if not isinstance(solver, AbstractMultistep):
-            guards = contact_guards(system, formulation, self.contact_tolerance(system, rtol))
-            solver = ProjectedSolver(solver, guards, tolerance_of_dropped(system, rtol))
+            guards = contact_guards(system, formulation, accuracy.at_contacts)
+            solver = ProjectedSolver(solver, guards, accuracy.rtol)
             return diffrax.ODETerm(VectorField(system, formulation)), solver
         _check_multistep(system, formulation, type(solver).__name__)
         if solver.solves_implicitly and not system.has_field_jacobian:
@@ -97,11 +98,8 @@ class Projection(AbstractManifold):
                 f"Projection with {type(solver).__name__} takes constraints that are ideal and bind positions or "
                 "velocities; use Partition()."
             )
-        tol = newton_tolerance(self.newton_tol, rtol)
-        if self.newton_tol is None:
-            tol = namespace(tol).minimum(tol, float(jnp.finfo(jnp.result_type(float)).eps) ** _LEFT_OUT)
         term = ProjectionTerm if system.velocity_rows else NormalisedTerm
-        return term(system, formulation, tol, self.contact_tolerance(system, rtol)), solver
+        return term(system, formulation, accuracy), solver
 
     def correction(self, interpolated):
         return _returned if interpolated else None
@@ -111,12 +109,10 @@ class Projection(AbstractManifold):
         chart: Any = solver_state.chart if isinstance(solver_state, AbstractMultistepState) else None
         return {} if chart is None else {"newton_iterations": chart}
 
-    def violated(self, system, t, y, rtol):
-        if tolerance_of_dropped(system, rtol) is None:
-            return False
-        return _violated(*lax.stop_gradient((Instant.of(system, t, y), rtol)))
+    def violated(self, system, t, y, accuracy):
+        return violated(Instant.of(system, t, y), accuracy.rtol)
 
-    def diagnose(self, system, t, y, evidence, result, failed, rtol):
+    def diagnose(self, system, t, y, evidence, result, failed, accuracy):
         if system.elimination is None:
             return diagnose(Instant.of(system, t, y), jnp.array(False), result, failed)
         # The rank of constraints that are eliminated along the graph of joints is not examined.
@@ -130,12 +126,6 @@ def _inertia(at):
 def _returned(system, t, y):
     """An interpolated state, returned to the constraints."""
     return project_normalized(system, t, y) if system.velocity_rows else normalize_state(system, t, y)
-
-
-@eqx.filter_jit
-def _violated(at, rtol):
-    """Whether redundant rows are violated at a state on the others."""
-    return violation_without_chart(at, rtol) > 1
 
 
 def _check_multistep(system, formulation, solver):
@@ -177,14 +167,11 @@ class AbstractProjectionTerm(AbstractConstrainedTerm):
 
 
 class ProjectionTerm(AbstractProjectionTerm):
-    """A constrained system, projected in the metric of the mass matrix; `at_contact`: the sizes that count as zero at
-    contacts, None without contacts.
-    """
+    """A constrained system, projected in the metric of the mass matrix."""
 
     system: AbstractEquation
     formulation: AbstractFormulation
-    newton_tol: Float[Array, ""]
-    at_contact: ContactTolerance | None = None
+    accuracy: Accuracy
 
     def evaluate(self, t, y, chart, args):
         at = self.at(t, y).normalized()
@@ -193,14 +180,14 @@ class ProjectionTerm(AbstractProjectionTerm):
     def project_near(self, t, y, linearized_at, args):
         at, near, chart = self.at(t, y), linearized_at.factors, linearized_at.chart
         if not self.system.ideal_on_velocities:
-            projection = project_in_metric(at, _inertia, near.constraints.projector, self.newton_tol)
+            projection = project_in_metric(at, _inertia, near.constraints.projector, self.accuracy.newton)
             return self._solved(*projection, chart)
-        out: Any = restore(at, near, self.newton_tol)
+        out: Any = restore(at, near, self.accuracy.newton)
         return self.evaluated(at.with_(q=out.q, u=out.u), out.udot, chart + out.iterations, out.failed)
 
     def project_cold(self, t, y, chart, args):
         # The guess may be far from the constraints: accelerations need a factor at the projected state.
-        return self._solved(*project_in_metric(self.at(t, y), _inertia, None, self.newton_tol), chart)
+        return self._solved(*project_in_metric(self.at(t, y), _inertia, None, self.accuracy.newton), chart)
 
     def _solved(self, at, projector: MassProjector, iterations, failed, chart):
         """The evaluation at a state on the constraints with a known projector."""
@@ -221,8 +208,7 @@ class NormalisedTerm(AbstractProjectionTerm):
 
     system: AbstractEquation
     formulation: AbstractFormulation
-    newton_tol: Float[Array, ""]
-    at_contact: ContactTolerance | None = None
+    accuracy: Accuracy
 
     def evaluate(self, t, y, chart, args):
         at = self.at(t, y).normalized()
@@ -242,12 +228,11 @@ class ProjectedSolver(AbstractSolverAround):
     """A Runge–Kutta solver whose steps end with a projection on the constraints of the term's system, or at events of
     contacts.
 
-    **Fields:** the `guards` of the contacts, None without any; `rtol`: the tolerance of integration, None if all rows
-    are independent.
+    **Fields:** the `guards` of the contacts, None without any; `rtol`: the tolerance of integration.
     """
 
     guards: ContactGuards | None
-    rtol: Float[Array, ""] | None = None
+    rtol: Scalar
 
     # A nested program, so that the step is traced once.
     @eqx.filter_jit
@@ -266,10 +251,10 @@ class ProjectedSolver(AbstractSolverAround):
         y1, dense_info = jax.tree.map(unknown, (y1, dense_info))
         error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed, NOT_PROJECTED, result)
-        if self.rtol is not None:
+        wrong = violated(Instant.of(system, t1, y1), self.rtol)
+        if wrong is not False:
             # diffrax discards the result of a rejected step.
-            violated = _violated(*lax.stop_gradient((Instant.of(system, t1, y1), self.rtol)))
-            result = diffrax.RESULTS.where(violated, _FAILED, result)
+            result = diffrax.RESULTS.where(wrong, _FAILED, result)
         if self.guards is not None:
             at = self.interpolation_cls(t0=first, t1=last, **dense_info).evaluate
             error = crossing(self.guards, direction, error, (first, last), (before, y0, y1), at, made_jump)

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._compat import cond_of_lanes
+from .._branches import cond_of_lanes
 from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot
 from ..linalg.newton import chord
 from ..system.equation import AbstractEquation

@@ -7,12 +7,12 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..contacts.guards import contact_guards
-from ..contacts.tolerance import ContactTolerance
 from ..formulations import AbstractFormulation
 from ..formulations.laws import Memory
 from ..solvers.manifold_term import AbstractManifoldTerm, ManifoldEvaluation
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
+from .accuracy import Accuracy
 from .compliant_gaps import compliant_gaps
 from .constraints import Linearise, SolvedState, rates_along, solved
 from .impulse import after_jump, found_at_jump
@@ -25,16 +25,11 @@ else:
 
 
 class AbstractConstrainedTerm(AbstractManifoldTerm):
-    """A constrained system, with its internal states if it has any.
-
-    **Fields:** `at_contact`: the sizes that count as zero at contacts, None without contacts; `newton_tol`: the size of
-    omitted corrections.
-    """
+    """A constrained system, with its internal states if it has any."""
 
     system: AbstractVar[AbstractEquation]
     formulation: AbstractVar[AbstractFormulation]
-    newton_tol: AbstractVar[Float[Array, ""]]
-    at_contact: AbstractVar[ContactTolerance | None]
+    accuracy: AbstractVar[Accuracy]
 
     def at(self, t: Any, y: State) -> Instant:
         """The system at a state."""
@@ -75,7 +70,7 @@ class AbstractConstrainedTerm(AbstractManifoldTerm):
 
     @property
     def guards(self):
-        return contact_guards(self.system, self.formulation, self.at_contact)
+        return contact_guards(self.system, self.formulation, self.accuracy.at_contacts)
 
     @property
     def gaps(self):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arguments import real_array
-from .._compat import default_float
+from .._compat import canonical
 from ..linalg.jitted import jitted
 
 
@@ -20,7 +20,7 @@ def over_arrays(label: str, law: Callable[..., Any], part: Any, **numbers: Any) 
 
     **Raises:** `ValueError` for anything but real numbers, and for shapes that do not fit.
     """
-    arrays = {name: real_array(f"{label}: {name}", x, default_float(), None) for name, x in numbers.items()}
+    arrays = {name: real_array(f"{label}: {name}", x, canonical(), None) for name, x in numbers.items()}
     try:
         shape = np.broadcast_shapes(*(x.shape for x in arrays.values()))
     except ValueError:

@@ -27,7 +27,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._arguments import warn_of_degrees
-from .._compat import default_float, is_weakly_typed, with_values
+from .._compat import canonical, is_weakly_typed, with_values
 from ..linalg.arrays import is_traced
 from .module_weights import ModuleWeights, as_weights
 from .units import Unit, power_of_length
@@ -129,7 +129,7 @@ def as_parameter(value: Any) -> Any:
 
     **Raises:** `ValueError` unless it is a real number or an array of real numbers.
     """
-    dtype = default_float()
+    dtype = canonical()
     if is_traced(value):
         return jnp.asarray(value, dtype)
     given = np.asarray(value) if not isinstance(value, dict) else np.array(None)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._compat import default_float
+from .._compat import canonical
 from ..linalg.arrays import ARRAYS, is_traced
 
 
@@ -43,7 +43,7 @@ def as_weights(module: Any) -> ModuleWeights:
     """
     if not isinstance(module, eqx.Module):
         raise ValueError(f"expected an equinox module, such as an eqx.nn.MLP, got {module!r}")
-    dtype, weights = default_float(), []
+    dtype, weights = canonical(), []
 
     def shape_of(path, leaf):
         if not isinstance(leaf, ARRAYS):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._arguments import check_kind, real_array, whole_number
-from .._compat import default_float
+from .._compat import canonical
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..linalg.arrays import ARRAYS, as_array, is_traced
@@ -155,7 +155,7 @@ def checked_state(system: AbstractSystem, state: Any) -> State:
                 f"{f' and {nz} internal states' if nz else ''}, got state.{name} of shape "
                 f"{np.shape(value)}."
             )
-    dtype = default_float()
+    dtype = canonical()
     if all(isinstance(x, jax.Array) and x.dtype == dtype for x in jax.tree.leaves(state)):
         return state
     return jax.tree.map(lambda x: jnp.asarray(x, dtype=dtype), state)

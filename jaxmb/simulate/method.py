@@ -10,6 +10,7 @@ from jax import lax
 from .._types import State
 from ..formulations import AbstractFormulation
 from ..manifold import AbstractManifold
+from ..manifold.accuracy import Accuracy
 from ..manifold.default import default_manifold
 from ..manifold.internal_states import counted_components, natural_units, state_blocks
 from ..solvers import AbstractMultistep, MultistepController
@@ -76,9 +77,14 @@ class Method(NamedTuple):
             return None
         return eqx.Partial(_headings_at, system)
 
+    @property
+    def accuracy(self) -> Accuracy:
+        """The tolerances of the motion on its constraints."""
+        return self.policy.accuracy(self.rtol)
+
     def prepared(self, system: AbstractSystem) -> tuple[Any, Any]:
         """The term of a system, and the solver, prepared for the term."""
-        return self.policy.prepare(system.prepared(), self.formulation, self.solver, self.rtol)
+        return self.policy.prepare(system.prepared(), self.formulation, self.solver, self.accuracy)
 
     def controls(self, system: AbstractSystem, state: State, duration: Any) -> Any:
         """The controller of the steps of a motion from a state."""

@@ -122,7 +122,7 @@ class Start(NamedTuple):
         finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]) & valid
         given = y
         if span.moving[0]:
-            guards = contact_guards(system, method.formulation, method.policy.contact_tolerance(system, method.rtol))
+            guards = contact_guards(system, method.formulation, method.accuracy.at_contacts)
             if guards is not None:
                 # The field includes the contacts that close or open, and the friction that slips, at the start.
                 y = guards.impact(span.t0, y).after
@@ -322,7 +322,7 @@ def _verdict(problem, interval, start, end, solution, lost, outside):
     steps = jnp.asarray(solution.stats["num_steps"], remaining.dtype)
     creeps = True if end.step is None else remaining > 1e3 * steps * jnp.abs(end.step)
     stuck, coupling = has_failed(result) & is_usable & (creeps | ~ran_out), None
-    violated = policy.violated(system.prepared(), end.t, end.y, problem.method.rtol)
+    violated = policy.violated(system.prepared(), end.t, end.y, problem.method.accuracy)
     later = [
         (lost, RESULTS.newton_failed),
         (inputs_ended(system, span.t0, span.t1) if problem.traced else False, RESULTS.input_ended),
@@ -363,7 +363,7 @@ def diagnosed(problem: Problem, t, y, evidence, result, stuck) -> tuple[Any, Any
     reactions there, None without friction.
     """
     system = problem.system.prepared()
-    result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck, problem.method.rtol)
+    result = problem.method.policy.diagnose(system, t, y, evidence, result, stuck, problem.method.accuracy)
     if system.catalogue.lost_headings:
         result = RESULTS.where(stuck & jnp.any(are_short(system, t, y.q)), RESULTS.singular_configuration, result)
     if not system.friction_rows.size:

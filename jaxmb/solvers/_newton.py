@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._compat import cond_of_any_lane
+from .._branches import cond_of_any_lane
 from ._field import Derivatives, Field, Solution, derivatives, filled, linearized
 
 if TYPE_CHECKING:

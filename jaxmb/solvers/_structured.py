@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._compat import cond_of_any_lane
+from .._branches import cond_of_any_lane
 from ._damping import eigenvalues
 from ._field import Field, probed_derivatives
 from ._newton import AbstractLinearization, StepEquation

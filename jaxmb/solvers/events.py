@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import cond_of_any_lane, cond_of_lanes, loop_of_lanes
+from .._branches import cond_of_any_lane, cond_of_lanes, loop_of_lanes
 from .controller import AbstractControllerAround, AbstractControllerState, intended_step, states_inside
 from .evaluation import ravel
 from .manifold_term import AbstractGuards

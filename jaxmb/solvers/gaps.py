@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._compat import loop_of_lanes
+from .._branches import loop_of_lanes
 from .manifold_term import AbstractGaps
 
 # A stretch of a step is examined in this many pieces; stretches that hide nothing grow by this factor.

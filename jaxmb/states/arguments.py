@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._arguments import check_kind, real_array, real_shape, warn_of_degrees
-from .._compat import default_float
+from .._compat import canonical
 from .._types import Scalar, State, VectorLike
 from ..linalg.arrays import as_array, is_traced, replaced
 from ..parts.names import UnknownNameError, unknown
@@ -33,7 +33,7 @@ def check_precision(function: str, system: AbstractSystem) -> None:
 
     Its numbers keep the other precision, which would limit the accuracy of a motion.
     """
-    old, now = system.guess.q.dtype, default_float()
+    old, now = system.guess.q.dtype, canonical()
     if old != now:
         raise ValueError(
             f"{function}: the system has numbers of {old}, and JAX now makes {now}: jax_enable_x64 was switched after "

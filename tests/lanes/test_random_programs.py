@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxmb._compat import cond_of_any_lane, cond_of_lanes, loop_of_lanes, while_loop
+from jaxmb._branches import cond_of_any_lane, cond_of_lanes, loop_of_lanes
+from jaxmb._compat import while_loop
 from jaxmb.lanes import in_lanes
 
 # The sizes of axes; some are the numbers of members as well.

@@ -26,7 +26,7 @@ def test_the_rate_of_a_field_has_the_derivatives_of_the_field(manifold, formulat
     system, names, _, _ = double_pendulum()
     t, point = jnp.array(0.3), {name: mb.parameters(system)[name] for name in names}
     y = mb.assemble(system, fix={"rod.angle": 0.3, "shank.angle": -0.4}, rates={"rod.angle": 1.0})
-    term, _ = manifold.prepare(system, formulation, Hermite(), 1e-8)
+    term, _ = manifold.prepare(system, formulation, Hermite(), manifold.accuracy(1e-8))
     chart = term.update_chart(t, y, term.init_chart(t, y, None), None)
     found, kept = term.project_cold(t, y, chart, None), term.kept(chart)
     random = np.random.default_rng(0)

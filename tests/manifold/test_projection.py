@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 import jaxmb as mb
 from jaxmb import planar, spatial
 from jaxmb.formulations import Multipliers
-from jaxmb.manifold.projection import ProjectionTerm
+from jaxmb.manifold.projection import Projection, ProjectionTerm
 
 J = np.diag([0.01, 0.018, 0.014])
 
@@ -19,7 +19,11 @@ def test_projection_of_a_state_off_a_circle():
     bob = planar.PointMass("bob", mass=2.0, position=(1.0, 0.0))
     rod = planar.Distance("rod", "ground", "bob", length=1.0)
     system = mb.Scene([bob], joints=[rod], forces=[mb.Gravity((0.0, -9.81))]).compile()
-    term, q, u = ProjectionTerm(system, Multipliers(), jnp.array(1e-12)), np.array([1.1, 0.2]), np.array([0.3, -0.7])
+    term, q, u = (
+        ProjectionTerm(system, Multipliers(), Projection().accuracy(1e-9)),
+        np.array([1.1, 0.2]),
+        np.array([0.3, -0.7]),
+    )
 
     @jax.jit
     def run(q, u):
@@ -56,7 +60,7 @@ def test_the_field_changes_as_its_differences_say_in_every_direction(inertial):
     """Also with the norm of a quaternion, which the constraints say nothing of."""
     system = links(inertial)
     start = mb.assemble(system, rates={"hinge0.angle": 0.5, "hinge1.angle": -0.8})
-    term = ProjectionTerm(system, Multipliers(), jnp.array(1e-10))
+    term = ProjectionTerm(system, Multipliers(), Projection(newton_tol=1e-10).accuracy(1e-8))
     y, state_of = ravel_pytree(start)
 
     @jax.jit

@@ -24,7 +24,8 @@ def test_restored_states_under_friction_have_derivatives():
         u=(-0.8, 0.6, -0.48),
         parameters={"mu": 0.3},
     )
-    term, _ = Partition().prepare(system, Partitioned(), mb.solvers.Adams(), 1e-8)
+    policy = Partition()
+    term, _ = policy.prepare(system, Partitioned(), mb.solvers.Adams(), policy.accuracy(1e-8))
     dq, du = np.random.default_rng(0).normal(size=(2, 3))
 
     @jax.jit

@@ -800,7 +800,9 @@ def test_gaps_that_count_as_closed():
     """A thousandth of the tolerance with every manifold, and no less than positions are found to."""
 
     def touch(policy, solver, rtol):
-        term, prepared = policy.prepare(BALL, policy.default_formulation(BALL), solver, np.float64(rtol))
+        term, prepared = policy.prepare(
+            BALL, policy.default_formulation(BALL), solver, policy.accuracy(np.float64(rtol))
+        )
         return float((term if isinstance(solver, mb.solvers.Adams) else prepared).guards.touch)
 
     ways = [
