@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -34,9 +33,9 @@ from .arguments import (
     split_internal_states,
     split_rates,
 )
-from .closest import closest_configuration, closest_velocities
 from .consistency import not_finite
 from .headings import check_headings
+from .nearest import Configuration, Velocities
 from .refusals import cannot_assemble, cannot_move
 
 # Rounding errors of residuals, in units of the machine's precision and the coordinates' size.
@@ -110,7 +109,8 @@ def assemble(
     is_concrete = not is_traced((system, guess, fix, u, t))
     at_rest = is_concrete and system.drift_free and not np.any(np.asarray(u)) and not np.any(fixed_rates)
     at = Instant(system, t, q, u)
-    u, ok_rates = (u, True) if at_rest else _velocities(at, fixed_rates)
+    free = at_rest or not system.velocity_rows
+    u, ok_rates = (u, True) if free else Velocities(at, tuple(fixed_rates.tolist())).found()
     # Under a derivative `ok` and `ok_rates` may be concrete although the state is traced.
     traced = is_traced((system, q, u, t))
     # Within a trace, results from concrete numbers are traced too.
@@ -171,35 +171,16 @@ def configuration(
     q, whole = system.normalize_fixed(q, fixed) if fixed.any() else (q, 0)
     if not system.coordinate_rows:
         return q, fixed, jnp.array(True)
-    is_concrete = not is_traced((system, q, t))
-    on_host = system.on_host(t) if is_concrete else None
-    if on_host is not None:
-        closest = on_host.closest_configuration(np.asarray(q), fixed, system.coordinate_rank - whole)
-        if closest is not None:
-            return jax.device_put(closest), fixed, jnp.array(True)
     # The poses of compilation often satisfy the constraints already; then no search is compiled.
-    elif is_concrete and guess is system.guess.q and not fixed.any():
+    if guess is system.guess.q and not fixed.any() and not is_traced((system, t)) and system.on_host(t) is None:
         met = _is_met(system, t, q)
         # Within a trace, results from concrete numbers are traced too.
         if not is_traced(met) and met:
             return q, fixed, jnp.array(True)
-    q, ok = closest_configuration(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole)
+    q, ok = Configuration(system, t, q, tuple(fixed.tolist()), system.coordinate_rank - whole).found()
     if throw and not is_traced((system, t, q, ok)) and not ok:
         raise ValueError(cannot_assemble(system, t, q, fixed))
     return q, fixed, ok
-
-
-def _velocities(guess, fixed):
-    """The second half of `assemble`: the velocities, and whether they satisfy the constraints."""
-    system = guess.system
-    if not system.velocity_rows:
-        return guess.u, jnp.array(True)
-    on_host = None if is_traced(guess) else system.on_host(guess.t)
-    if on_host is not None:
-        closest = on_host.closest_velocities(np.asarray(guess.q), np.asarray(guess.u), fixed, system.velocity_rank)
-        if closest is not None:
-            return jax.device_put(closest), jnp.array(True)
-    return closest_velocities(guess, tuple(fixed.tolist()))
 
 
 def _check_modes(system, q, fixed):

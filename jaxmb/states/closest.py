@@ -247,24 +247,42 @@ def closest_configuration(
     pivots = full_pivot(jacobian, scale=scale, tol=independent_above(q.dtype))
     ok = ok & (pivots.rank == rank)
     rows = pivots.order.rows[:rank]
-    square = jnp.where(fixed, 1.0, scale) ** 2
 
     # Without a minimiser, equations with a solution replace the optimality conditions, so that derivatives stay finite.
     closed = ok
 
-    def optimality(z):
+    def conditions(z):
         q, multipliers = z[: system.nq], z[system.nq :]
-        residual, pull = jax.vjp(lambda q: system.coordinate_residual(t, q)[rows], q)
-        (gradient,) = pull(multipliers)
-        balance = (q - guess) / square + jnp.where(fixed, 0.0, gradient)
+        independent = lambda q: system.coordinate_residual(t, q)[rows]
+        balance, residual = optimality(independent, q - guess, q, multipliers, system.coordinate_scale(), fixed)
         return jnp.concatenate([jnp.where(closed, balance, q - guess), jnp.where(closed, residual, multipliers)])
 
     selected = (jacobian * scale[None, :])[rows]
-    multipliers = solve(selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.sqrt(square)))
+    multipliers = solve(
+        selected @ selected.T, selected @ jnp.where(fixed, 0.0, (start - q) / jnp.where(fixed, 1.0, scale))
+    )
     nearby = jnp.concatenate([jnp.where(closed, q, start), jnp.where(closed, multipliers, 0.0)])
-    refined = root(optimality, nearby, _refine)[: system.nq]
+    refined = root(conditions, nearby, _refine)[: system.nq]
     ok = ok & jnp.all(jnp.isfinite(refined)) & (residual_size(frozen, t, refined, jacobian) <= tolerance(q.dtype))
     return jnp.where(ok, refined, q), ok
+
+
+def optimality(
+    residual: Callable[[Array], Float[Array, "m"]],
+    moved: Float[Array, "n"],
+    x: Float[Array, "n"],
+    multipliers: Float[Array, "m"],
+    scale: Float[Array, "n"],
+    fixed: Bool[np.ndarray, "n"],
+) -> tuple[Float[Array, "n"], Float[Array, "m"]]:
+    """The conditions of the closest state x, which has `moved` from the guess: the balance of the distance's gradient
+    with the forces of the multipliers, and the residual.
+
+    **Arguments:** the `scale` of each entry of x; `fixed`: which entries keep their values.
+    """
+    unmet, pull = jax.vjp(residual, x)
+    (gradient,) = pull(multipliers)
+    return moved / jnp.where(fixed, 1.0, scale) ** 2 + jnp.where(fixed, 0.0, gradient), unmet
 
 
 def _refine(residual, x):

@@ -111,7 +111,7 @@ class AbstractHost(abc.ABC):
             gradient = weights * (q - guess)[free]
             if not np.any(multipliers):
                 multipliers = np.linalg.lstsq(jacobian.T, -gradient, rcond=1e-12)[0]
-            curvature = np.diag(weights) + self._curvature(q, multipliers, free)
+            curvature = np.diag(weights) + self.curvature(q, multipliers)[np.ix_(free, free)]
             matrix = np.block([[curvature, jacobian.T], [jacobian, np.zeros((jacobian.shape[0],) * 2)]])
             right = -np.concatenate([gradient + jacobian.T @ multipliers, self.coordinate_residual(q)])
             if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(right))):
@@ -124,15 +124,15 @@ class AbstractHost(abc.ABC):
                 return q if self.holds(q) else None
         return None
 
-    def _curvature(self, q, multipliers, free):
-        """Second derivatives of the rows times multipliers, by differences, whose errors slow the last steps only."""
+    def curvature(self, q: Float[np.ndarray, "nq"], multipliers: Float[np.ndarray, "m"]) -> Float[np.ndarray, "nq nq"]:
+        """Second derivatives of the rows times multipliers, by differences of fourth order."""
         rows = []
-        for k in np.flatnonzero(free):
+        for k, scale in enumerate(self.coordinate_scale):
             step = np.zeros_like(q)
-            step[k] = np.finfo(float).eps ** (1 / 3) * self.coordinate_scale[k]
-            ahead, behind = (multipliers @ self.coordinate_jacobian(moved) for moved in (q + step, q - step))
-            rows.append((ahead - behind)[free] / (2 * step[k]))
-        out = np.array(rows).reshape(free.sum(), free.sum())
+            step[k] = np.finfo(float).eps ** 0.2 * scale
+            slopes = [multipliers @ self.coordinate_jacobian(q + n * step) for n in (-2, -1, 1, 2)]
+            rows.append((slopes[0] - 8 * slopes[1] + 8 * slopes[2] - slopes[3]) / (12 * step[k]))
+        out = np.array(rows).reshape(q.size, q.size)
         return 0.5 * (out + out.T)
 
     def closest_velocities(
