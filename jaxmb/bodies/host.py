@@ -158,7 +158,7 @@ class HostScene(AbstractHost):
             values = derivative(self._prepared(q))
         blocks = self._joined(self._groups[: self._positions], values, (x.blocks for x in self._evaluated(q)))
         rows = np.append(_flat(blocks), 0.0)[self._of_poses]
-        of_lengths = np.zeros((len(self._layout.turning), q.size))
+        of_lengths = np.zeros((len(self._layout.turning), q.size), q.dtype)
         places = self._layout.pose_index[self._layout.turning, 3:]
         of_lengths[np.arange(len(self._layout.turning))[:, None], places] = q[places]
         return np.concatenate([rows, of_lengths])

@@ -15,9 +15,7 @@ from jaxtyping import Array, Float
 from ..linalg.jitted import on_host
 from ..system import AbstractSystem
 from ..system.instant import Instant
-
-# The imaginary step of complex-step derivatives.
-_IMAGINARY = 1e-30
+from .on_host import IMAGINARY
 
 
 class Balance(eqx.Module):
@@ -116,7 +114,7 @@ class HostBalance:
         """As of `Balance`."""
         pull = lambda q: (self.jacobian(q)).T @ multipliers
         displacements = [self._host.along(q, x) for x in np.diag(self._scale)]
-        return np.stack([pull(q + 1j * _IMAGINARY * x).imag / _IMAGINARY for x in displacements], axis=1), pull(q)
+        return np.stack([pull(q + 1j * IMAGINARY * x).imag / IMAGINARY for x in displacements], axis=1), pull(q)
 
     def jacobian(self, q):
         """As of `Balance`."""

@@ -20,6 +20,10 @@ MOST = 150
 _STEPS, _REFINEMENTS, _VELOCITIES, _PROGRESS, _SMALL = 60, 16, 8, 0.001, 0.75
 # A full step is not shortened if it reduces the squared residuals below this share.
 _WHOLE = 0.01
+# Each Newton step must be below this part of the one before, or the curvature is found anew.
+_FAST = 0.1
+# The imaginary part of coordinates whose analytic functions give derivatives.
+IMAGINARY = 1e-30
 # Largest rounding error of residuals, in units of eps.
 _ROUNDING = 4.0
 
@@ -105,13 +109,16 @@ class AbstractHost(abc.ABC):
             return None
         free, small = ~held, np.finfo(float).eps ** _SMALL
         weights = 1 / self.coordinate_scale[free] ** 2
-        multipliers = np.zeros(self.coordinate_residual(q).size)
+        multipliers, curvature = np.zeros(self.coordinate_residual(q).size), np.diag(weights)
+        last, size = 0.0, np.inf
         for _ in range(_REFINEMENTS):
             jacobian = self.coordinate_jacobian(q)[:, free]
             gradient = weights * (q - guess)[free]
             if not np.any(multipliers):
                 multipliers = np.linalg.lstsq(jacobian.T, -gradient, rcond=1e-12)[0]
-            curvature = np.diag(weights) + self.curvature(q, multipliers)[np.ix_(free, free)]
+            # Steps converge fast with the curvature of an earlier one.
+            if not size <= _FAST * last:
+                curvature = np.diag(weights) + self.curvature(q, multipliers)[np.ix_(free, free)]
             matrix = np.block([[curvature, jacobian.T], [jacobian, np.zeros((jacobian.shape[0],) * 2)]])
             right = -np.concatenate([gradient + jacobian.T @ multipliers, self.coordinate_residual(q)])
             if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(right))):
@@ -120,18 +127,22 @@ class AbstractHost(abc.ABC):
             q = q.copy()
             q[free] += step[: free.sum()]
             multipliers = multipliers + step[free.sum() :]
-            if np.max(np.abs(step[: free.sum()]) / scale[free], initial=0.0) <= small:
+            last, size = size, np.max(np.abs(step[: free.sum()]) / scale[free], initial=0.0)
+            if size <= small:
                 return q if self.holds(q) else None
         return None
 
     def curvature(self, q: Float[np.ndarray, "nq"], multipliers: Float[np.ndarray, "m"]) -> Float[np.ndarray, "nq nq"]:
-        """Second derivatives of the rows times multipliers, by differences of fourth order."""
-        rows = []
-        for k, scale in enumerate(self.coordinate_scale):
-            step = np.zeros_like(q)
-            step[k] = np.finfo(float).eps ** 0.2 * scale
-            slopes = [multipliers @ self.coordinate_jacobian(q + n * step) for n in (-2, -1, 1, 2)]
-            rows.append((slopes[0] - 8 * slopes[1] + 8 * slopes[2] - slopes[3]) / (12 * step[k]))
+        """Second derivatives of the rows times multipliers."""
+        pull, rows = lambda q: multipliers @ self.coordinate_jacobian(q), []
+        for unit, scale in zip(np.eye(q.size), self.coordinate_scale, strict=True):
+            if self.analytic:
+                rows.append(pull(q + 1j * IMAGINARY * unit).imag / IMAGINARY)
+                continue
+            # Differences of fourth order.
+            size = np.finfo(float).eps ** 0.2 * scale
+            near, far = ((pull(q + n * size * unit) - pull(q - n * size * unit)) / (2 * n * size) for n in (1, 2))
+            rows.append((4 * near - far) / 3)
         out = np.array(rows).reshape(q.size, q.size)
         return 0.5 * (out + out.T)
 
