@@ -6,7 +6,8 @@ proportional to the number of bodies if loops are local: chains, trees, rings, n
 `simulate` chooses `Projection` with `Adams` from 30 constraint rows on (150 if rows are redundant), and with `Hermite`
 from 40 velocities on. `Hermite` eliminates bodies on stiff springs along with the joints. `print(system)` reports this
 choice and the order of elimination. Joint friction costs O(n³) in the number n of constraint rows with friction.
-`Hermite` needs dense matrices for friction, servos and internal states.
+`Hermite` needs dense matrices for friction, servos and internal states. `Chart` gives the equations of motion in
+independent coordinates to other programs.
 
 ```python
 on_constraints = jaxmb.manifold.project(system, 0.0, jaxmb.State(state.q + 1e-3, state.u))
@@ -15,6 +16,7 @@ on_constraints = jaxmb.manifold.project(system, 0.0, jaxmb.State(state.q + 1e-3,
 
 from .._moved import tell_of_moved as _tell_of_moved
 from .baumgarte import Baumgarte as Baumgarte
+from .chart import Chart as Chart
 from .manifold import AbstractManifold as AbstractManifold
 from .orthogonal_projection import project as project
 from .partition import Partition as Partition

@@ -25,25 +25,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._branches import cond_of_lanes
 from .._results import RESULTS
-from .._types import Velocities
 from ..formulations import AbstractFormulation, Partitioned
-from ..formulations.formulation import check_mass, row_levels
-from ..formulations.friction import solve_coupled
-from ..formulations.laws import Memory, laws_of
-from ..formulations.partitioned import reduced_accelerations
-from ..linalg.elimination import Factor, eliminate, full_pivot, positive_solver
-from ..linalg.jacobian import DenseJacobian
-from ..linalg.sums import unchecked_take
+from ..formulations.formulation import check_mass
+from ..formulations.laws import laws_of
+from ..linalg.elimination import eliminate
 from ..solvers import AbstractMultistep
 from ..solvers.manifold_term import ManifoldEvaluation
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .accuracy import Accuracy
+from .chart import choose, velocity_quality
+from .chart_constraints import ChartConstraints, acceleration, chart_constraints
 from .constraints import (
-    AbstractConstraints,
-    RestoredState,
     SolvedState,
-    implicitly,
     restore,
 )
 from .diagnosis import diagnose
@@ -59,7 +53,7 @@ from .implied import (
 )
 from .manifold import AbstractManifold
 from .orthogonal_projection import project_normalized
-from .split import AbstractSplit, Independent, kind_of_split, quality_of, restore_positions
+from .split import AbstractSplit, restore_positions
 from .term import AbstractConstrainedTerm
 
 if TYPE_CHECKING:
@@ -91,158 +85,6 @@ _ROW_GROWTH = 4.0
 _NEARER = 8.0
 # At a prediction, the gradient of a row may be independent of the others by this multiple of the tolerance.
 _UNRESOLVED = 100.0
-
-
-class ConstrainedAcceleration(eqx.Module):
-    """Velocities on the manifold of their coordinates, and accelerations.
-
-    **Fields:** `u`, `udot`; the `factor` of the velocities' Jacobian; the factor of `every` row of A, None if no row
-    binds accelerations only; the `memory` of the system's laws; `failed`: whether the laws failed to determine the
-    accelerations; the `jacobian` of ψ if rows of Φ are watched by the factor here, else None. The factors have no
-    derivatives.
-    """
-
-    u: Velocities
-    udot: Float[Array, "nu"]
-    factor: Factor
-    every: Factor | None
-    memory: Memory
-    failed: Bool[Array, ""]
-    jacobian: Float[Array, "velocity_rows nu"] | None
-
-
-# A nested program, so that it is traced once for all its uses.
-@eqx.filter_jit
-def acceleration(at: Instant, formulation: AbstractFormulation, split: AbstractSplit) -> ConstrainedAcceleration:
-    """Accelerations at coordinates on the manifold or near it.
-
-    **Arguments:** `at`: an instant with exact independent velocities; the dependent ones are a guess.
-    """
-    out = _acceleration(*lax.stop_gradient((at, formulation, split)))
-    linearise = eqx.Partial(_at_coordinates, split, out.factor, out.every)
-    solution = implicitly(linearise, at, RestoredState(at.q, out.u, out.udot, out.memory))
-    return dataclasses.replace(out, u=solution.u, udot=solution.udot, memory=solution.multipliers)
-
-
-def _acceleration(at, formulation, split):
-    system, before = at.system, at
-    factor = eliminate(at.jacobian[: system.velocity_rows], split.velocity, system.velocity_rank)
-    if system.linear and system.drift_free:
-        at = at.with_(u=factor.null_space @ at.u[split.velocity.columns[system.velocity_rank :]])
-    else:
-        at = at.with_(u=at.u - factor.right_inverse @ at.velocity_residual)
-    every, jacobian = None, DenseJacobian(before.jacobian, factor, factor.rows)
-    if split.acceleration is not None:
-        every = eliminate(at.jacobian, split.acceleration, system.acceleration_rank)
-        jacobian = DenseJacobian(at.jacobian, every, every.rows)
-    laws = laws_of(system)
-    udot, multipliers, failed = laws.solve(at, formulation, jacobian, at.gamma)
-    by_factor = drops_positions(system) and not split.ages
-    rows = before.jacobian[: system.velocity_rows] if by_factor else None
-    return ConstrainedAcceleration(at.u, udot, factor, every, laws.remembered(at, multipliers), failed, rows)
-
-
-def _at_coordinates(split, factor, every, at):
-    """The constraints of velocities and accelerations at fixed coordinates, by the factors of `acceleration`."""
-    if not at.system.linear:
-        # The given factors belong to other velocities, on which the Jacobian depends.
-        here = _chart_constraints(split, at)
-        factor, every = here.factor, here.every
-    factor = factor.for_matrix(at.jacobian[: at.system.velocity_rows])
-    coordinates = Independent(split.velocity, split.acceleration)
-    return ChartConstraints(factor, coordinates, None if every is None else every.for_matrix(at.jacobian))
-
-
-def _chart_constraints(split, at):
-    """The constraints in a chart at an instant."""
-    system, rows = at.system, at.system.velocity_rows
-    factor = eliminate(at.jacobian[:rows], split.velocity, system.velocity_rank)
-    every = None if split.acceleration is None else eliminate(at.jacobian, split.acceleration, system.acceleration_rank)
-    return ChartConstraints(factor, split, every)
-
-
-class ChartConstraints(AbstractConstraints):
-    """The constraints in a chart: independent coordinates and velocities keep their values.
-
-    **Fields:** the `factor` of the velocities' Jacobian at a state; the `split`, `Independent` for fixed coordinates;
-    the factor of `every` row of A, None if no row binds accelerations only; `outdated`: whether the split's matrix is
-    known to be useless.
-    """
-
-    factor: Factor
-    split: AbstractSplit
-    every: Factor | None = None
-    outdated: Bool[Array, ""] | bool = False
-
-    def restore(self, at, near, tol):
-        q, iterations, failed = restore_positions(at, self.split, self.outdated, tol)
-        # The factor is wrong by the distance of the two states: the first correction leaves its square, the second its
-        # cube.
-        right_inverse, at = self.factor.right_inverse, at.with_(q=q)
-        at = at.with_(u=at.u - right_inverse @ at.velocity_residual)
-        if not at.system.linear:
-            step = right_inverse @ at.velocity_residual
-            at = at.with_(u=at.u - step)
-            failed = failed | ~(jnp.max(jnp.abs(step)) <= jnp.sqrt(tol) * (1.0 + jnp.max(jnp.abs(at.u))))
-        # Residuals of the equations of motion, `A u̇ − γ` and `M u̇ − F − Aᵀ λ − C(λ)`. The accelerations are then
-        # wrong by the square of the distance, or by the distance where a reaction with friction changes its sign.
-        rows = at.acceleration_residual(near.udot)
-        unbalanced = self._unbalanced(at, near)
-        multipliers = self._of_accelerations.right_inverse.T @ unbalanced
-        multipliers = laws_of(at.system).recalled(at, multipliers, near.multipliers)
-        forces = unbalanced - at.constraint_force(multipliers)
-        change, reactions = self.cancel_residuals(at, multipliers, rows, forces)
-        memory = jax.tree.map(jnp.add, near.multipliers, reactions)
-        return RestoredState(q, at.u, near.udot + change, memory, iterations, failed)
-
-    def at(self, instant):
-        return _chart_constraints(self.split, instant)
-
-    def multipliers(self, at, restored):
-        return self._of_accelerations.right_inverse.T @ self._unbalanced(at, restored)
-
-    def _unbalanced(self, at, solution):
-        """`M u̇ − F − C`, the forces that ideal constraints must balance, from the memory of the laws."""
-        return at.inertia.product(solution.udot) - laws_of(at.system).applied(at, solution.multipliers)
-
-    def push_positions(self, at, along):
-        return self.split.push(at, along, self.factor)
-
-    def cancel_velocities(self, residual):
-        return -(self.factor.right_inverse @ residual)
-
-    @property
-    def _of_accelerations(self) -> Factor:
-        return self.factor if self.every is None else self.every
-
-    def _cancelling(self, inertia):
-        """`(rows, forces) -> change`, the function of `cancel_residuals` without C."""
-        factor = self._of_accelerations
-        solve = positive_solver(factor.null_space.T @ inertia.product(factor.null_space))
-
-        def cancel(rows, forces):
-            return reduced_accelerations(inertia, -forces, factor, -rows, solve)
-
-        return cancel
-
-    def balance(self, at, rows, forces):
-        change = self._cancelling(at.inertia)(rows, forces)
-        return change, self._of_accelerations.right_inverse.T @ (at.inertia.product(change) + forces)
-
-    def cancel_residuals(self, at, multipliers, rows, forces):
-        inertia, places = at.inertia, at.system.friction_rows
-        cancel = self._cancelling(inertia)
-        change = cancel(rows, forces)
-        if places.size == 0:
-            return change, None
-        # Friction responds to a change of the multipliers that it depends on, and so changes them again.
-        frictions = laws_of(at.system).slopes(at, multipliers)
-        responses = jax.vmap(lambda force: cancel(jnp.zeros_like(rows), -force))(frictions)
-        balance = unchecked_take(self._of_accelerations.right_inverse.T, places)
-        reaction = lambda change, forces: jnp.sum(balance * (inertia.product(change) + forces)[None], axis=1)
-        coupling = jax.vmap(reaction, out_axes=1)(responses, -frictions)
-        answer = solve_coupled(jnp.eye(places.size, dtype=rows.dtype) - coupling, reaction(change, forces))
-        return change + answer @ responses, answer
 
 
 # The default, made once.
@@ -314,12 +156,12 @@ class Partition(AbstractManifold):
             return result
         # Steps were refused until they reached the allowed violation.
         if drops_accelerations(system):
-            violation = jnp.maximum(violation, contradiction_ahead(*lax.stop_gradient((at, accuracy))))
+            violation = jnp.maximum(violation, contradiction_ahead(*lax.stop_gradient((at, accuracy.rtol))))
         return RESULTS.where(failed & (violation > 0.5), RESULTS.inconsistent_constraints, result)
 
 
-class Chart(eqx.Module):
-    """The index sets with their quality and counters.
+class ChartInUse(eqx.Module):
+    """The index sets of a chart with their quality and counters.
 
     **Fields:**
 
@@ -389,12 +231,12 @@ class AbstractChartTerm(AbstractConstrainedTerm):
     def init_chart(self, t, y, args):
         # A useless chart, so that charts are chosen in one place.
         at = lax.stop_gradient(self.at(t, y))
-        choose = lambda at: _choose(at, at.coordinate_jacobian)
-        split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(choose, at))
+        first = lambda at: choose(at, at.coordinate_jacobian)
+        split, quality, _ = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(first, at))
         redundant = DroppedRows.at_start(at) if drops_rows(self.system) else None
         memory = laws_of(self.system).remembered(at, jnp.zeros(self.system.acceleration_rows, y.q.dtype))
         unknown, none = jnp.full_like(quality, jnp.inf), jnp.zeros(5, int)
-        return Chart(split, unknown, quality, none, redundant, _both(memory, memory))
+        return ChartInUse(split, unknown, quality, none, redundant, _both(memory, memory))
 
     def evaluate(self, t, y, chart, args):
         return self._evaluate(lax.stop_gradient(chart.split).correct(self.at(t, y)), chart)
@@ -412,11 +254,11 @@ class AbstractChartTerm(AbstractConstrainedTerm):
         return out._replace(failed=failed | out.failed)
 
     @abc.abstractmethod
-    def _evaluate(self, at: Instant, chart: Chart) -> ManifoldEvaluation:
+    def _evaluate(self, at: Instant, chart: ChartInUse) -> ManifoldEvaluation:
         """The evaluation at coordinates near the constraints or on them."""
 
     @abc.abstractmethod
-    def _kept(self, chart: Chart, k: int) -> Any:
+    def _kept(self, chart: ChartInUse, k: int) -> Any:
         """See `kept`; with the memory of the laws at the prediction of a step (k = 0) or at its end (k = 1)."""
 
     def kept(self, chart):
@@ -458,7 +300,7 @@ class PartitionTerm(AbstractChartTerm):
     def _evaluate(self, at, chart: Any):
         out = acceleration(at, self.formulation, chart.split)
         split = chart.split.at_evaluation(out.factor)
-        quality = _velocity_quality(self.system, out.factor, split.velocity)
+        quality = velocity_quality(self.system, out.factor, split.velocity)
         chart = dataclasses.replace(chart, split=split, quality=quality, multipliers=_both(out.memory, out.memory))
         if out.jacobian is not None and chart.redundant is not None:
             # The state is off the constraints by an error of the prediction.
@@ -488,7 +330,7 @@ class PartitionTerm(AbstractChartTerm):
 
     def linearisation(self, kept):
         split, memory = kept
-        return eqx.Partial(_chart_constraints, split), memory
+        return eqx.Partial(chart_constraints, split), memory
 
 
 class FreeTerm(AbstractChartTerm):
@@ -534,7 +376,7 @@ def _updated(at, chart, max_influence):
 
     def renewed(chart, jacobian):
         def renew(chart):
-            split, fresh, singular = _choose(at, jacobian)
+            split, fresh, singular = choose(at, jacobian)
             counters = chart.counters + jnp.array([0, 0, 0, 1, 0]) + jnp.array([0, 0, 0, 0, 1]) * singular.astype(int)
             return dataclasses.replace(chart, split=split, quality=fresh, fresh=fresh, counters=counters)
 
@@ -573,31 +415,3 @@ def _watched(at, split, redundant, accuracy):
     every = eliminate(at.jacobian, split.acceleration, system.acceleration_rank)
     contradiction = violation_of_accelerations(at, every.right_inverse @ at.gamma, accuracy.rtol)
     return eqx.tree_at(lambda rows: rows.violation, redundant, jnp.maximum(redundant.violation, contradiction))
-
-
-def _choose(at, of_coordinates):
-    """A chart by full pivoting, its quality, and whether the rank is less than when the scene was compiled.
-
-    The rank may be higher: at a state within Newton's tolerance, redundant rows are only nearly redundant.
-    """
-    system, jacobian, rows = at.system, at.jacobian, at.system.velocity_rows
-    scale, levels = system.velocity_scale(), row_levels(system)
-    velocity = full_pivot(jacobian[:rows], scale=scale, level=levels[:rows])
-    singular = velocity.rank < system.velocity_rank
-    solved = eliminate(jacobian[:rows], velocity.order, system.velocity_rank)
-    quality = _velocity_quality(system, solved, velocity.order)
-    acceleration = None
-    if system.acceleration_rows > rows:
-        every = full_pivot(jacobian, scale=scale, level=levels)
-        acceleration, singular = every.order, singular | (every.rank < system.acceleration_rank)
-    orders = velocity.order, acceleration
-    split, quality, lost = kind_of_split(system).chosen(at, of_coordinates, orders, solved, quality)
-    return split, quality, singular | lost
-
-
-def _velocity_quality(system, solved, order):
-    """The quality of a chart, as in `Chart`."""
-    solved, rank = lax.stop_gradient(solved), system.velocity_rank
-    diagonal = solved.right_inverse.at[order.columns[:rank], order.rows[:rank]]
-    nearness = jnp.max(jnp.abs(diagonal.get(mode="promise_in_bounds", wrap_negative_indices=False)), initial=0.0)
-    return jnp.append(quality_of(system, solved, system.velocity_scale(), order, rank), nearness)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._branches import cond_of_lanes
 from ..linalg.elimination import Factor, PivotOrder, eliminate, full_pivot
-from ..linalg.newton import chord
+from ..linalg.newton import chord, newton
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .constraints import dense_along, push
@@ -26,6 +26,8 @@ else:
 
 # Largest number of Newton iterations for positions.
 _MAX_ITERATIONS = 12
+# The size of the last step of Newton's method, as a power of eps: the error is of the size of its square.
+_LAST = 0.6
 
 # Coordinates on the constraints, the number of Newton's iterations, and whether they failed.
 Restored = tuple[Float[Array, "nq"], Int[Array, ""] | None, Bool[Array, ""] | None]
@@ -51,12 +53,14 @@ class AbstractSplit(eqx.Module):
         orders: tuple[PivotOrder, PivotOrder | None],
         solved: Factor,
         quality: Float[Array, "k"],
+        scale: Float[Array, "nq"] | None = None,
     ) -> tuple[Self, Float[Array, "k"], Any]:
         """The split with these orders of velocities and accelerations; the quality, with the coordinates included;
         whether the coordinates have lost rank.
 
         **Arguments:** `of_coordinates`: the coordinates' Jacobian, None if the split does not age; `solved`: the factor
-        of the velocities' Jacobian, and its `quality`.
+        of the velocities' Jacobian, and its `quality`; `scale` of the coordinates in the search for pivots, by default
+        the system's.
         """
 
     @abc.abstractmethod
@@ -77,6 +81,15 @@ class AbstractSplit(eqx.Module):
 
         **Arguments:** `factor` of the velocities' Jacobian, if it is known.
         """
+
+    @abc.abstractmethod
+    def factor(self, at: Instant) -> Factor:
+        """The factor of the coordinates' Jacobian at an instant."""
+
+    def quality(self, at: Instant, of_velocities: Float[Array, "k"]) -> Float[Array, "k"]:
+        """The quality at an instant, from the quality of the velocities there."""
+        del at
+        return of_velocities
 
     def at_evaluation(self, factor: Factor) -> Self:
         """The split at a state, from the factor of the velocities' Jacobian there."""
@@ -100,7 +113,7 @@ class Independent(AbstractSplit):
     acceleration: PivotOrder | None
 
     @classmethod
-    def chosen(cls, at, of_coordinates, orders, solved, quality):
+    def chosen(cls, at, of_coordinates, orders, solved, quality, scale=None):
         return cls(*orders), quality, False
 
     def independent(self, system):
@@ -108,6 +121,10 @@ class Independent(AbstractSplit):
 
     def correct(self, at):
         return at
+
+    def factor(self, at):
+        n = at.q.size
+        return Factor(jnp.zeros((n, 0), at.q.dtype), jnp.eye(n, dtype=at.q.dtype), jnp.zeros(0, int))
 
     def restore(self, at, outdated, tol):
         return at.q, jnp.array(0), jnp.array(False)
@@ -127,7 +144,7 @@ class Shared(AbstractSplit):
     right_inverse: Float[Array, "nq mq"]
 
     @classmethod
-    def chosen(cls, at, of_coordinates, orders, solved, quality):
+    def chosen(cls, at, of_coordinates, orders, solved, quality, scale=None):
         return cls(*orders, solved.right_inverse), quality, False
 
     def independent(self, system):
@@ -141,9 +158,9 @@ class Shared(AbstractSplit):
         return _newton(at, self.right_inverse, 1.0, tol)
 
     def push(self, at, along, factor):
-        return _pushed(self._factor(at) if factor is None else factor, at, along)
+        return _pushed(self.factor(at) if factor is None else factor, at, along)
 
-    def _factor(self, at):
+    def factor(self, at):
         return eliminate(at.coordinate_jacobian, self.velocity, at.system.coordinate_rank)
 
     def at_evaluation(self, factor):
@@ -151,7 +168,7 @@ class Shared(AbstractSplit):
 
     def at_guess(self, at):
         # The stored matrix belongs to the state before the step.
-        return self.at_evaluation(self._factor(at))
+        return self.at_evaluation(self.factor(at))
 
     def orders(self):
         return eqx.tree_at(lambda split: split.right_inverse, self, None)
@@ -171,9 +188,10 @@ class Separate(AbstractSplit):
     ages: ClassVar[bool] = True
 
     @classmethod
-    def chosen(cls, at, of_coordinates: Any, orders, solved, quality):
+    def chosen(cls, at, of_coordinates: Any, orders, solved, quality, scale=None):
         system = at.system
-        pivots = full_pivot(of_coordinates, scale=system.coordinate_scale())
+        scale = system.coordinate_scale() if scale is None else scale
+        pivots = full_pivot(of_coordinates, scale=scale)
         split, of_split, _ = cls(*orders, pivots.order, jnp.zeros(())).refreshed(system, of_coordinates)
         return split, quality.at[:-1].max(of_split), pivots.rank < system.coordinate_rank
 
@@ -188,17 +206,21 @@ class Separate(AbstractSplit):
         restored = _newton(at, self.right_inverse, 0.0, tol)
 
         def with_factor_of_this_state(restored):
-            corrected, iterations, failed = _newton(at, self._factor(at).right_inverse, 1.0, tol)
+            corrected, iterations, failed = _newton(at, self.factor(at).right_inverse, 1.0, tol)
             return corrected, restored[1] + iterations, failed
 
         return cond_of_lanes(restored[2] | outdated, with_factor_of_this_state, lambda restored: restored, restored)
 
     def push(self, at, along, factor):
         del factor
-        return _pushed(self._factor(at), at, along)
+        return _pushed(self.factor(at), at, along)
 
-    def _factor(self, at):
+    def factor(self, at):
         return eliminate(at.coordinate_jacobian, self.coordinate, at.system.coordinate_rank)
+
+    def quality(self, at, of_velocities):
+        of_split = self.refreshed(at.system, at.coordinate_jacobian)[1]
+        return of_velocities.at[:-1].max(of_split)
 
     def refreshed(
         self, system: AbstractEquation, jacobian: Float[Array, "mq nq"]
@@ -235,6 +257,29 @@ def _restore_positions_jvp(primals, tangents):
     out = restore_positions(*primals)
     along, at = dense_along(tangents[0], at), at.with_(q=out[0])
     return out, (split.push(at, along, None), None, None)
+
+
+@eqx.filter_custom_jvp
+def solve_positions(at: Instant, split: AbstractSplit) -> tuple[Float[Array, "nq"], Bool[Array, ""]]:
+    """Solve `Φ = 0` for the dependent coordinates from a guess that may be far: q, and whether the search failed."""
+    scale, small = at.system.coordinate_scale(), jnp.finfo(at.q.dtype).eps ** _LAST
+
+    def correct(q):
+        here = at.with_(q=q)
+        step = split.factor(here).right_inverse @ here.coordinate_residual
+        return q - step, jnp.max(jnp.abs(step) / scale)
+
+    far = lambda q, size: (size > small) & jnp.all(jnp.isfinite(q))
+    q, size = newton(correct, far, at.q, most=_MAX_ITERATIONS, dtype=at.q.dtype)
+    return q, ~(size <= small)
+
+
+@solve_positions.def_jvp
+def _solve_positions_jvp(primals, tangents):
+    at, split = primals
+    out = solve_positions(*primals)
+    along, at = dense_along(tangents[0], at), at.with_(q=out[0])
+    return out, (split.push(at, along, None), None)
 
 
 def _newton(at, right_inverse, first, tol):

@@ -134,7 +134,8 @@ class AbstractHost(abc.ABC):
 
     def curvature(self, q: Float[np.ndarray, "nq"], multipliers: Float[np.ndarray, "m"]) -> Float[np.ndarray, "nq nq"]:
         """Second derivatives of the rows times multipliers."""
-        pull, rows = lambda q: multipliers @ self.coordinate_jacobian(q), []
+        pull: Any = lambda q: multipliers @ self.coordinate_jacobian(q)
+        rows = []
         for unit, scale in zip(np.eye(q.size), self.coordinate_scale, strict=True):
             if self.analytic:
                 rows.append(pull(q + 1j * IMAGINARY * unit).imag / IMAGINARY)

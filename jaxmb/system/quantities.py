@@ -144,6 +144,12 @@ def with_shapes(values: Mapping[str, Any], units: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {shape} {units.get(name, '')}".rstrip() for name, shape in shapes.items())
 
 
+def single_names(names: Mapping[str, list[int]], count: int) -> list[str]:
+    """The name of every entry of a vector, from the names of its parts."""
+    out = {index[0]: name for name, index in names.items() if len(index) == 1}
+    return [out[k] for k in range(count)]
+
+
 def rates_of(names: Mapping[str, list[int]]) -> dict[str, list[int]]:
     """The names that `rates=` takes, from `names` of a system's rates.
 

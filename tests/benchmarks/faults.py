@@ -753,11 +753,14 @@ FAULTS = [
     ),
     Fault("manifold/impulse.py", "return t + (moved - fixed)", "return t"),
     Fault(
-        "manifold/partition.py",
+        "manifold/chart_constraints.py",
         "return -(self.factor.right_inverse @ residual)",
         "return self.factor.right_inverse @ residual",
     ),
-    Fault("manifold/partition.py", "return change + answer @ responses, answer", "return change, answer"),
+    Fault("manifold/chart_constraints.py", "return change + answer @ responses, answer", "return change, answer"),
+    Fault("manifold/chart.py", "at = at.with_(u=at.u - step)", "at = at.with_(u=at.u + step)"),
+    Fault("states/nearest.py", "return -(inverse[: x.size] @ change)", "return inverse[: x.size] @ change"),
+    Fault("states/nearest.py", "curvature(forces), 0.0)", "0.0 * curvature(forces), 0.0)"),
     Fault(
         "manifold/projection.py",
         "at, udot, chart + iterations, failed | undetermined, near",
@@ -959,7 +962,7 @@ FAULTS = [
     ),
     Fault("studies/identify/profile.py", "float(ndtri((1 + level) / 2)) ** 2", "float(ndtri(level)) ** 2"),
     Fault("studies/identify/residuals.py", "np.median(sizes) / 0.6745", "np.median(sizes)"),
-    Fault("studies/identify/segments.py", "(arrival - starts[0])", "(starts[0] - arrival)"),
+    Fault("studies/identify/segments.py", "(arrival - starts[0], places", "(starts[0] - arrival, places"),
     Fault("studies/identify/sensors.py", "return gain * quantity + bias", "return gain * (quantity + bias)"),
     Fault("studies/identify/sensors.py", "+ jnp.sum(count * log)", "+ jnp.sum(log)"),
     Fault(

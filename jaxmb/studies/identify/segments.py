@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._types import State
-from ...states.assembly import assemble
-from ...system.instant import Instant
+from ...manifold import Chart
 from ..batch import batch
 from ..minimise import Linearised
 from .experiment import ExperimentModel
@@ -26,28 +25,40 @@ class Lanes(NamedTuple):
     samples: tuple[int, ...]
 
 
-class Place(NamedTuple):
-    """The vector of the unknowns, and for each experiment the initial states of its segments with charts.
+class Starts(NamedTuple):
+    """The states at the starts of segments, with charts there: the parts of each, stacked along axis 0.
 
-    A chart has bases of the tangent spaces, of q and of u, and the map from changes of both to its coordinates.
+    **Fields:** `parts`: the `indices`, the split and the quality of the charts; the `scales` of their coordinates.
     """
 
+    states: State
+    parts: Any
+    scales: np.ndarray
+
+    @property
+    def indices(self) -> np.ndarray:
+        """The places of the charts' coordinates among all coordinates and velocities."""
+        return np.asarray(self.parts[0])
+
+
+class Place(NamedTuple):
+    """The vector of the unknowns, and for each experiment the charts at the starts of its segments."""
+
     z: Array
-    states: tuple[State, ...]
-    charts: tuple[Any, ...]
+    charts: tuple["Starts", ...]
 
     @property
     def size(self) -> int:
         """The number of the unknowns and the coordinates of all charts."""
-        return self.z.size + sum(onto[..., 0].size for *_, onto in self.charts)
+        return self.z.size + sum(starts.indices.size for starts in self.charts)
 
     def split(self, vector: Any) -> list[Any]:
         """The charts' coordinates in a vector of unknowns and coordinates, shape (segments, coordinates) for each
         experiment.
         """
-        ends = np.cumsum([self.z.size, *(onto[..., 0].size for *_, onto in self.charts)])
+        ends = np.cumsum([self.z.size, *(starts.indices.size for starts in self.charts)])
         each = zip(self.charts, ends[:-1], ends[1:], strict=True)
-        return [vector[begin:end].reshape(onto.shape[:2]) for (*_, onto), begin, end in each]
+        return [vector[begin:end].reshape(starts.indices.shape) for starts, begin, end in each]
 
 
 def segmented(name: str, number: int, trial: ExperimentModel, segments: int) -> Lanes:
@@ -100,17 +111,15 @@ def moved(problem: Problem, lanes: tuple[Lanes, ...], place: Place, step: np.nda
     """The place after a step, with the states projected on the constraints of the new parameters."""
     change = jnp.asarray(step, place.z.dtype)
     z, states = place.z + change[: place.z.size], []
-    each = zip(lanes, place.states, place.charts, place.split(change), strict=True)
-    for lane, state, charts, move in each:
+    for lane, starts, move in zip(lanes, place.charts, place.split(change), strict=True):
         trial, flat = problem.trials[lane.number], _values_of(problem, lane, z)
-        states.append(_on_constraints(problem.system, trial, flat, lane.trials.t0, state, charts[:2], move))
+        states.append(_on_constraints(problem.system, trial, flat, lane.trials.t0, starts, move))
     return _placed(problem, lanes, z, states)
 
 
 def _placed(problem, lanes, z, states) -> Place:
     each = zip(lanes, states, strict=True)
-    charts = tuple(_charts(problem, lane, _values_of(problem, lane, z), state) for lane, state in each)
-    return Place(z, tuple(states), charts)
+    return Place(z, tuple(_starts(problem, lane, _values_of(problem, lane, z), state) for lane, state in each))
 
 
 def _values_of(problem, lane, z):
@@ -125,10 +134,10 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     residuals, jacobian, scores, score_rows, gaps, closing = [], [], [], [], [], []
     readings, objective = {}, 0.5 * prior_rows @ prior_rows
     columns = place.split(np.arange(total))
-    for lane, state, charts, lane_columns in zip(lanes, place.states, place.charts, columns, strict=True):
+    for lane, charts, lane_columns in zip(lanes, place.charts, columns, strict=True):
         trial, flat = problem.trials[lane.number], _values_of(problem, lane, place.z)
         inward = derivatives[problem.columns(lane.number)]
-        outcome = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, state, charts[:2])
+        outcome = _linearised_lanes(problem.system, lane.trials, lane.static, problem.options, flat, charts)
         seen, (rows, levels, starts, ends) = numbers(outcome)
 
         def whole(by_unknowns, by_states, inward=inward, lane_columns=lane_columns):
@@ -150,8 +159,10 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
         initial, of_initial = (np.asarray(x) for x in _initial(problem.system, trial, flat))
         first = np.pad(of_initial @ inward, ((0, 0), (0, total - n)))
         arrival, change = np.stack([initial, *ends[0][:-1]]), np.stack([first, *end[:-1]])
-        gaps.append((charts[2] @ (arrival - starts[0])[..., None]).reshape(-1))
-        closing.append((charts[2] @ (change - start)).reshape(-1, total))
+        places, scales = charts.indices, charts.scales
+        gaps.append((np.take_along_axis(arrival - starts[0], places, 1) / scales).reshape(-1))
+        of_gaps = np.take_along_axis(change - start, places[..., None], 1)
+        closing.append((of_gaps / scales[..., None]).reshape(-1, total))
         objective = objective + np.sum(seen.rows.objective)
         readings[problem.names[lane.number]] = {
             name: np.concatenate([x[k][:count] for k, count in enumerate(lane.samples)])
@@ -166,17 +177,15 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
 
 
 @eqx.filter_jit
-def _on_constraints(system, trial, flat, ts, states, tangents, moves) -> State:
+def _on_constraints(system, trial, flat, ts, starts, moves) -> State:
     changed = trial.changed_system(system, trial.named(flat))
-    return eqx.filter_vmap(lambda t, state, along, w: _near(changed, t, state, along, w))(ts, states, tangents, moves)
+    return eqx.filter_vmap(lambda t, start, w: _moved(changed, t, start, w))(ts, starts, moves)
 
 
-def _near(system, t, state, tangents, w) -> State:
-    """The state closest to the chart's point w, which has coordinates first of q, then of u."""
-    positions, velocities = tangents
-    split = positions.shape[1]
-    guess = State(state.q + positions @ w[:split], state.u + velocities @ w[split:])
-    return assemble(system, guess, t=t, throw=False)
+def _moved(system, t, start, w) -> State:
+    """The state whose independent coordinates differ by w, in units of the scales, from those of a start."""
+    chart = Chart(system, start.states, *start.parts)
+    return chart.state(t, chart.coordinates(start.states) + start.scales * w)
 
 
 @eqx.filter_jit
@@ -190,55 +199,41 @@ def _initial(system, trial, flat):
     return fn(flat), jax.jacfwd(fn)(flat)
 
 
-def _charts(problem, lane, flat, states) -> tuple[Any, Any, np.ndarray]:
-    system, trial = problem.system, problem.trials[lane.number]
-    positions, velocities = map(np.asarray, _constraint_jacobians(system, trial, flat, lane.trials.t0, states))
-    sizes = np.asarray(system.coordinate_scale()), np.asarray(system.velocity_scale())
-    bases, inverses = [], []
-    for jacobians, size, rank in zip(
-        (positions, velocities), sizes, (system.coordinate_rank, system.velocity_rank), strict=True
-    ):
-        if not np.all(np.isfinite(jacobians)):
-            jacobians = np.zeros_like(jacobians)
-        null = np.stack([_kernel(jacobian * size, rank) for jacobian in jacobians])
-        bases.append(size[:, None] * null)
-        inverses.append(np.swapaxes(null, 1, 2) / size)
-    onto = np.zeros((len(lane.samples), sum(b.shape[2] for b in bases), system.nq + system.nu))
-    split = inverses[0].shape[1]
-    onto[:, :split, : system.nq], onto[:, split:, system.nq :] = inverses
-    return jnp.asarray(bases[0]), jnp.asarray(bases[1]), onto
-
-
-def _kernel(matrix: np.ndarray, rank: int) -> np.ndarray:
-    return np.linalg.svd(matrix, full_matrices=True)[2][rank:].T if matrix.size else np.eye(matrix.shape[1])
+def _starts(problem, lane, flat, states) -> Starts:
+    parts = _charts(problem.system, problem.trials[lane.number], flat, lane.trials.t0, states)
+    return Starts(states, parts[:3], np.asarray(parts[3]))
 
 
 @eqx.filter_jit
-def _constraint_jacobians(system, trial, flat, ts, states):
+def _charts(system, trial, flat, ts, states):
     changed = trial.changed_system(system, trial.named(flat))
-    position = lambda t, state: changed.coordinate_jacobian(t, state.q)
-    velocity = lambda t, state: Instant.of(changed, t, state).velocity_jacobian
-    return jax.vmap(position)(ts, states), jax.vmap(velocity)(ts, states)
+    scales = jnp.concatenate([changed.coordinate_scale(), changed.velocity_scale()])
+
+    def parts(t, state):
+        chart = Chart.at(changed, t, state)
+        return chart.indices, chart.split, chart.fresh, scales[chart.indices]
+
+    return jax.vmap(parts)(ts, states)
 
 
 @eqx.filter_jit
-def _linearised_lanes(system, trials, static, options, flat, states, tangents):
+def _linearised_lanes(system, trials, static, options, flat, starts):
     """The outcome of every segment; and residuals, scores, start and end with their derivatives, in one batch."""
 
-    def lane(trial, state, along):
+    def lane(trial, place):
         trial = eqx.combine(trial, static)
 
         def fn(flat, w):
             theta = trial.named(flat)
             changed = trial.changed_system(system, theta)
-            start = _near(changed, trial.t0, state, along, w)
+            start = _moved(changed, trial.t0, place, w)
             seen = trial.seen(changed, start, theta, options)
             vector = lambda y: jnp.concatenate([y.q, y.u])
             out = seen.rows.residuals, seen.rows.scores, vector(start), vector(seen.end)
             return out, (seen, out)
 
-        w = jnp.zeros(sum(basis.shape[1] for basis in along), flat.dtype)
+        w = jnp.zeros_like(place.scales)
         jacobians, (seen, out) = jax.jacfwd(fn, argnums=(0, 1), has_aux=True)(flat, w)
         return seen, [(value, *both) for value, both in zip(out, jacobians, strict=True)]
 
-    return batch(lane)(trials, states, tangents)
+    return batch(lane)(trials, starts)

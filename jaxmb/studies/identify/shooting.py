@@ -1,8 +1,8 @@
 """Multiple shooting on the constraint manifold: long motions that are chaotic or unstable, in short segments.
 
-The states at the starts of segments are unknowns, each in independent coordinates: a chart of the constraint manifold
-maps w to the state closest to `x + T w`, with a basis T of the tangent space at x. Equality constraints `c = 0` join
-the start of each segment to the end of the previous segment. Each step solves
+The states at the starts of segments are unknowns, each in the independent coordinates of a chart there (see
+`jaxmb.manifold.Chart`). Equality constraints `c = 0` join the start of each segment to the end of the previous segment.
+Each step solves
 
     minimise ½ |r + J s|² + ½ μ |D s|²  subject to  c + C s = 0
 

@@ -22,7 +22,7 @@ from ...linalg.elimination import PivotSearch, eliminate, full_pivot
 from ...parts.names import unknown
 from ...system import AbstractSystem
 from ...system.instant import Instant
-from ...system.quantities import directions, rates_of
+from ...system.quantities import directions, rates_of, single_names
 from .quantities import checked_names, components, measured
 
 # Weights of preference between equally suitable states: turns before displacements, rates of chosen coordinates before
@@ -78,7 +78,7 @@ def displacement_names(system: AbstractSystem) -> list[str]:
     invariants translations and small turns about the body's axes, `"rod.x"` and `"rod.rotation_x"`.
     """
     if not _has_invariants(system):
-        return _singles(system.coordinate_names(), system.nq)
+        return single_names(system.coordinate_names(), system.nq)
     names = directions(system.rate_names())
     moves = [names[k] for k in range(system.nu)]
     return [f"{name[:-2]}rotation_{name[-1]}" if name[-3:-1] == ".w" else name for name in moves]
@@ -87,7 +87,7 @@ def displacement_names(system: AbstractSystem) -> list[str]:
 def rate_candidates(system: AbstractSystem, names: StateNames) -> list[str]:
     """Names of the rates among which velocities are chosen: rates of named coordinates, and all velocities."""
     named = [f"{name}_rate" for name in names.coordinates] if names.rates is None else []
-    return named + _singles(system.rate_names(), system.nu)
+    return named + single_names(system.rate_names(), system.nu)
 
 
 def check_state_names(system: AbstractSystem, t: Scalar, state: State, coordinates, rates) -> StateNames:
@@ -278,9 +278,3 @@ def _turns(system, rates=False):
         for name in (f"{body}.angle", f"{body}.angle_rate", f"{body}.angular_velocity"):
             turns[entries.get(name, [])] = True
     return turns
-
-
-def _singles(names, count):
-    """The name of every entry."""
-    out = {index[0]: name for name, index in names.items() if len(index) == 1}
-    return [out[k] for k in range(count)]
