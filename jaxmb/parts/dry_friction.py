@@ -176,7 +176,7 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
         return jnp.where(closed, reactions[0], 0.0)
 
     def limits(self, space: AbstractSpace, poses: Poses, reactions: Float[Array, "1"]) -> Float[Array, "rows"]:
-        """The normal force in a contact or a coupling, for each direction of slip."""
+        """The normal force in a contact, for each direction of slip; linear in the reactions."""
         return jnp.repeat(self.normal_force(space, poses, reactions)[None], self.rows)
 
     def seen_wrenches(self, space, poses, wrenches):
@@ -328,6 +328,10 @@ class DryFriction(AbstractDryFriction):
 
     def normal_force(self, space, poses, reactions):
         return norm(reactions) if self.in_gear else super().normal_force(space, poses, reactions)
+
+    def limits(self, space, poses, reactions):
+        # With its sign, since the force along the coordinate of a coupling is a sum of forces by several laws.
+        return reactions if self.in_gear else super().limits(space, poses, reactions)
 
     def slip(self, space, poses, velocities):
         return self.over_belt(self._relative_velocity(space, poses, velocities))

@@ -204,6 +204,7 @@ FAULTS = [
         "lowest = space.body_point(pose, centre)",
     ),
     Fault("parts/dry_friction.py", "else slip - self.speed", "else slip + self.speed"),
+    Fault("parts/dry_friction.py", "return reactions if self.in_gear", "return jnp.abs(reactions) if self.in_gear"),
     Fault(
         "parts/dry_friction.py",
         "against = -slip_direction(self._modes(poses), slips)",

@@ -536,6 +536,18 @@ def gearbox(coefficient=0.1, **options):
     return mb.Scene(bodies, joints=joints, forces=forces).compile()
 
 
+def test_reactions_of_dry_friction_are_linear_in_the_multipliers():
+    """They are sums over the forces of all laws, which may act either way: those along a coupling have a sign."""
+    for system in (gearbox(), slider(coefficient=0.3)):
+        start = mb.assemble(system)
+        at, random = Instant.of(system, jnp.zeros(()), start), np.random.default_rng(0)
+        a, b = random.normal(size=(2, system.acceleration_rows))
+        reactions = jit_quickly(lambda multipliers, at=at: jax.vmap(at.friction_reactions)(multipliers))
+        of_a, of_b, of_both = np.asarray(reactions(np.stack([a, b, 2.0 * a - 3.0 * b])))
+        np.testing.assert_allclose(of_both, 2.0 * of_a - 3.0 * of_b, rtol=0, atol=1e-12)
+        assert np.max(np.abs(of_a)) > 0
+
+
 def test_friction_in_a_gear_is_given_by_its_name():
     system = gearbox()
     assert list(system.friction_rows) == [k for k, (name, _) in enumerate(system.rows) if name == "gear"]
