@@ -70,7 +70,7 @@ _TRACED = (
     "change its numbers there with jaxmb.with_parameters."
 )
 # The user's place, counted from `Scene.compile`: equinox calls the methods of a module.
-_USER = 3
+_USER = 4
 
 
 def _as_tuple(parts: Any) -> tuple[Any, ...]:
@@ -177,68 +177,73 @@ class Scene(eqx.Module):
         contradictory constraints, and singular poses: there rows are dependent that are independent nearby. The message
         names the parts. Also within a function under `jit`: change parameters there instead.
         """
-        for part in (*self.bodies, *self.joints, *self.forces, *self.frames):
-            if is_traced(part):
-                raise ValueError(f"{part.label} has a number that JAX traces. {_TRACED}")
-        for body in self.bodies:
-            _call(body, "check")
-        for part in (*self.bodies, *self.frames):
-            warn_of_angles(part, part, stacklevel=_USER)
-        space = SPACE if self.bodies[0].dimension == 3 else PLANE
-        layout, index, of_parts = _placed(self, space)
-        guess = _given_state(self, layout)
-        if is_traced(guess):
-            raise ValueError(_TRACED)
-        given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
+        return with_structure(as_given(self))
 
-        frames = frames_by_name(self.frames, self.bodies)
-        index |= {name: index[frame.of_body] for name, frame in frames.items()}
-        observed = frozenset(frame.name for frame in self.frames)
-        resolved = KnownParts(space, index, of_parts, frames, observed, given, {})
-        parts, laws, gravity = _settled(self, resolved, layout)
 
-        def kind(cls, check=check_kernels):
-            return stack([(part, bodies) for part, bodies in parts if isinstance(part, cls)], layout, check)
+def as_given(scene: Scene) -> RigidBodySystem:
+    """The system of a scene at its given poses, before its structure is found: for pictures only."""
+    for part in (*scene.bodies, *scene.joints, *scene.forces, *scene.frames):
+        if is_traced(part):
+            raise ValueError(f"{part.label} has a number that JAX traces. {_TRACED}")
+    for body in scene.bodies:
+        _call(body, "check")
+    for part in (*scene.bodies, *scene.frames):
+        warn_of_angles(part, part, stacklevel=_USER)
+    space = SPACE if scene.bodies[0].dimension == 3 else PLANE
+    layout, index, of_parts = _placed(scene, space)
+    guess = _given_state(scene, layout)
+    if is_traced(guess):
+        raise ValueError(_TRACED)
+    given: Any = np.append(np.asarray(guess.q), np.asarray(space.ground, guess.q.dtype))[layout.pose_index]
 
-        def of_joints(group):
-            return tuple(of_joint[name] for name in group.names)
+    frames = frames_by_name(scene.frames, scene.bodies)
+    index |= {name: index[frame.of_body] for name, frame in frames.items()}
+    observed = frozenset(frame.name for frame in scene.frames)
+    resolved = KnownParts(space, index, of_parts, frames, observed, given, {})
+    parts, laws, gravity = _settled(scene, resolved, layout)
 
-        of_joint = {law.name: law.joint for law, _ in laws}
-        of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractStickSlip)}
-        constraints = kind(AbstractConstraint)
-        position, velocity = numbered(
-            [constraint_group(group) for group in constraints if group.rows],
-            [velocity_group(group, of_joint) for group in kind(AbstractVelocityConstraint)],
-        )
-        forces = ForceSet(
-            groups=tuple(map(ForceGroup, kind(AbstractForce))),
-            gravity=None if gravity is None else jax.device_put(gravity.acceleration),
-            gravity_name="" if gravity is None else gravity.name,
-        )
-        system = RigidBodySystem(
-            bodies=BodySet(
-                groups=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(self.bodies)], layout))),
-                tendons=tuple(map(CoordinateGroup, kind(AbstractTendon, None))),
-                names=tuple(body.name for body in self.bodies),
-                layout=layout,
-            ),
-            constraints=ConstraintSet(
-                position=position,
-                velocity=velocity,
-                servos=tuple(map(servo_group, kind(Servo, _check_program))),
-                nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
-                layout=layout,
-            ),
-            forces=forces.with_states(None),
-            frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in self.frames], layout))),
-            free_joints=tuple(CoordinateGroup(group) for group in constraints if not group.rows),
-            guess=dataclasses.replace(guess, z=forces.initial_states()),
-            length=_length([inner for part, _ in parts for inner in (part, *_inner(part))], guess, layout),
-            ranks=Ranks(0, 0, 0, 0),
-            implied=(),
-            elimination=None,
-        )
-        return with_structure(_with_initial_scalars(system))
+    def kind(cls, check=check_kernels):
+        return stack([(part, bodies) for part, bodies in parts if isinstance(part, cls)], layout, check)
+
+    def of_joints(group):
+        return tuple(of_joint[name] for name in group.names)
+
+    of_joint = {law.name: law.joint for law, _ in laws}
+    of_joint |= {part.name: part.joint_name for part, _ in parts if isinstance(part, AbstractStickSlip)}
+    constraints = kind(AbstractConstraint)
+    position, velocity = numbered(
+        [constraint_group(group) for group in constraints if group.rows],
+        [velocity_group(group, of_joint) for group in kind(AbstractVelocityConstraint)],
+    )
+    forces = ForceSet(
+        groups=tuple(map(ForceGroup, kind(AbstractForce))),
+        gravity=None if gravity is None else jax.device_put(gravity.acceleration),
+        gravity_name="" if gravity is None else gravity.name,
+    )
+    system = RigidBodySystem(
+        bodies=BodySet(
+            groups=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(scene.bodies)], layout))),
+            tendons=tuple(map(CoordinateGroup, kind(AbstractTendon, None))),
+            names=tuple(body.name for body in scene.bodies),
+            layout=layout,
+        ),
+        constraints=ConstraintSet(
+            position=position,
+            velocity=velocity,
+            servos=tuple(map(servo_group, kind(Servo, _check_program))),
+            nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
+            layout=layout,
+        ),
+        forces=forces.with_states(None),
+        frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in scene.frames], layout))),
+        free_joints=tuple(CoordinateGroup(group) for group in constraints if not group.rows),
+        guess=dataclasses.replace(guess, z=forces.initial_states()),
+        length=_length([inner for part, _ in parts for inner in (part, *_inner(part))], guess, layout),
+        ranks=Ranks(0, 0, 0, 0),
+        implied=(),
+        elimination=None,
+    )
+    return _with_initial_scalars(system)
 
 
 def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int], dict[str, tuple[int, ...]]]:

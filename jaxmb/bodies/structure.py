@@ -60,7 +60,8 @@ def with_structure(system: RigidBodySystem) -> RigidBodySystem:
         raise ValueError(
             "The scene cannot be compiled: the mechanism cannot be assembled from the given poses, residuals [m, rad] "
             f"remain in {listed}. The assembly starts at the position and the {turn} of each body: give poses that are "
-            "nearer to an assembled mechanism. Else check lengths, points and axes: joints may contradict each other."
+            "nearer to an assembled mechanism. Else check lengths, points and axes: joints may contradict each other. "
+            "jaxmb.viz.plot_scene(scene) draws the gaps."
             f"{without_a_joint(system, np.zeros((), q.dtype), system.guess.q)}"
         )
     joints = JointBlocks(_parts(system), _of_parts(at.blocks), system.layout, system.known_scales()[1])

@@ -1,5 +1,6 @@
 """Pictures of motions and of their stability.
 
+`plot_scene` draws a scene before it moves, also where it cannot be assembled; `plot_motion` draws quantities over time.
 `show` and `plot_mechanism` draw wheels, pins, springs, tracks and terrain; other bodies are bars from the mass centre
 to the points where parts act. `show` also takes other shapes: `shapes={"crank": jaxmb.shapes.Box((1.0, 0.1, 0.1))}`, or
 `shapes.Mesh.read(file)`; a user-defined part defines them by its methods `shapes` and `path`. A picture shows the saved
@@ -13,3 +14,4 @@ from .animation import MovingPicture as MovingPicture, save_html as save_html, s
 from .mechanism import plot_mechanism as plot_mechanism
 from .motion import plot_motion as plot_motion
 from .root_locus import plot_root_locus as plot_root_locus
+from .scene import plot_scene as plot_scene

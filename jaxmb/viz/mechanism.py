@@ -1,8 +1,10 @@
 """A mechanism drawn at several times of its motion."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from .._arguments import whole_number
 from .._types import State
@@ -10,12 +12,13 @@ from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
 from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
 from ..system import AbstractSystem
+from ..system.picture import Picture
 from ..trajectory import Trajectory, picture_of
 from .figure import new_figure
 from .meshes import heights
 from .one_motion import as_motion, check_finite, one_motion
 from .silhouettes import area, edges, stroke
-from .solids import COLORS, solids
+from .solids import COLORS, Placed, solids
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,24 +66,38 @@ def plot_mechanism(
     shapes = solids(picture, {}, None)
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))
+    figure, axes = drawn(picture, shapes, shown.tolist())
+    bodies = [name for name in picture.positions if name != GROUND]
+    if len(bodies) <= _FEW:
+        for k, name in enumerate(bodies):
+            path, color = picture.positions[name][:, : 2 if picture.planar else 3], faded(COLORS[k % len(COLORS)], 1.0)
+            axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
+            axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
+        figure.legend(loc="outside right upper", fontsize="small")
+    finish(figure, axes, picture, shapes)
+    if len(shown) <= _TIMES:
+        axes.set_title("t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s", fontsize="medium")
+    return figure
+
+
+def drawn(picture: Picture, shapes: Sequence[Placed], shown: Sequence[int]) -> tuple[Any, Any]:
+    """A figure and its axes, with bodies, springs and tracks at the `shown` times, fainter at earlier times."""
     figure = new_figure(8.0, 6.0)
     axes: Any = figure.add_subplot(projection=None if picture.planar else "3d")
     draw = _draw_areas if picture.planar else _draw_edges
     # Objects on the ground are drawn once.
-    draw(
-        axes, picture, [placed for placed in shapes if placed[0] == GROUND and placed[1].primitive != "ground"], 0, 1.0
-    )
+    of_ground = [placed for placed in shapes if placed[0] == GROUND and placed[1].primitive != "ground"]
+    draw(axes, picture, of_ground, 0, 1.0)
+    moving = [placed for placed in shapes if placed[0] != GROUND]
     for order, time in enumerate(shown):
         fade = (order + 1) / len(shown)
-        draw(axes, picture, [placed for placed in shapes if placed[0] != GROUND], time, fade)
+        draw(axes, picture, moving, time, fade)
         _draw_paths(axes, picture, time, fade)
-    bodies = [name for name in picture.positions if name != GROUND]
-    if len(bodies) <= _FEW:
-        for k, name in enumerate(bodies):
-            path, color = picture.positions[name][:, : 2 if picture.planar else 3], _faded(COLORS[k % len(COLORS)], 1.0)
-            axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
-            axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
-        figure.legend(loc="outside right upper", fontsize="small")
+    return figure, axes
+
+
+def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -> None:
+    """Draw the terrain, and give the axes labels and equal scales."""
     if picture.planar:
         for ground in [shape for _, shape in shapes if shape.primitive == "ground"]:
             _draw_ground(axes, ground)
@@ -92,29 +109,26 @@ def plot_mechanism(
     (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     if picture.planar:
         figure.set_figheight(float(np.clip(6.5 * (top - bottom) / (high - low) + 1.0, 2.2, 6.5)))
-    if len(shown) <= _TIMES:
-        axes.set_title("t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s", fontsize="medium")
-    return figure
 
 
 def _draw_areas(axes, picture, shapes, time, fade):
-    areas = [(_in_world(picture, body, area(shape), time), shape.color) for body, shape in shapes]
+    areas = [(in_world(picture, body, area(shape), time), shape.color) for body, shape in shapes]
     for corners, color in sorted(areas, key=lambda polygon: float(np.mean(polygon[0][:, 2]))):
         axes.fill(
-            *corners[:, :2].T, facecolor=_faded(color, fade), edgecolor=_faded(_EDGE, fade), linewidth=0.4, zorder=2
+            *corners[:, :2].T, facecolor=faded(color, fade), edgecolor=faded(_EDGE, fade), linewidth=0.4, zorder=2
         )
 
 
 def _draw_edges(axes, picture, shapes, time, fade):
     for body, shape in shapes:
         for line in edges(shape):
-            axes.plot(*_in_world(picture, body, line, time).T, color=_faded(shape.color, fade), linewidth=2)
+            axes.plot(*in_world(picture, body, line, time).T, color=faded(shape.color, fade), linewidth=2)
 
 
 def _draw_paths(axes, picture, time, fade):
     for line in picture.paths.values():
         points = stroke(line, time, picture.width)[:, : 2 if picture.planar else 3]
-        axes.plot(*points.T, color=_faded(DARK, fade), linewidth=2.0 if line.kind == "belt" else 1.0, zorder=2)
+        axes.plot(*points.T, color=faded(DARK, fade), linewidth=2.0 if line.kind == "belt" else 1.0, zorder=2)
 
 
 def _draw_ground(axes, ground):
@@ -124,14 +138,15 @@ def _draw_ground(axes, ground):
     profile = np.stack([x - ground.position[0], heights(ground, (x - ground.position[0])[:, None]), 0 * x], axis=1)
     line = ground.position + profile @ rotation_matrix(ground.orientation).T
     bottom = min(axes.get_ylim()[0], float(line[:, 1].min()) - 0.02 * (high - low))
-    axes.fill_between(line[:, 0], line[:, 1], bottom, color=_faded(GROUND_COLOR, 1.0), linewidth=0, zorder=1)
+    axes.fill_between(line[:, 0], line[:, 1], bottom, color=faded(GROUND_COLOR, 1.0), linewidth=0, zorder=1)
     axes.set(xlim=(low, high), ylim=(bottom, axes.get_ylim()[1]))
 
 
-def _in_world(picture, body, points, time):
+def in_world(picture: Picture, body: str, points: Float[np.ndarray, "n 3"], time: int) -> Float[np.ndarray, "n 3"]:
+    """The places of points of a body at a time."""
     return picture.positions[body][time] + points @ rotation_matrix(picture.orientations[body][time]).T
 
 
-def _faded(color, share):
+def faded(color: Color, share: float) -> tuple[float, ...]:
     """A colour of matplotlib, mixed with white."""
     return tuple(1 - share * (1 - np.array(color) / 255))

@@ -141,6 +141,7 @@ CONCRETE = {
     "studies.inverse.required: Trajectory",
     "studies.sweep.cases: Cases",
     "system.design: Variable",
+    "viz.scene: Scene",
 }
 # The function that they stand in says what they hold beside what others hold.
 DESCRIBED = {"simulate.solve: Counted", "solvers.mesh: Counted", "solvers.order: StepEstimate"}

@@ -1,0 +1,125 @@
+"""A scene drawn before it moves: bodies and joints with their names, and joints that do not close."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._types import State
+from ..bodies.scene import Scene, as_given
+from ..parts.base import GROUND
+from ..simulate.arguments import checked_state
+from ..system import AbstractSystem
+from ..trajectory import picture_of, still
+from .mechanism import drawn, faded, finish, in_world
+from .solids import COLORS, solids
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Joints are open from this residual on, relative to the system's size.
+_OPEN = 1e-6
+# Largest numbers of names in a picture, and of open joints in its title.
+_NAMES, _TITLE = 30, 3
+_RED = (0.8, 0.05, 0.1)
+
+
+def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: float = 0.0) -> "Figure":
+    """Draw a scene with the names of its bodies and joints, before it is compiled, assembled or moved.
+
+    ```python
+    scene = jaxmb.mechanisms.get("four_bar").scene
+    jaxmb.viz.plot_scene(scene)  # At the poses given with the bodies.
+    jaxmb.viz.plot_scene(system, state)
+    ```
+
+    Points of a joint that do not meet are joined by a red line with their distance: where `compile` or `assemble`
+    fails, the picture shows which joint is open.
+
+    **Arguments:** `scene`: a `Scene`, at the poses given with its bodies, or a compiled system; `state` of a system,
+    default the poses found when it was compiled; `t`: the time, for driven joints [s].
+
+    **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows.
+
+    **Raises:** `ValueError` for a state without a system, and for a system without bodies; `ImportError` without
+    matplotlib.
+    """
+    # A concrete class, since there is one kind of scene, and it has no state.
+    if isinstance(scene, Scene):
+        if state is not None:
+            raise ValueError("plot_scene draws a Scene at the poses of its bodies; a state needs a compiled system.")
+        system: Any = as_given(scene)
+    elif isinstance(scene, AbstractSystem):
+        system = scene
+    else:
+        raise ValueError(f"plot_scene draws a Scene or a compiled system, got a {type(scene).__name__}.")
+    if not system.body_names:
+        raise ValueError(f"plot_scene draws bodies, and a {type(system).__name__} has none.")
+    y: Any = system.guess if state is None else checked_state(system, state)
+    picture = picture_of(still(system, y, t))
+    shapes = solids(picture, {}, None)
+    figure, axes = drawn(picture, shapes, [0])
+    dimension = 2 if picture.planar else 3
+    bodies = [name for name in picture.positions if name != GROUND]
+    joints = {name: part for name, part in picture.parts.items() if any(x is not None for x in part.points)}
+    named = len(bodies) + len(joints) <= _NAMES
+    for k, name in enumerate(bodies):
+        color = faded(COLORS[k % len(COLORS)], 1.0)
+        place = picture.positions[name][0, :dimension]
+        axes.plot(*place, "o", color=color, markersize=4, zorder=4)
+        if len(bodies) <= _NAMES:
+            _write(axes, place, name, color, (0, 7), weight="bold")
+    residuals = _residuals(system, t, y)
+    least = _OPEN * float(system.length)
+    largest = {name: float(np.max(np.abs(values))) for name, values in residuals.items()}
+    for name, part in joints.items():
+        points = [
+            in_world(picture, body, point[None], 0)[0, :dimension]
+            for body, point in zip(part.bodies, part.points, strict=True)
+            if point is not None
+        ]
+        is_open = largest.get(name, 0.0) > least
+        for point in points:
+            color = _RED if is_open else "black"
+            axes.plot(*point, "o", color=color, markerfacecolor="white", markersize=5, zorder=5)
+        text = name
+        if is_open:
+            gap, text = points[-1] - points[0], f"{name}: off by {largest[name]:.3g}"
+            # The first rows of joints whose points meet are the distances of these points.
+            unmet = np.linalg.norm(residuals[name][:dimension])
+            if unmet > least and np.isclose(unmet, np.linalg.norm(gap), atol=least):
+                text = f"{name}: {np.linalg.norm(gap):.3g} m apart"
+                axes.plot(*np.stack([points[0], points[-1]]).T, color=_RED, linewidth=2, zorder=6)
+        if named or is_open:
+            _write(axes, np.mean(points, axis=0), text, _RED if is_open else "0.25", (6, -11))
+    finish(figure, axes, picture, shapes)
+    _entitle(axes, largest, least)
+    return figure
+
+
+def _residuals(system, t, state):
+    """The residuals [m, rad] of each joint."""
+    out: dict[str, list[float]] = {}
+    values = np.asarray(system.position_residual(np.asarray(t, state.q.dtype), state.q))
+    for (name, _), value in zip(system.rows, values, strict=False):
+        out.setdefault(name, []).append(float(value))
+    return out
+
+
+def _write(axes, place, text, color, offset, **style):
+    options = {"fontsize": "small", "color": color, "zorder": 7, **style}
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
+    if len(place) == 3:
+        axes.text(*place, text, bbox=box, **options)
+    else:
+        axes.annotate(text, place, xytext=offset, textcoords="offset points", bbox=box, ha="center", **options)
+
+
+def _entitle(axes, largest, least):
+    """Say whether all joints close, from their largest residuals."""
+    unmet = sorted((name for name, x in largest.items() if x > least), key=largest.__getitem__, reverse=True)
+    if unmet:
+        named = ", ".join(f"{name} by {largest[name]:.3g}" for name in unmet[:_TITLE])
+        more = f" and {len(unmet) - _TITLE} more" if len(unmet) > _TITLE else ""
+        axes.set_title(f"open joints [m, rad]: {named}{more}", fontsize="medium", color=_RED)
+    elif largest:
+        axes.set_title("all joints are closed", fontsize="medium")

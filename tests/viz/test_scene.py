@@ -1,0 +1,95 @@
+"""Scenes drawn before they move: names, points, and joints that do not close."""
+
+import matplotlib.colors
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar, spatial, viz
+
+
+def bar(name, length, position, angle):
+    return planar.Body(name, mass=1.0, inertia=planar.rod(1.0, length), position=position, angle=angle)
+
+
+def four_bar(angle=0.6):
+    """A scene whose given poses leave gaps."""
+    return mb.Scene(
+        [bar("crank", 1.0, (0.5, 0.0), 0.0), bar("rod", 2.0, (1.5, 0.8), angle), bar("rocker", 2.0, (2.2, 0.8), 1.2)],
+        joints=[
+            planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+            planar.Revolute("B", "crank", "rod", point_a=(0.5, 0.0), point_b=(-1.0, 0.0)),
+            planar.Revolute("C", "rod", "rocker", point_a=(1.0, 0.0), point_b=(1.0, 0.0)),
+            planar.Revolute("D", "rocker", "ground", point_a=(-1.0, 0.0), point_b=(2.0, 0.0)),
+        ],
+        forces=[planar.SpringDamper("spring", "ground", "rod", stiffness=10.0, free_length=1.0, point_a=(0.0, 2.0))],
+    )
+
+
+def read(figure):
+    """The texts, the red lines as pairs of points, and the title."""
+    (axes,) = figure.axes
+    red = [line.get_xydata() for line in axes.lines if matplotlib.colors.to_rgb(line.get_color())[0] > 0.75]
+    return {text.get_text() for text in axes.texts}, [line for line in red if len(line) == 2], axes.get_title()
+
+
+def test_plot_scene_shows_the_gaps_of_the_given_poses():
+    texts, gaps, title = read(viz.plot_scene(four_bar()))
+    rod = np.array([1.5, 0.8]) - np.array([np.cos(0.6), np.sin(0.6)])
+    assert {"crank", "rod", "rocker", "A", "spring"} <= texts
+    assert f"B: {np.linalg.norm(rod - [1.0, 0.0]):.3g} m apart" in texts
+    assert any(np.allclose(gap, [[1.0, 0.0], rod]) for gap in gaps) and len(gaps) == 3
+    assert title == "open joints [m, rad]: C by 0.367, B by 0.325, D by 0.162"
+
+
+def test_plot_scene_shows_an_assembled_system():
+    system = four_bar().compile()
+    texts, gaps, title = read(viz.plot_scene(system, mb.assemble(system, fix={"crank.angle": 1.0})))
+    assert texts == {"crank", "rod", "rocker", "A", "B", "C", "D", "spring"}
+    assert gaps == [] and title == "all joints are closed"
+
+
+def test_plot_scene_shows_a_scene_that_cannot_be_compiled():
+    """Its message names the picture."""
+    short = mb.Scene(
+        [bar("crank", 1.0, (0.5, 0.0), 0.0), bar("rod", 0.5, (1.2, 0.0), 0.0)],
+        joints=[
+            planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+            planar.Revolute("B", "crank", "rod", point_a=(0.5, 0.0), point_b=(-0.25, 0.0)),
+            planar.Revolute("C", "rod", "ground", point_a=(0.25, 0.0), point_b=(4.0, 0.0)),
+        ],
+    )
+    with pytest.raises(ValueError, match=r"cannot be assembled .* jaxmb\.viz\.plot_scene\(scene\) draws the gaps\."):
+        short.compile()
+    texts, gaps, _ = read(viz.plot_scene(short))
+    assert "C: 2.55 m apart" in texts
+    assert any(np.allclose(gap, [[1.45, 0.0], [4.0, 0.0]]) for gap in gaps)
+
+
+def test_plot_scene_of_joints_whose_points_need_not_meet():
+    """A slide is off its axis, whatever its displacement; in space a hinge may be turned only."""
+    body = planar.Body("piston", mass=1.0, inertia=0.1, position=(0.5, 0.2))
+    rail = planar.Prismatic("slide", "ground", "piston", axis=(1.0, 0.0), point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    texts, gaps, title = read(viz.plot_scene(mb.Scene([body], joints=[rail])))
+    assert "slide: off by 0.2" in texts and gaps == [] and title.endswith("slide by 0.2")
+    door = spatial.Body("door", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.0))
+    hinge = spatial.Revolute(
+        "hinge",
+        "ground",
+        "door",
+        point=(0.0, 0.0, 0.0),
+        axis_a=(0.0, 0.0, 1.0),
+        axis_b=(0.0, 0.6, 0.8),
+    )
+    (axes,) = viz.plot_scene(mb.Scene([door], joints=[hinge])).axes
+    assert f"hinge: off by {np.sqrt(0.4):.3g}" in {text.get_text() for text in axes.texts}
+
+
+def test_plot_scene_refuses_what_it_cannot_draw():
+    scene = four_bar()
+    with pytest.raises(ValueError, match=r"at the poses of its bodies; a state needs a compiled system"):
+        viz.plot_scene(scene, mb.State(np.zeros(9), np.zeros(9)))
+    with pytest.raises(ValueError, match=r"draws a Scene or a compiled system, got a Body"):
+        viz.plot_scene(scene.bodies[0])
+    with pytest.raises(ValueError, match=r"draws bodies, and a LagrangianSystem has none"):
+        viz.plot_scene(mb.mechanisms.appell_hamel().system)
