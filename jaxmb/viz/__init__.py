@@ -1,6 +1,7 @@
 """Pictures of motions and of their stability.
 
-`plot_scene` draws a scene before it moves, also where it cannot be assembled; `plot_motion` draws quantities over time.
+`plot_scene` draws a scene before it moves, also where it cannot be assembled; `plot_motion` draws quantities over time;
+`save_movie` writes an animated GIF or a film.
 `show` and `plot_mechanism` draw wheels, pins, springs, tracks and terrain; other bodies are bars from the mass centre
 to the points where parts act. `show` also takes other shapes: `shapes={"crank": jaxmb.shapes.Box((1.0, 0.1, 0.1))}`, or
 `shapes.Mesh.read(file)`; a user-defined part defines them by its methods `shapes` and `path`. A picture shows the saved
@@ -13,5 +14,6 @@ Figures need the extra `jaxmb[plot]`, moving pictures `jaxmb[view]`; matplotlib 
 from .animation import MovingPicture as MovingPicture, save_html as save_html, show as show
 from .mechanism import plot_mechanism as plot_mechanism
 from .motion import plot_motion as plot_motion
+from .movie import save_movie as save_movie
 from .root_locus import plot_root_locus as plot_root_locus
 from .scene import plot_scene as plot_scene
