@@ -15,6 +15,7 @@ from execute_notebooks import FOLDER, GALLERY, difference, digest, executed, pri
 from PIL import Image
 
 import jaxmb as mb
+from jaxmb.cli.commands import parser
 
 ROOT = FOLDER.parent
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -23,6 +24,10 @@ LARGEST = 2 * 2**20
 FORBIDDEN = re.compile(
     r"/(home|root|tmp|Users|work|workspace)/|[A-Z]:\\\\|https?://|urllib|requests|^[!%](?!matplotlib inline)", re.M
 )
+# A formula whose backslashes are doubled is shown as it is written.
+DOUBLED = re.compile(r"\$[^$]*\\\\[a-zA-Z,;][^$]*\$")
+COMMAND = re.compile(r"`jaxmb\s+(\w+)")
+COMMANDS = set(parser()._subparsers._group_actions[0].choices)  # pyright: ignore
 
 
 def test_there_are_notebooks():
@@ -44,6 +49,9 @@ def test_lint(path):
             texts += [output.get("text", ""), output.get("data", {}).get("text/plain", "")]
         for text in texts:
             assert not FORBIDDEN.search(text), f"{path.name}: {FORBIDDEN.search(text)!r}"
+        if cell.cell_type == "markdown":
+            assert not DOUBLED.search(cell.source), f"{path.name}: {DOUBLED.search(cell.source)!r}"
+            assert set(COMMAND.findall(cell.source)) <= COMMANDS, path.name
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
