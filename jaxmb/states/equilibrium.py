@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._types import Coordinates, Scalar, State, VectorLike
-from ..linalg.arrays import is_traced, namespace
+from ..linalg.arrays import derivatives_of, is_traced, namespace
 from ..linalg.failure import nan_where
 from ..linalg.jitted import on_host
 from ..linalg.newton import root
@@ -129,9 +129,7 @@ def equilibrium(
         raise ValueError(
             "A prescribed motion has a velocity at this time; choose a time t at which all drivers are at rest."
         )
-    outcome: Any = None if is_traced((system, time, start)) else _on_host(system, time, start, held, bool(stable))
-    outcome = _balanced(system, time, start, held, bool(stable)) if outcome is None else outcome
-    q, unbalanced, falling, ok, overlaps, pulls = outcome
+    q, unbalanced, falling, ok, overlaps, pulls = _found(system, time, start, held, bool(stable))
     if errors and not bool(ok):
         unbalanced = np.asarray(unbalanced) / np.asarray(system.velocity_scale())
         raise ValueError(_only_unstable(system, falling) if np.any(falling) else _not_found(system, start, unbalanced))
@@ -263,30 +261,64 @@ def _step(local: _Linearised, *, downhill: bool) -> Float[Array, "n"]:
     return xp.linalg.solve(stiffness, local.directions @ xp.where(quiet, 0.0, along))
 
 
-@eqx.filter_jit
-def _balanced(
-    system: AbstractSystem, t: Array, start: Coordinates, held: tuple[int, ...], stable: bool
-) -> tuple[
-    Float[Array, "nq"],
-    Float[Array, "nu"],
-    Float[Array, "nu"],
-    Bool[Array, ""],
-    Bool[Array, "contacts"],
-    Bool[Array, "contacts"],
-]:
-    """The equilibrium, and facts about it.
+class _Outcome(NamedTuple):
+    """An equilibrium, and facts about it.
 
-    These are the residual forces in the scales of velocities; the displacement along which a discarded equilibrium
-    falls, else zero; whether the search succeeded; which open contacts are overlapped; which closed contacts pull.
+    **Fields:** the residual forces, `unbalanced`, in the scales of velocities; the displacement along which a discarded
+    equilibrium is `falling`, else zero; `ok`: whether the search succeeded; which open contacts have `overlaps`; which
+    closed contacts have `pulls`.
     """
+
+    q: Float[Array, "nq"]
+    unbalanced: Float[Array, "nu"]
+    falling: Float[Array, "nu"]
+    ok: Bool[Array, ""]
+    overlaps: Bool[Array, "contacts"]
+    pulls: Bool[Array, "contacts"]
+
+
+def _found(system, t, start, held, stable) -> _Outcome:
+    """The equilibrium; known numbers are searched in NumPy, also those of a derivative."""
+    frozen = lax.stop_gradient((system, t, start))
+    found: Any = (None, None, None) if is_traced(frozen) else _on_host(*frozen, held, stable)
+    outcome, local, host = found
+    if outcome is None:
+        return _balanced(system, t, start, held, stable)
+    if not is_traced((system, t, start)):
+        return outcome
+    if not outcome.ok:
+        return _balanced(system, t, start, held, stable)
+    balance = Balance(system, t, start[np.array(held, int)], held)
+    inverse = None
+    if host is not None and max(derivatives_of((system, t, start)).orders) == 1:
+        inverse = _inverse(host, np.asarray(outcome.q), local)
+    return outcome._replace(q=_followed(balance, outcome.q, local, outcome.ok, inverse)[0])
+
+
+@eqx.filter_jit
+def _balanced(system: AbstractSystem, t: Array, start: Coordinates, held: tuple[int, ...], stable: bool) -> _Outcome:
+    """The equilibrium by a program."""
     balance = Balance(system, t, start[np.array(held, int)], held)
     search = _settled if stable else _nearest
     fixed = lax.stop_gradient(balance)
     q, local, falling, ok = search(functools.partial(_linearised, fixed), lax.stop_gradient(start), _unknown(balance))
+    q, multipliers = _followed(balance, q, local, ok)
+    overlaps, pulls = lax.stop_gradient(_against(system, t, q, multipliers, local.implied))
+    return _Outcome(q, local.force, falling, ok, overlaps, pulls)
 
-    # The equations of the equilibrium, for its derivatives, with a unique solution: the configuration does not move
-    # along loose directions, and the multipliers of implied rows are as small as possible.
-    n, stiff = system.nu, jnp.max(jnp.abs(local.curvatures))
+
+# A nested program, which is one of its own for known numbers.
+@eqx.filter_jit
+def _followed(
+    balance: Balance, q: Coordinates, local: _Linearised, ok: Any, inverse: Array | None = None
+) -> tuple[Array, Array]:
+    """A known equilibrium and its multipliers, with their derivatives by the implicit function theorem.
+
+    **Arguments:** `inverse` of the derivative of the equations, for first derivatives, if it is known.
+    """
+    # Equations with a unique solution: the configuration does not move along loose directions, and the multipliers of
+    # implied rows are as small as possible.
+    n, stiff = balance.system.nu, jnp.max(jnp.abs(local.curvatures))
     loose = jnp.where(local.loose[None, :], local.directions, 0.0) @ local.directions.T
     jacobian = lax.stop_gradient(balance).jacobian(q)
 
@@ -300,10 +332,12 @@ def _balanced(
         return jnp.where(ok, jnp.concatenate([force, rows]), x - initial)
 
     initial = jnp.concatenate([jnp.zeros(n, q.dtype), local.multipliers])
-    solved = root(equations, initial, lambda _, x: x)
-    q = balance.moved(q, solved[:n])
-    overlaps, pulls = lax.stop_gradient(_against(system, t, q, solved[n:], local.implied))
-    return q, local.force, falling, ok, overlaps, pulls
+    if inverse is None:
+        solved = root(equations, initial, lambda _, x: x)
+    else:
+        unmet = equations(initial)
+        solved = initial - inverse @ (unmet - lax.stop_gradient(unmet))
+    return balance.moved(q, solved[:n]), solved[n:]
 
 
 def _against(system, t, q, multipliers, implied):
@@ -318,8 +352,10 @@ def _against(system, t, q, multipliers, implied):
 _linearised_alone, _against_alone = on_host(_linearised), on_host(_against)
 
 
-def _on_host(system, t, start, held, stable):
-    """`_balanced` with the search in NumPy, for concrete numbers; None if a matrix is singular or not finite."""
+def _on_host(system, t, start, held, stable) -> tuple[_Outcome | None, Any, HostBalance | None]:
+    """`_balanced` with the search in NumPy, for concrete numbers, with the balance there and its equations; None if a
+    matrix is singular or not finite.
+    """
     start, time = jax.tree.map(np.asarray, (start, t))
     balance = Balance(system, time, start[np.array(held, int)], held)
     host = balance_on_host(balance)
@@ -327,11 +363,25 @@ def _on_host(system, t, start, held, stable):
     try:
         q, local, falling, ok = (_settled if stable else _nearest)(at, start, _unknown(balance))
     except np.linalg.LinAlgError:
-        return None
-    against = (np.zeros(0, bool),) * 2
+        return None, None, None
+    against: Any = (np.zeros(0, bool),) * 2
     if ok and system.contacts:
         against = _against_alone(system, time, q, local.multipliers, local.implied)
-    return jax.device_put(q), local.force, falling, jax.device_put(np.asarray(ok)), *against
+    return _Outcome(jax.device_put(q), local.force, falling, jax.device_put(np.asarray(ok)), *against), local, host
+
+
+def _inverse(host: HostBalance, q: np.ndarray, local: Any) -> Array | None:
+    """The inverse of the derivative of the equations in `_followed`, None if it is singular."""
+    jacobian, stiff = host.jacobian(q), np.max(np.abs(local.curvatures))
+    softness = np.asarray(host.applied_along(q)[0]) + host.of_rows_along(q, local.multipliers)[0]
+    loose = np.where(local.loose[None, :], local.directions, 0.0) @ local.directions.T
+    rows = jacobian / local.sizes[:, None]
+    matrix = np.block([[softness - stiff * loose, jacobian.T], [rows, local.implied * local.sizes / stiff]])
+    try:
+        inverse = np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return None
+    return jax.device_put(inverse) if np.all(np.isfinite(inverse)) else None
 
 
 def _nearest(at: _At, start: Coordinates, unknown: _Linearised):

@@ -10,8 +10,11 @@ import pytest
 import jaxmb as mb
 from jaxmb import mechanisms, planar, spatial
 from jaxmb.formulations import Partitioned, accelerations
+from jaxmb.states import equilibrium
 from jaxmb.states.balance import Balance
 
+# Most are of single operations, outside of `jit`.
+MOST_PROGRAMS = 80
 G = 9.81
 
 
@@ -70,6 +73,46 @@ def test_equilibrium_of_a_pendulum_on_a_spring_and_its_derivatives():
     of = lambda stiffness, mass: solve(stiffness, mass).q[5]
     np.testing.assert_allclose(jax.jit(jax.jacfwd(of, (0, 1)))(5.0, 2.0), slopes, rtol=1e-10)
     np.testing.assert_allclose(jax.jit(jax.jacrev(of, (0, 1)))(5.0, 2.0), slopes, rtol=1e-10)
+
+
+def test_equilibrium_of_known_numbers_has_derivatives_without_a_search_in_a_program(monkeypatch):
+    """In forward and reverse mode, by a stiffness, a mass and a held coordinate; the search is in NumPy."""
+    monkeypatch.setattr(equilibrium, "_balanced", None)
+    system = cart()
+
+    def end(x):
+        changed = mb.with_parameters(system, {"spring.stiffness": x[0], "bob.mass": x[1]})
+        return mb.equilibrium(changed, fix={"cart.x": x[2]}).q
+
+    angle, stiff = bob_angle(5.0, 2.0), 5.0 - 2.0 * G * np.sin(bob_angle(5.0, 2.0))
+    by_angle = np.array([-angle / stiff, -G * np.cos(angle) / stiff, 0.0])
+    known = np.zeros((6, 3))
+    known[3:] = np.outer([-np.sin(angle), np.cos(angle), 1.0], by_angle)
+    known[[0, 3], 2] += 1.0
+    x = jnp.array([5.0, 2.0, 0.3])
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(end)(x), known, rtol=0, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["double_wishbone", "five_link"])
+def test_equilibrium_of_a_machine_has_the_derivatives_of_a_program(name):
+    """First and second ones, by all masses and stiffnesses together."""
+    built = mechanisms.get(name)
+    system, known = built.system, mb.parameters(built.system)
+    names = [key for key in known if key.endswith(("mass", "stiffness"))]
+
+    def end(x):
+        changed = {key: known[key] * (1 + x * (k + 1) / len(names)) for k, key in enumerate(names)}
+        state = mb.equilibrium(mb.with_parameters(system, changed), built.state)
+        return jnp.sum(state.q * np.arange(1.0, system.nq + 1))
+
+    np.testing.assert_allclose(jax.grad(end)(0.0), jax.jit(jax.grad(end))(0.0), rtol=1e-9)
+    near, far = ((end(h) - end(-h)) / (2 * h) for h in (1e-3, 2e-3))
+    np.testing.assert_allclose(jax.grad(end)(0.0), (4 * near - far) / 3, rtol=1e-5)
+    slope = jax.grad(end)
+    near, far = ((slope(h) - slope(-h)) / (2 * h) for h in (1e-3, 2e-3))
+    np.testing.assert_allclose(jax.grad(slope)(0.0), (4 * near - far) / 3, rtol=1e-4)
 
 
 @pytest.mark.slow
