@@ -100,7 +100,8 @@ class Chart(eqx.Module):
 
         **Arguments:** `near`: a state from which the search for the dependent coordinates starts, default the origin.
 
-        **Returns:** the state; NaN where the search fails, and beyond a `quality` of 100.
+        **Returns:** the state; NaN where the search fails, where rows that others implied are violated, and beyond a
+        `quality` of 100.
         """
         return _state(self, t, x, near)[0].state
 
@@ -119,14 +120,17 @@ class Chart(eqx.Module):
 def _chosen(system, t, state, preferred):
     at = Instant.of(system, jnp.asarray(t, state.q.dtype), state)
     split, quality, singular = choose(at, at.coordinate_jacobian, preferred)
-    violation = jnp.zeros((), state.q.dtype)
-    if system.velocity_rows:
-        violation = jnp.max(jnp.concatenate(at.violations(at.row_sizes())))
+    violation = _violation(at) if system.velocity_rows else jnp.zeros((), state.q.dtype)
     # In the order of the coordinates and velocities.
     velocities = jnp.sort(split.velocity.columns[system.velocity_rank :]) + system.nq
     states = system.nq + system.nu + np.arange(system.nz)
     indices = [jnp.asarray(x, jnp.int32) for x in (jnp.sort(split.independent(system)), velocities, states)]
     return (jnp.concatenate(indices), split, quality[:-1]), singular, violation
+
+
+def _violation(at):
+    """The largest violation of the constraints, relative to the system's size and speed."""
+    return jnp.max(jnp.concatenate(at.violations(at.row_sizes())))
 
 
 def _joined(state):
@@ -151,6 +155,9 @@ def _state(chart, t, x, near):
     if not system.linear:
         small = jnp.finfo(q.dtype).eps ** _SMALL * jnp.max(jnp.abs(at.u), initial=1.0)
         failed = failed | ~(jnp.max(jnp.abs(step), initial=0.0) <= small)
+    if system.velocity_rank < system.velocity_rows:
+        # Rows that others implied hold only if the parameters agree with each other.
+        failed = failed | ~(lax.stop_gradient(_violation(at)) <= _TOLERANCE)
     failed = failed | ~(lax.stop_gradient(_growth(chart, at)) <= _LOST)
     valid = jnp.where(failed, jnp.nan, 1.0).astype(q.dtype)
     return at.with_(q=at.q * valid, u=at.u * valid), failed

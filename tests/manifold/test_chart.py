@@ -116,6 +116,18 @@ def test_motion_beyond_the_border_of_a_chart_fails():
     assert np.isnan(chart.state(0.0, chart.coordinates(built.state).at[:3].add(10.0)).q).all()
 
 
+@pytest.mark.slow
+def test_chart_has_no_state_where_implied_rows_are_violated():
+    """A linkage that moves for one ratio of its lengths only."""
+    built = mb.mechanisms.bennett()
+    chart, known = Chart.at(built.system, 0.0, built.state), mb.parameters(built.system)
+    name = next(key for key in known if key.endswith("point_a") and np.any(np.asarray(known[key]) != 0))
+    x = chart.coordinates(built.state)
+    assert np.all(np.isfinite(chart.state(0.0, x).q))
+    longer = chart.on(mb.with_parameters(built.system, {name: 1.01 * known[name]}))
+    assert np.all(np.isnan(longer.state(0.0, x).q)) and np.all(np.isnan(longer.field(0.0, x)))
+
+
 def test_chart_refuses_states_and_names_that_it_cannot_take():
     system, start = FOUR_BAR.system, FOUR_BAR.state
     with pytest.raises(ValueError, match=r"violates the constraints by 0\.\d+, relative .* jaxmb\.assemble"):
