@@ -255,12 +255,22 @@ def contact_events(system: AbstractSystem, formulation: AbstractFormulation, rec
         *rows, _ = _of_records(system, formulation, record)
     else:
         # The start is the first record, so that one program serves all.
-        with_start = lambda first, rest: jnp.concatenate([jnp.expand_dims(first, axis), rest], axis)
+        xp: Any = jnp if is_traced((system, formulation, record)) else np
+        with_start = lambda first, rest: xp.concatenate([xp.expand_dims(first, axis), rest], axis)
         times, states = map(with_start, record.start, (record.times, record.states))
-        rows = _of_records(system, formulation, record._replace(number=record.number + 1, times=times, states=states))
-        parted = [(lax.index_in_dim(x, 0, axis, False), lax.slice_in_dim(x, 1, None, axis=axis)) for x in rows]
+        number = xp.asarray(record.number) + 1
+        rows = _of_records(system, formulation, record._replace(number=number, times=times, states=states))
+        parted = [_parted(x, axis) for x in rows]
         start, rows = AtStart(record.start[0], *(x for x, _ in parted[1:])), [x for _, x in parted[:-1]]
     return ContactEvents(contacts.names, contacts.n, *_in_order(rows, axis, most), start=start, end=record.end)
+
+
+def _parted(x: Any, axis: int) -> tuple[Any, Any]:
+    """The first entry along an axis, and the others."""
+    if isinstance(x, np.ndarray):
+        first, rest = np.split(x, [1], axis)
+        return np.squeeze(first, axis), rest
+    return lax.index_in_dim(x, 0, axis, False), lax.slice_in_dim(x, 1, None, axis=axis)
 
 
 def _of_records(system, formulation, record):

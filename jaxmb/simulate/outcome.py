@@ -45,8 +45,7 @@ class Flags(NamedTuple):
 
     **Fields:** `failed`; `inconsistent`: its start violates the constraints; `stuck`: it got stuck on its way; `whole`:
     every requested state was saved; `ran_out`: there were too few steps; `long`: it took at least as many steps as
-    derivatives keep at once; `wrong_derivative`: differences of the vector field contradict its derivative, if the
-    solver compares them.
+    derivatives keep at once.
     """
 
     failed: Any
@@ -55,7 +54,6 @@ class Flags(NamedTuple):
     whole: Any
     ran_out: Any
     long: Any
-    wrong_derivative: Any
 
 
 class Outcome(NamedTuple):
@@ -130,7 +128,11 @@ def warn_of_parts(system, motion, reach) -> None:
         warnings.warn(caution, stacklevel=5)
 
 
-def warn_of_wrong_derivative() -> None:
+def warn_of_wrong_derivative(stats: dict[str, Any]) -> None:
+    """Warn if differences contradict the derivative of the vector field, as far as this is known."""
+    wrong = stats.get("wrong_derivative", False)
+    if is_traced(wrong) or not np.any(wrong):
+        return
     warnings.warn(
         "The derivative of the vector field contradicts its differences, so the results of `Hermite` may be wrong: "
         "look for `stop_gradient`, rounding and integers in the functions of parts.",

@@ -194,8 +194,6 @@ class Run:
         """A solved run whose flags are numbers."""
         if flags.stuck:
             trajectory, outcome = _diagnosed(problem, trajectory, outcome)
-        if flags.wrong_derivative:
-            warn_of_wrong_derivative()
         if flags.long:
             note_long(problem.system, problem.method.solver)
         return Ended(problem, trajectory, outcome, flags)
@@ -215,6 +213,7 @@ class Run:
             return trajectory
         if asked.solver == "auto":
             warn_of_stiffness(stats)
+        warn_of_wrong_derivative(stats)
         if ended.flags is None:
             trajectory = ended.trajectory.trimmed()
             if asked.throw:

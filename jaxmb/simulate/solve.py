@@ -260,8 +260,7 @@ def _solved(problem: Problem) -> tuple[dict[str, Any], Outcome, Carry | None]:
         motion = nan_where(failed, motion, inputs)
     stats = _statistics(problem, solver, solution, end)
     complete, long = jnp.all(jnp.isfinite(ts)), stats["num_steps"] >= MOST_ROWS
-    wrong = stats.get("wrong_derivative", False)
-    flags = Flags(failed, ~jnp.asarray(start.consistent), stuck, complete, ran_out, long, wrong)
+    flags = Flags(failed, ~jnp.asarray(start.consistent), stuck, complete, ran_out, long)
     evidence = method.policy.evidence(solution.solver_state)
     turning = None if carry is None else carry.progress.turning
     reach = None if turning is None else turning.reach
