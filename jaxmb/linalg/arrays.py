@@ -35,11 +35,13 @@ class Derivatives(NamedTuple):
     """The derivatives that are being taken by each leaf of a pytree.
 
     **Fields:** `orders` of the derivatives, which are unknown under a `jax.jit` that is differentiated as a whole;
-    `known`: whether the values of all leaves are known, as for derivatives outside of `jax.jit` and `jax.vmap`.
+    `known`: whether the values of all leaves are known, as for derivatives outside of `jax.jit` and `jax.vmap`;
+    `levels`: how many derivatives are nested, two also for a mixed one, of one order by each of two leaves.
     """
 
     orders: tuple[int, ...]
     known: bool
+    levels: int
 
 
 def derivatives_of(tree: Any) -> Derivatives:
@@ -47,7 +49,7 @@ def derivatives_of(tree: Any) -> Derivatives:
     leaves = jax.tree.leaves(tree)
     tracers = [k for k, x in enumerate(leaves) if isinstance(x, Tracer)]
     traced = [k for k in tracers if jnp.issubdtype(leaves[k].dtype, jnp.inexact)]
-    orders, is_concrete = [0] * len(leaves), not tracers
+    orders, is_concrete, levels = [0] * len(leaves), not tracers, 0
 
     # JAX calls the rule when it takes a derivative, with the values of outer derivatives.
     @jax.custom_jvp
@@ -55,8 +57,9 @@ def derivatives_of(tree: Any) -> Derivatives:
         return leaves[0]
 
     def rule(primals, tangents):
-        nonlocal is_concrete
-        outer, is_concrete = derivatives_of(primals)
+        nonlocal is_concrete, levels
+        outer, is_concrete, levels = derivatives_of(primals)
+        levels += 1
         is_concrete = is_concrete and traced == tracers
         for k, order, tangent in zip(traced, outer, tangents, strict=True):
             orders[k] = order + (not isinstance(tangent, SymbolicZero))
@@ -66,7 +69,7 @@ def derivatives_of(tree: Any) -> Derivatives:
     probe.defjvp(rule, symbolic_zeros=True)
     if traced:
         probe(*(leaves[k] for k in traced))
-    return Derivatives(tuple(orders), is_concrete)
+    return Derivatives(tuple(orders), is_concrete, levels)
 
 
 def as_array(value: Any, dtype: Any) -> Any:

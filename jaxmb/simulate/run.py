@@ -358,7 +358,7 @@ def _settled(problem, asked):
     known = not traced or (taken is not None and taken.known)
     tries = traced and known and not was_long(system, problem.method.solver)
     # Derivatives of a program under `jit` may be of any order.
-    second = max(orders) > 1 if any(orders) else traced
+    second = taken.levels > 1 if taken is not None and any(orders) else traced
     kept = kept_steps(state, asked.max_steps) if second else kept_steps(state)
     rooms = rooms_for(asked.max_steps, problem.saveat, state, tries) if traced else [room_of_calls(saves, state)]
     if span.is_backward() and system.contacts:

@@ -290,7 +290,7 @@ def _found(system, t, start, held, stable) -> _Outcome:
         return _balanced(system, t, start, held, stable)
     balance = Balance(system, t, start[np.array(held, int)], held)
     inverse = None
-    if host is not None and max(derivatives_of((system, t, start)).orders) == 1:
+    if host is not None and derivatives_of((system, t, start)).levels == 1:
         inverse = _inverse(host, np.asarray(outcome.q), local)
     return outcome._replace(q=_followed(balance, outcome.q, local, outcome.ok, inverse)[0])
 

@@ -760,6 +760,7 @@ FAULTS = [
     ),
     Fault("manifold/chart_constraints.py", "return change + answer @ responses, answer", "return change, answer"),
     Fault("manifold/chart.py", "at = at.with_(u=at.u - step)", "at = at.with_(u=at.u + step)"),
+    Fault("linalg/arrays.py", "levels += 1", "levels = 1"),
     Fault("states/equilibrium.py", "initial - inverse @ (unmet", "initial + inverse @ (unmet"),
     Fault("states/nearest.py", "return -(inverse[: x.size] @ change)", "return inverse[: x.size] @ change"),
     Fault("states/nearest.py", "curvature(forces), 0.0)", "0.0 * curvature(forces), 0.0)"),
