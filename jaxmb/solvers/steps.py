@@ -83,7 +83,7 @@ class AbstractSteps(eqx.Module):
 
     def start(self, terms: PyTree, before: Any, after: Any) -> PyTree[Array]:
         """The row of the start of a run (`starts`), from the states around the first accepted step."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} says starts, and needs a method start.")
 
     @abc.abstractmethod
     def linearised(self, of: Callable, moved: Moving, like: PyTree[Array], row: PyTree[Array]) -> LinearStep:
