@@ -35,7 +35,18 @@ def test_derivatives_that_are_taken(around, order, known):
         return x
 
     around(f)(jnp.array(1.0))
-    assert found == [((0, 0, 0, order), known)]
+    assert found == [((0, 0, 0, order), known, order)]
+
+
+def test_mixed_derivatives_are_nested_twice_though_each_order_is_one():
+    found = []
+
+    def f(x, y):
+        found.append(derivatives_of((x, y)))
+        return x * y
+
+    jax.jacfwd(jax.grad(f, argnums=0), argnums=1)(jnp.array(1.0), jnp.array(2.0))
+    assert found == [((1, 1), True, 2)]
 
 
 def test_a_traced_count_is_not_known():
